@@ -1,0 +1,56 @@
+"""Identify dynamic models with hysteresis from recordings, and find the physics that a simulator leaves out.
+
+Every public name is reachable as ``pilfr_casadi.<name>``; its module is imported when the name is first used, so that
+``import pilfr_casadi`` itself costs next to nothing.
+"""
+
+import importlib
+import sys
+import types
+from typing import Any
+
+__version__ = "0.1.0"
+
+# public name -> submodule that defines it
+_EXPORTS = {
+    "InputError": "recording",
+    "Recording": "recording",
+    "as_recordings": "recording",
+    "multisine": "signals",
+    "nrmse": "metrics",
+    "orthogonal_multisine": "signals",
+    "prbs": "signals",
+    "read": "readers",
+    "read_csv": "readers",
+    "read_mat": "readers",
+    "read_npz": "readers",
+    "rmse": "metrics",
+    "sine_sweep": "signals",
+    "tukey_realizations": "signals",
+}
+
+__all__ = sorted(_EXPORTS)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _EXPORTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_EXPORTS[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_EXPORTS})
+
+
+class _Package(types.ModuleType):
+    """This package: where a public name equals its submodule's (``fit`` in ``fit.py``), the public name wins."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if isinstance(value, types.ModuleType) and _EXPORTS.get(name) == name:
+            value = getattr(value, name)
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

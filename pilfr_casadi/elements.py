@@ -1,0 +1,104 @@
+"""Elements: laws with memory from a local signal z to an internal signal w.
+
+An element is anything with `channels`, `memory`, `parameters()` and `step(z, s, p) -> (w, s_next)`; `close_loop` puts it into
+a model's port. `PrandtlIshlinskii` is the layer of Krikelis et al. (2024), Eq. 16: `w_i(k) = Σ_j w_ij H_rij[z_i](k)`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+
+from .operators import GeneralizedPlay, Play, Stop
+from .parameters import Parameter, ParameterSet
+from .recording import InputError
+
+Operator = Play | Stop | GeneralizedPlay
+
+
+class Element(Protocol):
+    """What `close_loop` needs of an element."""
+
+    @property
+    def channels(self) -> int:
+        """Number of signals in and out, `n_z = n_w`."""
+
+    @property
+    def memory(self) -> int:
+        """Number of memory states."""
+
+    def parameters(self) -> ParameterSet:
+        """The element's parameters with start values and bounds."""
+
+    def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
+        """Symbolic step: z (channels, 1), s (memory, 1), p by name -> w (channels, 1), next s."""
+
+
+@dataclass(frozen=True)
+class PrandtlIshlinskii:
+    """A layer of N hysteresis operators of one kind a channel, Eq. 16.
+
+    Parameters
+    ----------
+    operator : Play, Stop or GeneralizedPlay (class or instance)
+        The operator.
+    n : int
+        Operators a channel, N.
+    channels : int
+        Number of signals, each with weights `w[i, :] ≥ 0` and thresholds `r[i, :] ≥ 0` of its own.
+
+    rounded : bool
+        Round the kinks over a band of half-width `eps`, then a parameter, fixed at 0 until changed (see `operators`).
+    """
+
+    operator: Any = Play
+    n: int = 10
+    channels: int = 1
+    rounded: bool = False
+    kind: str = field(init=False, default="prandtl_ishlinskii")
+
+    def __post_init__(self) -> None:
+        operator = self.operator() if isinstance(self.operator, type) else self.operator
+        if not isinstance(operator, Play | Stop | GeneralizedPlay):
+            raise InputError(f"The operator {self.operator!r} is unknown; use Play, Stop or GeneralizedPlay.")
+        if self.n < 1 or self.channels < 1:
+            raise InputError(
+                f"A Prandtl-Ishlinskii element needs n >= 1 and channels >= 1; {self.n} and {self.channels} were given."
+            )
+        object.__setattr__(self, "operator", operator)
+
+    @property
+    def memory(self) -> int:
+        """One play state an operator."""
+        return self.n * self.channels
+
+    def parameters(self) -> ParameterSet:
+        """`w`, `r` (channels, N), explicit bounds `≥ 0`, and the operator's own."""
+        shape = (self.channels, self.n)
+        grid = np.tile((np.arange(self.n) + 0.5) / self.n, (self.channels, 1))
+        own = ParameterSet(
+            {
+                "w": Parameter(np.full(shape, 1.0 / self.n), bounds=(0.0, np.inf)),
+                "r": Parameter(grid, bounds=(0.0, np.inf)),
+            }
+        )
+        if self.rounded:
+            own = own | {"eps": Parameter(0.0, bounds=(0.0, np.inf), fixed=True)}
+        return own | self.operator.parameters(self.channels)
+
+    def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
+        """One step; memory is stacked channel by channel."""
+        eps = p["eps"] if self.rounded else 0.0
+        w_out, s_out = [], []
+        for i in range(self.channels):
+            for j in range(self.n):
+                q = s[i * self.n + j]
+                more = {"channel": i} if isinstance(self.operator, GeneralizedPlay) else {}
+                v, q_next = self.operator.step(z[i], q, p["r"][i, j], p, eps, **more)
+                w_out.append(p["w"][i, j] * v)
+                s_out.append(q_next)
+        w = [sum(w_out[i * self.n + 1 : (i + 1) * self.n], w_out[i * self.n]) for i in range(self.channels)]
+        return ca.vertcat(*w), ca.vertcat(*s_out)

@@ -1,0 +1,124 @@
+"""The PI-LFR model class and what is the same with some blocks fixed.
+
+    x⁺ = A x + B_u u + B_w w,   y = C_y x + D_yu u + D_yw w + y_0,   z = C_z x + D_zu u,   w = element(z)
+
+Krikelis et al. (2024), Eq. 15-17, with `n_z = n_w` channels, and a constant `y_0` for sensors that do not read zero at rest.
+Without an element this is a linear state-space model; `hammerstein` and `wiener` fix blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from .elements import Element
+from .model import Model, close_loop, open_model
+from .parameters import Parameter, ParameterSet
+from .recording import InputError
+
+BLOCKS = ("A", "B_u", "B_w", "C_y", "D_yu", "D_yw", "C_z", "D_zu", "y_0")
+
+
+def block_shapes(nx: int, n_u: int, n_y: int, n_w: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the linear blocks."""
+    return {
+        "A": (nx, nx),
+        "B_u": (nx, n_u),
+        "B_w": (nx, n_w),
+        "C_y": (n_y, nx),
+        "D_yu": (n_y, n_u),
+        "D_yw": (n_y, n_w),
+        "C_z": (n_w, nx),
+        "D_zu": (n_w, n_u),
+        "y_0": (n_y,),
+    }
+
+
+@dataclass(frozen=True)
+class PILFR:
+    """A PI-LFR model structure: what to identify, before data says how many inputs and outputs there are.
+
+    Parameters
+    ----------
+    nx : int
+        States of the linear part.
+    element : Element or None
+        The element in the loop, usually `PrandtlIshlinskii`; None for a linear model.
+    fixed : mapping
+        Blocks held at a value, for example `{"D_yu": 0.0}`; a scalar fills the block.
+    offset : bool
+        Estimate the constant `y_0`.
+
+    Raises
+    ------
+    InputError
+        If nx is negative or a fixed block is unknown.
+    """
+
+    nx: int
+    element: Element | None = None
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    offset: bool = True
+
+    def __post_init__(self) -> None:
+        if int(self.nx) != self.nx or self.nx < 0:
+            raise InputError(f"The number of states is {self.nx}; give a whole number, 0 or more.")
+        for name in self.fixed:
+            if name not in BLOCKS:
+                raise InputError(f"The fixed block {name!r} is unknown; the blocks are {', '.join(BLOCKS)}.")
+
+    @property
+    def n_w(self) -> int:
+        """Channels of the element."""
+        return 0 if self.element is None else self.element.channels
+
+    def model(self, n_u: int, n_y: int, values: Mapping[str, Any] | None = None, *, inputs: tuple[str, ...] = (), outputs: tuple[str, ...] = ()) -> Model:
+        """The closed model for n_u inputs and n_y outputs, blocks starting at `values` (zero where not given)."""
+        entries = {}
+        fixed = dict(self.fixed) if self.offset else {"y_0": 0.0, **self.fixed}
+        for name, shape in block_shapes(self.nx, n_u, n_y, self.n_w).items():
+            value = fixed.get(name, (values or {}).get(name, 0.0))
+            entries[name] = Parameter(np.broadcast_to(np.asarray(value, dtype=float), shape), fixed=name in fixed)
+        opened = open_model(
+            _step,
+            _port,
+            ParameterSet(entries),
+            n_x=self.nx,
+            n_u=n_u,
+            n_w=self.n_w,
+            inputs=inputs,
+            outputs=outputs,
+        )
+        if self.element is None:
+            return opened
+        closed = close_loop(opened, self.element)
+        own = {k: {"value": v} for k, v in (values or {}).items() if k not in BLOCKS}
+        return closed.with_parameters(closed.parameters.change(**own))
+
+    def linear(self) -> PILFR:
+        """The same structure without its element."""
+        return replace(self, element=None, fixed={k: v for k, v in self.fixed.items() if k not in ("B_w", "D_yw", "C_z", "D_zu")})
+
+
+def _step(x: Any, u: Any, w: Any, p: dict[str, Any]) -> tuple[Any, Any]:
+    x_next = p["A"] @ x + p["B_u"] @ u + p["B_w"] @ w
+    return x_next, p["C_y"] @ x + p["D_yu"] @ u + p["D_yw"] @ w + p["y_0"]
+
+
+def _port(x: Any, u: Any, p: dict[str, Any]) -> Any:
+    return p["C_z"] @ x + p["D_zu"] @ u
+
+
+def hammerstein(nx: int, element: Element, offset: bool = True) -> PILFR:
+    """PI-Hammerstein: the input passes the element first; `z = u`, and u reaches the dynamics only through w."""
+    eye = np.eye(element.channels)
+    return PILFR(nx, element, {"C_z": 0.0, "D_zu": eye, "B_u": 0.0, "D_yu": 0.0}, offset)
+
+
+def wiener(nx: int, element: Element, offset: bool = True) -> PILFR:
+    """PI-Wiener: the linear dynamics come first, the output is read through the element; `y = w`."""
+    eye = np.eye(element.channels)
+    return PILFR(nx, element, {"B_w": 0.0, "C_y": 0.0, "D_yu": 0.0, "D_yw": eye}, offset)

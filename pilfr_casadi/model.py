@@ -1,0 +1,164 @@
+"""The model: one symbolic step with a port, and closing the loop around an element.
+
+An open model is `z = h(x, u, p)`, `(x⁺, y) = f(x, u, w, p)`; an element is `(w, s⁺) = e(z, s, p)`. `z` does not depend on `w`
+(`D_zw = 0` in Krikelis et al. (2024), Eq. 15), so a step is explicit. `close_loop` joins the two; the state of the closed
+model is `[x; s]`, the element's memory included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+
+from .elements import Element
+from .parameters import ParameterSet
+from .recording import InputError
+
+StepExpression = Callable[[Any, Any, Any, dict[str, Any]], tuple[Any, Any]]
+PortExpression = Callable[[Any, Any, dict[str, Any]], Any]
+
+
+def _default_names(names: tuple[str, ...], n: int, letter: str) -> tuple[str, ...]:
+    if not names:
+        return (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
+    if len(names) != n:
+        raise InputError(f"{len(names)} names were given for {n} signals ({', '.join(names)}); give one name each.")
+    return tuple(names)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A discrete-time model, open (`element is None` and `n_w > 0`) or closed.
+
+    Attributes
+    ----------
+    step : casadi.Function
+        `(x, u, w, p) -> (x_next, y)`; shapes (n_x,), (n_u,), (n_w,), (n_p,) -> (n_x,), (n_y,).
+    port : casadi.Function
+        `(x, u, p) -> z`, shape (n_w,).
+    memory : casadi.Function
+        `(z, s, p) -> (w, s_next)`, the element; without one it has no memory and `w = 0`.
+    parameters : ParameterSet
+        All parameters, the element's included.
+    """
+
+    step: ca.Function
+    port: ca.Function
+    memory: ca.Function
+    parameters: ParameterSet
+    element: Element | None
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    @property
+    def n_x(self) -> int:
+        """States without the element's memory."""
+        return int(self.step.size1_in(0))
+
+    @property
+    def n_u(self) -> int:
+        """Inputs."""
+        return int(self.step.size1_in(1))
+
+    @property
+    def n_w(self) -> int:
+        """Channels of the port."""
+        return int(self.step.size1_in(2))
+
+    @property
+    def n_y(self) -> int:
+        """Outputs."""
+        return int(self.step.size1_out(1))
+
+    @property
+    def n_s(self) -> int:
+        """Memory states of the element."""
+        return int(self.memory.size1_in(1))
+
+    def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Fresh symbols x, s, u, p of this model's sizes."""
+        sizes = (("x", self.n_x), ("s", self.n_s), ("u", self.n_u), ("p", self.parameters.size))
+        x, s, u, p = (ca.SX.sym(name, n) for name, n in sizes)
+        return x, s, u, p
+
+    @cached_property
+    def closed(self) -> ca.Function:
+        """`(x, u, p) -> (x_next, y)` with `x = [x; s]`: the whole step as one Function."""
+        x, s, u, p = self.symbols()
+        z = self.port(x, u, p)
+        w, s_next = self.memory(z, s, p)
+        x_next, y = self.step(x, u, w, p)
+        state = ca.vertcat(x, s)
+        return ca.Function("closed", [state, u, p], [ca.vertcat(x_next, s_next), y], ["x", "u", "p"], ["x_next", "y"])
+
+    def with_parameters(self, parameters: ParameterSet) -> Model:
+        """The same equations with other start values, bounds or fixed flags."""
+        if tuple(parameters) != tuple(self.parameters) or parameters.size != self.parameters.size:
+            raise InputError("The parameters given do not match the model's; change values with `parameters.change`.")
+        return replace(self, parameters=parameters)
+
+
+def open_model(
+    step: StepExpression,
+    port: PortExpression,
+    parameters: ParameterSet,
+    *,
+    n_x: int,
+    n_u: int,
+    n_w: int,
+    states: tuple[str, ...] = (),
+    inputs: tuple[str, ...] = (),
+    outputs: tuple[str, ...] = (),
+) -> Model:
+    """An open model from Python expressions `step(x, u, w, p) -> (x_next, y)` and `port(x, u, p) -> z`; p maps names to symbols."""
+    x, u, w = ca.SX.sym("x", n_x), ca.SX.sym("u", n_u), ca.SX.sym("w", n_w)
+    vector = ca.SX.sym("p", parameters.size)
+    named = parameters.symbols(vector)
+    x_next, y = step(x, u, w, named)
+    z = port(x, u, named) if n_w else ca.SX(0, 1)
+    z_in, s = ca.SX.sym("z", n_w), ca.SX(0, 1)
+    return Model(
+        step=ca.Function("step", [x, u, w, vector], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),
+        port=ca.Function("port", [x, u, vector], [z], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [z_in, s, vector], [ca.SX(n_w, 1), s], ["z", "s", "p"], ["w", "s_next"]),
+        parameters=parameters,
+        element=None,
+        states=_default_names(states, n_x, "x"),
+        inputs=_default_names(inputs, n_u, "u"),
+        outputs=_default_names(outputs, int(y.shape[0]), "y"),
+    )
+
+
+def close_loop(model: Model, element: Element) -> Model:
+    """Put an element into the model's port.
+
+    Raises
+    ------
+    InputError
+        If the port is already closed, or the element has another number of channels.
+    """
+    if model.element is not None:
+        raise InputError("The model's port is closed already; close an open model.")
+    if element.channels != model.n_w:
+        raise InputError(
+            f"The element has {element.channels} channels, the model's port has {model.n_w}; give as many."
+        )
+    parameters = model.parameters | element.parameters()
+    vector = ca.SX.sym("p", parameters.size)
+    own = vector[: model.parameters.size]
+    x, _, u, _ = model.symbols()
+    z, w, s = ca.SX.sym("z", model.n_w), ca.SX.sym("w", model.n_w), ca.SX.sym("s", element.memory)
+    w_out, s_next = element.step(z, s, parameters.symbols(vector))
+    return replace(
+        model,
+        step=ca.Function("step", [x, u, w, vector], model.step(x, u, w, own), ["x", "u", "w", "p"], ["x_next", "y"]),
+        port=ca.Function("port", [x, u, vector], [model.port(x, u, own)], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [z, s, vector], [w_out, s_next], ["z", "s", "p"], ["w", "s_next"]),
+        parameters=parameters,
+        element=element,
+    )

@@ -1,0 +1,298 @@
+"""The simulation-error problem: Krikelis et al. (2024), Eq. 20, over any number of recordings.
+
+    minimise  1/2 mean(e²) + 1/2 Σ ((θ_i - m_i) / s_i)² v/R + l1 Σ |w|      e = (y_hat(θ) - y) / σ_y,
+    subject to  lower <= θ <= upper,  lower_g <= g(θ) <= upper_g.
+
+θ stacks the model's free parameters and, for each recording whose initial state is estimated, that state with the element's
+memory. The mean runs over all R scored samples and outputs; `v` is the noise variance that the priors are weighed against.
+Derivatives come from the sensitivity recursion; `normal` accumulates `JᵀJ` and `Jᵀe` over stretches of the record, so memory
+does not grow with its length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .compiled import make_engine
+from .constraints import Constraint, compile_constraints
+from .model import Model
+from .recording import InputError, Recording, as_recordings
+from .sensitivities import Engine
+
+STRETCH = 2048
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One recording inside the problem: its first variable (or None), its weight rows, and samples run before it."""
+
+    recording: Recording
+    first: int | None
+    state: np.ndarray
+    warm_up: np.ndarray
+
+
+class Problem:
+    """Minimise the simulation error of a closed model over recordings.
+
+    Parameters
+    ----------
+    model : Model
+        Closed model; its parameters give start, bounds and what is fixed.
+    recordings : Recording or sequence of Recording
+        Data, with their initial states.
+    engine : {"auto", "c", "vm"}
+        How the model is run.
+    constraints : sequence of Constraint
+        Further constraints on the named parameters.
+    l1 : dict
+        Weight of the absolute sum of non-negative parameters by name, for example `{"w": 1e-4}`.
+    noise : float
+        Standard deviation of the noise relative to the output's, against which priors are weighed.
+    periods : int
+        Periods run before a recording in periodic steady state.
+
+    Raises
+    ------
+    InputError
+        If model and recordings do not fit each other, or nothing is left to estimate.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        recordings: Recording | Sequence[Recording],
+        *,
+        engine: str | Engine = "auto",
+        constraints: Sequence[Constraint] = (),
+        l1: dict[str, float] | None = None,
+        noise: float = 1.0,
+        periods: int = 2,
+        scale: np.ndarray | None = None,
+    ) -> None:
+        self.model = model
+        self.recordings = as_recordings(recordings)
+        self.engine = make_engine(model, engine) if isinstance(engine, str) else engine
+        self.constraints = tuple(constraints)
+        parameters = model.parameters
+        self._base = parameters.start
+        self.free = parameters.free
+        n_free = int(self.free.sum())
+        for r in self.recordings:
+            if r.n_u != model.n_u or r.n_y != model.n_y:
+                raise InputError(
+                    f"The recording has {r.n_u} inputs and {r.n_y} outputs, the model {model.n_u} and {model.n_y}; they must match."
+                )
+        self.scale = _output_scale(self.recordings) if scale is None else np.asarray(scale, dtype=float)
+        self._parts = list(self._lay_out(n_free, periods))
+        self._residuals = sum((len(p.recording) - p.recording.skip) * model.n_y for p in self._parts)
+        n_state = model.n_x + model.n_s
+        n_initial = sum(n_state for p in self._parts if p.first is not None)
+        self.labels = tuple(np.array(parameters.labels, dtype=object)[self.free]) + tuple(
+            f"initial[{i}].{k}" for i, p in enumerate(self._parts) if p.first is not None for k in range(n_state)
+        )
+        unbounded = np.full(n_initial, np.inf)
+        self.lower = np.concatenate([parameters.lower[self.free], -unbounded])
+        self.upper = np.concatenate([parameters.upper[self.free], unbounded])
+        states = [p.state for p in self._parts if p.first is not None]
+        self.start = np.concatenate([parameters.start[self.free], *states])
+        if self.size == 0:
+            raise InputError("Every parameter is fixed and no initial state is estimated; free at least one parameter.")
+        self._columns = np.where(self.free, np.cumsum(self.free) - 1, -1)
+        self._set_penalties(l1 or {}, noise)
+        g, slope, self.g_lower, self.g_upper, self.g_labels = compile_constraints(self.constraints, parameters)
+        self._g, self._g_slope = g, slope
+
+    def _lay_out(self, at: int, periods: int) -> Iterator[_Part]:
+        n_state = self.model.n_x + self.model.n_s
+        for r in self.recordings:
+            zero, nothing = np.zeros(n_state), r.u[:0]
+            if isinstance(r.initial, str):
+                if r.initial == "zero":
+                    yield _Part(r, None, zero, nothing)
+                elif r.initial == "estimate":
+                    yield _Part(r, at, zero, nothing)
+                    at += n_state
+                else:
+                    if r.period is None:
+                        raise InputError("A recording in periodic steady state needs its period in samples; give `period=`.")
+                    yield _Part(r, None, zero, np.tile(r.u[: r.period], (periods, 1)))
+            else:
+                given = np.asarray(r.initial, dtype=float).ravel()
+                if given.size not in (self.model.n_x, n_state):
+                    raise InputError(f"An initial state of {given.size} numbers was given; expected {self.model.n_x} or {n_state}.")
+                yield _Part(r, None, np.concatenate([given, zero[given.size :]]), nothing)
+
+    def _set_penalties(self, l1: dict[str, float], noise: float) -> None:
+        parameters = self.model.parameters
+        weight, mean, slope = (np.zeros(parameters.size) for _ in range(3))
+        for name, strength in l1.items():
+            where = parameters.position(name)
+            if np.any(parameters.lower[where] < 0):
+                raise InputError(f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior.")
+            slope[where] = strength
+        for name, p in parameters.items():
+            if p.prior is not None:
+                where = parameters.position(name)
+                mean[where] = np.broadcast_to(np.asarray(p.prior[0], dtype=float), p.value.shape).ravel(order="F")
+                std = np.broadcast_to(np.asarray(p.prior[1], dtype=float), p.value.shape).ravel(order="F")
+                weight[where] = noise**2 / std**2 / self._residuals
+        pad = np.zeros(self.size - int(self.free.sum()))
+        self._prior_weight, self._prior_mean, self._l1 = (np.concatenate([a[self.free], pad]) for a in (weight, mean, slope))
+
+    @property
+    def size(self) -> int:
+        """Number of variables."""
+        return len(self.start)
+
+    @property
+    def residuals(self) -> int:
+        """Number of scored residuals R."""
+        return self._residuals
+
+    def parameters(self, theta: np.ndarray) -> np.ndarray:
+        """The model's full parameter vector (n_p,) at θ."""
+        p = self._base.copy()
+        p[self.free] = theta[: int(self.free.sum())]
+        return p
+
+    def initial_states(self, theta: np.ndarray) -> list[np.ndarray]:
+        """State with memory at each recording's first sample (before any warm-up periods)."""
+        n = self.model.n_x + self.model.n_s
+        return [p.state if p.first is None else theta[p.first : p.first + n] for p in self._parts]
+
+    def _penalty(self, theta: np.ndarray) -> float:
+        return float(0.5 * self._prior_weight @ (theta - self._prior_mean) ** 2 + self._l1 @ theta)
+
+    def simulate(self, theta: np.ndarray) -> list[np.ndarray]:
+        """Simulated outputs, one (M, n_y) array a recording."""
+        p, out = self.parameters(theta), []
+        for part, state in zip(self._parts, self.initial_states(theta), strict=True):
+            if len(part.warm_up):
+                state = self.engine.simulate(part.warm_up, p, state)[1]
+            out.append(self.engine.simulate(part.recording.u, p, state)[0])
+        return out
+
+    def residual(self, theta: np.ndarray) -> np.ndarray:
+        """Normalised residuals `(y_hat - y) / σ_y` of all scored samples, shape (R,)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            pairs = zip(self._parts, self.simulate(theta), strict=True)
+            return np.concatenate([((y - p.recording.y) / self.scale)[p.recording.skip :].ravel() for p, y in pairs])
+
+    def cost(self, theta: np.ndarray) -> float:
+        """Value of the objective; infinite where the simulation diverges."""
+        e = self.residual(theta)
+        with np.errstate(over="ignore", invalid="ignore"):
+            value = 0.5 * float(e @ e) / self._residuals + self._penalty(theta)
+        return value if np.isfinite(value) else np.inf
+
+    def stretches(self, theta: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Residuals (R_b,), their Jacobian (R_b, n_c) and its columns in θ, stretch by stretch of each recording."""
+        p, n_free, n_state = self.parameters(theta), int(self.free.sum()), self.model.n_x + self.model.n_s
+        for part, state in zip(self._parts, self.initial_states(theta), strict=True):
+            estimated = part.first is not None
+            columns = np.arange(n_free)
+            seed = np.zeros((n_state, n_free + n_state * estimated))
+            if part.first is not None:
+                seed[:, n_free:] = np.eye(n_state)
+                columns = np.concatenate([columns, part.first + np.arange(n_state)])
+            for a in range(0, len(part.warm_up), STRETCH):
+                _, _, state, seed = self.engine.sensitivity(part.warm_up[a : a + STRETCH], p, state, seed, self._columns)
+            r = part.recording
+            for a in range(0, len(r), STRETCH):
+                b = min(a + STRETCH, len(r))
+                y, jac, state, seed = self.engine.sensitivity(r.u[a:b], p, state, seed, self._columns)
+                cut = min(max(r.skip - a, 0), b - a)
+                e = ((y - r.y[a:b]) / self.scale)[cut:].ravel()
+                if not np.all(self.scale == 1.0):
+                    jac = jac / self.scale[None, :, None]
+                yield e, jac[cut:].reshape(e.size, -1), columns
+
+    def jacobian(self, theta: np.ndarray) -> np.ndarray:
+        """Jacobian of `residual`, shape (R, size)."""
+        out, at = np.zeros((self._residuals, self.size)), 0
+        for e, jac, columns in self.stretches(theta):
+            out[at : at + e.size, columns] = jac
+            at += e.size
+        return out
+
+    def normal(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Objective, its gradient and Gauss-Newton Hessian at θ."""
+        value, gradient, hessian = 0.0, np.zeros(self.size), np.zeros((self.size, self.size))
+        for e, jac, columns in self.stretches(theta):
+            value += float(e @ e)
+            gradient[columns] += e @ jac
+            hessian[np.ix_(columns, columns)] += jac.T @ jac
+        m = self._residuals
+        gradient = gradient / m + self._prior_weight * (theta - self._prior_mean) + self._l1
+        return 0.5 * value / m + self._penalty(theta), gradient, hessian / m + np.diag(self._prior_weight)
+
+    def constraint(self, theta: np.ndarray) -> np.ndarray:
+        """Values g(θ) of the general constraints."""
+        return np.asarray(self._g(self.parameters(theta))).ravel()
+
+    def constraint_jacobian(self, theta: np.ndarray) -> np.ndarray:
+        """Jacobian of `constraint`, shape (n_g, size)."""
+        jac = np.zeros((len(self.g_lower), self.size))
+        if len(jac):
+            jac[:, : int(self.free.sum())] = np.asarray(self._g_slope(self.parameters(theta)))[:, self.free]
+        return jac
+
+    def nrmse(self, theta: np.ndarray) -> list[float]:
+        """NRMSE of each recording (Eq. 27, averaged over outputs)."""
+        out = []
+        for part, y in zip(self._parts, self.simulate(theta), strict=True):
+            e = (y - part.recording.y)[part.recording.skip :]
+            out.append(float(np.mean(np.sqrt(np.mean(e**2, axis=0)) / np.std(part.recording.y[part.recording.skip :], axis=0))))
+        return out
+
+
+def _output_scale(recordings: Sequence[Recording]) -> np.ndarray:
+    return np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
+
+
+def to_nlp(problem: Problem) -> dict[str, Any]:
+    """The problem unrolled over the horizon as CasADi expressions, ready for `ca.nlpsol` with costs and constraints of one's own.
+
+    Returns
+    -------
+    dict
+        `x` (decision variables θ), `f` (cost), `g` (constraints) as `nlpsol` takes them; `lbx`, `ubx`, `lbg`, `ubg`, `x0`;
+        `residual` (R,), `simulated` (one (n_y, M) expression a recording) and `parameters` (named expressions).
+    """
+    model = problem.model
+    theta = ca.MX.sym("theta", problem.size)
+    n_free, n_state = int(problem.free.sum()), model.n_x + model.n_s
+    p = ca.MX(ca.DM(problem.parameters(problem.start)))
+    if n_free:
+        p[np.flatnonzero(problem.free).tolist()] = theta[:n_free]
+    simulated, residual = [], []
+    for part in problem._parts:
+        state = ca.MX(ca.DM(part.state)) if part.first is None else theta[part.first : part.first + n_state]
+        r = part.recording
+        u = np.concatenate([part.warm_up, r.u])
+        run = model.closed.mapaccum("run", len(u))
+        _, y = run(state, u.T, ca.repmat(p, 1, len(u)))
+        y = y[:, len(part.warm_up) :]
+        simulated.append(y)
+        residual.append(ca.vec(((y - r.y.T) / np.tile(problem.scale[:, None], (1, len(r))))[:, r.skip :]))
+    e = ca.vertcat(*residual)
+    penalty = 0.5 * ca.dot(problem._prior_weight, (theta - problem._prior_mean) ** 2) + ca.dot(problem._l1, theta)
+    return {
+        "x": theta,
+        "f": 0.5 * ca.sumsqr(e) / problem.residuals + penalty,
+        "g": problem._g(p),
+        "x0": problem.start,
+        "lbx": problem.lower,
+        "ubx": problem.upper,
+        "lbg": problem.g_lower,
+        "ubg": problem.g_upper,
+        "residual": e,
+        "simulated": simulated,
+        "parameters": model.parameters.symbols(p),
+    }

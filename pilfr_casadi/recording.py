@@ -1,0 +1,354 @@
+"""The recording: sampled inputs and outputs of one experiment, checked once where data enters.
+
+A :class:`Recording` holds ``M`` samples of ``n_u`` inputs and ``n_y`` outputs on one uniform time grid, and says what a
+simulation of it has to know besides: the state it starts from, what the input does between the samples, whether it is
+periodic, and how many leading samples are not scored. It never changes once made; everything behind the door trusts it.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import Any, Self
+
+import numpy as np
+
+HOLDS = ("zero", "linear", None)
+INITIALS = ("zero", "estimate", "periodic")
+SAME_STEP = (
+    1e-4  # recordings fitted together may differ by this share in `dt` (a time column is written with few digits)
+)
+
+
+class InputError(ValueError):
+    """Something given by the user cannot be used; the message is one plain sentence for that user."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording:
+    """Sampled inputs and outputs of one experiment; immutable.
+
+    Parameters
+    ----------
+    u : array, (M, n_u) or (M,)
+        Inputs at the samples. Copied; stored as a read-only (M, n_u) array.
+    y : array, (M, n_y) or (M,)
+        Outputs at the same samples. Copied; stored as a read-only (M, n_y) array.
+    dt : float
+        Time from one sample to the next, in seconds.
+    inputs, outputs : tuple of str
+        Names of the columns; ``u`` or ``u1, u2, ...`` and ``y`` or ``y1, y2, ...`` where left out.
+    units : mapping of str to str
+        Unit by column name, for figures and reports; columns may be missing.
+    period : int, optional
+        Samples per period, when the recording is in periodic steady state from sample `skip` on.
+    initial : {"estimate", "zero", "periodic"} or array, (nx,)
+        State at the first sample: to be estimated, zero, that of the periodic steady state, or given.
+    hold : {"zero", "linear"}, optional
+        What the input does between the samples: held, or interpolated. ``None`` means not said.
+    skip : int
+        Leading samples that are simulated but not scored.
+    name : str
+        Name for messages, tables and figures.
+
+    Raises
+    ------
+    InputError
+        When a value is not a finite real number, or lengths, shapes, names or options do not fit together.
+    """
+
+    u: np.ndarray
+    y: np.ndarray
+    dt: float
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    period: int | None = None
+    initial: str | np.ndarray = "estimate"
+    hold: str | None = None
+    skip: int = 0
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        u, inputs = _columns(self.u, self.inputs, "u", "input", self.label)
+        y, outputs = _columns(self.y, self.outputs, "y", "output", self.label)
+        if len(u) != len(y):
+            raise InputError(
+                f"{self.label} has {len(u)} samples of u but {len(y)} of y; give arrays of shape (samples, channels) "
+                "with the same number of samples."
+            )
+        if len(u) < 2:
+            raise InputError(
+                f"{self.label} has {len(u)} sample(s) and at least 2 are needed; arrays are (samples, channels), "
+                "so transpose them if they lie the other way."
+            )
+        twice = sorted(set(inputs) & set(outputs))
+        if twice:
+            raise InputError(f"{self.label} names {twice[0]!r} both as an input and as an output; give it one role.")
+        strange = sorted(set(self.units) - {*inputs, *outputs})
+        if strange:
+            raise InputError(
+                f"{self.label} gives a unit for {strange[0]!r}; its columns are {_listed(inputs + outputs)}."
+            )
+        _check_options(self, len(u))
+        initial = self.initial
+        if not isinstance(initial, str):
+            initial = _initial_state(initial, self.label)
+        clean = dict(u=u, y=y, dt=float(self.dt), inputs=inputs, outputs=outputs, initial=initial)
+        clean["units"] = MappingProxyType(dict(self.units))
+        for key, value in clean.items():
+            object.__setattr__(self, key, value)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        values = [getattr(self, f.name) for f in fields(self)]
+        return Recording, tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
+
+    @property
+    def label(self) -> str:
+        """How messages call this recording."""
+        return f"recording {self.name!r}" if self.name else "the recording"
+
+    @property
+    def n_u(self) -> int:
+        """Number of inputs."""
+        return self.u.shape[1]
+
+    @property
+    def n_y(self) -> int:
+        """Number of outputs."""
+        return self.y.shape[1]
+
+    @property
+    def t(self) -> np.ndarray:
+        """Time of the samples from zero on, (M,), in seconds."""
+        return np.arange(len(self)) * self.dt
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def __repr__(self) -> str:
+        def channels(names: tuple[str, ...]) -> str:
+            return ", ".join(f"{n} [{self.units[n]}]" if n in self.units else n for n in names)
+
+        head = f"Recording {self.name!r}" if self.name else "Recording"
+        text = f"{head}: {len(self)} samples, dt {self.dt:.6g} s ({len(self) * self.dt:.4g} s), "
+        text += f"inputs {channels(self.inputs)}, outputs {channels(self.outputs)}"
+        extras = {"period": self.period, "hold": self.hold, "skip": self.skip or None}
+        initial = self.initial if isinstance(self.initial, str) else "given"
+        shown = [f"initial {initial}", *(f"{key} {value}" for key, value in extras.items() if value is not None)]
+        return f"<{text}, {', '.join(shown)}>"
+
+    def with_(self, **changes: Any) -> Self:
+        """Return a copy with some fields replaced, checked anew."""
+        return replace(self, **changes)
+
+    def slice(self, start: int | None = None, stop: int | None = None) -> Self:
+        """Return the samples from `start` up to `stop`, counted as in a Python slice.
+
+        The state at a later first sample is not the one given for the old first sample, so ``initial`` becomes
+        ``"estimate"`` there; ``"periodic"`` stays where a whole period is left.
+
+        Parameters
+        ----------
+        start, stop : int, optional
+            First sample, and the one after the last.
+
+        Raises
+        ------
+        InputError
+            When fewer than two samples are left.
+        """
+        first, last, _ = slice(start, stop).indices(len(self))
+        if last - first < 2:
+            raise InputError(
+                f"samples {first} to {last} of {self.label}, which has {len(self)}, are fewer than 2; cut a longer one."
+            )
+        skip = max(self.skip - first, 0)
+        skip = skip if skip < last - first else 0
+        period = self.period if self.period is not None and self.period <= last - first - skip else None
+        keeps = (isinstance(self.initial, str) and self.initial == "periodic") if first else True
+        if isinstance(self.initial, str) and self.initial == "periodic" and period is None:
+            keeps = False
+        return replace(
+            self,
+            u=self.u[first:last],
+            y=self.y[first:last],
+            period=period,
+            skip=skip,
+            initial=self.initial if keeps else "estimate",
+        )
+
+    def split(self, fraction: float) -> tuple[Self, Self]:
+        """Cut in two: the first `fraction` of the samples, and the rest.
+
+        Parameters
+        ----------
+        fraction : float
+            Share of the samples in the first piece, between 0 and 1.
+
+        Returns
+        -------
+        first, second : Recording
+        """
+        if not 0 < fraction < 1:
+            raise InputError(f"{self.label} cannot be split at {fraction}; give a fraction between 0 and 1.")
+        cut = round(fraction * len(self))
+        return self.slice(0, cut), self.slice(cut, None)
+
+
+def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, ...]:
+    """Take one recording or several, return a tuple.
+
+    Raises
+    ------
+    InputError
+        When there is none, or something else than a recording among them.
+    """
+    if isinstance(data, Recording):
+        return (data,)
+    if not isinstance(data, Iterable):
+        raise InputError(f"a Recording or a list of them is needed, not {type(data).__name__}; read_csv makes one.")
+    recordings = tuple(data)
+    for item in recordings:
+        if not isinstance(item, Recording):
+            raise InputError(f"every item must be a Recording, not {type(item).__name__}; read_csv makes one.")
+    if not recordings:
+        raise InputError("no recording was given; give at least one.")
+    return recordings
+
+
+def check_for_identification(data: Recording | Iterable[Recording], n_min: int = 2) -> tuple[Recording, ...]:
+    """Check that recordings can be fitted together and carry something to fit.
+
+    Parameters
+    ----------
+    data : Recording or iterable of Recording
+        What is to be fitted.
+    n_min : int
+        Smallest number of scored samples over all recordings, e.g. the number of free parameters.
+
+    Returns
+    -------
+    recordings : tuple of Recording
+
+    Raises
+    ------
+    InputError
+        When names or steps differ, samples are too few, every input is constant, or an output is constant.
+    """
+    recordings = as_recordings(data)
+    first = recordings[0]
+    for other in recordings[1:]:
+        for key in ("inputs", "outputs"):
+            a, b = getattr(first, key), getattr(other, key)
+            if a != b:
+                raise InputError(
+                    f"{other.label} has the {key} {_listed(b)} and {first.label} has {_listed(a)}; "
+                    "recordings fitted together need the same, in the same order."
+                )
+        if abs(other.dt - first.dt) > SAME_STEP * first.dt:
+            raise InputError(
+                f"{other.label} has a step of {other.dt:g} s and {first.label} one of {first.dt:g} s; "
+                "resample them to one step before fitting them together."
+            )
+    scored = sum(len(r) - r.skip for r in recordings)
+    if scored < n_min:
+        raise InputError(
+            f"there are {scored} scored samples in {len(recordings)} recording(s), but at least {n_min} are needed; "
+            "record longer or choose a smaller model."
+        )
+    if not any(_varies(r.u[:, i]) for r in recordings for i in range(r.n_u)):
+        raise InputError(
+            f"the input {_listed(first.inputs)} never changes in {_listed([r.label for r in recordings])}; "
+            "nothing can be identified without excitation."
+        )
+    for i, name in enumerate(first.outputs):
+        if not any(_varies(r.y[r.skip :, i]) for r in recordings):
+            raise InputError(
+                f"the output {name!r} never changes in {_listed([r.label for r in recordings])}; check the sensor "
+                "or leave this output out."
+            )
+    return recordings
+
+
+def _varies(x: np.ndarray) -> bool:
+    return bool(np.ptp(x) > 1e-12 * np.max(np.abs(x)))
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names)
+
+
+def _columns(
+    values: Any, names: Sequence[str], letter: str, role: str, label: str
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the signal as a read-only (M, n) copy, and its names."""
+    try:
+        given = np.asarray(values)
+        real = given.dtype.kind in "biuf" or given.dtype == object
+        array = np.array(given, dtype=float) if real else None
+    except (TypeError, ValueError):
+        array = None
+    if array is None:
+        raise InputError(f"{letter} of {label} is not an array of real numbers; give one of shape (samples, channels).")
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2 or array.shape[1] == 0:
+        raise InputError(
+            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels)."
+        )
+    n = array.shape[1]
+    names = (names,) if isinstance(names, str) else tuple(names)
+    if not names:
+        names = (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
+    if len(names) != n:
+        raise InputError(f"{label} has {n} {role} column(s) but {len(names)} name(s) {_listed(names)}; give one each.")
+    if len(set(names)) != n or not all(isinstance(name, str) and name for name in names):
+        raise InputError(f"the {role} names {names} of {label} must be distinct and not empty.")
+    if not np.isfinite(array).all():
+        k, i = np.argwhere(~np.isfinite(array))[0]
+        raise InputError(
+            f"sample {k} of {role} {names[i]!r} in {label} is {array[k, i]}; only finite numbers can be used, so "
+            "repair or cut out that piece."
+        )
+    array.setflags(write=False)
+    return array, names
+
+
+def _initial_state(values: Any, label: str) -> np.ndarray:
+    try:
+        state = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        state = np.empty(0)
+    if state.ndim != 1 or state.size == 0 or not np.isfinite(state).all():
+        raise InputError(
+            f"the initial state of {label} must be a vector of finite numbers, or one of {_listed(INITIALS)}."
+        )
+    state.setflags(write=False)
+    return state
+
+
+def _check_options(r: Recording, m: int) -> None:
+    if not isinstance(r.dt, (int, float, np.number)) or not math.isfinite(r.dt) or r.dt <= 0:
+        raise InputError(
+            f"{r.label} has a step dt of {r.dt!r}; give the seconds from one sample to the next, above zero."
+        )
+    if r.hold not in HOLDS:
+        raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear' or None.")
+    if isinstance(r.initial, str) and r.initial not in INITIALS:
+        raise InputError(
+            f"initial of {r.label} is {r.initial!r}; give one of {_listed(INITIALS)}, or the state itself."
+        )
+    if not _is_count(r.skip) or not 0 <= r.skip < m:
+        raise InputError(f"skip of {r.label} is {r.skip!r}; give a number of samples from 0 to {m - 1}.")
+    if r.period is not None and (not _is_count(r.period) or not 2 <= r.period <= m - r.skip):
+        raise InputError(
+            f"period of {r.label} is {r.period!r} samples; it must be a whole number from 2 to {m - r.skip}, so that "
+            "one period lies after the skipped samples."
+        )
+    if isinstance(r.initial, str) and r.initial == "periodic" and r.period is None:
+        raise InputError(f"initial of {r.label} is 'periodic' but its period is not given; set period, in samples.")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)

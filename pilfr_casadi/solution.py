@@ -1,0 +1,68 @@
+"""What every solver returns: the best point with a status that is a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+
+class Status(Enum):
+    """How a solve ended; the value is the sentence shown to the user."""
+
+    CONVERGED = "Converged: no admissible step improves the fit noticeably."
+    SMALL_STEP = "Converged: the last steps were too small to matter."
+    MAX_ITERATIONS = "Not converged: the iteration limit was reached; the best point so far is returned."
+    TIME_LIMIT = "Not converged: the time limit was reached; the best point so far is returned."
+    INTERRUPTED = "Not converged: interrupted; the best point so far is returned."
+    DIVERGED_START = "Failed: the simulation diverges at the start values; start from a stable model."
+    INFEASIBLE = "Failed: the constraints cannot be met from this start; loosen them or start elsewhere."
+    SOLVER_FAILED = "Not converged: the solver stopped early; the best point so far is returned."
+
+    @property
+    def converged(self) -> bool:
+        """Whether the result is a minimum."""
+        return self in (Status.CONVERGED, Status.SMALL_STEP)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One line of a solver's history."""
+
+    number: int
+    cost: float
+    seconds: float
+    step: float = 0.0
+    damping: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A solver's result.
+
+    Attributes
+    ----------
+    theta : numpy.ndarray
+        Variables, shape (n,), inside their bounds.
+    cost : float
+        Objective there.
+    violation : float
+        Largest violation of the general constraints (0 where they hold).
+    multipliers : numpy.ndarray
+        Multipliers of bounds (n,) followed by those of the general constraints (n_g,); positive at an upper limit.
+    """
+
+    theta: np.ndarray
+    cost: float
+    status: Status
+    iterations: int
+    seconds: float
+    violation: float = 0.0
+    multipliers: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    history: tuple[Iteration, ...] = ()
+    message: str = ""
+
+
+Progress = Callable[[Iteration], None]
