@@ -16,9 +16,10 @@ _EXPORTS = {
     "InputError": "recording",
     "Recording": "recording",
     "as_recordings": "recording",
-    "multisine": "signals",
+    "excited_bins": "multisines",
+    "multisine": "multisines",
     "nrmse": "metrics",
-    "orthogonal_multisine": "signals",
+    "orthogonal_multisine": "multisines",
     "prbs": "signals",
     "read": "readers",
     "read_csv": "readers",
@@ -26,6 +27,7 @@ _EXPORTS = {
     "read_npz": "readers",
     "rmse": "metrics",
     "sine_sweep": "signals",
+    "steady_periods": "signals",
     "tukey_realizations": "signals",
 }
 

@@ -117,7 +117,8 @@ class _Run:
                 calm = len(recent) > options.patience and recent[-1 - options.patience] - recent[-1] < options.tolerance * abs(recent[-1])
                 if calm and violation.sum() <= 1e-9:
                     return Status.CONVERGED
-            floor = np.maximum(scale, 1e-10 * max(float(scale.max()), 1e-300))
+            # a column that has been zero so far does not move, whatever its damping: the method is invariant to units
+            floor = np.where(scale > 0, scale, 1.0)
             damped = hessian + self.damping * np.diag(floor)
             step, good = self._step(damped, gradient, slope)
             predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)

@@ -9,7 +9,7 @@ Without an element this is a linear state-space model; `hammerstein` and `wiener
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -49,26 +49,33 @@ class PILFR:
         The element in the loop, usually `PrandtlIshlinskii`; None for a linear model.
     fixed : mapping
         Blocks held at a value, for example `{"D_yu": 0.0}`; a scalar fills the block.
+    bounds : mapping
+        `(lower, upper)` by parameter name, for example `{"w": (0, 2)}`.
+    priors : mapping
+        `(mean, std)` by parameter name: a quadratic prior, see `Parameter`.
     offset : bool
         Estimate the constant `y_0`.
 
     Raises
     ------
     InputError
-        If nx is negative or a fixed block is unknown.
+        If nx is negative, or a fixed, bounded or prior parameter is unknown.
     """
 
     nx: int
     element: Element | None = None
     fixed: Mapping[str, Any] = field(default_factory=dict)
+    bounds: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
+    priors: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
     offset: bool = True
 
     def __post_init__(self) -> None:
         if int(self.nx) != self.nx or self.nx < 0:
             raise InputError(f"The number of states is {self.nx}; give a whole number, 0 or more.")
-        for name in self.fixed:
-            if name not in BLOCKS:
-                raise InputError(f"The fixed block {name!r} is unknown; the blocks are {', '.join(BLOCKS)}.")
+        known = (*BLOCKS, *(self.element.parameters() if self.element else ()))
+        for name in (*self.fixed, *self.bounds, *self.priors):
+            if name not in known:
+                raise InputError(f"There is no parameter {name!r} to fix or bound; there are {', '.join(known)}.")
 
     @property
     def n_w(self) -> int:
@@ -77,30 +84,23 @@ class PILFR:
 
     def model(self, n_u: int, n_y: int, values: Mapping[str, Any] | None = None, *, inputs: tuple[str, ...] = (), outputs: tuple[str, ...] = ()) -> Model:
         """The closed model for n_u inputs and n_y outputs, blocks starting at `values` (zero where not given)."""
-        entries = {}
-        fixed = dict(self.fixed) if self.offset else {"y_0": 0.0, **self.fixed}
-        for name, shape in block_shapes(self.nx, n_u, n_y, self.n_w).items():
-            value = fixed.get(name, (values or {}).get(name, 0.0))
-            entries[name] = Parameter(np.broadcast_to(np.asarray(value, dtype=float), shape), fixed=name in fixed)
-        opened = open_model(
-            _step,
-            _port,
-            ParameterSet(entries),
-            n_x=self.nx,
-            n_u=n_u,
-            n_w=self.n_w,
-            inputs=inputs,
-            outputs=outputs,
-        )
-        if self.element is None:
-            return opened
-        closed = close_loop(opened, self.element)
-        own = {k: {"value": v} for k, v in (values or {}).items() if k not in BLOCKS}
-        return closed.with_parameters(closed.parameters.change(**own))
+        values, fixed = dict(values or {}), dict(self.fixed) if self.offset else {"y_0": 0.0, **self.fixed}
+        shapes = block_shapes(self.nx, n_u, n_y, self.n_w)
+        blocks = ParameterSet({name: Parameter(np.zeros(shape)) for name, shape in shapes.items()})
+        model = open_model(_step, _port, blocks, n_x=self.nx, n_u=n_u, n_w=self.n_w, inputs=inputs, outputs=outputs)
+        if self.element is not None:
+            model = close_loop(model, self.element)
+        changes: dict[str, dict[str, Any]] = {}
+        for name, p in model.parameters.items():
+            value = np.broadcast_to(np.asarray(fixed.get(name, values.get(name, p.value)), dtype=float), p.value.shape)
+            low, high = self.bounds.get(name, p.bounds)
+            change = {"value": value if name in fixed else np.clip(value, low, high), "bounds": (low, high)}
+            changes[name] = change | ({"fixed": True} if name in fixed else {}) | ({"prior": self.priors[name]} if name in self.priors else {})
+        return model.with_parameters(model.parameters.change(**changes))
 
     def linear(self) -> PILFR:
-        """The same structure without its element."""
-        return replace(self, element=None, fixed={k: v for k, v in self.fixed.items() if k not in ("B_w", "D_yw", "C_z", "D_zu")})
+        """The linear model of the same order, everything free."""
+        return PILFR(self.nx, offset=self.offset)
 
 
 def _step(x: Any, u: Any, w: Any, p: dict[str, Any]) -> tuple[Any, Any]:

@@ -70,8 +70,8 @@ def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
     still = np.flatnonzero(sigma <= 1e-14 * np.abs(measured).max(axis=0))
     if still.size:
         raise InputError(
-            f"output {still[0] + 1} of {len(sigma)} never changes, so an error relative to its standard deviation does not "
-            "exist; leave it out or use rmse."
+            f"output {still[0] + 1} of {len(sigma)} never changes, so an error relative to its standard deviation does "
+            "not exist; leave it out or use rmse."
         )
     return float(np.mean(errors / sigma))
 
@@ -80,7 +80,8 @@ def _scored(y: np.ndarray, y_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np
     y, y_hat = np.asarray(y, dtype=float), np.asarray(y_hat, dtype=float)
     if y.shape != y_hat.shape or y.ndim not in (1, 2):
         raise InputError(
-            f"measured outputs have the shape {y.shape} and simulated ones {y_hat.shape}; give the same, (samples, outputs)."
+            f"measured outputs have the shape {y.shape} and simulated ones {y_hat.shape}; give both as "
+            "(samples, outputs)."
         )
     if not 0 <= skip < len(y):
         raise InputError(f"skip is {skip} of {len(y)} samples; at least one sample must be scored.")

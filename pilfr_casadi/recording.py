@@ -88,14 +88,14 @@ class Recording:
         strange = sorted(set(self.units) - {*inputs, *outputs})
         if strange:
             raise InputError(
-                f"{self.label} gives a unit for {strange[0]!r}; its columns are {_listed(inputs + outputs)}."
+                f"{self.label} gives a unit for {strange[0]!r}; its columns are {listed(inputs + outputs)}."
             )
         _check_options(self, len(u))
         initial = self.initial
         if not isinstance(initial, str):
             initial = _initial_state(initial, self.label)
-        clean = dict(u=u, y=y, dt=float(self.dt), inputs=inputs, outputs=outputs, initial=initial)
-        clean["units"] = MappingProxyType(dict(self.units))
+        units = MappingProxyType(dict(self.units))
+        clean = dict(u=u, y=y, dt=float(self.dt), inputs=inputs, outputs=outputs, units=units, initial=initial)
         for key, value in clean.items():
             object.__setattr__(self, key, value)
 
@@ -148,11 +148,6 @@ class Recording:
         The state at a later first sample is not the one given for the old first sample, so ``initial`` becomes
         ``"estimate"`` there; ``"periodic"`` stays where a whole period is left.
 
-        Parameters
-        ----------
-        start, stop : int, optional
-            First sample, and the one after the last.
-
         Raises
         ------
         InputError
@@ -163,33 +158,15 @@ class Recording:
             raise InputError(
                 f"samples {first} to {last} of {self.label}, which has {len(self)}, are fewer than 2; cut a longer one."
             )
-        skip = max(self.skip - first, 0)
-        skip = skip if skip < last - first else 0
-        period = self.period if self.period is not None and self.period <= last - first - skip else None
-        keeps = (isinstance(self.initial, str) and self.initial == "periodic") if first else True
-        if isinstance(self.initial, str) and self.initial == "periodic" and period is None:
-            keeps = False
-        return replace(
-            self,
-            u=self.u[first:last],
-            y=self.y[first:last],
-            period=period,
-            skip=skip,
-            initial=self.initial if keeps else "estimate",
-        )
+        skip = max(self.skip - first, 0) if self.skip < last else 0
+        period = self.period if (self.period or 0) <= last - first - skip else None
+        periodic = isinstance(self.initial, str) and self.initial == "periodic"
+        keeps = period is not None if periodic else first == 0
+        initial = self.initial if keeps else "estimate"
+        return replace(self, u=self.u[first:last], y=self.y[first:last], period=period, skip=skip, initial=initial)
 
     def split(self, fraction: float) -> tuple[Self, Self]:
-        """Cut in two: the first `fraction` of the samples, and the rest.
-
-        Parameters
-        ----------
-        fraction : float
-            Share of the samples in the first piece, between 0 and 1.
-
-        Returns
-        -------
-        first, second : Recording
-        """
+        """Cut in two: the first `fraction` (between 0 and 1) of the samples, and the rest; see :meth:`slice`."""
         if not 0 < fraction < 1:
             raise InputError(f"{self.label} cannot be split at {fraction}; give a fraction between 0 and 1.")
         cut = round(fraction * len(self))
@@ -218,7 +195,7 @@ def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, .
 
 
 def check_for_identification(data: Recording | Iterable[Recording], n_min: int = 2) -> tuple[Recording, ...]:
-    """Check that recordings can be fitted together and carry something to fit.
+    """Check that recordings can be fitted together and carry something to fit; return them as a tuple.
 
     Parameters
     ----------
@@ -226,10 +203,6 @@ def check_for_identification(data: Recording | Iterable[Recording], n_min: int =
         What is to be fitted.
     n_min : int
         Smallest number of scored samples over all recordings, e.g. the number of free parameters.
-
-    Returns
-    -------
-    recordings : tuple of Recording
 
     Raises
     ------
@@ -243,7 +216,7 @@ def check_for_identification(data: Recording | Iterable[Recording], n_min: int =
             a, b = getattr(first, key), getattr(other, key)
             if a != b:
                 raise InputError(
-                    f"{other.label} has the {key} {_listed(b)} and {first.label} has {_listed(a)}; "
+                    f"{other.label} has the {key} {listed(b)} and {first.label} has {listed(a)}; "
                     "recordings fitted together need the same, in the same order."
                 )
         if abs(other.dt - first.dt) > SAME_STEP * first.dt:
@@ -259,13 +232,13 @@ def check_for_identification(data: Recording | Iterable[Recording], n_min: int =
         )
     if not any(_varies(r.u[:, i]) for r in recordings for i in range(r.n_u)):
         raise InputError(
-            f"the input {_listed(first.inputs)} never changes in {_listed([r.label for r in recordings])}; "
+            f"the input {listed(first.inputs)} never changes in {listed([r.label for r in recordings])}; "
             "nothing can be identified without excitation."
         )
     for i, name in enumerate(first.outputs):
         if not any(_varies(r.y[r.skip :, i]) for r in recordings):
             raise InputError(
-                f"the output {name!r} never changes in {_listed([r.label for r in recordings])}; check the sensor "
+                f"the output {name!r} never changes in {listed([r.label for r in recordings])}; check the sensor "
                 "or leave this output out."
             )
     return recordings
@@ -275,8 +248,9 @@ def _varies(x: np.ndarray) -> bool:
     return bool(np.ptp(x) > 1e-12 * np.max(np.abs(x)))
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names)
+def listed(names: Sequence[str], most: int = 20) -> str:
+    """Join names for a message; of many, the first ones."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def _columns(
@@ -302,7 +276,7 @@ def _columns(
     if not names:
         names = (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
     if len(names) != n:
-        raise InputError(f"{label} has {n} {role} column(s) but {len(names)} name(s) {_listed(names)}; give one each.")
+        raise InputError(f"{label} has {n} {role} column(s) but {len(names)} name(s) {listed(names)}; give one each.")
     if len(set(names)) != n or not all(isinstance(name, str) and name for name in names):
         raise InputError(f"the {role} names {names} of {label} must be distinct and not empty.")
     if not np.isfinite(array).all():
@@ -322,7 +296,7 @@ def _initial_state(values: Any, label: str) -> np.ndarray:
         state = np.empty(0)
     if state.ndim != 1 or state.size == 0 or not np.isfinite(state).all():
         raise InputError(
-            f"the initial state of {label} must be a vector of finite numbers, or one of {_listed(INITIALS)}."
+            f"the initial state of {label} must be a vector of finite numbers, or one of {listed(INITIALS)}."
         )
     state.setflags(write=False)
     return state
@@ -336,9 +310,7 @@ def _check_options(r: Recording, m: int) -> None:
     if r.hold not in HOLDS:
         raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear' or None.")
     if isinstance(r.initial, str) and r.initial not in INITIALS:
-        raise InputError(
-            f"initial of {r.label} is {r.initial!r}; give one of {_listed(INITIALS)}, or the state itself."
-        )
+        raise InputError(f"initial of {r.label} is {r.initial!r}; give one of {listed(INITIALS)}, or the state itself.")
     if not _is_count(r.skip) or not 0 <= r.skip < m:
         raise InputError(f"skip of {r.label} is {r.skip!r}; give a number of samples from 0 to {m - 1}.")
     if r.period is not None and (not _is_count(r.period) or not 2 <= r.period <= m - r.skip):

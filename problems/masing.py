@@ -16,21 +16,19 @@ Runge-Kutta step that stays on one branch is of fourth order; the few steps that
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.signals import sine_sweep, tukey_realizations
+from pilfr_casadi.signals import sine_sweep, steady_periods, tukey_realizations
 
 FS = 120.0  # Hz
 F_MAX = 30.0  # Hz
 N_PERIOD = 1024
 N_REALIZATIONS = 3
-SNR_DB = 50.0
-SWEEP_RATE = 1.17  # Hz/s
 
 
 class Branch(NamedTuple):
@@ -102,3 +100,289 @@ class MasingSpring:
         while spring.turns and spring.direction * (spring.x - spring.branch.close) >= 0.0:
             spring = replace(spring, turns=spring.turns[:-2])
         return spring
+
+
+def stop_density(r: ArrayLike, K: float, r_u: float) -> np.ndarray:
+    """Density w(r) of the stops that make up the spring, ``(K^2 / r_u) exp(-K r / r_u)``, N/m^2, at thresholds r, m."""
+    return np.asarray(K**2 / r_u * np.exp(-K / r_u * np.asarray(r, float)))
+
+
+def stop_elements(n: int, x_max: float, K: float, r_u: float) -> tuple[np.ndarray, np.ndarray]:
+    """Discretise the spring into n stops of equally spaced thresholds.
+
+    The virgin curve of these stops is the chord polygon of the spring's on [0, x_max]; it errs by at most
+    ``(K^2 / r_u) (x_max / n)^2 / 8``, and any branch by at most twice that.
+
+    Parameters
+    ----------
+    n : int
+        Number of stops.
+    x_max : float
+        Largest elongation, m, that the polygon has to cover.
+    K, r_u : float
+        Stiffness, N/m, and strength, N, of the spring.
+
+    Returns
+    -------
+    r, w : array, (n,)
+        Thresholds, m, and weights, N/m.
+    """
+    r = np.linspace(0.0, x_max, n + 1)
+    slopes = np.diff(-r_u * np.expm1(-K / r_u * r)) / np.diff(r)
+    return r[1:], slopes - np.append(slopes[1:], 0.0)
+
+
+@dataclass(frozen=True)
+class MasingRig:
+    """Physical parameters of the rig, Krikelis et al. (2024), Table 1; in kg, N/m, N s/m and N."""
+
+    m1: float = 2.27
+    m2: float = 2.86
+    k1: float = 1100.0
+    d1: float = 15.0
+    k2: float = 1.1e4
+    d2: float = 19.9
+    K: float = 3000.0
+    r_u: float = 0.8
+
+    @property
+    def spring(self) -> MasingSpring:
+        """The hysteretic spring before it has ever moved."""
+        return MasingSpring(self.K, self.r_u)
+
+    def matrices(self, *, virgin_spring: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Continuous-time linear model of Eq. 25 with states (x1, v1, x2, v2), input u and output x2.
+
+        Parameters
+        ----------
+        virgin_spring : bool
+            Put a linear spring of the initial stiffness K in the place of the hysteretic one; otherwise leave it out.
+
+        Returns
+        -------
+        A, B, C, D : array, (4, 4), (4, 1), (1, 4), (1, 1)
+            In the order in which ``control.ss`` takes them.
+        """
+        m1, m2, d1, k2, d2 = self.m1, self.m2, self.d1, self.k2, self.d2
+        k1 = self.k1 + (self.K if virgin_spring else 0.0)
+        first = [-(k1 + k2) / m1, -(d1 + d2) / m1, k2 / m1, d2 / m1]
+        second = [k2 / m2, d2 / m2, -k2 / m2, -d2 / m2]
+        A = np.array([[0.0, 1.0, 0.0, 0.0], first, [0.0, 0.0, 0.0, 1.0], second])
+        return A, np.array([[0.0], [0.0], [0.0], [1.0 / m2]]), np.array([[0.0, 0.0, 1.0, 0.0]]), np.zeros((1, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """True motion of the rig at the samples: x1, x2 in m, v1, v2 in m/s, spring force k_H in N; each (M,)."""
+
+    x1: np.ndarray
+    v1: np.ndarray
+    x2: np.ndarray
+    v2: np.ndarray
+    k_H: np.ndarray
+
+
+State = tuple[float, float, float, float]
+Stepper = Callable[[State, float, float, float, Branch], State]
+
+
+def _stepper(rig: MasingRig) -> Stepper:
+    """Classical Runge-Kutta step of Eq. 25 along one branch; the input starts at u, N, and changes at the rate du, N/s."""
+    A, B, _, _ = rig.matrices(virgin_spring=False)
+    (p1, p2, p3, p4), (q1, q2, q3, q4) = A[1].tolist(), A[3].tolist()
+    b, m1, expm1 = float(B[3, 0]), rig.m1, math.expm1
+
+    def step(state: State, h: float, u: float, du: float, branch: Branch) -> State:
+        x0, f0, gain, rate, _ = branch
+        f0, gain, half = f0 / m1, gain / m1, 0.5 * h
+        x1, v1, x2, v2 = state
+        a1 = p1 * x1 + p2 * v1 + p3 * x2 + p4 * v2 - f0 + gain * expm1(rate * (x1 - x0))
+        a2 = q1 * x1 + q2 * v1 + q3 * x2 + q4 * v2 + b * u
+        u += half * du
+        xb, vb, yb, wb = x1 + half * v1, v1 + half * a1, x2 + half * v2, v2 + half * a2
+        b1 = p1 * xb + p2 * vb + p3 * yb + p4 * wb - f0 + gain * expm1(rate * (xb - x0))
+        b2 = q1 * xb + q2 * vb + q3 * yb + q4 * wb + b * u
+        xc, vc, yc, wc = x1 + half * vb, v1 + half * b1, x2 + half * wb, v2 + half * b2
+        c1 = p1 * xc + p2 * vc + p3 * yc + p4 * wc - f0 + gain * expm1(rate * (xc - x0))
+        c2 = q1 * xc + q2 * vc + q3 * yc + q4 * wc + b * u
+        u += half * du
+        xd, vd, yd, wd = x1 + h * vc, v1 + h * c1, x2 + h * wc, v2 + h * c2
+        d1 = p1 * xd + p2 * vd + p3 * yd + p4 * wd - f0 + gain * expm1(rate * (xd - x0))
+        d2 = q1 * xd + q2 * vd + q3 * yd + q4 * wd + b * u
+        h /= 6.0
+        return (
+            x1 + h * (v1 + 2.0 * (vb + vc) + vd),
+            v1 + h * (a1 + 2.0 * (b1 + c1) + d1),
+            x2 + h * (v2 + 2.0 * (wb + wc) + wd),
+            v2 + h * (a2 + 2.0 * (b2 + c2) + d2),
+        )
+
+    return step
+
+
+def _crossing(value: Callable[[float], float], h: float) -> float:
+    """Time in [0, h] at which `value` changes sign: secant rule, Illinois variant."""
+    lo, hi, f_lo, f_hi = 0.0, h, value(0.0), value(h)
+    if f_lo * f_hi >= 0.0:  # already there at the start
+        return 0.0
+    for _ in range(100):
+        mid = hi - f_hi * (hi - lo) / (f_hi - f_lo)
+        f_mid = value(mid)
+        if f_mid * f_hi < 0.0:
+            lo, f_lo = hi, f_hi
+        else:
+            f_lo *= 0.5
+        if f_mid == 0.0 or abs(mid - hi) <= 1e-12 * h:
+            return mid
+        hi, f_hi = mid, f_mid
+    return hi
+
+
+def _advance(
+    step: Stepper, spring: MasingSpring, state: State, h: float, u: float, du: float
+) -> tuple[MasingSpring, State]:
+    """Go on for the time h, cutting the step at every reversal and at every loop that closes."""
+    while True:
+        branch, sign, start, force = spring.branch, spring.direction, state, u
+        end, cut = step(start, h, force, du, branch), h
+
+        def along(t: float, index: int, level: float) -> float:
+            return step(start, t, force, du, branch)[index] - level  # noqa: B023 (used within this turn of the loop only)
+
+        turning = sign * end[1] < 0.0
+        if turning:
+            cut = _crossing(lambda t: along(t, 1, 0.0), h)
+            end = step(start, cut, force, du, branch)
+        if sign * (end[0] - branch.close) >= 0.0:
+            cut = _crossing(lambda t: along(t, 0, branch.close), cut)  # noqa: B023
+            _, v1, x2, v2 = step(start, cut, force, du, branch)
+            spring, state = spring.move(branch.close), (branch.close, v1, x2, v2)
+        elif turning:
+            x1, _, x2, v2 = end
+            spring, state = replace(spring, x=x1).turn(), (x1, 0.0, x2, v2)
+        else:
+            return spring, end
+        h, u = h - cut, u + cut * du
+
+
+def simulate(
+    u: ArrayLike, fs: float, *, rig: MasingRig | None = None, substeps: int = 8, hold: str = "zero"
+) -> Motion:
+    """Simulate the rig from rest.
+
+    Parameters
+    ----------
+    u : array_like, (M,) or (M, 1)
+        Force on mass 2, N.
+    fs : float
+        Sampling frequency, Hz.
+    rig : MasingRig, optional
+        Parameters; those of Table 1 by default.
+    substeps : int
+        Runge-Kutta steps per sample.
+    hold : {"zero", "linear"}
+        Whether the force is held or interpolated between the samples.
+
+    Returns
+    -------
+    Motion
+        State and spring force at the samples, before the force of that sample has acted.
+
+    Raises
+    ------
+    InputError
+        For an input that is not one finite column, or an option out of its range.
+    """
+    force = np.asarray(u, float)
+    force = force[:, 0] if force.ndim == 2 and force.shape[1] == 1 else force
+    if force.ndim != 1 or not force.size or not np.isfinite(force).all():
+        raise InputError(f"the rig has one force, but u has shape {force.shape} or is not finite; pass one column of it.")
+    if hold not in ("zero", "linear"):
+        raise InputError(f"hold is {hold!r}; use 'zero' or 'linear' for a force held or interpolated between samples.")
+    if substeps < 1 or not fs > 0.0:
+        raise InputError(f"{substeps} substeps at {fs} Hz cannot be simulated; both must be positive.")
+    rig = rig or MasingRig()
+    step, spring, h = _stepper(rig), rig.spring, 1.0 / (fs * substeps)
+    rates = np.zeros(force.size) if hold == "zero" else np.append(np.diff(force), 0.0) * fs
+    branch, sign = spring.branch, spring.direction
+    state: State = (0.0, 0.0, 0.0, 0.0)
+    rows = []
+    for u_k, du in zip(force.tolist(), rates.tolist(), strict=True):
+        rows.append((*state, branch.force(state[0])))
+        for i in range(substeps):
+            u_i = u_k + i * h * du
+            end = step(state, h, u_i, du, branch)
+            if sign * end[1] < 0.0 or sign * (end[0] - branch.close) >= 0.0:
+                spring, end = _advance(step, spring, state, h, u_i, du)
+                branch, sign = spring.branch, spring.direction
+            state = end
+    return Motion(*np.array(rows).T.copy())
+
+
+@dataclass(frozen=True, eq=False)
+class Benchmark:
+    """The records of one seed and the truth behind them.
+
+    Attributes
+    ----------
+    records : dict of str to Recording
+        ``train``, ``multisine`` and ``sweep``: what an identification may see.
+    steady : tuple of Recording
+        The steady periods of the training record, one per realization, for the best linear approximation (Sec. 6.3).
+    truth : dict of str to Motion
+        Noise-free motion under each of the three inputs.
+    rig : MasingRig
+        The parameters.
+    """
+
+    records: dict[str, Recording]
+    steady: tuple[Recording, ...]
+    truth: dict[str, Motion]
+    rig: MasingRig
+
+
+def benchmark(seed: int, *, snr_db: float = 50.0, rig: MasingRig | None = None) -> Benchmark:
+    """Data sets of Krikelis et al. (2024), Sec. 6.2, for one seed, with the truth; noise and phases are independent.
+
+    The training record is 3 realizations of a multisine of 1024 samples at 120 Hz, excited up to 30 Hz: half a period
+    ramped up, one steady period, half a period ramped down, the whole of unit standard deviation.  The multisine test is
+    another such record, ramps included, with fresh phases.  The sweep runs from 0.1 to 30 Hz at 1.17 Hz/s with unit
+    amplitude.  Each output is x2 plus white Gaussian noise `snr_db` below its own variance, the rig starts at rest, and
+    the force is held between samples.
+
+    Parameters
+    ----------
+    seed : int
+        Not negative; equal seeds give equal data.
+    snr_db : float
+        Signal-to-noise ratio, dB; ``inf`` for no noise.
+    rig : MasingRig, optional
+        Parameters; those of Table 1 by default.
+
+    Returns
+    -------
+    Benchmark
+    """
+    rig = rig or MasingRig()
+    phases, fresh_phases, *noises = np.random.default_rng(seed).spawn(5)
+    inputs = {
+        "train": tukey_realizations(N_REALIZATIONS, N_PERIOD, F_MAX, FS, phases),
+        "multisine": tukey_realizations(N_REALIZATIONS, N_PERIOD, F_MAX, FS, fresh_phases),
+        "sweep": sine_sweep(0.1, F_MAX, FS, rate=1.17),
+    }
+    truth, records = {}, {}
+    for (name, u), noise in zip(inputs.items(), noises, strict=True):
+        truth[name] = motion = simulate(u, FS, rig=rig)
+        y = motion.x2 + noise.standard_normal(u.size) * motion.x2.std() * 10.0 ** (-snr_db / 20.0)
+        units = {"u": "N", "x2": "m"}
+        records[name] = Recording(u, y, 1.0 / FS, ("u",), ("x2",), units, initial="zero", hold="zero", name=name)
+    steady = tuple(
+        records["train"].slice(part.start, part.stop).with_(period=N_PERIOD, initial="periodic", name=f"steady period {i}")
+        for i, part in enumerate(steady_periods(N_REALIZATIONS, N_PERIOD), 1)
+    )
+    return Benchmark(records, steady, truth, rig)
+
+
+def records(seed: int) -> dict[str, Recording]:
+    """Training, multisine test and sweep test record of one seed; see :func:`benchmark`."""
+    return benchmark(seed).records

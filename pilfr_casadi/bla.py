@@ -1,0 +1,425 @@
+r"""Best linear approximation (BLA): frequency response functions with their variances, from recordings.
+
+The BLA is the linear model that explains the output best in the least-squares sense for the given class of inputs,
+Krikelis et al. (2024), Eq. 21,
+
+.. math:: G_\text{BLA} = \arg\min_G E\{|\tilde y(k) - G(q^{-1}) \tilde u(k)|^2\}.
+
+:func:`robust_bla` averages over steady periods (what differs between periods is noise) and over realizations of the
+input (what differs between them beyond the noise is nonlinear distortion); with several inputs each realization takes
+``n_u`` experiments, best orthogonal multisines: with the spectra of the experiments side by side, ``G = Y U⁻¹``
+(Pintelon & Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012, chapters 3, 4 and 7).
+:func:`plain_bla` takes any recordings: in a window around each frequency the response and the transient (leakage) are
+polynomials of the frequency, fitted by least squares (the local polynomial method, same book, chapter 7).
+
+All spectra are Fourier coefficients, ``DFT / N``: a line of amplitude ``a`` has the modulus ``a / 2``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .recording import InputError, Recording, check_for_identification
+
+Array = np.ndarray
+
+EXCITED = 1e-3  # share of the largest input amplitude below which a line counts as not excited
+SINGULAR = 1e4  # condition number of the input matrix above which a line is left out
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BLA:
+    """A frequency response function with its variances.
+
+    The variances are those of the mean `G` over all realizations and periods; an estimate ``G[k, i, j]`` scatters about
+    the true one with ``E|ΔG|² = var``. For the level of one realization (as the paper's Fig. 8 and 13 show the total
+    variance) multiply by the number of realizations: :attr:`var_total_realization`, :attr:`var_noise_realization`.
+
+    Parameters
+    ----------
+    frequency : array, (F,)
+        Frequencies in Hz, increasing.
+    G : complex array, (F, n_y, n_u)
+        Response from each input to each output, output unit per input unit.
+    var_noise : array, (F, n_y, n_u), optional
+        Variance of `G` from noise alone; ``None`` where it cannot be told (a single period).
+    var_total : array, (F, n_y, n_u), optional
+        Variance of `G` from noise and nonlinear distortion; ``None`` where it cannot be told (a single realization).
+    dt : float
+        Time from one sample to the next, in seconds.
+    n_realizations, n_periods : int
+        Realizations averaged, and steady periods averaged in each.
+    """
+
+    frequency: Array
+    G: Array
+    var_noise: Array | None
+    var_total: Array | None
+    dt: float
+    n_realizations: int = 1
+    n_periods: int = 1
+
+    @property
+    def n_u(self) -> int:
+        """Number of inputs."""
+        return self.G.shape[2]
+
+    @property
+    def n_y(self) -> int:
+        """Number of outputs."""
+        return self.G.shape[1]
+
+    @property
+    def var_noise_realization(self) -> Array | None:
+        """Noise variance at the level of one realization (its periods averaged), (F, n_y, n_u)."""
+        return None if self.var_noise is None else self.var_noise * self.n_realizations
+
+    @property
+    def var_total_realization(self) -> Array | None:
+        """Variance from noise and nonlinear distortion at the level of one realization, (F, n_y, n_u)."""
+        return None if self.var_total is None else self.var_total * self.n_realizations
+
+    def __repr__(self) -> str:
+        text = f"{self.n_y} output(s), {self.n_u} input(s), {len(self.frequency)} frequencies from "
+        text += f"{self.frequency[0]:.4g} to {self.frequency[-1]:.4g} Hz, "
+        for name, var in (("noise", self.var_noise), ("total", self.var_total)):
+            if var is not None:
+                text += f"{name} {100 * np.sqrt(np.sum(var) / np.sum(np.abs(self.G) ** 2)):.3g} %, "
+        text += f"{self.n_realizations} realization(s) of {self.n_periods} period(s)"
+        return f"<BLA: {text}>"
+
+
+@dataclass(frozen=True, eq=False)
+class OutputSpectra:
+    """Spectra of the outputs at the excited lines, at the level of one experiment with its periods averaged.
+
+    Parameters
+    ----------
+    frequency : array, (F,)
+        Frequencies in Hz.
+    power : array, (F, n_y)
+        Mean squared modulus of the output's Fourier coefficients over the experiments.
+    var_noise : array, (F, n_y), optional
+        The share of it that noise makes; ``None`` with a single period.
+    var_total : array, (F, n_y), optional
+        The share that noise and nonlinear distortion make; ``None`` with a single realization.
+    """
+
+    frequency: Array
+    power: Array
+    var_noise: Array | None
+    var_total: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Spectra:
+    """Spectra of periodic experiments at the excited lines: `U` (M, n_u, P, F, n_u), `Y` (M, n_u, P, F, n_y)."""
+
+    frequency: Array
+    U: Array
+    Y: Array
+    dt: float
+
+    def frf(self) -> tuple[Array, Array]:
+        """Response of each realization, (M, F, n_y, n_u), and the inverses of its input matrices, (M, F, n_u, n_u)."""
+        inverse = np.linalg.inv(_side_by_side(self.U))
+        return _side_by_side(self.Y) @ inverse, inverse
+
+    def noise(self, G: Array) -> Array | None:
+        """Variance of ``Y - G U`` of one experiment with its periods averaged, (M, n_u, F, n_y)."""
+        n_periods = self.U.shape[2]
+        if n_periods == 1:
+            return None
+        error = self.Y - np.einsum("mfij,mepfj->mepfi", G, self.U)
+        error -= error.mean(axis=2, keepdims=True)
+        return np.sum(np.abs(error) ** 2, axis=2) / (n_periods * (n_periods - 1))
+
+
+def robust_bla(
+    recordings: Recording | Iterable[Recording], period: int | None = None, lines: Sequence[int] | Array | None = None
+) -> BLA:
+    """Estimate the BLA, its noise variance and its total variance from periodic steady-state recordings.
+
+    Parameters
+    ----------
+    recordings : Recording or iterable of Recording
+        One per experiment, each a whole number P of steady periods after its `skip` samples, the same P in all. With
+        ``n_u`` inputs each ``n_u`` recordings in the order given make one realization, and their inputs must be
+        linearly independent at every line: orthogonal multisines are best.
+    period : int, optional
+        Samples per period; left out, the recordings' own.
+    lines : array of int, optional
+        Excited harmonics, 1 being one cycle per period. Left out, they are found: every input exceeds 0.1 % of its
+        largest amplitude and, with several periods, 20 times the power of its own variation between periods.
+
+    Returns
+    -------
+    BLA
+        On the excited lines strictly between zero and the Nyquist frequency. `var_noise` is ``None`` with one period,
+        `var_total` with one realization. Noise on measured inputs is included in both.
+
+    Raises
+    ------
+    InputError
+        When period and length, or the number of recordings and of inputs, do not fit, or the inputs of a realization
+        depend on each other.
+
+    References
+    ----------
+    Krikelis et al. (2024), Sec. 5.3 and 6.3; Pintelon & Schoukens (2012), Sec. 4.3 and 7.3 (the robust method).
+    """
+    spectra = _periodic_spectra(recordings, period, lines)
+    G, inverse = spectra.frf()
+    n = len(G)
+    var = spectra.noise(G)
+    var_noise = None
+    if var is not None:  # δG = (δY - G δU) U⁻¹ in each realization
+        var_noise = np.einsum("mefi,mfej->fij", var, np.abs(inverse) ** 2) / n**2
+    var_total = None if n == 1 else np.var(G, axis=0, ddof=1) / n
+    return BLA(spectra.frequency, G.mean(axis=0), var_noise, var_total, spectra.dt, n, spectra.U.shape[2])
+
+
+def output_spectra(
+    recordings: Recording | Iterable[Recording], period: int | None = None, lines: Sequence[int] | Array | None = None
+) -> OutputSpectra:
+    """Spectra of the outputs, of their noise, and of noise and nonlinear distortion together.
+
+    Parameters
+    ----------
+    recordings, period, lines
+        As for :func:`robust_bla`.
+
+    Returns
+    -------
+    OutputSpectra
+        The distortion is what ``Y - G U`` varies by between realizations, `G` being the BLA.
+
+    Raises
+    ------
+    InputError
+        As :func:`robust_bla`.
+    """
+    spectra = _periodic_spectra(recordings, period, lines)
+    G, _ = spectra.frf()
+    n, n_u = spectra.U.shape[:2]
+    U, Y = spectra.U.mean(axis=2), spectra.Y.mean(axis=2)
+    var = spectra.noise(G)
+    var_noise = None if var is None else var.mean(axis=(0, 1))
+    var_total = None
+    if n > 1:
+        error = Y - np.einsum("fij,mefj->mefi", G.mean(axis=0), U)
+        var_total = np.sum(np.abs(error) ** 2, axis=(0, 1)) / ((n - 1) * n_u)
+    return OutputSpectra(spectra.frequency, np.mean(np.abs(Y) ** 2, axis=(0, 1)), var_noise, var_total)
+
+
+def plain_bla(
+    recordings: Recording | Iterable[Recording],
+    order: int = 2,
+    window: int | None = None,
+    n_frequencies: int = 1000,
+    floor: float = 0.01,
+) -> BLA:
+    """Estimate the BLA from any recordings by the local polynomial method.
+
+    Parameters
+    ----------
+    recordings : Recording or iterable of Recording
+        Of any length and with any input; samples up to `skip` are left out. Periodic ones that hold a whole number of
+        periods are averaged over them first.
+    order : int
+        Order of the local polynomials of the response and the transient.
+    window : int, optional
+        Excited lines in a window, in the shortest recording (more in proportion in longer ones); left out, what the
+        polynomials need and at least 10 degrees of freedom, and at least the distance of the frequencies returned.
+    n_frequencies : int
+        At most so many frequencies are returned, spread over the excited lines of the shortest recording.
+    floor : float
+        Lines at which no input reaches this share of its largest amplitude do not count as excited.
+
+    Returns
+    -------
+    BLA
+        `var_total` is from the residual of the local fits: noise, nonlinear distortion and what the polynomials cannot
+        follow. Neighbours share data, so their errors are correlated. `var_noise` is ``None``.
+
+    Raises
+    ------
+    InputError
+        When samples are too few for the window, or the inputs cannot be told apart.
+
+    References
+    ----------
+    Pintelon & Schoukens (2012), Sec. 7.2.2 and 7.3.5; Krikelis et al. (2024), Eq. 21.
+    """
+    if order < 0 or n_frequencies < 1 or (window is not None and window < 1):
+        raise InputError(
+            f"order {order}, window {window} and n_frequencies {n_frequencies} must not be negative, nor the last two "
+            "zero; leave them out for the defaults."
+        )
+    records = check_for_identification(recordings)
+    scale = np.sqrt(np.mean([np.var(r.u[r.skip :], axis=0) for r in records], axis=0))
+    if np.any(scale == 0):
+        raise InputError(
+            f"the input {records[0].inputs[int(np.argmin(scale))]!r} never changes in any recording; its response "
+            "cannot be estimated, leave it out."
+        )
+    lines = [_excited_spectrum(r, scale, floor) for r in records]
+    shortest = min(range(len(lines)), key=lambda r: len(lines[r][0]))
+    available = len(lines[shortest][0])
+    n_u, n_rec, n_poly = len(scale), len(records), order + 1
+    step = max(1, -(-available // n_frequencies))
+    if window is None:
+        need = n_poly + -(-(n_poly * n_u + max(10, (n_poly * (n_u + n_rec)) // 2)) // n_rec)
+        window = max(need, step)
+    if window > available or n_rec * window <= n_poly * (n_u + n_rec):
+        raise InputError(
+            f"{n_rec} recording(s) with at least {available} excited lines cannot fill windows of {window} lines for "
+            f"polynomials of order {order} and {n_u} input(s); record longer or lower the order."
+        )
+    grid = lines[shortest][0][step // 2 :: step]
+    share = [max(window, min(len(f), round(window * len(f) / available))) for f, _, _ in lines]
+    per_frequency = sum(share) * n_poly * (n_u + n_rec)
+    chunk = max(1, int(4e6) // per_frequency)
+    parts = [_local_polynomials(grid[k : k + chunk], lines, share, order) for k in range(0, len(grid), chunk)]
+    G, var, good = (np.concatenate(p) for p in zip(*parts, strict=True))
+    if not good.any():
+        raise InputError(
+            f"the {n_u} inputs {', '.join(records[0].inputs)} move together at every frequency; excite them "
+            "independently or add recordings with other inputs."
+        )
+    return BLA(grid[good], G[good] / scale, None, var[good] / scale**2, records[0].dt)
+
+
+def _periodic_spectra(
+    recordings: Recording | Iterable[Recording], period: int | None, lines: Sequence[int] | Array | None
+) -> _Spectra:
+    records = check_for_identification(recordings)
+    n_u = records[0].n_u
+    if len(records) % n_u:
+        raise InputError(
+            f"{len(records)} recording(s) do not make whole realizations of {n_u} experiments each; with {n_u} inputs "
+            f"give {n_u} recordings per realization, or use plain_bla."
+        )
+    U, Y = zip(*(_period_spectra(r, period) for r in records), strict=True)
+    if len({x.shape for x in U}) > 1:
+        raise InputError(
+            f"the recordings hold {sorted({x.shape[0] for x in U})} periods of {sorted({2 * x.shape[1] for x in U})} "
+            "samples; give them all the same (drop early periods by `skip`)."
+        )
+    N = period or records[0].period
+    assert N is not None
+    n_last = (N + 1) // 2  # the first line at or above the Nyquist frequency
+    shape = (len(records) // n_u, n_u, *U[0].shape[:2])
+    U_all, Y_all = np.reshape(U, (*shape, n_u)), np.reshape(Y, (*shape, -1))
+    harmonics = _find_lines(U_all[..., :n_last, :]) if lines is None else np.unique(np.asarray(lines, dtype=int))
+    if harmonics.size == 0 or harmonics[0] < 1 or harmonics[-1] >= n_last:
+        raise InputError(
+            f"no usable excited lines among 1 to {n_last - 1}; check the period of {N} samples or give `lines` there."
+        )
+    U_all, Y_all = U_all[..., harmonics, :], Y_all[..., harmonics, :]
+    matrix = _side_by_side(U_all)
+    size = np.sqrt(np.mean(np.abs(matrix) ** 2, axis=(0, 1, 3)))  # units of the inputs must not matter
+    good = np.all(np.linalg.cond(matrix / size[:, None]) < SINGULAR, axis=0)
+    if not good.any():
+        raise InputError(
+            f"the {n_u} inputs are linearly dependent over the {n_u} experiments of a realization at every line; use "
+            "orthogonal multisines, grouped by realization."
+        )
+    harmonics, U_all, Y_all = harmonics[good], U_all[..., good, :], Y_all[..., good, :]
+    return _Spectra(harmonics / (N * records[0].dt), U_all, Y_all, records[0].dt)
+
+
+def _period_spectra(r: Recording, period: int | None) -> tuple[Array, Array]:
+    """Fourier coefficients of each steady period of a recording, (P, N // 2 + 1, n_u) and (..., n_y)."""
+    N = r.period if period is None else period
+    if N is None:
+        raise InputError(f"the period of {r.label} is not known; set `period`, in samples, or use plain_bla.")
+    steady = len(r) - r.skip
+    if N < 3 or steady % N:
+        raise InputError(
+            f"{r.label} has {steady} samples after the skipped ones, which are not whole periods of {N} samples; cut "
+            "it or correct `period` or `skip`."
+        )
+    u, y = (x[r.skip :].reshape(-1, N, x.shape[1]) for x in (r.u, r.y))
+    return np.fft.rfft(u, axis=1) / N, np.fft.rfft(y, axis=1) / N
+
+
+def _side_by_side(X: Array) -> Array:
+    """Mean over the periods, (M, n_u, P, F, n) -> (M, F, n, n_u): the experiments of a realization as columns."""
+    return np.moveaxis(X.mean(axis=2), 1, -1)
+
+
+def _find_lines(U: Array) -> Array:
+    """Harmonics at which every input is excited, from spectra (M, n_u, P, F, n_u) that start at frequency zero."""
+    n_periods = U.shape[2]
+    power = np.mean(np.abs(U.mean(axis=2)) ** 2, axis=(0, 1))
+    limit = EXCITED**2 * power[1:].max(axis=0, initial=0.0) * np.ones_like(power)
+    if n_periods > 1:
+        noise = np.mean(np.var(U, axis=2, ddof=1), axis=(0, 1)) / n_periods
+        smooth = np.stack([_moving_mean(x, 10) for x in noise.T], axis=1)
+        limit = np.maximum(limit, 20 * smooth)
+    excited = np.all(power > limit, axis=1)
+    excited[0] = False
+    return np.flatnonzero(excited)
+
+
+def _moving_mean(x: Array, half: int) -> Array:
+    """Mean over the neighbours up to `half` away, along the first axis, fewer at the ends."""
+    total = np.concatenate([np.zeros((1, *x.shape[1:])), np.cumsum(x, axis=0)])
+    k = np.arange(len(x))
+    first, last = np.maximum(k - half, 0), np.minimum(k + half + 1, len(x))
+    return (total[last] - total[first]) / (last - first).reshape(-1, *(1,) * (x.ndim - 1))
+
+
+def _excited_spectrum(r: Recording, scale: Array, floor: float) -> tuple[Array, Array, Array]:
+    """Frequencies and spectra of one recording where any input is excited; equal noise in recordings of any length."""
+    u, y = r.u[r.skip :] / scale, r.y[r.skip :]
+    weight = 1.0
+    if r.period is not None and len(u) % r.period == 0:
+        weight = np.sqrt(len(u) // r.period)
+        u, y = (x.reshape(-1, r.period, x.shape[1]).mean(axis=0) for x in (u, y))
+    N = len(u)
+    U, Y = (weight * np.fft.rfft(x - x.mean(axis=0), axis=0)[: (N + 1) // 2] / np.sqrt(N) for x in (u, y))
+    size = np.abs(U)
+    excited = np.flatnonzero(np.any(size > floor * size.max(axis=0), axis=1))
+    return excited / (N * r.dt), U[excited], Y[excited]
+
+
+def _local_polynomials(
+    grid: Array, lines: list[tuple[Array, Array, Array]], share: list[int], order: int
+) -> tuple[Array, Array, Array]:
+    """Local least squares at the frequencies `grid`: response, its variance, and whether it can be told."""
+    n_u, n_y, n_rec, n_poly = lines[0][1].shape[1], lines[0][2].shape[1], len(lines), order + 1
+    ends = np.concatenate([[0], np.cumsum(share)])
+    K = np.zeros((len(grid), ends[-1], n_poly * (n_u + n_rec)), dtype=complex)
+    Y = np.empty((len(grid), ends[-1], n_y), dtype=complex)
+    x = np.empty((len(grid), ends[-1]))
+    for r, (f, _, _) in enumerate(lines):
+        first = np.clip(np.searchsorted(f, grid) - share[r] // 2, 0, len(f) - share[r])
+        index = first[:, None] + np.arange(share[r])
+        x[:, ends[r] : ends[r + 1]] = f[index] - grid[:, None]
+        Y[:, ends[r] : ends[r + 1]] = lines[r][2][index]
+        K[:, ends[r] : ends[r + 1], :n_u] = lines[r][1][index]
+    size = np.max(np.abs(x), axis=1)
+    powers = (x / size[:, None])[..., None] ** np.arange(n_poly)
+    U = K[..., :n_u].copy()
+    for p in range(n_poly):
+        K[..., p * n_u : (p + 1) * n_u] = U * powers[..., p, None]
+        for r in range(n_rec):
+            K[:, ends[r] : ends[r + 1], n_poly * n_u + r * n_poly + p] = powers[:, ends[r] : ends[r + 1], p]
+    length = np.linalg.norm(K, axis=1)
+    length[length == 0] = 1.0
+    Q, R = np.linalg.qr(K / length[:, None, :])
+    diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
+    good = diagonal.min(axis=1) > 1e-8 * diagonal.max(axis=1)
+    R[~good] = np.eye(R.shape[1])
+    inverse = np.linalg.inv(R) / length[:, :, None]
+    coefficients = Q.conj().swapaxes(1, 2) @ Y
+    dof = ends[-1] - K.shape[2]
+    var = (np.sum(np.abs(Y) ** 2, axis=1) - np.sum(np.abs(coefficients) ** 2, axis=1)) / dof
+    response = (inverse[:, :n_u] @ coefficients).swapaxes(1, 2)
+    gain = np.sum(np.abs(inverse[:, :n_u]) ** 2, axis=2)
+    return response, np.maximum(var, 0.0)[:, :, None] * gain[:, None, :], good

@@ -1,0 +1,310 @@
+"""`fit`: the verb that takes a model and recordings and returns one immutable result."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from .compiled import make_engine
+from .constraints import Constraint
+from .elements import PrandtlIshlinskii
+from .gauge import standard_errors
+from .gauss_newton import GaussNewton
+from .lfr import PILFR
+from .metrics import nrmse
+from .model import Model
+from .multistart import Candidate, Search, linear_model, search_starts, stability
+from .problem import Problem
+from .recording import InputError, Recording, as_recordings, check_for_identification
+from .sensitivities import Engine
+from .solution import Solution, Status
+
+Progress = Callable[[str, int, int, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted model and how it came about.
+
+    Attributes
+    ----------
+    model : Model
+        Closed model with the fitted values as its parameters' values.
+    structure : PILFR or None
+        What was asked for, where it was a PI-LFR.
+    solution : Solution
+        Status, cost, iterations, history, multipliers.
+    train_nrmse : tuple of float
+        NRMSE (Eq. 27) of each training recording.
+    initial : tuple of array
+        State with memory at the first sample of each training recording.
+    labels : tuple of str
+        Names of the variables in `solution.theta`.
+    errors : dict
+        Standard errors by parameter name, in the gauge of `gauge.standard_errors`; nan where fixed or at a bound.
+    candidates : tuple of Candidate
+        Every start that was tried.
+    """
+
+    model: Model
+    structure: PILFR | None
+    dt: float
+    solution: Solution
+    train_nrmse: tuple[float, ...]
+    initial: tuple[np.ndarray, ...]
+    labels: tuple[str, ...] = ()
+    errors: dict[str, np.ndarray] = field(default_factory=dict)
+    active: tuple[str, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
+    linear: Model | None = None
+    seconds: float = 0.0
+    units: dict[str, str] = field(default_factory=dict)
+    engine: str = "auto"
+
+    @property
+    def status(self) -> Status:
+        """How the winning solve ended."""
+        return self.solution.status
+
+    @property
+    def parameters(self) -> dict[str, np.ndarray]:
+        """Fitted values by name."""
+        return {name: p.value for name, p in self.model.parameters.items()}
+
+    @cached_property
+    def _engine(self) -> Engine:
+        return make_engine(self.model, self.engine)
+
+    def initial_state(self, recording: Recording, samples: int | None = None) -> np.ndarray:
+        """State with memory at a recording's first sample, as its `initial` says.
+
+        Where it is to be estimated, the model is held and the state fitted to the first `samples` samples (default: ten a
+        state, at least 50); nothing later in the recording is looked at.
+        """
+        n = self.model.n_x + self.model.n_s
+        initial = recording.initial
+        if not isinstance(initial, str):
+            given = np.asarray(initial, dtype=float).ravel()
+            if given.size not in (self.model.n_x, n):
+                raise InputError(f"An initial state of {given.size} numbers was given; expected {self.model.n_x} or {n}.")
+            return np.concatenate([given, np.zeros(n - given.size)])
+        values = self.model.parameters.start
+        state = np.zeros(n)
+        if initial == "periodic":
+            period = recording.u[: recording.period]
+            for _ in range(20):
+                before = state
+                state = self._engine.simulate(period, values, state)[1]
+                if np.max(np.abs(state - before)) <= 1e-10 * max(float(np.max(np.abs(state))), 1e-300):
+                    break
+        elif initial == "estimate" and n:
+            samples = min(len(recording), samples or max(10 * n, 50))
+            held = self.model.with_parameters(self.model.parameters.change(**{k: {"fixed": True, "prior": None} for k in self.model.parameters}))
+            head = recording.slice(0, max(samples, 2)).with_(skip=0)
+            problem = Problem(held, head, engine=self._engine, scale=np.maximum(np.std(recording.y, axis=0), 1e-300))
+            state = GaussNewton(max_iterations=50).solve(problem).theta
+        return state
+
+    def simulate(self, recording: Recording) -> np.ndarray:
+        """Simulated outputs for a recording's inputs, shape (M, n_y)."""
+        return self.signals(recording)["y"]
+
+    def signals(self, recording: Recording) -> dict[str, np.ndarray]:
+        """Simulated `y` (M, n_y) with the element's `z` and `w` (M, n_w)."""
+        self._check(recording)
+        state = self.initial_state(recording)
+        y, _, z, w = self._engine.simulate(recording.u, self.model.parameters.start, state, True)
+        return {"y": y, "z": z, "w": w}
+
+    def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
+        """NRMSE (Eq. 27) over outputs, averaged over recordings, in free-run simulation."""
+        return float(np.mean([nrmse(r.y, self.simulate(r), skip=r.skip) for r in as_recordings(recordings)]))
+
+    def _check(self, recording: Recording) -> None:
+        if (recording.n_u, recording.n_y) != (self.model.n_u, self.model.n_y):
+            raise InputError(
+                f"The recording has {recording.n_u} inputs and {recording.n_y} outputs, the model {self.model.n_u} and {self.model.n_y}."
+            )
+        if abs(recording.dt / self.dt - 1) > 1e-4:
+            raise InputError(f"The recording's step is {recording.dt:g} s, the model's {self.dt:g} s; resample the recording.")
+
+    def plot(self, recordings: Recording | Sequence[Recording], **options: Any) -> Any:
+        """Figures of the fit over recordings; see `plots.plot_fit`."""
+        from .plots import plot_fit
+
+        return plot_fit(self, recordings, **options)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model as JSON, atomically; see `export.save`."""
+        from .export import save
+
+        save(self, path)
+
+    def to_casadi(self, name: str = "model") -> Any:
+        """`casadi.Function (x, u) -> (x_next, y)`, operator memory inside x; see `export.to_casadi`."""
+        from .export import to_casadi
+
+        return to_casadi(self, name)
+
+    def __str__(self) -> str:
+        errors = ", ".join(f"{e:.4f}" for e in self.train_nrmse)
+        lines = [
+            self.status.value,
+            f"NRMSE on the training recording{'s' if len(self.train_nrmse) > 1 else ''}: {errors}",
+            f"{self.solution.iterations} iterations in the last solve, {self.seconds:.1f} s in all, {len(self.candidates)} starts",
+        ]
+        if self.candidates:
+            failed = sum(not c.solution.status.converged for c in self.candidates)
+            lines.append(f"starts that did not converge: {failed} of {len(self.candidates)}")
+        lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def fit(
+    model: PILFR | Model,
+    train: Recording | Sequence[Recording],
+    *,
+    solver: Any = None,
+    starts: int = 8,
+    seed: int = 0,
+    start: str = "grid",
+    stable: bool | float = True,
+    constraints: Sequence[Constraint] = (),
+    l1: dict[str, float] | None = None,
+    noise: float | None = None,
+    engine: str = "auto",
+    executor: Executor | None = None,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Fit:
+    """Identify a model from recordings by minimising the simulation error (Krikelis et al. 2024, Eq. 20).
+
+    Parameters
+    ----------
+    model : PILFR or Model
+        A PI-LFR structure (start values are found), or a closed model of your own (started at its values).
+    train : Recording or sequence of Recording
+        Training data; nothing else is used.
+    solver : GaussNewton or Ipopt
+        Solver of the final problem.
+    starts, seed : int
+        Number of random starts and the seed of all of them.
+    start : {"grid", "paper"}
+        Thresholds on a grid with screening and re-gridding, or the paper's start alone (Eq. 22-24).
+    stable : bool or float
+        Bound on the spectral radius of a PI-LFR's linear part, 1 by default; False for none.
+    constraints, l1, noise
+        See `Problem`.
+    engine : {"auto", "c", "vm"}
+        Generated C, or CasADi's virtual machine.
+    executor, workers
+        Where starts run: any `concurrent.futures.Executor`, or a pool of `workers` processes. The numbers do not depend on it.
+    progress : callable
+        Called with (stage, done, total, smallest training error so far).
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    InputError
+        If recordings and model do not fit each other, hold too little, or the start is not usable.
+    """
+    began = time.perf_counter()
+    solver = solver or GaussNewton()
+    if isinstance(model, Model):
+        recordings = check_for_identification(train, int(model.parameters.free.sum()) + 2)
+        problem = Problem(model, recordings, constraints=constraints, l1=l1, noise=noise or 1.0, engine=engine)
+        return _result(model, None, problem, solver.solve(problem), began, recordings)
+    if starts < 1:
+        raise InputError(f"{starts} starts were asked for; give 1 or more.")
+    if start not in ("grid", "paper"):
+        raise InputError(f"The start {start!r} is unknown; use 'grid' or 'paper'.")
+    recordings = check_for_identification(train, _fewest_samples(model, train))
+    limits = stability(model, 1.0 if stable is True else float(stable)) if stable else ()
+    linear, problem, solution = linear_model(recordings, model, engine=engine, constraints=limits[:1])
+    fitted = _fitted(linear, problem, solution)
+    if model.element is None:
+        with_bounds = model.model(linear.n_u, linear.n_y, {k: p.value for k, p in fitted.parameters.items()}, inputs=linear.inputs, outputs=linear.outputs)
+        problem = Problem(with_bounds, recordings, constraints=(*limits, *constraints), noise=noise or 1.0, engine=engine)
+        return _result(with_bounds, model, problem, solver.solve(problem), began, recordings)
+    if not isinstance(model.element, PrandtlIshlinskii):
+        raise InputError("A PI-LFR is identified with a PrandtlIshlinskii element; pass a closed Model for any other.")
+    blocks = {k: p.value for k, p in fitted.parameters.items()}
+    search = Search(model, recordings, blocks, solver, (*limits, *constraints), engine, start, l1 or {}, noise)
+    pool = ProcessPoolExecutor(workers) if executor is None and workers > 1 else None
+    try:
+        seen: list[float] = []
+
+        def report(candidate: Candidate) -> None:
+            seen.append(candidate.error)
+            if progress:
+                progress("starts" if len(seen) <= starts else "polish", len(seen), starts, min(seen))
+
+        candidates, best, stopped = search_starts(search, starts, seed, executor or pool, report)
+    finally:
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
+    problem = search.problem(best.model, noise=best.error)
+    result = best.solution
+    if stopped:
+        from dataclasses import replace
+
+        result = replace(result, status=Status.INTERRUPTED)
+    return _result(best.model, model, problem, result, began, recordings, tuple(candidates), fitted)
+
+
+def _fewest_samples(model: PILFR, train: Recording | Sequence[Recording]) -> int:
+    first = as_recordings(train)[0]
+    shape = model.model(first.n_u, first.n_y)
+    return max(int(shape.parameters.free.sum()), 10 * model.nx) + 2
+
+
+def _fitted(model: Model, problem: Problem, solution: Solution) -> Model:
+    return model.with_parameters(model.parameters.at(problem.parameters(solution.theta)))
+
+
+def _result(
+    model: Model,
+    structure: PILFR | None,
+    problem: Problem,
+    solution: Solution,
+    began: float,
+    recordings: tuple[Recording, ...],
+    candidates: tuple[Candidate, ...] = (),
+    linear: Model | None = None,
+) -> Fit:
+    fitted = _fitted(model, problem, solution)
+    theta = solution.theta
+    at_bound = [
+        f"{label} = {value:g}"
+        for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
+        if value in (low, high)
+    ]
+    g = problem.constraint(theta) if problem.constraints else np.zeros(0)
+    at_bound += [name for name, value, high in zip(problem.g_labels, g, problem.g_upper, strict=True) if value >= high - 1e-7]
+    return Fit(
+        model=fitted,
+        structure=structure,
+        dt=recordings[0].dt,
+        solution=solution,
+        train_nrmse=tuple(problem.nrmse(theta)),
+        initial=tuple(problem.initial_states(theta)),
+        labels=problem.labels,
+        errors=standard_errors(problem, theta, structure),
+        active=tuple(at_bound),
+        candidates=candidates,
+        linear=linear,
+        seconds=time.perf_counter() - began,
+        units=dict(recordings[0].units),
+    )

@@ -1,0 +1,298 @@
+"""Readers: CSV, ``.mat`` and ``.npz`` files into recordings, checked at this door.
+
+A file holds one recording: a time column (``t``, ``t_s`` or ``time``, in seconds, uniform) and one column for each
+input and output by name; other columns are ignored. Whatever is wrong with it is said in one sentence that names the
+file, the column and the line.
+"""
+
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+
+from .csv_table import existing_file, read_table
+from .recording import InputError, Recording, listed
+from .timebase import TIME_NAMES, refuse_other_unit, step_of, time_column
+
+PathLike = str | Path
+Names = Sequence[str] | str
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What is wanted from a file."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    columns: Mapping[str, str]
+    dt: float | None
+    time_tolerance: float | None
+    options: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        if not self.inputs or not self.outputs:
+            raise InputError("a recording needs at least one input and one output; name their columns.")
+        known = {*self.inputs, *self.outputs, *TIME_NAMES}
+        for name in self.columns:
+            if name not in known:
+                raise InputError(
+                    f"a column is given for {name!r}, which is none of the inputs {listed(self.inputs)}, the "
+                    f"outputs {listed(self.outputs)}, or t; correct the name."
+                )
+        if self.dt is not None and not (np.isfinite(self.dt) and self.dt > 0):
+            raise InputError(f"the step dt is {self.dt!r}; give seconds from one sample to the next, above zero.")
+
+    def column(self, name: str) -> str:
+        return self.columns.get(name, name)
+
+    def found_in(self, names: Sequence[str]) -> int:
+        return sum(self.column(name) in names for name in (*self.inputs, *self.outputs))
+
+    def locate(self, names: Sequence[str], source: str) -> tuple[str | None, list[str]]:
+        """Return the time column, if any, and those of the inputs and outputs."""
+        mapped = [self.columns[name] for name in TIME_NAMES if name in self.columns]
+        time = time_column(names, mapped[0] if mapped else None, source)
+        wanted = [self.column(name) for name in (*self.inputs, *self.outputs)]
+        for role, column in zip((*self.inputs, *self.outputs), wanted, strict=True):
+            if column not in names:
+                hint = f"map it, as in {role}=COLUMN" if len(names) > 1 else "separate columns by commas"
+                raise InputError(f"{source} has no column {column!r}; it has {listed(names)}: {hint}.")
+        for name in [*wanted, time] if time else wanted:
+            if list(names).count(name) > 1:
+                raise InputError(f"{source} has {list(names).count(name)} columns named {name!r}; rename all but one.")
+        if time is None and self.dt is None:
+            refuse_other_unit(names, source)
+            raise InputError(
+                f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in "
+                "seconds, or state the step dt."
+            )
+        return time, wanted
+
+    def step(self, t: np.ndarray | None, time: str | None, source: str, place: Callable[[int], str]) -> float:
+        if t is None:
+            assert self.dt is not None
+            return float(self.dt)
+        return step_of(t, f"{source}: column {time!r}", place, dt=self.dt, tolerance=self.time_tolerance)
+
+
+@overload
+def read_csv(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
+@overload
+def read_csv(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
+def read_csv(
+    path: PathLike | Iterable[PathLike],
+    inputs: Names,
+    outputs: Names,
+    *,
+    columns: Mapping[str, str] | None = None,
+    dt: float | None = None,
+    time_tolerance: float | None = None,
+    **recording_options: Any,
+) -> Recording | tuple[Recording, ...]:
+    """Read recordings from CSV files with a header row.
+
+    Parameters
+    ----------
+    path : str or Path, or several
+        One file, or a list of files with the same columns.
+    inputs, outputs : str or sequence of str
+        Names of the inputs and outputs, which are also their columns where `columns` does not say otherwise.
+    columns : mapping, optional
+        Column by name, e.g. ``{"force": "u_vir_V"}``; the key ``"t"`` chooses the time column.
+    dt : float, optional
+        Step in seconds. Needed where there is no time column; where there is one, its step must agree within 0.1 %,
+        which finds times that are not in seconds.
+    time_tolerance : float, optional
+        How far samples may lie off the uniform grid, in steps, beyond the rounding of the written times; 1e-4 by
+        default.
+    **recording_options
+        Further fields of :class:`Recording`: `hold`, `initial`, `period`, `skip`, `units`, `name` (by default the
+        file's).
+
+    Returns
+    -------
+    recording : Recording, or tuple of Recording when several paths were given
+
+    Raises
+    ------
+    InputError
+        When a file, a column or a cell cannot be used.
+    """
+    request = _request(inputs, outputs, columns=columns, dt=dt, time_tolerance=time_tolerance, **recording_options)
+    return _each(path, request, _from_csv)
+
+
+@overload
+def read_mat(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
+@overload
+def read_mat(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
+def read_mat(
+    path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
+) -> Recording | tuple[Recording, ...]:
+    """Read recordings from MATLAB files (up to version 7.2): one vector for time and for each input and output.
+
+    Parameters, returned values and errors are those of :func:`read_csv`. A matrix with a row for each sample gives the
+    channels ``name1, name2, ...``.
+    """
+    request = _request(inputs, outputs, **options)
+    return _each(path, request, lambda p, r: _from_arrays(p, _mat_arrays(p), r))
+
+
+@overload
+def read_npz(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
+@overload
+def read_npz(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
+def read_npz(
+    path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
+) -> Recording | tuple[Recording, ...]:
+    """Read recordings from NumPy archives (``numpy.savez``): one vector for time and for each input and output.
+
+    Parameters, returned values and errors are those of :func:`read_csv`. A matrix with a row for each sample gives the
+    channels ``name1, name2, ...``.
+    """
+    request = _request(inputs, outputs, **options)
+    return _each(path, request, lambda p, r: _from_arrays(p, _npz_arrays(p), r))
+
+
+@overload
+def read(path: PathLike, inputs: Names, outputs: Names, **options: Any) -> Recording: ...
+@overload
+def read(path: Iterable[PathLike], inputs: Names, outputs: Names, **options: Any) -> tuple[Recording, ...]: ...
+def read(
+    path: PathLike | Iterable[PathLike], inputs: Names, outputs: Names, **options: Any
+) -> Recording | tuple[Recording, ...]:
+    """Read recordings with the reader for the file's suffix: .csv, .tsv, .txt or .dat, .mat, .npz.
+
+    Parameters, returned values and errors are those of :func:`read_csv`; files of different kinds may be mixed.
+    """
+    if isinstance(path, (str, Path)):
+        suffix = Path(path).suffix.lower()
+        if suffix not in _READERS:
+            existing_file(path)
+            raise InputError(f"{path} has the suffix {suffix!r}; files named {', '.join(_READERS)} can be read.")
+        return _READERS[suffix](path, inputs, outputs, **options)
+    return tuple(read(p, inputs, outputs, **options) for p in path)
+
+
+_READERS: dict[str, Callable[..., Recording]] = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), read_csv),
+    ".mat": read_mat,
+    ".npz": read_npz,
+}
+
+
+def _request(
+    inputs: Names,
+    outputs: Names,
+    *,
+    columns: Mapping[str, str] | None = None,
+    dt: float | None = None,
+    time_tolerance: float | None = None,
+    **recording_options: Any,
+) -> _Request:
+    inputs, outputs = ((n,) if isinstance(n, str) else tuple(n) for n in (inputs, outputs))
+    return _Request(inputs, outputs, dict(columns or {}), dt, time_tolerance, recording_options)
+
+
+def _each(
+    path: PathLike | Iterable[PathLike], request: _Request, reader: Callable[[Path, _Request], Recording]
+) -> Recording | tuple[Recording, ...]:
+    if isinstance(path, (str, Path)):
+        return reader(Path(path), request)
+    return tuple(reader(Path(p), request) for p in path)
+
+
+def _from_csv(path: Path, request: _Request) -> Recording:
+    table = read_table(path, request.found_in)
+    time, wanted = request.locate(table.names, str(path))
+    numbers = table.columns([*wanted, time] if time else wanted)
+    t = numbers[:, -1] if time else None
+    dt = request.step(t, time, str(path), lambda k: f"line {table.line_of_row(k)}")
+    n_u, n = len(request.inputs), len(wanted)
+    return _recording(path, request, numbers[:, :n_u], numbers[:, n_u:n], dt, request.inputs, request.outputs)
+
+
+def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray], request: _Request) -> Recording:
+    time, wanted = request.locate(list(arrays), str(path))
+    parts = [_samples(arrays[name], name, path) for name in wanted]
+    lengths = {name: len(part) for name, part in zip(wanted, parts, strict=True)}
+    t = None
+    if time is not None:
+        t = _samples(arrays[time], time, path)[:, 0]
+        lengths[time] = len(t)
+    if len(set(lengths.values())) > 1:
+        counts = ", ".join(f"{name} {n}" for name, n in lengths.items())
+        raise InputError(f"{path} has vectors of different lengths ({counts} samples); give all the same.")
+    dt = request.step(t, time, str(path), lambda k: f"sample {k}")
+    n_u = len(request.inputs)
+    u, y = np.hstack(parts[:n_u]), np.hstack(parts[n_u:])
+    inputs = _channel_names(request.inputs, parts[:n_u])
+    outputs = _channel_names(request.outputs, parts[n_u:])
+    return _recording(path, request, u, y, dt, inputs, outputs)
+
+
+def _channel_names(names: Sequence[str], parts: Sequence[np.ndarray]) -> tuple[str, ...]:
+    pairs = zip(names, parts, strict=True)
+    return tuple(f"{n}{i + 1}" if p.shape[1] > 1 else n for n, p in pairs for i in range(p.shape[1]))
+
+
+def _recording(
+    path: Path,
+    request: _Request,
+    u: np.ndarray,
+    y: np.ndarray,
+    dt: float,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+) -> Recording:
+    options = {"name": path.stem, **request.options}
+    try:
+        return Recording(u, y, dt, inputs, outputs, **options)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _samples(values: np.ndarray, name: str, path: Path) -> np.ndarray:
+    """Return the array as (M, channels) of finite numbers; a row vector is taken as a column."""
+    if values.dtype.kind not in "biuf" or values.ndim > 2 or values.size == 0:
+        raise InputError(
+            f"{path}: variable {name!r} holds {values.dtype} of shape {values.shape}; give a vector of real numbers."
+        )
+    column = values.reshape(-1, 1) if values.ndim < 2 or 1 in values.shape else values
+    column = column.astype(float)
+    bad = np.argwhere(~np.isfinite(column))
+    if bad.size:
+        k, i = bad[0]
+        raise InputError(
+            f"{path}: variable {name!r}, sample {k} is {column[k, i]}; only finite numbers can be used: repair or "
+            "cut out that piece."
+        )
+    return column
+
+
+def _mat_arrays(path: Path) -> dict[str, np.ndarray]:
+    from scipy.io import loadmat
+
+    existing_file(path)
+    try:
+        content = loadmat(path)
+    except NotImplementedError:
+        raise InputError(f"{path} is a MATLAB file of version 7.3; save it with the option -v7.") from None
+    except Exception as error:  # the parser raises many kinds on damaged files
+        raise InputError(
+            f"{path} cannot be read as a MATLAB file ({error}); save it again with the option -v7."
+        ) from None
+    return {name: value for name, value in content.items() if not name.startswith("__")}
+
+
+def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
+    existing_file(path)
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
+            return {name: content[name] for name in content.files}
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path} cannot be read as a NumPy archive ({reason}); write it with numpy.savez.") from None

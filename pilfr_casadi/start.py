@@ -1,0 +1,142 @@
+"""Start values: from a linear approximation to a PI-LFR worth optimising.
+
+`paper_start` is Krikelis et al. (2024), Eq. 22-24. `grid_start` keeps its random direction of z but spreads the thresholds over
+the range that z visits, instead of drawing them from `U(0, R)`: idle or identical thresholds hardly separate again.
+`regrid` takes a fitted element, smooths its density of weights, and places the thresholds anew so that each stands for an
+equal share of `density^0.4` (the knots of a good piecewise-linear approximation of the loading curve). It continues the tail
+of the density beyond the visited range, where data alone says nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from .elements import PrandtlIshlinskii
+from .lfr import PILFR
+
+Blocks = dict[str, np.ndarray]
+LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
+
+
+def states_of(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:
+    """States (M, nx) of the linear part driven by u (M, n_u), from zero."""
+    a, b = blocks["A"], u @ blocks["B_u"].T
+    out, x = np.empty((len(u), len(a))), np.zeros(len(a))
+    for k in range(len(u)):
+        out[k] = x
+        x = a @ x + b[k]
+    return out
+
+
+def unit_states(blocks: Mapping[str, np.ndarray], inputs: list[np.ndarray]) -> tuple[Blocks, list[np.ndarray]]:
+    """Scale each state to unit variance (Sec. 5.3); returns the blocks and the states of each recording, scaled alike."""
+    states = [states_of(blocks, u) for u in inputs]
+    spread = np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0))
+    spread = np.where(spread > 0, spread, 1.0)
+    scaled = dict(blocks)
+    scaled["A"] = blocks["A"] * spread / spread[:, None]
+    scaled["B_u"] = blocks["B_u"] / spread[:, None]
+    scaled["C_y"] = blocks["C_y"] * spread
+    return scaled, [x / spread for x in states]
+
+
+def paper_start(structure: PILFR, linear: Mapping[str, np.ndarray], rng: np.random.Generator, spread: float = 0.1) -> Blocks:
+    """The start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)` with `R = spread`, `B_w = D_yw = 0`."""
+    element = _layer(structure)
+    n_x, n_u = linear["B_u"].shape
+    shape = (element.channels, element.n)
+    blocks = {name: linear[name] for name in LINEAR}
+    blocks["C_z"], blocks["D_zu"] = rng.uniform(-1, 1, (element.channels, n_x)), rng.uniform(-1, 1, (element.channels, n_u))
+    blocks["w"], blocks["r"] = rng.uniform(0, 1 / element.n, shape), rng.uniform(0, spread, shape)
+    return blocks
+
+
+def grid_start(
+    structure: PILFR, linear: Mapping[str, np.ndarray], inputs: list[np.ndarray], states: list[np.ndarray], rng: np.random.Generator
+) -> Blocks:
+    """A random direction of z scaled to unit deviation, thresholds on a grid over its range, equal weights, `B_w = D_yw = 0`.
+
+    Where `structure` fixes blocks such that the input reaches the dynamics only through the element (Hammerstein), or the
+    output is read only through it (Wiener), the linear blocks move to the other side of the element.
+    """
+    element = _layer(structure)
+    blocks = paper_start(structure, linear, rng)
+    u, x = np.concatenate(inputs), np.concatenate(states)
+    fixed = structure.fixed
+    if "B_u" in fixed and "D_zu" in fixed:
+        blocks["B_w"], blocks["D_yw"] = linear["B_u"], linear["D_yu"]
+    if "C_y" in fixed and "D_yw" in fixed:
+        blocks["C_z"], blocks["D_zu"] = linear["C_y"], linear["D_yu"]
+    held = {k: np.broadcast_to(np.asarray(v, dtype=float), blocks[k].shape) for k, v in fixed.items() if k in blocks}
+    blocks |= held
+    z = x @ blocks["C_z"].T + u @ blocks["D_zu"].T
+    size = np.std(z, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    if not {"C_z", "D_zu", "D_yw"} & set(fixed):
+        blocks["C_z"], blocks["D_zu"], z = blocks["C_z"] / size[:, None], blocks["D_zu"] / size[:, None], z / size
+    reach = np.max(np.abs(z), axis=0)
+    blocks["r"] = 0.9 * reach[:, None] * np.arange(element.n) / element.n
+    blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
+    return blocks
+
+
+def _layer(structure: PILFR) -> PrandtlIshlinskii:
+    element = structure.element
+    if not isinstance(element, PrandtlIshlinskii):
+        raise TypeError("start values are made for a Prandtl-Ishlinskii element")
+    return element
+
+
+def density(r: np.ndarray, w: np.ndarray, grid: np.ndarray, width: float) -> np.ndarray:
+    """Smoothed density of weights over thresholds: Gaussian kernels, mirrored at zero; shapes (N,), (N,), (G,) -> (G,)."""
+    kernels = sum(np.exp(-0.5 * ((grid[:, None] - sign * r) / width) ** 2) for sign in (1, -1))
+    return np.asarray(kernels @ w) / (width * np.sqrt(2 * np.pi))
+
+
+def regrid(r: np.ndarray, w: np.ndarray, reach: float, *, beyond: float = 1.3, smooth: float = 1 / 12) -> tuple[np.ndarray, np.ndarray]:
+    """Thresholds and weights of one channel placed anew along the smoothed density.
+
+    Parameters
+    ----------
+    r, w : array, shape (N,)
+        Fitted thresholds and weights.
+    reach : float
+        Largest |z| visited.
+    beyond : float
+        How far the thresholds may reach, in units of `reach`; the tail is extrapolated log-linearly, never rising.
+    smooth : float
+        Kernel width in units of `reach`.
+
+    Returns
+    -------
+    r, w : array, shape (N,)
+        New thresholds (ascending) and the weights that the density gives them.
+    """
+    grid = np.linspace(0.0, beyond * reach, 600)
+    d = density(r, w, grid, smooth * reach)
+    tail = (grid >= 0.4 * reach) & (grid <= 0.85 * reach)
+    log_d = np.log(d + 1e-6 * d.max())
+    slope = min(float(np.polyfit(grid[tail], log_d[tail], 1)[0]), 0.0)
+    out = grid > 0.85 * reach
+    d[out] = np.exp(np.mean(log_d[tail]) + slope * (grid[out] - np.mean(grid[tail])))
+    share = _integral(d**0.4, grid)
+    edges = np.interp(np.linspace(0, 1, len(r) + 1), share / share[-1], grid)
+    mass = np.diff(np.interp(edges, grid, _integral(d, grid)))
+    moment = np.diff(np.interp(edges, grid, _integral(d * grid, grid)))
+    return moment / np.maximum(mass, 1e-300), mass
+
+
+def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0.0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(x))])
+
+
+def regridded(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3) -> dict[str, Any]:
+    """The values with every channel's thresholds and weights placed anew; z (M, n_w) is the signal of the fitted model."""
+    rows = [
+        regrid(r, w, float(np.max(np.abs(z_i))), beyond=beyond) if w.sum() > 0 and np.max(np.abs(z_i)) > 0 else (r, w)
+        for r, w, z_i in zip(values["r"], values["w"], z.T, strict=True)
+    ]
+    return {**values, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}

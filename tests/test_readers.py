@@ -1,0 +1,324 @@
+"""Reading recordings: what is accepted, and one sentence with file, column and line for everything that is not."""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pilfr_casadi import InputError, read, read_csv, read_mat, read_npz
+from pilfr_casadi.timebase import step_of
+
+GOOD = "t,force,x2\n0,1,10\n0.1,2,20\n0.2,3,30\n0.3,4,40\n"
+MATRIX = np.array([[0.0, 1, 10], [0.1, 2, 20], [0.2, 3, 30], [0.3, 4, 40]])
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(content, name="rig.csv"):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write
+
+
+def sentence(caught):
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.endswith(".")
+    return text
+
+
+# ---------------------------------------------------------------------------------------------- CSV that is accepted
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        GOOD,
+        GOOD.replace("t,", "t_s,"),
+        GOOD.replace("t,", "time,"),
+        GOOD.encode("utf-8-sig"),
+        GOOD.replace("\n", "\r\n"),
+        GOOD.replace("\n", "\r"),
+        GOOD.replace(",", ";"),
+        GOOD.replace(",", "\t"),
+        GOOD.replace(",", " , "),
+        GOOD.rstrip("\n"),
+        "\n" + GOOD + "\n\n",
+        GOOD.replace("\n0.2", "\n\n0.2"),
+        GOOD.replace("t,force,x2", '"t","force","x2"').replace("0.2,3", '"0.2",3'),
+        GOOD.replace("0.1,2,20", "1e-1,+2.0,2E1"),
+        "x2,label,t,force\n10,a,0,1\n20,b,0.1,2\n30,,0.2,3\n40,nan,0.3,4\n",
+        "x2,x,t,x,force\n10,a,0,1,1\n20,b,0.1,1,2\n30,,0.2,1,3\n40,nan,0.3,1,4\n",
+        "temp °C,t,force,x2\n1,0,1,10\n1,0.1,2,20\n1,0.2,3,30\n1,0.3,4,40\n".encode("latin-1"),
+    ],
+)
+def test_accepted(write, content):
+    r = read_csv(write(content), inputs=["force"], outputs=["x2"])
+    assert np.array_equal(r.u, MATRIX[:, 1:2])
+    assert np.array_equal(r.y, MATRIX[:, 2:])
+    assert (r.dt, r.inputs, r.outputs, r.name) == (0.1, ("force",), ("x2",), "rig")
+
+
+def test_options_reach_the_recording(write):
+    r = read_csv(write(GOOD), "force", "x2", hold="linear", initial="zero", skip=1, name="a", units={"force": "N"})
+    assert (r.hold, r.initial, r.skip, r.name, r.units["force"]) == ("linear", "zero", 1, "a", "N")
+    with pytest.raises(InputError, match=r"rig\.csv: hold"):
+        read_csv(write(GOOD), "force", "x2", hold="cubic")
+
+
+def test_columns_are_mapped(write):
+    path = write(GOOD.replace("t,force", "clock,u_vir_V"))
+    r = read_csv(path, "force", "x2", columns={"force": "u_vir_V", "t": "clock"})
+    assert r.inputs == ("force",)
+    assert np.array_equal(r.u, MATRIX[:, 1:2])
+    both = read_csv(path, ["a", "b"], "x2", columns={"a": "u_vir_V", "b": "u_vir_V", "time": "clock"})
+    assert np.array_equal(both.u[:, 0], both.u[:, 1])
+
+
+def test_dt_instead_of_time(write):
+    path = write(GOOD.replace("t,force", "t_ms,force"))
+    assert read_csv(path, "force", "x2", dt=0.02).dt == 0.02
+    assert read_csv(write(GOOD), "force", "x2", dt=0.10005).dt == 0.10005  # agrees within 0.1 %
+
+
+def test_several_files_give_a_tuple(write):
+    paths = [write(GOOD, "a.csv"), str(write(GOOD, "b.csv"))]
+    a, b = read_csv(paths, "force", "x2")
+    assert (a.name, b.name) == ("a", "b")
+    assert isinstance(read_csv(paths[:1], "force", "x2"), tuple)
+
+
+@pytest.mark.parametrize("fmt", ["%.17g", "%.9g", "%.7g", "%.6f", "%.4f"])
+@given(rate=st.floats(20, 2000), m=st.integers(3, 400), start=st.sampled_from([0.0, 3.0, 120.0]))
+def test_rounding_of_the_written_times_is_no_fault(fmt, rate, m, start):
+    t = start + np.arange(m) / rate
+    written = np.array([float(fmt % value) for value in t])
+    coarse = 10.0 ** -int(fmt[2]) if fmt.endswith("f") else 10.0 ** (np.ceil(np.log10(t[-1] + 1)) - int(fmt[2:-1]))
+    if coarse * rate > 0.05:  # coarser than a twentieth of a step is another story
+        return
+    step = step_of(written, "t", str)
+    assert abs(step * rate - 1) <= 2 * coarse * rate / (m - 1) + 1e-11
+
+
+def test_a_million_rows_in_a_few_seconds(tmp_path):
+    m = 10**6
+    rows = np.column_stack([np.arange(m) * 1e-3, np.sin(np.arange(m)), np.cos(np.arange(m))])
+    path = tmp_path / "long.csv"
+    block = "".join(f"{t:.3f},{u:.6f},{y:.6f}\n" for t, u, y in rows[:1000])
+    with path.open("w") as file:  # the same thousand values again and again, with their own times
+        file.write("t,u,y\n")
+        values = [line.split(",", 1)[1] for line in block.splitlines(keepends=True)]
+        file.writelines(f"{k / 1000:.3f},{values[k % 1000]}" for k in range(m))
+    start = time.perf_counter()
+    r = read_csv(path, "u", "y")
+    assert time.perf_counter() - start < 10
+    assert (len(r), r.dt) == (m, 0.001)
+    np.testing.assert_allclose(r.y[:1000, 0], rows[:1000, 2], atol=1e-6)
+
+
+# ---------------------------------------------------------------------------------------------- CSV that is refused
+
+BAD_FILES = {
+    "empty": ("", "rig.csv is empty"),
+    "blank": ("\n \n", "rig.csv is empty"),
+    "no data": ("t,force,x2\n\n", "header but no data"),
+    "one row": ("t,force,x2\n0,1,2\n", "only one sample"),
+    "no header": (GOOD.split("\n", 1)[1], "no header row: line 1 reads '0,1,10'"),
+    "missing column": (GOOD.replace("force", "forc"), "no column 'force'; it has t, forc, x2"),
+    "blanks between": (GOOD.replace(",", " "), "separate columns by commas"),
+    "duplicate input": (
+        GOOD.replace("x2", "force").replace("t,", "t,x2,").replace("\n0", "\n0,1"),
+        "2 columns named 'force'",
+    ),
+    "duplicate time": (GOOD.replace("x2", "x2,t").replace("0\n", "0,0\n"), "2 columns named 't'"),
+    "two times": (GOOD.replace("x2", "x2,time").replace("0\n", "0,0\n"), r"several time columns \(t, time\)"),
+    "no time": (GOOD.replace("t,", "clock,"), "no time column; it has clock, force, x2"),
+    "milliseconds": (GOOD.replace("t,", "t_ms,"), "'t_ms' is time in ms"),
+    "unit in brackets": (GOOD.replace("t,", "Time [us],"), "'Time \\[us\\]' is time in us"),
+    "word": (GOOD.replace("0.2,3", "0.2,high"), "column 'force', line 4 reads 'high', which is not a number"),
+    "underscore": (GOOD.replace("0.2,3,30", "0.2,3,3_0"), "column 'x2', line 4 reads '3_0'"),
+    "decimal comma": (GOOD.replace(",", ";").replace("0.2;3", "0.2;3,5"), "line 4 reads '3,5'.* with a point"),
+    "unit row": (GOOD.replace("x2\n", "x2\ns,N,m\n"), "column 'force', line 2 reads 'N'"),
+    "gap": (GOOD.replace("0.2,3,", "0.2,,"), "column 'force', line 4 is empty"),
+    "nan": (GOOD.replace("30", "NaN"), "column 'x2', line 4 is NaN"),
+    "inf": (GOOD.replace("30", "-inf"), "column 'x2', line 4 is -inf"),
+    "nan time": (GOOD.replace("0.2,", "nan,"), "column 't', line 4 is nan"),
+    "line after blank": (GOOD.replace("\n0.1", "\n\n\n0.1").replace("40", "x"), "column 'x2', line 7 reads 'x'"),
+    "short row": (GOOD.replace("0.2,3,30", "0.2,3"), "line 4 has 2 cell.* names 3"),
+    "long row": (GOOD.replace("0.2,3,30", "0.2,3,30,1"), "line 4 has 4 cell.* names 3"),
+    "half written": (GOOD[:-6], "line 5 has 1 cell"),
+    "backwards": (GOOD.replace("0.2,", "0.05,"), "line 4 is 0.05 s, after 0.1 s; time must increase"),
+    "standing": (GOOD.replace("0.2,", "0.1,"), "line 4 is 0.1 s, after 0.1 s"),
+    "missing row": (GOOD.replace("0.1,2,20\n", ""), "not uniform: line 3 comes 0.2 s after"),
+    "jitter": (GOOD.replace("0.2,", "0.203,"), "not uniform: line 4"),
+    "binary": (bytes(range(256)) * 40, "not text"),
+    "utf-16": (GOOD.encode("utf-16"), "UTF-16"),
+    "json": ('{"t": [' + "1," * 200000 + "]}\n2", "rig.csv"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_FILES)
+def test_refused(write, fault):
+    content, words = BAD_FILES[fault]
+    path = write(content)
+    with pytest.raises(InputError, match=words) as caught:
+        read_csv(path, inputs=["force"], outputs=["x2"])
+    text = sentence(caught)
+    assert str(path) in text
+    assert len(text) < 400 + len(str(path)) or fault == "json"
+
+
+def test_no_such_file_and_directory(tmp_path):
+    for reader in (read_csv, read_mat, read_npz):
+        with pytest.raises(InputError, match=r"no file .*gone\.csv"):
+            reader(tmp_path / "gone.csv", "u", "y")
+        with pytest.raises(InputError, match="is a directory"):
+            reader(tmp_path, "u", "y")
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e6, 1 / 60])
+def test_a_stated_step_finds_times_in_another_unit(write, factor):
+    text = "t,u,y\n" + "".join(f"{k * 0.01 * factor!r},{k % 3},{k % 4}\n" for k in range(10))
+    with pytest.raises(InputError, match="must be in seconds") as caught:
+        read_csv(write(text), "u", "y", dt=0.01)
+    assert f"a ratio of {factor:.4g}" in sentence(caught)
+
+
+def test_wishes_that_cannot_be_met(write):
+    path = write(GOOD)
+    for options, words in [
+        (dict(columns={"forc": "u"}), "none of the inputs force"),
+        (dict(columns={"t": "clock"}), "no column 'clock' for the time"),
+        (dict(columns={"force": "u"}), "no column 'u'; .*as in force=COLUMN"),
+        (dict(dt=0.0), "above zero"),
+        (dict(dt=float("nan")), "above zero"),
+        (dict(inputs=()), "at least one input"),
+    ]:
+        with pytest.raises(InputError, match=words):
+            read_csv(path, **(dict(inputs="force", outputs="x2") | options))
+    path = write(GOOD.replace("t,", "t_ms,"))
+    with pytest.raises(InputError, match="time in ms"):
+        read_csv(path, "force", "x2", columns={"t": "t_ms"})
+
+
+def test_time_tolerance_is_stated():
+    t = np.arange(100) * 0.01
+    t[50] += 2e-5
+    with pytest.raises(InputError, match=r"k50 .*0\.002 steps"):
+        step_of(t, "t", lambda k: f"k{k}")
+    assert step_of(t, "t", str, tolerance=0.01) == 0.01
+
+
+@given(m=st.integers(20, 200), share=st.floats(0.001, 0.5), seed=st.integers(0, 99))
+def test_one_sample_off_is_always_found(m, share, seed):
+    k = int(np.random.default_rng(seed).integers(1, m - 1))
+    t = np.arange(m) * 0.0123456789012
+    t[k] += share * 0.0123456789012
+    with pytest.raises(InputError, match=f"not uniform: k{k} "):
+        step_of(t, "t", lambda i: f"k{i}")
+
+
+@given(m=st.integers(10, 300), step=st.sampled_from([0.1, 1.0, 4.0, 0.001, 1 / 120]), data=st.data())
+def test_a_missing_sample_is_always_found(m, step, data):
+    k = data.draw(st.integers(1, m - 2))
+    t = np.round(np.arange(m) * step, 4)
+    with pytest.raises(InputError, match=f"not uniform: k{k} "):
+        step_of(np.delete(t, k), "t", lambda i: f"k{i}")
+
+
+# ---------------------------------------------------------------------------------------------- .mat and .npz
+
+T, U, Y = MATRIX.T
+
+
+def save(path, **arrays):
+    if path.suffix == ".mat":
+        from scipy.io import savemat
+
+        savemat(path, arrays)
+    else:
+        np.savez(path, **arrays)
+    return path
+
+
+KINDS = pytest.mark.parametrize(("suffix", "reader"), [(".mat", read_mat), (".npz", read_npz)])
+
+
+@KINDS
+def test_arrays(tmp_path, suffix, reader):
+    path = save(tmp_path / f"rig{suffix}", t=T, force=U, x2=Y, note="any")
+    for r in (reader(path, "force", "x2"), read(path, ["force"], ["x2"], dt=0.1)):
+        assert np.array_equal(r.u, MATRIX[:, 1:2])
+        assert np.array_equal(r.y, MATRIX[:, 2:])
+        assert (r.dt, r.name) == (0.1, "rig")
+    path = save(tmp_path / f"rows{suffix}", u=np.column_stack([U, Y]), y=Y[None, :])
+    r = reader(path, "u", "y", dt=0.5, hold="zero")
+    assert (r.inputs, r.outputs, r.u.shape, r.dt, r.hold) == (("u1", "u2"), ("y",), (4, 2), 0.5, "zero")
+    assert len(reader([path, path], "u", "y", dt=0.5)) == 2
+
+
+@KINDS
+@pytest.mark.parametrize(
+    ("arrays", "words"),
+    [
+        (dict(t=T, force=U), "no column 'x2'"),
+        (dict(force=U, x2=Y), "no time column"),
+        (dict(time_ms=T, force=U, x2=Y), "time in ms"),
+        (dict(t=T, force=U[:3], x2=Y), r"different lengths \(force 3, x2 4, t 4 samples\)"),
+        (dict(t=T, force=U * [1, np.nan, 1, 1], x2=Y), "'force', sample 1 is nan"),
+        (dict(t=T, force=U, x2=Y * 1j), "'x2' holds complex128"),
+        (dict(t=T, force=np.zeros((4, 2, 2)), x2=Y), "'force' holds"),
+        (dict(t=T**2, force=U, x2=Y), "not uniform: sample 1 "),
+        (dict(t=-T, force=U, x2=Y), "must increase"),
+    ],
+)
+def test_arrays_refused(tmp_path, suffix, reader, arrays, words):
+    path = save(tmp_path / f"rig{suffix}", **arrays)
+    with pytest.raises(InputError, match=words) as caught:
+        reader(path, "force", "x2")
+    assert str(path) in sentence(caught)
+
+
+@KINDS
+def test_damaged_files(tmp_path, write, suffix, reader):
+    whole = save(tmp_path / f"whole{suffix}", t=T, force=U, x2=Y).read_bytes()
+    for content in (b"", b"t,u,y\n0,1,2\n", bytes(range(256)), whole[: len(whole) // 2], whole[:200]):
+        path = write(content, f"bad{suffix}")
+        with pytest.raises(InputError) as caught:
+            reader(path, "force", "x2")
+        assert str(path) in sentence(caught)
+
+
+def test_a_single_array_is_no_archive(tmp_path):
+    path = tmp_path / "single.npz"
+    with path.open("wb") as file:
+        np.save(file, T)
+    with pytest.raises(InputError, match=r"single\.npz cannot be read as a NumPy archive"):
+        read_npz(path, "force", "x2")
+
+
+def test_no_code_is_run_from_an_archive(tmp_path):
+    path = tmp_path / "objects.npz"
+    np.savez(path, t=T, force=np.array([{}, {}, {}, {}], dtype=object), x2=Y)
+    with pytest.raises(InputError, match=r"objects\.npz"):
+        read_npz(path, "force", "x2")
+
+
+def test_matlab_7_3(write):
+    head = b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + b"\0\2IM" + b"\x89HDF\r\n\x1a\n" + b"\0" * 600
+    with pytest.raises(InputError, match=r"version 7\.3"):
+        read_mat(write(head, "new.mat"), "u", "y")
+
+
+def test_read_by_suffix(write, tmp_path):
+    npz = save(tmp_path / "b.npz", t=T, force=U, x2=Y)
+    a, b = read([write(GOOD, "a.TXT"), npz], "force", "x2")
+    assert np.array_equal(a.u, b.u)
+    with pytest.raises(InputError, match=r"suffix '\.xlsx'; files named \.csv"):
+        read(write(GOOD, "a.xlsx"), "force", "x2")
+    with pytest.raises(InputError, match="no file"):
+        read(tmp_path / "gone.xlsx", "force", "x2")

@@ -1,0 +1,184 @@
+"""The recording: checked once at the door, immutable behind it."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pilfr_casadi.recording import InputError, Recording, as_recordings, check_for_identification
+
+
+def recording(m=20, n_u=1, n_y=1, **options):
+    rng = np.random.default_rng(0)
+    return Recording(rng.normal(size=(m, n_u)), rng.normal(size=(m, n_y)), 0.1, **options)
+
+
+def test_vectors_become_columns_with_names():
+    r = Recording([1, 2, 3], np.zeros((3, 2)), 0.5)
+    assert (r.u.shape, r.y.shape, r.u.dtype) == ((3, 1), (3, 2), float)
+    assert (r.inputs, r.outputs, r.n_u, r.n_y, len(r)) == (("u",), ("y1", "y2"), 1, 2, 3)
+    assert r.t.tolist() == [0.0, 0.5, 1.0]
+    assert (r.initial, r.hold, r.period, r.skip, dict(r.units)) == ("estimate", None, None, 0, {})
+
+
+def test_nothing_can_change():
+    u, units = np.arange(4.0), {"u": "N"}
+    r = Recording(u, u, 1.0, units=units, initial=[1.0, 2.0])
+    u[0], units["u"] = 99.0, "kN"
+    assert r.u[0, 0] == 0.0
+    assert r.units["u"] == "N"
+    for array in (r.u, r.y, r.initial):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+    with pytest.raises(AttributeError):
+        r.dt = 2.0
+    with pytest.raises(TypeError):
+        r.units["u"] = "kN"
+
+
+def test_pickle_keeps_everything_and_stays_read_only():
+    r = recording(
+        inputs=("force",), units={"force": "N"}, period=5, skip=3, hold="linear", initial="periodic", name="rig"
+    )
+    back = pickle.loads(pickle.dumps(r))
+    assert repr(back) == repr(r)
+    assert np.array_equal(back.u, r.u)
+    assert not back.u.flags.writeable
+
+
+def test_repr_says_what_matters():
+    text = repr(recording(inputs=("force",), units={"force": "N"}, hold="zero", name="rig"))
+    for part in ("'rig'", "20 samples", "dt 0.1 s", "force [N]", "hold zero", "initial estimate"):
+        assert part in text
+    assert "period" not in text
+
+
+def test_with_checks_again():
+    r = recording()
+    assert r.with_(hold="linear").hold == "linear"
+    assert r.hold is None
+    with pytest.raises(InputError, match="hold"):
+        r.with_(hold="cubic")
+
+
+NAN = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (dict(u=np.arange(19.0)), "19 samples of u but 20 of y"),
+        (dict(u=[1.0], y=[1.0]), "at least 2"),
+        (dict(u=np.zeros((20, 1, 1))), r"shape \(20, 1, 1\)"),
+        (dict(u=np.zeros((20, 0))), r"shape \(20, 0\)"),
+        (dict(u=["a"] * 20), "real numbers"),
+        (dict(u=np.full(20, 1j)), "real numbers"),
+        (dict(u=[[1.0], [1.0, 2.0]]), "real numbers"),
+        (dict(u=NAN, y=np.zeros(3), inputs=("force", "volt")), "sample 1 of input 'volt' in recording 'rig' is nan"),
+        (dict(y=np.full(20, np.inf)), "sample 0 of output 'y'.* is inf"),
+        (dict(dt=0.0), "above zero"),
+        (dict(dt=np.nan), "above zero"),
+        (dict(dt="fast"), "above zero"),
+        (dict(inputs=("a", "b")), "1 input column.* 2 name"),
+        (dict(u=np.zeros((20, 2)), inputs=("a", "a")), "distinct"),
+        (dict(inputs=("",)), "distinct and not empty"),
+        (dict(inputs=("x",), outputs=("x",)), "both as an input and as an output"),
+        (dict(units={"forc": "N"}), "'forc'; its columns are u, y"),
+        (dict(hold="cubic"), "'zero', 'linear' or None"),
+        (dict(initial="steady"), "zero, estimate, periodic"),
+        (dict(initial=[1.0, np.nan]), "finite numbers"),
+        (dict(initial=np.zeros((2, 2))), "vector"),
+        (dict(initial="periodic"), "set period"),
+        (dict(period=1), "from 2 to 20"),
+        (dict(period=4.0), "from 2 to 20"),
+        (dict(period=16, skip=5), "from 2 to 15"),
+        (dict(skip=20), "from 0 to 19"),
+        (dict(skip=-1), "from 0 to 19"),
+    ],
+)
+def test_each_fault_has_its_sentence(change, words):
+    rng = np.random.default_rng(0)
+    fields = dict(u=rng.normal(size=20), y=rng.normal(size=20), dt=0.1, name="rig") | change
+    with pytest.raises(InputError, match=words) as caught:
+        Recording(**fields)
+    assert "\n" not in str(caught.value)
+    assert "'rig'" in str(caught.value)
+
+
+@given(start=st.integers(-25, 25), stop=st.none() | st.integers(-25, 25), skip=st.integers(0, 10))
+def test_slice_is_the_python_slice(start, stop, skip):
+    r = recording(skip=skip, initial="zero")
+    expected = r.u[start:stop]
+    if len(expected) < 2:
+        with pytest.raises(InputError, match="fewer than 2"):
+            r.slice(start, stop)
+        return
+    piece = r.slice(start, stop)
+    assert np.array_equal(piece.u, expected)
+    assert np.array_equal(piece.y, r.y[start:stop])
+    first = range(20)[start:stop][0]
+    assert piece.initial == ("zero" if first == 0 else "estimate")
+    if skip < first + len(piece):
+        assert piece.skip == max(0, skip - first)
+
+
+def test_slice_keeps_a_period_only_while_there_is_one():
+    r = recording(period=5, initial="periodic", skip=2)
+    assert (r.slice(5).period, r.slice(5).initial, r.slice(5).skip) == (5, "periodic", 0)
+    short = r.slice(0, 4)
+    assert (short.period, short.initial, short.skip) == (None, "estimate", 2)
+
+
+@given(st.floats(0.1, 0.9))
+def test_split_loses_nothing(fraction):
+    r = recording(initial=np.ones(3))
+    first, second = r.split(fraction)
+    assert np.array_equal(np.vstack([first.u, second.u]), r.u)
+    assert np.array_equal(first.initial, np.ones(3))
+    assert second.initial == "estimate"
+    assert len(first) == round(20 * fraction)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0, float("nan")])
+def test_split_outside(fraction):
+    with pytest.raises(InputError, match="between 0 and 1"):
+        recording().split(fraction)
+
+
+def test_as_recordings():
+    r = recording()
+    assert as_recordings(r) == (r,)
+    assert as_recordings(iter([r, r])) == (r, r)
+    for wrong, words in [([], "no recording"), ([r, "x"], "not str"), (3, "not int")]:
+        with pytest.raises(InputError, match=words):
+            as_recordings(wrong)
+
+
+def test_identification_takes_what_varies():
+    still = recording().with_(u=np.full(20, 3.0))
+    both = check_for_identification([still, recording()], n_min=40)
+    assert len(both) == 2
+
+
+@pytest.mark.parametrize(
+    ("others", "n_min", "words"),
+    [
+        ([recording(inputs=("f",), name="b")], 2, "'b' has the inputs f and the recording has u"),
+        ([recording().with_(dt=0.101, name="b")], 2, "resample"),
+        ([recording(skip=10)], 31, "30 scored samples"),
+    ],
+)
+def test_recordings_that_do_not_fit_together(others, n_min, words):
+    with pytest.raises(InputError, match=words):
+        check_for_identification([recording(), *others], n_min)
+
+
+def test_nothing_to_identify():
+    r = recording(n_u=2, n_y=2)
+    with pytest.raises(InputError, match="u1, u2 never changes"):
+        check_for_identification(r.with_(u=np.full((20, 2), [1.0, 0.1])))
+    with pytest.raises(InputError, match="output 'y2' never changes"):
+        check_for_identification(r.with_(y=r.y * [1.0, 0.0]))
+    assert check_for_identification(r.with_(u=r.u * [0.0, 1.0]))
