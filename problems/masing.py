@@ -29,6 +29,7 @@ FS = 120.0  # Hz
 F_MAX = 30.0  # Hz
 N_PERIOD = 1024
 N_REALIZATIONS = 3
+MAX_EVENTS = 20  # within one substep
 
 
 class Branch(NamedTuple):
@@ -73,7 +74,9 @@ class MasingSpring:
     def branch(self) -> Branch:
         """Curve of the next movement in the present direction, with the elongation that closes its loop."""
         if not self.turns:
-            return Branch(0.0, 0.0, self.direction * self.r_u, -self.direction * self.K / self.r_u, self.direction * math.inf)
+            return Branch(
+                0.0, 0.0, self.direction * self.r_u, -self.direction * self.K / self.r_u, self.direction * math.inf
+            )
         x0, f0 = self.turns[-1]
         close = self.turns[-2][0] if len(self.turns) > 1 else -x0
         return Branch(x0, f0, self.direction * 2.0 * self.r_u, -self.direction * self.K / (2.0 * self.r_u), close)
@@ -220,14 +223,42 @@ def _stepper(rig: MasingRig) -> Stepper:
     return step
 
 
-def _crossing(value: Callable[[float], float], h: float) -> float:
-    """Time in [0, h] at which `value` changes sign: secant rule, Illinois variant."""
-    lo, hi, f_lo, f_hi = 0.0, h, value(0.0), value(h)
-    if f_lo * f_hi >= 0.0:  # already there at the start
+def _advance(
+    step: Stepper, spring: MasingSpring, start: State, h: float, u: float, du: float
+) -> tuple[MasingSpring, State]:
+    """Go on for the time h, cutting the step at every reversal and at every loop that closes."""
+    end = start
+    for _ in range(MAX_EVENTS):
+        branch, sign, cut = spring.branch, spring.direction, h
+        end = step(start, h, u, du, branch)
+        turning = sign * end[1] < 0.0
+        if turning:
+            cut = _crossing(1, 0.0, step, start, h, u, du, branch)
+            end = step(start, cut, u, du, branch)
+        if sign * (end[0] - branch.close) >= 0.0:
+            cut = _crossing(0, branch.close, step, start, cut, u, du, branch)
+            _, v1, x2, v2 = step(start, cut, u, du, branch)
+            spring, start = spring.move(branch.close), (branch.close, v1, x2, v2)
+        elif turning:
+            x1, _, x2, v2 = end
+            spring, start = replace(spring, x=x1).turn(), (x1, 0.0, x2, v2)
+        else:
+            break
+        h, u = h - cut, u + cut * du
+    return spring, end
+
+
+def _crossing(
+    entry: int, level: float, step: Stepper, start: State, h: float, u: float, du: float, branch: Branch
+) -> float:
+    """Time in [0, h] at which an entry of the state crosses a level: secant rule, Illinois variant."""
+    lo, hi = 0.0, h
+    f_lo, f_hi = start[entry] - level, step(start, h, u, du, branch)[entry] - level
+    if f_lo * f_hi >= 0.0:  # there from the start
         return 0.0
     for _ in range(100):
         mid = hi - f_hi * (hi - lo) / (f_hi - f_lo)
-        f_mid = value(mid)
+        f_mid = step(start, mid, u, du, branch)[entry] - level
         if f_mid * f_hi < 0.0:
             lo, f_lo = hi, f_hi
         else:
@@ -238,36 +269,7 @@ def _crossing(value: Callable[[float], float], h: float) -> float:
     return hi
 
 
-def _advance(
-    step: Stepper, spring: MasingSpring, state: State, h: float, u: float, du: float
-) -> tuple[MasingSpring, State]:
-    """Go on for the time h, cutting the step at every reversal and at every loop that closes."""
-    while True:
-        branch, sign, start, force = spring.branch, spring.direction, state, u
-        end, cut = step(start, h, force, du, branch), h
-
-        def along(t: float, index: int, level: float) -> float:
-            return step(start, t, force, du, branch)[index] - level  # noqa: B023 (used within this turn of the loop only)
-
-        turning = sign * end[1] < 0.0
-        if turning:
-            cut = _crossing(lambda t: along(t, 1, 0.0), h)
-            end = step(start, cut, force, du, branch)
-        if sign * (end[0] - branch.close) >= 0.0:
-            cut = _crossing(lambda t: along(t, 0, branch.close), cut)  # noqa: B023
-            _, v1, x2, v2 = step(start, cut, force, du, branch)
-            spring, state = spring.move(branch.close), (branch.close, v1, x2, v2)
-        elif turning:
-            x1, _, x2, v2 = end
-            spring, state = replace(spring, x=x1).turn(), (x1, 0.0, x2, v2)
-        else:
-            return spring, end
-        h, u = h - cut, u + cut * du
-
-
-def simulate(
-    u: ArrayLike, fs: float, *, rig: MasingRig | None = None, substeps: int = 8, hold: str = "zero"
-) -> Motion:
+def simulate(u: ArrayLike, fs: float, *, rig: MasingRig | None = None, substeps: int = 8, hold: str = "zero") -> Motion:
     """Simulate the rig from rest.
 
     Parameters
@@ -296,7 +298,9 @@ def simulate(
     force = np.asarray(u, float)
     force = force[:, 0] if force.ndim == 2 and force.shape[1] == 1 else force
     if force.ndim != 1 or not force.size or not np.isfinite(force).all():
-        raise InputError(f"the rig has one force, but u has shape {force.shape} or is not finite; pass one column of it.")
+        raise InputError(
+            f"the rig has one force, but u has shape {force.shape} or is not finite; pass one column of it."
+        )
     if hold not in ("zero", "linear"):
         raise InputError(f"hold is {hold!r}; use 'zero' or 'linear' for a force held or interpolated between samples.")
     if substeps < 1 or not fs > 0.0:
@@ -377,7 +381,9 @@ def benchmark(seed: int, *, snr_db: float = 50.0, rig: MasingRig | None = None) 
         units = {"u": "N", "x2": "m"}
         records[name] = Recording(u, y, 1.0 / FS, ("u",), ("x2",), units, initial="zero", hold="zero", name=name)
     steady = tuple(
-        records["train"].slice(part.start, part.stop).with_(period=N_PERIOD, initial="periodic", name=f"steady period {i}")
+        records["train"]
+        .slice(part.start, part.stop)
+        .with_(period=N_PERIOD, initial="periodic", name=f"steady period {i}")
         for i, part in enumerate(steady_periods(N_REALIZATIONS, N_PERIOD), 1)
     )
     return Benchmark(records, steady, truth, rig)

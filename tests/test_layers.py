@@ -13,11 +13,11 @@ LAYERS = {
     1: ("operators", "elements"),
     2: ("model", "simulator"),
     3: ("simulate", "sensitivities", "compiled", "bla", "subspace"),
-    4: ("lfr", "start", "problem", "constraints", "baselines"),
+    4: ("lfr", "gauge", "start", "problem", "nlp", "constraints", "baselines"),
     5: ("gauss_newton", "ipopt", "solution"),
     6: ("fit", "multistart", "export", "plots"),
     7: ("diagnose",),
-    8: ("cli", "report"),
+    8: ("cli", "report", "demo", "progress"),
 }
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")

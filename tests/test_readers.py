@@ -152,6 +152,7 @@ BAD_FILES = {
     "long row": (GOOD.replace("0.2,3,30", "0.2,3,30,1"), "line 4 has 4 cell.* names 3"),
     "half written": (GOOD[:-6], "line 5 has 1 cell"),
     "backwards": (GOOD.replace("0.2,", "0.05,"), "line 4 is 0.05 s, after 0.1 s; time must increase"),
+    "backwards after blank": (GOOD.replace("\n0.1", "\n\n\n0.1").replace("0.2,", "0.05,"), "line 6 is 0.05 s"),
     "standing": (GOOD.replace("0.2,", "0.1,"), "line 4 is 0.1 s, after 0.1 s"),
     "missing row": (GOOD.replace("0.1,2,20\n", ""), "not uniform: line 3 comes 0.2 s after"),
     "jitter": (GOOD.replace("0.2,", "0.203,"), "not uniform: line 4"),
