@@ -1,6 +1,7 @@
 """The command line: a thin skin over the Python API.
 
-Exit status: 0 done, 1 no usable result, 2 bad input (one plain sentence on stderr), 130 interrupted (the best so far is written).
+Exit status: 0 done, 1 no usable result, 2 bad input (one plain sentence on stderr), 130 interrupted (the best so far is
+written).
 """
 
 from __future__ import annotations
@@ -44,26 +45,48 @@ def _say(sentence: str, status: int) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="pilfr", description="Identify dynamic models with hysteresis from recordings.")
+    parser = argparse.ArgumentParser(
+        prog="pilfr", description="Identify dynamic models with hysteresis from recordings."
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     fit = commands.add_parser("fit", help="identify a PI-LFR model from recordings")
     fit.add_argument("train", nargs="+", help="training recordings (.csv, .mat, .npz)")
     _data_options(fit)
-    fit.add_argument("--test", action="append", default=[], metavar="FILE", help="recording to report on, never fitted (repeatable)")
-    fit.add_argument("--nx", type=int, default=None, help="states of the linear part (default: chosen on the training data)")
-    fit.add_argument("--operators", type=int, default=20, metavar="N", help="hysteresis operators a channel; 0 for a linear model")
-    fit.add_argument("--operator", choices=("play", "stop", "generalized_play"), default="play", help="kind of operator")
+    fit.add_argument(
+        "--test", action="append", default=[], metavar="FILE", help="recording to report on, never fitted (repeatable)"
+    )
+    fit.add_argument(
+        "--nx", type=int, default=None, help="states of the linear part (default: chosen on the training data)"
+    )
+    fit.add_argument(
+        "--operators", type=int, default=20, metavar="N", help="hysteresis operators a channel; 0 for a linear model"
+    )
+    fit.add_argument(
+        "--operator", choices=("play", "stop", "generalized_play"), default="play", help="kind of operator"
+    )
     fit.add_argument("--channels", type=int, default=1, help="channels of the element")
-    fit.add_argument("--structure", choices=("lfr", "hammerstein", "wiener"), default="lfr", help="where the element sits")
-    fit.add_argument("--bound", action="append", default=[], metavar="NAME=LOW:HIGH", help="bounds of a parameter (repeatable)")
-    fit.add_argument("--fix", action="append", default=[], metavar="NAME=VALUE", help="hold a block at a value (repeatable)")
-    fit.add_argument("--from", dest="start_from", metavar="MODEL.json", help="start from a saved model instead of searching")
-    fit.add_argument("--solver", choices=("gauss-newton", "ipopt"), default="gauss-newton", help="solver of the final problem")
+    fit.add_argument(
+        "--structure", choices=("lfr", "hammerstein", "wiener"), default="lfr", help="where the element sits"
+    )
+    fit.add_argument(
+        "--bound", action="append", default=[], metavar="NAME=LOW:HIGH", help="bounds of a parameter (repeatable)"
+    )
+    fit.add_argument(
+        "--fix", action="append", default=[], metavar="NAME=VALUE", help="hold a block at a value (repeatable)"
+    )
+    fit.add_argument(
+        "--from", dest="start_from", metavar="MODEL.json", help="start from a saved model instead of searching"
+    )
+    fit.add_argument(
+        "--solver", choices=("gauss-newton", "ipopt"), default="gauss-newton", help="solver of the final problem"
+    )
     fit.add_argument("--starts", type=int, default=8, help="random starts (default 8)")
     fit.add_argument("--seed", type=int, default=0, help="seed of all starts")
     fit.add_argument("--workers", type=int, default=1, help="processes; the numbers do not depend on it")
-    fit.add_argument("--engine", choices=("auto", "c", "vm"), default="auto", help="generated C or CasADi's virtual machine")
+    fit.add_argument(
+        "--engine", choices=("auto", "c", "vm"), default="auto", help="generated C or CasADi's virtual machine"
+    )
     fit.add_argument("--out", default="fit", metavar="DIR", help="folder for model.json and report.html (default: fit)")
     fit.set_defaults(run=_fit)
 
@@ -71,7 +94,9 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("model", help="model.json")
     simulate.add_argument("data", help="recording (.csv, .mat, .npz)")
     _data_options(simulate, named=False)
-    simulate.add_argument("--out", required=True, metavar="FILE", help="CSV file for time, inputs and simulated outputs")
+    simulate.add_argument(
+        "--out", required=True, metavar="FILE", help="CSV file for time, inputs and simulated outputs"
+    )
     simulate.set_defaults(run=_simulate)
 
     export = commands.add_parser("export", help="write a saved model as a serialized CasADi function")
@@ -90,12 +115,26 @@ def _data_options(parser: argparse.ArgumentParser, named: bool = True) -> None:
     how = {"required": True} if named else {"default": None}
     parser.add_argument("--inputs", metavar="NAME[,NAME]", help="names of the inputs", **how)
     parser.add_argument("--outputs", metavar="NAME[,NAME]", help="names of the outputs", **how)
-    parser.add_argument("--column", action="append", default=[], metavar="NAME=COLUMN", help="column of a name, where it differs (repeatable)")
-    parser.add_argument("--initial", choices=("estimate", "zero", "periodic"), default="estimate", help="state at the first sample")
-    parser.add_argument("--period", type=int, default=None, metavar="SAMPLES", help="samples a period, for records in steady state")
+    parser.add_argument(
+        "--column",
+        action="append",
+        default=[],
+        metavar="NAME=COLUMN",
+        help="column of a name, where it differs (repeatable)",
+    )
+    parser.add_argument(
+        "--initial", choices=("estimate", "zero", "periodic"), default="estimate", help="state at the first sample"
+    )
+    parser.add_argument(
+        "--period", type=int, default=None, metavar="SAMPLES", help="samples a period, for records in steady state"
+    )
     parser.add_argument("--hold", choices=("zero", "linear"), default=None, help="what the input does between samples")
-    parser.add_argument("--skip", type=int, default=0, metavar="SAMPLES", help="leading samples that are simulated, not scored")
-    parser.add_argument("--dt", type=float, default=None, metavar="SECONDS", help="step, where the file has no time column")
+    parser.add_argument(
+        "--skip", type=int, default=0, metavar="SAMPLES", help="leading samples that are simulated, not scored"
+    )
+    parser.add_argument(
+        "--dt", type=float, default=None, metavar="SECONDS", help="step, where the file has no time column"
+    )
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -123,9 +162,14 @@ def _bounds(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
         low, sign, high = value.partition(":")
         if not sign:
             raise InputError(f"--bound {name}={value} was given; write --bound NAME=LOW:HIGH.")
-        out[name] = (_number(low, "--bound") if low else -float("inf"), _number(high, "--bound") if high else float("inf"))
+        out[name] = (
+            _number(low, "--bound") if low else -float("inf"),
+            _number(high, "--bound") if high else float("inf"),
+        )
         if out[name][0] > out[name][1]:
-            raise InputError(f"The bounds {value} of {name} are infeasible: the lower one exceeds the upper one; swap them.")
+            raise InputError(
+                f"The bounds {value} of {name} are infeasible: the lower one exceeds the upper one; swap them."
+            )
     return out
 
 
@@ -185,7 +229,9 @@ def _fit(options: argparse.Namespace) -> int:
         else:
             nx = options.nx if options.nx is not None else _choose_order(train)
             search = {"starts": options.starts, "seed": options.seed, "workers": options.workers}
-            result = fit(_structure(options, nx), train, solver=solver, engine=options.engine, progress=progress, **search)
+            result = fit(
+                _structure(options, nx), train, solver=solver, engine=options.engine, progress=progress, **search
+            )
     result.save(folder / "model.json")
     page = fit_report(result, train, tests, folder)
     print(result)
@@ -194,7 +240,11 @@ def _fit(options: argparse.Namespace) -> int:
     print(f"model: {folder / 'model.json'}\nreport: {page}")
     if result.status.name == "INTERRUPTED":
         return INTERRUPTED
-    return DONE if min(result.train_nrmse) < 1.0 else _say("The model explains nothing of the training recording.", NO_RESULT)
+    return (
+        DONE
+        if min(result.train_nrmse) < 1.0
+        else _say("The model explains nothing of the training recording.", NO_RESULT)
+    )
 
 
 def _share_of_range(result: Any, recording: Recording) -> str:

@@ -1,11 +1,12 @@
 """Constraints on a model's named parameters, as CasADi expressions that every solver takes the same way.
 
-`stable` bounds the spectral radius. For every matrix norm and every m, `ρ(A) <= ‖A^m‖^(1/m)`, with equality as m grows, so
+`stable` bounds the spectral radius. For every matrix norm and every m, `ρ(A) <= ‖A^m‖^(1/m)`, with equality as m grows,
+so
 
     (1/m) log ‖A^m‖_F <= log ρ_max,   m = 2^squarings,
 
-is one smooth inequality that guarantees the bound exactly, at any point where it holds. Repeated squaring with the norm taken out
-after each step keeps the numbers in range.
+is one smooth inequality that guarantees the bound exactly, at any point where it holds. Repeated squaring with the norm
+taken out after each step keeps the numbers in range.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class Constraint:
     name: str = "constraint"
 
 
-def log_norm_of_power(matrix: Any, squarings: int = 12) -> Any:
+def log_norm_of_power(matrix: Any, squarings: int = 20) -> Any:
     """`(1/m) log ‖A^m‖_F` with `m = 2^squarings`: an upper bound of `log ρ(A)`, smooth in A."""
     log_scale, power = 0.0, matrix
     for k in range(squarings + 1):
@@ -53,7 +54,26 @@ def log_norm_of_power(matrix: Any, squarings: int = 12) -> Any:
     return log_scale
 
 
-def stable(radius: float = 1.0, matrix: Callable[[Mapping[str, Any]], Any] | None = None, squarings: int = 12) -> Constraint:
+def linear_part(p: Mapping[str, Any]) -> Any:
+    """The matrix `A`."""
+    return p["A"]
+
+
+@dataclass(frozen=True)
+class LogRadius:
+    """`log_norm_of_power` of a square matrix picked from the named parameters; a class, so that it can be pickled."""
+
+    matrix: Callable[[Mapping[str, Any]], Any] = linear_part
+    squarings: int = 20
+
+    def __call__(self, p: Mapping[str, Any]) -> Any:
+        """The expression for named parameters p."""
+        return log_norm_of_power(self.matrix(p), self.squarings)
+
+
+def stable(
+    radius: float = 1.0, matrix: Callable[[Mapping[str, Any]], Any] = linear_part, name: str = "spectral radius"
+) -> Constraint:
     """Spectral radius of `A` (or of another square expression of the parameters) at most `radius`.
 
     Raises
@@ -63,11 +83,12 @@ def stable(radius: float = 1.0, matrix: Callable[[Mapping[str, Any]], Any] | Non
     """
     if not radius > 0:
         raise InputError(f"The spectral radius was bounded by {radius}; give a positive number.")
-    pick = matrix or (lambda p: p["A"])
-    return Constraint(lambda p: log_norm_of_power(pick(p), squarings), upper=float(np.log(radius)), name=f"spectral radius <= {radius:g}")
+    return Constraint(LogRadius(matrix), upper=float(np.log(radius)), name=f"{name} <= {radius:g}")
 
 
-def compile_constraints(constraints: tuple[Constraint, ...], parameters: ParameterSet) -> tuple[ca.Function, ca.Function, np.ndarray, np.ndarray, tuple[str, ...]]:
+def compile_constraints(
+    constraints: tuple[Constraint, ...], parameters: ParameterSet
+) -> tuple[ca.Function, ca.Function, np.ndarray, np.ndarray, tuple[str, ...]]:
     """One Function `p -> g`, its Jacobian, the bounds and a label an entry.
 
     Raises
@@ -82,7 +103,9 @@ def compile_constraints(constraints: tuple[Constraint, ...], parameters: Paramet
         try:
             g = ca.vec(c.expression(named))
         except KeyError as e:
-            raise InputError(f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(parameters)}.") from e
+            raise InputError(
+                f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(parameters)}."
+            ) from e
         size = int(g.shape[0])
         low, high = (np.broadcast_to(np.asarray(b, dtype=float).ravel(), (size,)) for b in (c.lower, c.upper))
         if np.any(low > high):

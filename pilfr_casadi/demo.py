@@ -1,7 +1,7 @@
 """The demonstration: identify a two-mass rig with a hysteretic spring from recordings that come with the package.
 
-The recordings are the benchmark of Krikelis et al. (2024), Sec. 6, simulated exactly (`python -m problems.masing_rig --write-demo`
-writes them): training multisine, multisine test and sine-sweep test, 50 dB signal-to-noise ratio.
+The recordings are the benchmark of Krikelis et al. (2024), Sec. 6, simulated exactly: training multisine, multisine test
+and sine-sweep test, 50 dB signal-to-noise ratio. `python -m problems.masing_rig --write-demo` writes them.
 """
 
 from __future__ import annotations
@@ -53,8 +53,15 @@ def run_demo(folder: Path, workers: int) -> int:
 
     recordings = demo_recordings()
     console = Console()
-    console.print("Identifying the rig: force on one mass -> displacement; the other mass hangs on a hysteretic spring.")
-    table = Table("model", *(f"{s}{unit}" for s in SETS for unit in (" here", " paper")), "time", title="NRMSE in simulation (Krikelis et al. 2024, Table 2)")
+    console.print(
+        "Identifying the rig: force on one mass -> displacement; the other mass hangs on a hysteretic spring."
+    )
+    table = Table(
+        "model",
+        *(f"{s}{unit}" for s in SETS for unit in (" here", " paper")),
+        "time",
+        title="NRMSE in simulation (Krikelis et al. 2024, Table 2)",
+    )
     best: Fit | None = None
     for row, published in PUBLISHED.items():
         n = 0 if row == "LTI" else int(row.partition("=")[2])
@@ -70,5 +77,7 @@ def run_demo(folder: Path, workers: int) -> int:
     best.save(folder / "model.json")
     page = fit_report(best, [recordings["train"]], [recordings["multisine"], recordings["sweep"]], folder)
     console.print(best.status.value)
-    console.print(f"The model is in {folder / 'model.json'}; for the pictures open {page} in a browser.", soft_wrap=True)
+    console.print(
+        f"The model is in {folder / 'model.json'}; for the pictures open {page} in a browser.", soft_wrap=True
+    )
     return 0 if best.status.converged else 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -43,8 +44,8 @@ class Fit:
         Status, cost, iterations, history, multipliers.
     train_nrmse : tuple of float
         NRMSE (Eq. 27) of each training recording.
-    initial : tuple of array
-        State with memory at the first sample of each training recording.
+    initial : dict
+        Fingerprint of each training recording -> state with memory at its first sample.
     labels : tuple of str
         Names of the variables in `solution.theta`.
     errors : dict
@@ -58,7 +59,7 @@ class Fit:
     dt: float
     solution: Solution
     train_nrmse: tuple[float, ...]
-    initial: tuple[np.ndarray, ...]
+    initial: dict[str, np.ndarray]
     labels: tuple[str, ...] = ()
     errors: dict[str, np.ndarray] = field(default_factory=dict)
     active: tuple[str, ...] = ()
@@ -85,15 +86,21 @@ class Fit:
     def initial_state(self, recording: Recording, samples: int | None = None) -> np.ndarray:
         """State with memory at a recording's first sample, as its `initial` says.
 
-        Where it is to be estimated, the model is held and the state fitted to the first `samples` samples (default: ten a
-        state, at least 50); nothing later in the recording is looked at.
+        Where it is to be estimated, a recording of the training gets the state of the fit. For any other the model is
+        held and the state fitted to the first `samples` samples (default: ten a state, at least 50); nothing later is
+        looked at.
         """
         n = self.model.n_x + self.model.n_s
         initial = recording.initial
+        known = self.initial.get(fingerprint(recording))
+        if known is not None and isinstance(initial, str) and initial == "estimate":
+            return known
         if not isinstance(initial, str):
             given = np.asarray(initial, dtype=float).ravel()
             if given.size not in (self.model.n_x, n):
-                raise InputError(f"An initial state of {given.size} numbers was given; expected {self.model.n_x} or {n}.")
+                raise InputError(
+                    f"An initial state of {given.size} numbers was given; expected {self.model.n_x} or {n}."
+                )
             return np.concatenate([given, np.zeros(n - given.size)])
         values = self.model.parameters.start
         state = np.zeros(n)
@@ -106,7 +113,9 @@ class Fit:
                     break
         elif initial == "estimate" and n:
             samples = min(len(recording), samples or max(10 * n, 50))
-            held = self.model.with_parameters(self.model.parameters.change(**{k: {"fixed": True, "prior": None} for k in self.model.parameters}))
+            held = self.model.with_parameters(
+                self.model.parameters.change(**{k: {"fixed": True, "prior": None} for k in self.model.parameters})
+            )
             head = recording.slice(0, max(samples, 2)).with_(skip=0)
             problem = Problem(held, head, engine=self._engine, scale=np.maximum(np.std(recording.y, axis=0), 1e-300))
             state = GaussNewton(max_iterations=50).solve(problem).theta
@@ -130,10 +139,13 @@ class Fit:
     def _check(self, recording: Recording) -> None:
         if (recording.n_u, recording.n_y) != (self.model.n_u, self.model.n_y):
             raise InputError(
-                f"The recording has {recording.n_u} inputs and {recording.n_y} outputs, the model {self.model.n_u} and {self.model.n_y}."
+                f"The recording has {recording.n_u} inputs and {recording.n_y} outputs, "
+                f"the model {self.model.n_u} and {self.model.n_y}; they must match."
             )
         if abs(recording.dt / self.dt - 1) > 1e-4:
-            raise InputError(f"The recording's step is {recording.dt:g} s, the model's {self.dt:g} s; resample the recording.")
+            raise InputError(
+                f"The recording's step is {recording.dt:g} s, the model's {self.dt:g} s; resample the recording."
+            )
 
     def plot(self, recordings: Recording | Sequence[Recording], **options: Any) -> Any:
         """Figures of the fit over recordings; see `plots.plot_fit`."""
@@ -158,11 +170,11 @@ class Fit:
         lines = [
             self.status.value,
             f"NRMSE on the training recording{'s' if len(self.train_nrmse) > 1 else ''}: {errors}",
-            f"{self.solution.iterations} iterations in the last solve, {self.seconds:.1f} s in all, {len(self.candidates)} starts",
+            f"{self.solution.iterations} iterations in the last solve, {self.seconds:.1f} s in all",
         ]
         if self.candidates:
             failed = sum(not c.solution.status.converged for c in self.candidates)
-            lines.append(f"starts that did not converge: {failed} of {len(self.candidates)}")
+            lines.append(f"{len(self.candidates)} starts, of which {failed} did not converge")
         lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
         return "\n".join(lines)
 
@@ -207,7 +219,7 @@ def fit(
     engine : {"auto", "c", "vm"}
         Generated C, or CasADi's virtual machine.
     executor, workers
-        Where starts run: any `concurrent.futures.Executor`, or a pool of `workers` processes. The numbers do not depend on it.
+        Where starts run: any `concurrent.futures.Executor`, or a pool of `workers` processes; the numbers are the same.
     progress : callable
         Called with (stage, done, total, smallest training error so far).
 
@@ -225,6 +237,8 @@ def fit(
     if isinstance(model, Model):
         recordings = check_for_identification(train, int(model.parameters.free.sum()) + 2)
         problem = Problem(model, recordings, constraints=constraints, l1=l1, noise=noise or 1.0, engine=engine)
+        if not np.isfinite(problem.cost(problem.start)):
+            raise InputError("The simulation diverges at the start values; start from a stable model.")
         return _result(model, None, problem, solver.solve(problem), began, recordings)
     if starts < 1:
         raise InputError(f"{starts} starts were asked for; give 1 or more.")
@@ -234,9 +248,19 @@ def fit(
     limits = stability(model, 1.0 if stable is True else float(stable)) if stable else ()
     linear, problem, solution = linear_model(recordings, model, engine=engine, constraints=limits[:1])
     fitted = _fitted(linear, problem, solution)
+    if solution.status is Status.INTERRUPTED:
+        return _result(linear, model.linear(), problem, solution, began, recordings)
     if model.element is None:
-        with_bounds = model.model(linear.n_u, linear.n_y, {k: p.value for k, p in fitted.parameters.items()}, inputs=linear.inputs, outputs=linear.outputs)
-        problem = Problem(with_bounds, recordings, constraints=(*limits, *constraints), noise=noise or 1.0, engine=engine)
+        with_bounds = model.model(
+            linear.n_u,
+            linear.n_y,
+            {k: p.value for k, p in fitted.parameters.items()},
+            inputs=linear.inputs,
+            outputs=linear.outputs,
+        )
+        problem = Problem(
+            with_bounds, recordings, constraints=(*limits, *constraints), noise=noise or 1.0, engine=engine
+        )
         return _result(with_bounds, model, problem, solver.solve(problem), began, recordings)
     if not isinstance(model.element, PrandtlIshlinskii):
         raise InputError("A PI-LFR is identified with a PrandtlIshlinskii element; pass a closed Model for any other.")
@@ -262,6 +286,11 @@ def fit(
 
         result = replace(result, status=Status.INTERRUPTED)
     return _result(best.model, model, problem, result, began, recordings, tuple(candidates), fitted)
+
+
+def fingerprint(recording: Recording) -> str:
+    """Short digest of a recording's numbers."""
+    return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes()).hexdigest()[:16]
 
 
 def _fewest_samples(model: PILFR, train: Recording | Sequence[Recording]) -> int:
@@ -292,14 +321,16 @@ def _result(
         if value in (low, high)
     ]
     g = problem.constraint(theta) if problem.constraints else np.zeros(0)
-    at_bound += [name for name, value, high in zip(problem.g_labels, g, problem.g_upper, strict=True) if value >= high - 1e-7]
+    at_bound += [
+        name for name, value, high in zip(problem.g_labels, g, problem.g_upper, strict=True) if value >= high - 1e-7
+    ]
     return Fit(
         model=fitted,
         structure=structure,
         dt=recordings[0].dt,
         solution=solution,
         train_nrmse=tuple(problem.nrmse(theta)),
-        initial=tuple(problem.initial_states(theta)),
+        initial={fingerprint(r): state for r, state in zip(recordings, problem.initial_states(theta), strict=True)},
         labels=problem.labels,
         errors=standard_errors(problem, theta, structure),
         active=tuple(at_bound),

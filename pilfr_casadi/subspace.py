@@ -19,13 +19,13 @@ deterministic part of MIMO state space models given in innovations form, Automat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .bla import BLA
+from .bla import BLA, _moving_mean
 from .recording import InputError, Recording, check_for_identification
 
 if TYPE_CHECKING:
@@ -35,6 +35,9 @@ Array = np.ndarray
 Data = BLA | Recording | Iterable[Recording]
 
 CHUNK = 8192  # rows handled at once in a sequential QR
+ROUNDING = 1e-8  # relative errors below are rounding
+LADDER = tuple(round(4 * 1.5**k) for k in range(12))  # numbers of block rows to try: 4, 6, 9, 14, 20, 30, ...
+TRIALS = 3  # how many of them for each order
 
 
 def frequency_subspace(bla: BLA, nx: int, weight: bool = True, block_rows: int | None = None) -> control.StateSpace:
@@ -66,7 +69,8 @@ def frequency_subspace(bla: BLA, nx: int, weight: bool = True, block_rows: int |
     ----------
     McKelvey, Akçay & Ljung (1996), algorithm 2; see the module docstring.
     """
-    return _frequency_problem(bla, weight).solve([_order(nx)], block_rows)[0].system()
+    problem = _FrequencyProblem(bla, weight)
+    return problem.solve([_order(nx)], block_rows)[0].system(problem.dt)
 
 
 def time_subspace(
@@ -101,10 +105,11 @@ def time_subspace(
     ----------
     Verhaegen (1994); see the module docstring.
     """
-    return _TimeProblem(recordings, offset).solve([_order(nx)], block_rows)[0].system()
+    problem = _TimeProblem(recordings, offset)
+    return problem.solve([_order(nx)], block_rows)[0].system(problem.dt)
 
 
-def singular_values(data: Data, block_rows: int | None = None, weight: bool = True) -> Array:
+def singular_values(data: Data, block_rows: int | None = None, weight: bool = True, offset: bool = False) -> Array:
     """Singular values that the subspace identification sees, largest first: where they drop is the order.
 
     Parameters
@@ -114,14 +119,21 @@ def singular_values(data: Data, block_rows: int | None = None, weight: bool = Tr
     block_rows : int, optional
         As there; left out, as many as the data allow, at most 20.
     weight : bool
-        As for :func:`frequency_subspace`.
+        For a BLA: as for :func:`frequency_subspace`.
+    offset : bool
+        For recordings: as for :func:`time_subspace`.
 
     Returns
     -------
     array, (block_rows * n_y,)
+
+    Raises
+    ------
+    InputError
+        When the data are too few.
     """
-    problem = _frequency_problem(data, weight) if isinstance(data, BLA) else _TimeProblem(data, False)
-    return problem.range_space(min(20, problem.most_rows) if block_rows is None else problem.rows(1, block_rows)[0])[1]
+    problem = _FrequencyProblem(data, weight) if isinstance(data, BLA) else _TimeProblem(data, offset)
+    return problem.range_space(problem.ladder(1, block_rows or min(20, max(2, problem.most_rows)))[0])[2]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -158,7 +170,9 @@ class OrderSelection:
         return "\n".join([*rows, f"smallest order within {100 * self.margin:g} % of the best on the validation part"])
 
 
-def select_order(data: Data, orders: Iterable[int] = range(1, 11), margin: float = 0.05) -> OrderSelection:
+def select_order(
+    data: Data, orders: Iterable[int] = range(1, 11), margin: float = 0.05, offset: bool = False
+) -> OrderSelection:
     """Try several orders on one part of the data and judge them on the other.
 
     Parameters
@@ -170,6 +184,8 @@ def select_order(data: Data, orders: Iterable[int] = range(1, 11), margin: float
         Orders to try.
     margin : float
         The recommended order is the smallest whose validation error is at most ``1 + margin`` times the best.
+    offset : bool
+        For recordings: as for :func:`time_subspace`.
 
     Returns
     -------
@@ -180,24 +196,464 @@ def select_order(data: Data, orders: Iterable[int] = range(1, 11), margin: float
     InputError
         When there is no order, an order is not a whole number above zero, or the data are too few for it.
     """
-    orders = tuple(sorted({_order(n) for n in orders}))
-    if not orders or margin < 0:
-        raise InputError(f"orders {orders} with a margin of {margin}: give at least one order and a margin of 0 or more.")
-    error: Callable[[_Realization], float]
+    tried = sorted({_order(n) for n in orders})
+    if not tried or margin < 0:
+        raise InputError(
+            f"orders {tried} with a margin of {margin}: give at least one order and a margin of 0 or more."
+        )
+    train: _Problem
+    held: _Problem
     if isinstance(data, BLA):
-        problem: _Problem = _frequency_problem(data, True, slice(0, None, 2))
-        error = _frequency_problem(data, True, slice(1, None, 2)).error
+        train, held = (_FrequencyProblem(data, True, slice(k, None, 2)) for k in (0, 1))
     else:
         records = check_for_identification(data)
+        if len(records) == 1:
+            records = records[0].slice(records[0].skip).split(0.7)
         n_train = max(1, min(len(records) - 1, round(0.7 * len(records))))
-        train, held = records[:n_train], records[n_train:]
-        if not held:
-            steady = records[0].slice(records[0].skip)
-            train, held = steady.split(0.7)[:1], steady.split(0.7)[1:]
-        problem, error = _TimeProblem(train, False), _TimeProblem(held, False).error
-    models = problem.solve(orders, None)
-    validation = np.array([error(m) for m in models])
-    best = max((1 + margin) * np.min(validation), 1e-7)  # errors that small are rounding
-    recommended = next(n for n, e in zip(orders, validation, strict=True) if e <= best)
-    values = problem.range_space(min(20, problem.most_rows))[1]
-    return OrderSelection(orders, np.array([problem.error(m) for m in models]), validation, recommended, margin, values)
+        train, held = _TimeProblem(records[:n_train], offset), _TimeProblem(records[n_train:], offset)
+    models = train.solve(tried, None)
+    train_error, error = (np.array([part.error(m) for m in models]) for part in (train, held))
+    good_enough = max((1 + margin) * np.min(error), ROUNDING)
+    recommended = next(n for n, e in zip(tried, error, strict=True) if e <= good_enough)
+    values = train.range_space(min(20, train.most_rows))[2]
+    return OrderSelection(tuple(tried), train_error, error, recommended, margin, values)
+
+
+def frequency_response(system: Any, frequency: Array) -> Array:
+    """Frequency response of a discrete state-space model, fast for many frequencies.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Or anything with `A`, `B`, `C`, `D` and `dt`.
+    frequency : array, (F,)
+        Frequencies in Hz.
+
+    Returns
+    -------
+    complex array, (F, n_y, n_u)
+    """
+    z = np.exp(2j * np.pi * np.asarray(frequency) * system.dt)
+    return _resolvent(np.asarray(system.A), np.asarray(system.C), z) @ np.asarray(system.B) + np.asarray(system.D)
+
+
+def simulate_states(system: Any, u: Array, x0: Array | None = None) -> Array:
+    """State trajectory of a discrete state-space model.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Or anything with `A` (nx, nx) and `B` (nx, n_u).
+    u : array, (M, n_u)
+        Inputs.
+    x0 : array, (nx,), optional
+        State at the first sample; zero if left out.
+
+    Returns
+    -------
+    array, (M, nx)
+    """
+    A, B = np.asarray(system.A, dtype=float), np.asarray(system.B, dtype=float)
+    u = np.asarray(u, dtype=float)
+    if u.ndim != 2 or u.shape[1] != B.shape[1]:
+        raise InputError(f"u has the shape {u.shape}; the model needs (samples, {B.shape[1]}).")
+    start = np.zeros(len(A)) if x0 is None else np.asarray(x0, dtype=float)
+    if start.shape != (len(A),):
+        raise InputError(f"x0 has the shape {start.shape}; the model has {len(A)} states.")
+    return _propagate(A.T, (u @ B.T)[None], start[None])[0][0]
+
+
+def simulate_lti(system: Any, u: Array, x0: Array | None = None) -> Array:
+    """Output of a discrete state-space model.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Or anything with `A`, `B`, `C` and `D`.
+    u : array, (M, n_u)
+        Inputs.
+    x0 : array, (nx,), optional
+        State at the first sample; zero if left out.
+
+    Returns
+    -------
+    array, (M, n_y)
+
+    Raises
+    ------
+    InputError
+        When the shapes of `u` or `x0` do not fit the model.
+    """
+    return simulate_states(system, u, x0) @ np.asarray(system.C).T + np.asarray(u) @ np.asarray(system.D).T
+
+
+def unit_variance(system: Any, u: Array) -> control.StateSpace:
+    """Scale the states so that each has unit variance under an input, Krikelis et al. (2024), Sec. 5.3.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Discrete model.
+    u : array, (M, n_u)
+        Input, from the zero state on.
+
+    Returns
+    -------
+    control.StateSpace
+        The same model in other coordinates. A state that the input does not move keeps its scale.
+
+    Raises
+    ------
+    InputError
+        When `u` does not fit the model, or the states grow without bound under it.
+    """
+    import control
+
+    x = simulate_states(system, u)
+    std = np.std(x, axis=0)
+    if not np.all(np.isfinite(std)):
+        raise InputError("the states of the model grow without bound under this input; give a stable model.")
+    std[std <= 1e-12 * np.max(np.abs(x), axis=0, initial=0.0)] = 1.0
+    A, B, C = (np.asarray(M) for M in (system.A, system.B, system.C))
+    return control.StateSpace(A * std / std[:, None], B / std[:, None], C * std, system.D, system.dt)
+
+
+@dataclass(frozen=True, eq=False)
+class _Matrices:
+    """`A`, `B`, `C`, `D` in the units of the data."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+    def system(self, dt: float) -> control.StateSpace:
+        import control
+
+        return control.StateSpace(self.A, self.B, self.C, self.D, dt)
+
+
+class _Problem:
+    """What the two ways share: from range spaces to models, the best over a few numbers of block rows.
+
+    A problem supplies `range_space(r)`: the observability matrix up to a basis change, the same shifted by one step
+    (one block row less), and the singular values, in outputs divided by `y_scale`; and `reduced(A, C)`: triangular
+    factors ``[K y]`` of the least-squares problems ``K theta = y`` for `B` and `D`, input after input.
+    """
+
+    dt: float
+    u_scale: Array
+    y_scale: Array
+    most_rows: int
+    size: float  # sum of squares of the (weighted) data
+    too_few: str
+
+    def range_space(self, r: int) -> tuple[Array, Array, Array]:
+        raise NotImplementedError
+
+    def reduced(self, A: Array, C: Array) -> list[Array]:
+        raise NotImplementedError
+
+    def ladder(self, nx: int, block_rows: int | None) -> list[int]:
+        """Numbers of block rows to try for an order: steps of one common ladder, so that orders share them."""
+        least = -(-nx // len(self.y_scale)) + 1
+        if least > self.most_rows:
+            raise InputError(f"{self.too_few} for order {nx}; record more or choose a lower order.")
+        if block_rows is not None:
+            if not least <= block_rows <= self.most_rows:
+                raise InputError(
+                    f"block_rows is {block_rows}; for order {nx} and these data give {least} to {self.most_rows}."
+                )
+            return [block_rows]
+        steps = [r for r in LADDER if least < r <= self.most_rows][:TRIALS]
+        return steps or [min(least + 1, self.most_rows)]
+
+    def solve(self, orders: list[int], block_rows: int | None) -> list[_Matrices]:
+        """Return the best model of each order."""
+        spaces: dict[int, tuple[Array, Array, Array]] = {}
+        models = []
+        for nx in orders:
+            trials = []
+            for r in self.ladder(nx, block_rows):
+                if r not in spaces:
+                    spaces[r] = self.range_space(r)
+                basis, shifted, _ = spaces[r]
+                A = np.linalg.lstsq(basis[: len(shifted), :nx], shifted[:, :nx], rcond=None)[0]
+                trials.append(self.complete(_reflected(A), basis[: len(self.y_scale), :nx]))
+            models.append(min(trials, key=lambda trial: trial[1])[0])
+        return models
+
+    def complete(self, A: Array, C: Array) -> tuple[_Matrices, float]:
+        """Add the best `B` and `D` to `A` and scaled `C`; return the model and its relative error."""
+        blocks = self.reduced(A, C)
+        theta = [_least_squares(R[:, :-1], R[:, -1]) for R in blocks]
+        BD = np.concatenate(theta).reshape(len(self.u_scale), -1)
+        B, D = BD[:, : len(A)].T / self.u_scale, BD[:, len(A) :].T / self.u_scale
+        error = self.relative_error(blocks, BD)
+        return _Matrices(A, B, self.y_scale[:, None] * C, self.y_scale[:, None] * D), error
+
+    def relative_error(self, blocks: list[Array], BD: Array) -> float:
+        theta = BD.reshape(len(blocks), -1)
+        left = sum(float(np.sum((R[:, :-1] @ t - R[:, -1]) ** 2)) for R, t in zip(blocks, theta, strict=True))
+        return float(np.sqrt(left / self.size))
+
+    def error(self, model: _Matrices) -> float:
+        """Relative error of a model on the data of this problem."""
+        C, D = model.C / self.y_scale[:, None], model.D / self.y_scale[:, None]
+        BD = np.vstack([model.B * self.u_scale, D * self.u_scale]).T
+        return self.relative_error(self.reduced(model.A, C), BD)
+
+
+class _FrequencyProblem(_Problem):
+    """Subspace identification from the response at some of the frequencies of a BLA."""
+
+    def __init__(self, bla: BLA, weight: bool, part: slice = slice(None)) -> None:
+        G, self.dt = np.asarray(bla.G, dtype=complex)[part], bla.dt
+        frequency = np.asarray(bla.frequency, dtype=float)[part]
+        if G.ndim != 3 or len(G) != len(frequency) or not np.all(np.isfinite(G)):
+            raise InputError("G of the BLA must be finite, of shape (frequencies, outputs, inputs); check the BLA.")
+        if np.any(frequency < 0) or np.any(frequency > 0.5000001 / bla.dt):
+            raise InputError(
+                f"the BLA has frequencies outside 0 to {0.5 / bla.dt:g} Hz, half the sampling rate; check the unit of "
+                "frequency and dt."
+            )
+        self.z = np.exp(2j * np.pi * frequency * bla.dt)
+        self.y_scale, self.u_scale = _balanced_units(np.sqrt(np.mean(np.abs(G) ** 2, axis=0)))
+        units = self.y_scale[:, None] / self.u_scale
+        self.G = G / units
+        self.var = np.ones(G.shape)
+        self.weighted = weight and bla.var_total is not None
+        if self.weighted:
+            var = _moving_mean(np.asarray(bla.var_total)[part], 5) / units**2
+            self.var = var + ROUNDING**2 * np.mean(np.abs(self.G) ** 2)
+        self.size = max(float(np.sum(np.abs(self.G) ** 2 / self.var)), 1e-300)
+        F, n_y, n_u = G.shape
+        self.most_rows = (2 * F * n_u - 1) // (n_y + n_u) if 2 * F > 2 else 0
+        self.too_few = f"{F} frequencies are too few"
+
+    def range_space(self, r: int) -> tuple[Array, Array, Array]:
+        F, n_y, _ = self.G.shape
+        s = 1 / np.sqrt(np.mean(self.var, axis=(1, 2)))
+        Q, H = _orthonormal_polynomials(self.z, s, r)
+        T = (Q[:, None, None, :] * self.G.transpose(1, 2, 0)).reshape(-1, F)
+        for _ in range(2):  # project off the rows of the input, which are orthonormal
+            T -= (T @ Q.conj().T).real @ Q
+        T = np.stack([T.real, T.imag], axis=-1).reshape(r * n_y, -1)
+        K = np.eye(r * n_y)
+        if self.weighted:  # covariance of the noise in T is K K'
+            for i in range(n_y):
+                covariance = ((Q * self.var[:, i].sum(axis=1)) @ Q.conj().T).real
+                K[i::n_y, i::n_y] = np.linalg.cholesky(covariance)
+            T = np.linalg.solve(K, T)
+        left, values, _ = np.linalg.svd(_triangle(T.T).T)
+        basis = np.linalg.norm(s) * (K @ left)
+        shifted = np.einsum("ij,iok->jok", H, basis.reshape(r, n_y, -1)).reshape((r - 1) * n_y, -1)
+        return basis, shifted, values
+
+    def reduced(self, A: Array, C: Array) -> list[Array]:
+        F, n_y, n_u = self.G.shape
+        K = np.empty((F, n_y, len(A) + n_y + 1), dtype=complex)
+        K[..., : len(A)] = _resolvent(A, C, self.z)
+        K[..., len(A) : -1] = np.eye(n_y)
+        blocks = []
+        for j in range(n_u):
+            K[..., -1] = self.G[..., j]
+            rows = (K / np.sqrt(self.var[..., j, None])).reshape(F * n_y, -1)
+            blocks.append(_triangle(np.concatenate([rows.real, rows.imag])))
+        return blocks
+
+
+class _TimeProblem(_Problem):
+    """Subspace identification from recordings."""
+
+    def __init__(self, recordings: Recording | Iterable[Recording], offset: bool) -> None:
+        records = check_for_identification(recordings)
+        self.dt, self.offset = records[0].dt, offset
+        u, y = [r.u[r.skip :] for r in records], [r.y[r.skip :] for r in records]
+        self.y_scale = _or_one(np.std(np.concatenate(y), axis=0))
+        self.u_scale = _or_one(np.sqrt(np.mean(np.concatenate(u) ** 2, axis=0)))
+        self.records = [(a / self.u_scale, b / self.y_scale) for a, b in zip(u, y, strict=True)]
+        n = u[0].shape[1] + y[0].shape[1]
+        lengths = np.array([len(a) for a in u])
+        self.size = float(lengths.sum() * len(self.y_scale))
+        r = np.arange(1, lengths.max() // 2 + 2)
+        columns = np.maximum(lengths - 2 * r[:, None] + 1, 0).sum(axis=1)
+        self.most_rows = int(np.max(r[columns >= 2 * r * n], initial=0))
+        self.too_few = f"{lengths.sum()} samples in {len(lengths)} recording(s) are too few"
+
+    def range_space(self, r: int) -> tuple[Array, Array, Array]:
+        n_u, n_y = len(self.u_scale), len(self.y_scale)
+        R = None
+        for u, y in self.records:
+            n = len(u) - 2 * r + 1
+            if n < 1:
+                continue
+            windows = [
+                _windows(u[r:], r),
+                _windows(u[: len(u) - r], r),
+                _windows(y[: len(y) - r], r),
+                _windows(y[r:], r),
+            ]
+            mean = [w.mean(axis=0) if self.offset else 0.0 for w in windows]
+            for k in range(0, n, CHUNK):
+                rows = [
+                    (w[k : k + CHUNK] - m).reshape(min(CHUNK, n - k), -1) for w, m in zip(windows, mean, strict=True)
+                ]
+                R = _folded(R, np.concatenate(rows, axis=1))
+        assert R is not None
+        past = r * (2 * n_u + n_y)
+        left, values, _ = np.linalg.svd(R[r * n_u : past, past:].T)
+        return left, left[n_y:], values
+
+    def reduced(self, A: Array, C: Array) -> list[Array]:
+        n_u, n_y, nx = len(self.u_scale), len(self.y_scale), len(A)
+        free = nx + n_y * self.offset  # initial state and offset: eliminated recording by recording
+        total = None
+        for u, y in self.records:
+            x = np.zeros((n_u + 1, n_y, nx))
+            x[n_u] = C
+            R = None
+            for k in range(0, len(u), CHUNK):
+                m = min(CHUNK, len(u) - k)
+                force = np.zeros((n_u + 1, n_y, m, nx))
+                force[:n_u] = u[k : k + m].T[:, None, :, None] * C[:, None, :]
+                response, last = _propagate(A, force.reshape(-1, m, nx), x.reshape(-1, nx))
+                x, response = last.reshape(x.shape), response.reshape(force.shape)
+                K = np.zeros((n_y, m, free + n_u * (nx + n_y) + 1))
+                K[..., :nx] = response[n_u]
+                if self.offset:
+                    K[..., nx:free] = np.eye(n_y)[:, None]
+                for j in range(n_u):
+                    first = free + j * (nx + n_y)
+                    K[..., first : first + nx] = response[j]
+                    K[..., first + nx : first + nx + n_y] = np.eye(n_y)[:, None] * u[k : k + m, j, None]
+                K[..., -1] = y[k : k + m].T
+                R = _folded(R, K.reshape(n_y * m, -1))
+            assert R is not None
+            total = _folded(total, R[free:, free:])
+        assert total is not None
+        return [total]
+
+
+def _order(nx: int) -> int:
+    if isinstance(nx, bool) or not isinstance(nx, (int, np.integer)) or nx < 1:
+        raise InputError(f"the order nx is {nx!r}; give a whole number of at least 1.")
+    return int(nx)
+
+
+def _or_one(scale: Array) -> Array:
+    return np.where(scale > 0, scale, 1.0)
+
+
+def _balanced_units(size: Array) -> tuple[Array, Array]:
+    """Scales of outputs (rows) and inputs (columns) that make every row and column of `size` one in mean square."""
+    rows, columns = np.ones(size.shape[0]), np.ones(size.shape[1])
+    for _ in range(100):
+        rows = _or_one(np.sqrt(np.mean((size * columns) ** 2, axis=1)))
+        columns = 1 / _or_one(np.sqrt(np.mean((size / rows[:, None]) ** 2, axis=0)))
+    return rows, columns
+
+
+def _orthonormal_polynomials(z: Array, s: Array, r: int) -> tuple[Array, Array]:
+    """Polynomials of degree 0 to r - 1 at `z`, times `s`, orthonormal over `z` and its conjugates.
+
+    Returns the values, (r, F), and the real recurrence `H`, (r, r - 1): ``z q_j = sum_i H[i, j] q_i``.
+    """
+    Q, H = np.empty((r, len(z)), dtype=complex), np.zeros((r, r - 1))
+    Q[0] = s / np.linalg.norm(s)
+    for j in range(r - 1):
+        v = z * Q[j]
+        for _ in range(2):
+            h = (Q[: j + 1].conj() @ v).real
+            H[: j + 1, j] += h
+            v -= h @ Q[: j + 1]
+        H[j + 1, j] = np.linalg.norm(v)
+        Q[j + 1] = v / H[j + 1, j]
+    return Q, H
+
+
+def _resolvent(A: Array, C: Array, z: Array) -> Array:
+    """``C (z I - A)⁻¹`` at every `z`, (F, n_y, nx), by one Schur form and substitution."""
+    from scipy.linalg import schur
+
+    T, V = schur(A, output="complex")
+    c = C @ V
+    X = np.empty((len(z), *C.shape), dtype=complex)
+    for j in range(len(A)):
+        X[..., j] = (c[:, j] + X[..., :j] @ T[:j, j]) / (z - T[j, j])[:, None]
+    return X @ V.conj().T
+
+
+def _reflected(A: Array) -> Array:
+    """Move eigenvalues outside the unit circle (or on it) to ``1 / conj(lambda)``, strictly inside."""
+    from scipy.linalg import schur
+
+    if np.max(np.abs(np.linalg.eigvals(A))) < 1:
+        return A
+    T, V = schur(A, output="real")
+    k = 0
+    while k < len(T):
+        two = k + 1 < len(T) and T[k + 1, k] != 0
+        block = T[k : k + 2, k : k + 2] if two else T[k : k + 1, k : k + 1]
+        radius = np.sqrt(abs(np.linalg.det(block))) if two else abs(block[0, 0])
+        if radius >= 1:
+            block *= min(radius**-2, (1 - 1e-6) / radius)
+        k += 2 if two else 1
+    return V @ T @ V.T
+
+
+def _propagate(At: Array, v: Array, x0: Array) -> tuple[Array, Array]:
+    """States of ``x(k+1) = x(k) At + v(k)`` (rows) for several runs at once, and the state after the last sample.
+
+    The samples are cut into about sqrt(M) pieces that are run side by side, so that Python loops over sqrt(M) steps.
+
+    Parameters
+    ----------
+    At : array, (nx, nx)
+    v : array, (runs, M, nx)
+    x0 : array, (runs, nx)
+    """
+    runs, M, nx = v.shape
+    length = int(np.ceil(np.sqrt(M)))
+    pieces = -(-M // length)
+    V = np.zeros((runs, pieces, length, nx))
+    V.reshape(runs, -1, nx)[:, :M] = v
+    gained = np.zeros((runs, pieces, nx))
+    for i in range(length):
+        gained = gained @ At + V[:, :, i]
+    power = np.linalg.matrix_power(At, length)
+    start = np.empty((runs, pieces, nx))
+    x = x0
+    for k in range(pieces):
+        start[:, k] = x
+        x = x @ power + gained[:, k]
+    X = np.empty_like(V)
+    x = start
+    for i in range(length):
+        X[:, :, i] = x
+        x = x @ At + V[:, :, i]
+    X = X.reshape(runs, -1, nx)[:, :M]
+    return X, X[:, -1] @ At + v[:, -1]
+
+
+def _windows(x: Array, r: int) -> Array:
+    """All windows of `r` samples, oldest first, (M - r + 1, r, n); a view."""
+    return np.lib.stride_tricks.sliding_window_view(x, r, axis=0).swapaxes(1, 2)
+
+
+def _triangle(rows: Array) -> Array:
+    R: Any = np.linalg.qr(rows, mode="r")
+    return R
+
+
+def _folded(R: Array | None, rows: Array) -> Array:
+    """Triangular factor of `R` with more rows below it, as many rows as columns."""
+    folded = _triangle(rows if R is None else np.concatenate([R, rows]))
+    missing = folded.shape[1] - len(folded)
+    return np.concatenate([folded, np.zeros((missing, folded.shape[1]))]) if missing else folded
+
+
+def _least_squares(K: Array, y: Array) -> Array:
+    """Least squares with columns scaled to one length."""
+    length = _or_one(np.linalg.norm(K, axis=0))
+    return np.linalg.lstsq(K / length, y, rcond=1e-13)[0] / length
