@@ -1,12 +1,17 @@
 """The engine that runs generated C: the symbolic step, written out by CasADi, inside the time loops of `_kernel.c`.
 
 A library is built once a structure and kept in a private per-user cache, keyed by source, compiler, processor and CasADi
-version. A cache directory that others can write to is not used. Without a C compiler `make_engine` falls back to
-`sensitivities.VirtualMachine`, which gives the same numbers.
+version; its file name holds a digest of its content, so that a damaged one is built anew. A cache directory that others can
+write to is not used. Without a working C compiler `make_engine` falls back to `sensitivities.VirtualMachine`, which gives the
+same numbers.
+
+Most partial derivatives of a state-space model are parameters, signals or constants themselves. The kernel looks these up; only the
+others are written out as code, so that the code does not grow with the square of the number of states.
 """
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import functools
 import hashlib
@@ -16,18 +21,23 @@ import shutil
 import stat
 import subprocess
 import tempfile
+import warnings
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from .model import Model
 from .recording import InputError
-from .sensitivities import TARGETS, Engine, Linearization, VirtualMachine, linearize
+from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
 
-FLAGS = ("-O3", "-march=native", "-fPIC", "-shared", "-std=c11", "-fno-math-errno")
-LANE = 8
-_SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3, "p": 4}
+# without contraction the generated step gives the very numbers of the virtual machine, and operators slip at the same samples
+COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
+FLAGS = (("-O3", "-march=native", *COMMON), ("-O3", *COMMON))  # the second where the compiler does not know the processor
+PATIENCE = 600.0  # seconds for one compilation
+_SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
+_VALUES = ("constant", "p", "u", "x", "s", "z", "w", "computed")
 
 
 @functools.cache
@@ -42,152 +52,222 @@ def compiler() -> str | None:
 
 
 @functools.cache
-def _machine() -> str:
+def _machine(cc: str) -> str:
     """What a compiled library depends on besides its source."""
-    version = subprocess.run([compiler() or "cc", "--version"], capture_output=True, text=True, check=False).stdout
+    version = subprocess.run([cc, "--version"], capture_output=True, text=True, check=False).stdout
     cpu = platform.machine() + platform.processor()
     info = Path("/proc/cpuinfo")
     if info.exists():
         lines = info.read_text(errors="replace").splitlines()
         cpu += "".join(sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))}))
-    return "|".join((version, cpu, ca.__version__, " ".join(FLAGS), platform.platform()))
+    return "|".join((cc, version, cpu, ca.__version__, str(FLAGS), platform.platform()))
 
 
 def _private(directory: Path) -> bool:
-    """Whether a directory belongs to this user and nobody else can write to it."""
+    """Whether a directory belongs to this user and nobody else can write to it, nor put another in its place."""
     try:
-        info = directory.lstat()
+        info, above = directory.lstat(), directory.parent.stat()
     except OSError:
         return False
+    others = stat.S_IWGRP | stat.S_IWOTH
     mine = not hasattr(os, "getuid") or info.st_uid == os.getuid()
-    return stat.S_ISDIR(info.st_mode) and mine and not info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    kept = not above.st_mode & others or above.st_mode & stat.S_ISVTX
+    return stat.S_ISDIR(info.st_mode) and mine and not info.st_mode & others and bool(kept)
 
 
 @functools.cache
 def cache_directory() -> Path:
-    """The private cache, `$XDG_CACHE_HOME/pilfr_casadi` or `~/.cache/pilfr_casadi`; a fresh temporary one where that is not safe."""
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    directory = base / "pilfr_casadi"
+    """The private cache, `$XDG_CACHE_HOME/pilfr_casadi` or `~/.cache/pilfr_casadi`; one for this process where that is not safe."""
     try:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        directory = base / "pilfr_casadi"
         base.mkdir(parents=True, exist_ok=True)
         directory.mkdir(mode=0o700, exist_ok=True)
-    except OSError:
-        return Path(tempfile.mkdtemp(prefix="pilfr-"))
-    return (
-        directory if _private(directory) and os.access(directory, os.W_OK) else Path(tempfile.mkdtemp(prefix="pilfr-"))
-    )
+        if _private(directory) and os.access(directory, os.W_OK | os.X_OK):
+            return directory
+    except (OSError, RuntimeError):
+        pass
+    temporary = tempfile.mkdtemp(prefix="pilfr-")
+    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+    return Path(temporary)
+
+
+def _values(linear: Linearization) -> tuple[list[float], ca.Function, dict[str, int], dict[tuple[str, str], list[int]]]:
+    """Where the kernel finds the nonzeros of each block.
+
+    Returns the constants; the Function of those that have to be computed, each once; where each of `_VALUES` begins in their stack;
+    and the place in the stack of each nonzero, in the order of the block's pattern.
+    """
+    symbol = linear.symbols()
+    blocks = linear.blocks(symbol)
+    known = {e.element_hash(): (k, i) for k, v in symbol.items() for i, e in enumerate(v.elements())}
+    constants: dict[float, int] = {}
+    computed: dict[int, tuple[int, Any]] = {}
+
+    def place(e: Any) -> tuple[str, int]:
+        if e.is_constant():
+            return "constant", constants.setdefault(float(e), len(constants))
+        if e.element_hash() in known:
+            return known[e.element_hash()]
+        return "computed", computed.setdefault(e.element_hash(), (len(computed), e))[0]
+
+    places = {key: [place(e) for e in block.nonzeros()] for key, block in blocks.items()}
+    rest = ca.vertcat(*(e for _, e in computed.values())) if computed else ca.SX(0, 1)
+    function = ca.Function("pilfr_computed", [symbol[k] for k in linear.partial.name_in()], [rest])
+    lengths = {**linear.sizes, "constant": len(constants), "computed": len(computed)}
+    at, end = {}, 0
+    for k in _VALUES:
+        at[k] = end
+        end += lengths[k]
+    entries = {key: [at[k] + i for k, i in found] for key, found in places.items()}
+    return list(constants), function, {**at, "end": end}, entries
 
 
 def source_code(linear: Linearization) -> str:
     """The whole C source for one structure: CasADi's code for the step, the term tables, and the time loops."""
-    generator = ca.CodeGenerator(
-        "generated", {"with_header": False, "main": False, "indent": 0, "casadi_int": "long long"}
-    )
-    generator.add(linear.step)
-    generator.add(linear.function)
-    n = linear.sizes
-    sizes = [max(linear.step.sz_iw(), linear.function.sz_iw()), max(linear.step.sz_w(), linear.function.sz_w())]
-    sizes += [max(linear.step.sz_arg(), linear.function.sz_arg()), max(linear.step.sz_res(), linear.function.sz_res())]
-    lines = [
-        f"#define {key} {size + 1}" for key, size in zip(("SZ_IW", "SZ_W", "SZ_ARG", "SZ_RES"), sizes, strict=True)
-    ]
-    lines += [f"#define N_{key.upper()} {n[key]}" for key in ("x", "s", "z", "y", "u", "p")]
-    lines.append("typedef struct { int source, index, nonzero; } term_t;")
-    at, most = 0, 0
-    for target, sources in TARGETS.items():
-        terms: list[list[str]] = [[] for _ in range(n[target])]
-        for source in sources:
-            row, col = linear.patterns[target, source].get_triplet()
-            for i, j in zip(row, col, strict=True):
-                terms[i].append(f"{{{_SOURCES[source]},{j},{at}}}")
-                at += 1
-        first = np.concatenate([[0], np.cumsum([len(t) for t in terms])]).astype(int)
-        most = max([most, *(len(t) for t in terms)])
-        flat = [t for row_terms in terms for t in row_terms] or ["{0,0,0}"]
-        lines.append(f"static const int ROW_{target}[] = {{{','.join(map(str, first))}}};")
-        lines.append(f"static const term_t TERM_{target}[] = {{{','.join(flat)}}};")
-    diagonal = linear.patterns["s", "s"].is_diag()
-    lines += [f"#define N_NZ {at}", f"#define MAX_TERMS {most}", f"#define DIAGONAL {int(diagonal)}"]
-    kernel = (Path(__file__).with_name("_kernel.c")).read_text()
+    constants, computed, at, entries = _values(linear)
+    options = {"with_header": False, "main": False, "indent": 0, "casadi_int": "long long"}
+    generator = ca.CodeGenerator("generated", options)
+    lines = ["typedef struct { int source, index, value; } term_t;", "typedef struct { int parameter, value; } direct_t;"]
+    for function in (linear.step, computed):
+        generator.add(function)
+    for key in ("iw", "w", "arg", "res"):
+        size = max(getattr(f, f"sz_{key}")() for f in (linear.step, computed))
+        lines.append(f"#define SZ_{key.upper()} {size + 1}")
+    lines += [f"#define N_{key.upper()} {linear.sizes[key]}" for key in ("x", "s", "z", "y", "u", "p")]
+    lines += [f"#define AT_{key.upper()} {at[key]}" for key in _VALUES]
+    lines.append(f"static const double CONSTANTS[] = {{{', '.join(map(repr, constants)) or '0'}}};")
+    most = 0
+    for target in TARGETS:
+        n = linear.sizes[target]
+        terms: list[list[str]] = [[] for _ in range(n)]
+        direct: list[list[str]] = [[] for _ in range(n)]
+        for source in TARGETS[target]:
+            pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
+            for i, j, value in zip(*pattern.get_triplet(), entries[target, source], strict=True):
+                if source == "p":
+                    direct[i].append(f"{{{j},{value}}}")
+                else:
+                    terms[i].append(f"{{{_SOURCES[source]},{j},{value}}}")
+        lines += [*_table(f"TERM_{target}", "term_t", f"ROW_{target}", terms)]
+        lines += [*_table(f"DIRECT_{target}", "direct_t", f"DIRECT_ROW_{target}", direct)]
+        most = max(most, sum(map(len, terms)))
+    # a diagonal s_s lets the memory's slopes be advanced in place
+    diagonal = linear.partial.sparsity_out(BLOCKS.index(("s", "s"))).is_diag()
+    lines += [f"#define N_VALUES {at['end']}", f"#define N_TERMS {most}", f"#define KEEPS {int(diagonal)}"]
+    kernel = Path(__file__).with_name("_kernel.c").read_text(encoding="utf-8")
     return "\n".join([generator.dump(), *lines, kernel])
 
 
+def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[str, str]:
+    """C tables of the entries of all rows, one after the other, and of where each row begins."""
+    first = np.cumsum([0, *map(len, rows)]).tolist()
+    flat = ",".join(entry for row in rows for entry in row) or "{0}"
+    return f"static const {kind} {name}[] = {{{flat}}};", f"static const int {starts}[] = {{{','.join(map(str, first))}}};"
+
+
+def _digest(library: Path) -> str:
+    return hashlib.sha256(library.read_bytes()).hexdigest()[:16]
+
+
 def build(source: str) -> Path:
-    """Compile, or take from the cache, the library of a source; written under another name first, so never half there."""
+    """Compile, or take from the cache, the library of a source; written under another name first, so never half there.
+
+    Raises
+    ------
+    InputError
+        If there is no compiler, or it does not work.
+    """
     cc = compiler()
     if cc is None:
         raise InputError("No C compiler was found; install one (cc, gcc or clang) or use engine='vm'.")
-    key = hashlib.sha256("\n".join((source, cc, _machine())).encode()).hexdigest()[:32]
-    library = cache_directory() / f"{key}.so"
-    if library.exists():
-        return library
-    with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
-        c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
-        c_file.write_text(source)
-        done = subprocess.run(
-            [cc, *FLAGS, str(c_file), "-o", str(partial), "-lm"], capture_output=True, text=True, check=False
-        )
-        if done.returncode:
-            raise RuntimeError(f"The C compiler {cc} failed on generated code: {done.stderr.strip()[:500]}")
-        os.replace(partial, library)
-    return library
+    try:
+        key = hashlib.sha256("\n".join((source, _machine(cc))).encode()).hexdigest()[:32]
+        for library in cache_directory().glob(f"{key}-*.so"):
+            if library.stem == f"{key}-{_digest(library)}":
+                return library
+            library.unlink(missing_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
+            c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
+            c_file.write_text(source, encoding="utf-8")
+            for flags in FLAGS:
+                command = [cc, *flags, str(c_file), "-o", str(partial), "-lm"]
+                done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
+                if not done.returncode and partial.exists():
+                    library = cache_directory() / f"{key}-{_digest(partial)}.so"
+                    os.replace(partial, library)
+                    return library
+        reason = (done.stderr.strip().splitlines() or ["no message"])[0][:300]
+    except (OSError, subprocess.TimeoutExpired) as error:
+        reason = str(error)
+    raise InputError(f"The C compiler {cc} could not build the model ({reason}); repair it, name another in CC, or use engine='vm'.")
 
 
-def _pointer(array: np.ndarray) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
+def _pointer(array: np.ndarray | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p() if array is None else ctypes.c_void_p(array.ctypes.data)
 
 
 class Compiled:
-    """Generated C behind the `Engine` protocol."""
+    """Generated C behind the `Engine` protocol; it keeps nothing between calls, so threads may share it."""
 
     def __init__(self, model: Model) -> None:
         self.linear = linearize(model)
-        self.library = ctypes.CDLL(str(build(source_code(self.linear))))
+        library = build(source_code(self.linear))
+        try:
+            self.library = ctypes.CDLL(str(library))
+        except OSError as error:
+            raise InputError(f"The compiled model cannot be loaded ({error}); use engine='vm'.") from error
+
+    def _call(self, name: str, *arguments: Any) -> None:
+        if getattr(self.library, name)(*arguments):
+            raise MemoryError("the compiled model found no memory for its slopes")
+
+    def _arguments(self, u: np.ndarray, p: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, ...]:
+        n = self.linear.sizes
+        u = np.ascontiguousarray(u, dtype=float).reshape(len(u), n["u"])
+        p = np.ascontiguousarray(p, dtype=float).reshape(n["p"])
+        return u, p, np.array(state, dtype=float).reshape(n["x"] + n["s"]), np.empty((len(u), n["y"]))
 
     def simulate(
         self, u: np.ndarray, p: np.ndarray, state: np.ndarray, signals: bool = False
     ) -> tuple[np.ndarray, ...]:
         """See `Engine.simulate`."""
-        n, length = self.linear.sizes, len(u)
-        u, p = np.ascontiguousarray(u, dtype=float), np.ascontiguousarray(p, dtype=float)
-        state, y = np.array(state, dtype=float), np.empty((length, n["y"]))
-        z, w = (np.empty((length, n["z"])) for _ in range(2)) if signals else (None, None)
-        null = ctypes.c_void_p()
-        more = [null if a is None else _pointer(a) for a in (z, w)]
-        self.library.pilfr_simulate(
-            ctypes.c_long(length), _pointer(u), _pointer(p), _pointer(state), _pointer(y), *more
-        )
-        return (y, state, z, w) if z is not None and w is not None else (y, state)
+        u, p, state, y = self._arguments(u, p, state)
+        more = [np.empty((len(u), self.linear.sizes["z"])) for _ in range(2)] if signals else []
+        z, w = more or (None, None)
+        self._call("pilfr_simulate", ctypes.c_long(len(u)), *map(_pointer, (u, p, state, y, z, w)))
+        return (y, state, *more)
 
     def sensitivity(
         self, u: np.ndarray, p: np.ndarray, state: np.ndarray, seed: np.ndarray, columns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See `Engine.sensitivity`."""
-        n, length, n_c = self.linear.sizes, len(u), seed.shape[1]
-        ld = -(-max(n_c, 1) // LANE) * LANE
-        u, p = np.ascontiguousarray(u, dtype=float), np.ascontiguousarray(p, dtype=float)
-        state, y = np.array(state, dtype=float), np.empty((length, n["y"]))
-        slope = np.zeros((len(state), ld))
-        slope[:, :n_c] = seed
-        col = np.ascontiguousarray(columns, dtype=ctypes.c_long)
-        jac = np.empty((length, n["y"], ld))
-        scratch = np.zeros((2 * n["z"] + n["x"] + n["s"], ld))
-        arrays = [_pointer(a) for a in (u, p, state, slope, col)]
-        rest = [_pointer(a) for a in (y, jac, scratch)]
-        self.library.pilfr_sensitivity(ctypes.c_long(length), *arrays, ctypes.c_long(ld), *rest)
-        return y, jac[:, :, :n_c], state, slope[:, :n_c].copy()
+        u, p, state, y = self._arguments(u, p, state)
+        n_c = seed.shape[1]
+        slope = np.array(seed, dtype=float, order="C").reshape(len(state), n_c)
+        column = np.ascontiguousarray(columns, dtype=ctypes.c_long).reshape(len(p))
+        jac = np.empty((*y.shape, n_c))
+        before, after = map(_pointer, (u, p, state, slope, column)), map(_pointer, (y, jac))
+        self._call("pilfr_sensitivity", ctypes.c_long(len(u)), *before, ctypes.c_long(n_c), *after)
+        return y, jac, state, slope
 
 
 def make_engine(model: Model, engine: str = "auto") -> Engine:
-    """The engine for a closed model: "c", "vm", or "auto" (C where there is a compiler).
+    """The engine for a closed model: "c", "vm", or "auto" (C where there is a compiler that works).
 
     Raises
     ------
     InputError
-        If the engine is unknown, or "c" is asked for without a compiler.
+        If the engine is unknown, or "c" is asked for without a compiler that works.
     """
     if engine not in ("auto", "c", "vm"):
         raise InputError(f"The engine {engine!r} is unknown; use 'auto', 'c' or 'vm'.")
     if engine == "vm" or (engine == "auto" and compiler() is None):
         return VirtualMachine(model)
-    return Compiled(model)
+    try:
+        return Compiled(model)
+    except InputError as error:
+        if engine == "c":
+            raise
+        warnings.warn(f"{error} The slower virtual machine is used.", RuntimeWarning, stacklevel=2)
+        return VirtualMachine(model)

@@ -115,10 +115,10 @@ def _port(x: Any, u: Any, p: dict[str, Any]) -> Any:
 def hammerstein(nx: int, element: Element, offset: bool = True) -> PILFR:
     """PI-Hammerstein: the input passes the element first; `z = u`, and u reaches the dynamics only through w."""
     eye = np.eye(element.channels)
-    return PILFR(nx, element, {"C_z": 0.0, "D_zu": eye, "B_u": 0.0, "D_yu": 0.0}, offset)
+    return PILFR(nx, element, {"C_z": 0.0, "D_zu": eye, "B_u": 0.0, "D_yu": 0.0}, offset=offset)
 
 
 def wiener(nx: int, element: Element, offset: bool = True) -> PILFR:
     """PI-Wiener: the linear dynamics come first, the output is read through the element; `y = w`."""
     eye = np.eye(element.channels)
-    return PILFR(nx, element, {"B_w": 0.0, "C_y": 0.0, "D_yu": 0.0, "D_yw": eye}, offset)
+    return PILFR(nx, element, {"B_w": 0.0, "C_y": 0.0, "D_yu": 0.0, "D_yw": eye}, offset=offset)

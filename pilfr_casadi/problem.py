@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from .compiled import make_engine
 from .constraints import Constraint, compile_constraints
 from .model import Model
+from .nlp import Horizon, to_nlp
 from .recording import InputError, Recording, as_recordings
 from .sensitivities import Engine
 
@@ -243,6 +242,16 @@ class Problem:
             jac[:, : int(self.free.sum())] = np.asarray(self._g_slope(self.parameters(theta)))[:, self.free]
         return jac
 
+    def to_nlp(self) -> Horizon:
+        """The problem written out over the horizon as CasADi expressions, to add costs and constraints of one's own.
+
+        Returns
+        -------
+        Horizon
+            What `casadi.nlpsol` takes (`x, f, g`, bounds, start), with residual, simulated outputs and named parameters.
+        """
+        return to_nlp(self)
+
     def nrmse(self, theta: np.ndarray) -> list[float]:
         """NRMSE of each recording (Eq. 27, averaged over outputs)."""
         out = []
@@ -254,45 +263,3 @@ class Problem:
 
 def _output_scale(recordings: Sequence[Recording]) -> np.ndarray:
     return np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
-
-
-def to_nlp(problem: Problem) -> dict[str, Any]:
-    """The problem unrolled over the horizon as CasADi expressions, ready for `ca.nlpsol` with costs and constraints of one's own.
-
-    Returns
-    -------
-    dict
-        `x` (decision variables θ), `f` (cost), `g` (constraints) as `nlpsol` takes them; `lbx`, `ubx`, `lbg`, `ubg`, `x0`;
-        `residual` (R,), `simulated` (one (n_y, M) expression a recording) and `parameters` (named expressions).
-    """
-    model = problem.model
-    theta = ca.MX.sym("theta", problem.size)
-    n_free, n_state = int(problem.free.sum()), model.n_x + model.n_s
-    p = ca.MX(ca.DM(problem.parameters(problem.start)))
-    if n_free:
-        p[np.flatnonzero(problem.free).tolist()] = theta[:n_free]
-    simulated, residual = [], []
-    for part in problem._parts:
-        state = ca.MX(ca.DM(part.state)) if part.first is None else theta[part.first : part.first + n_state]
-        r = part.recording
-        u = np.concatenate([part.warm_up, r.u])
-        run = model.closed.mapaccum("run", len(u))
-        _, y = run(state, u.T, ca.repmat(p, 1, len(u)))
-        y = y[:, len(part.warm_up) :]
-        simulated.append(y)
-        residual.append(ca.vec(((y - r.y.T) / np.tile(problem.scale[:, None], (1, len(r))))[:, r.skip :]))
-    e = ca.vertcat(*residual)
-    penalty = 0.5 * ca.dot(problem._prior_weight, (theta - problem._prior_mean) ** 2) + ca.dot(problem._l1, theta)
-    return {
-        "x": theta,
-        "f": 0.5 * ca.sumsqr(e) / problem.residuals + penalty,
-        "g": problem._g(p),
-        "x0": problem.start,
-        "lbx": problem.lower,
-        "ubx": problem.upper,
-        "lbg": problem.g_lower,
-        "ubg": problem.g_upper,
-        "residual": e,
-        "simulated": simulated,
-        "parameters": model.parameters.symbols(p),
-    }

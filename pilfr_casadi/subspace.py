@@ -19,7 +19,7 @@ deterministic part of MIMO state space models given in innovations form, Automat
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +37,8 @@ Data = BLA | Recording | Iterable[Recording]
 CHUNK = 8192  # rows handled at once in a sequential QR
 ROUNDING = 1e-8  # relative errors below are rounding
 LADDER = tuple(round(4 * 1.5**k) for k in range(12))  # numbers of block rows to try: 4, 6, 9, 14, 20, 30, ...
-TRIALS = 3  # how many of them for each order
+TRIALS = 4  # how many of them for each order
+BUDGET = 4e9  # and none above the first that takes more multiplications than this (samples times rows squared)
 
 
 def frequency_subspace(bla: BLA, nx: int, weight: bool = True, block_rows: int | None = None) -> control.StateSpace:
@@ -107,6 +108,29 @@ def time_subspace(
     """
     problem = _TimeProblem(recordings, offset)
     return problem.solve([_order(nx)], block_rows)[0].system(problem.dt)
+
+
+def subspace_matrices(
+    recordings: Recording | Iterable[Recording], nx: int, offset: bool = False, block_rows: int | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """Matrices of :func:`time_subspace`, without the import of the control package.
+
+    Parameters
+    ----------
+    recordings, nx, offset, block_rows
+        As for :func:`time_subspace`.
+
+    Returns
+    -------
+    A, B, C, D : array, (nx, nx), (nx, n_u), (n_y, nx), (n_y, n_u)
+
+    Raises
+    ------
+    InputError
+        As :func:`time_subspace`.
+    """
+    model = _TimeProblem(recordings, offset).solve([_order(nx)], block_rows)[0]
+    return model.A, model.B, model.C, model.D
 
 
 def singular_values(data: Data, block_rows: int | None = None, weight: bool = True, offset: bool = False) -> Array:
@@ -181,7 +205,7 @@ def select_order(
         Of a BLA every second frequency is held out, of a single recording the last 30 % of the samples, of several
         recordings the last 30 % of them, at least one.
     orders : iterable of int
-        Orders to try.
+        Orders to try; those too high for the data are left out, unless all are.
     margin : float
         The recommended order is the smallest whose validation error is at most ``1 + margin`` times the best.
     offset : bool
@@ -211,6 +235,7 @@ def select_order(
             records = records[0].slice(records[0].skip).split(0.7)
         n_train = max(1, min(len(records) - 1, round(0.7 * len(records))))
         train, held = _TimeProblem(records[:n_train], offset), _TimeProblem(records[n_train:], offset)
+    tried = [n for n in tried if train.least_rows(n) <= train.most_rows] or tried[:1]
     models = train.solve(tried, None)
     train_error, error = (np.array([part.error(m) for m in models]) for part in (train, held))
     good_enough = max((1 + margin) * np.min(error), ROUNDING)
@@ -232,9 +257,11 @@ def frequency_response(system: Any, frequency: Array) -> Array:
     Returns
     -------
     complex array, (F, n_y, n_u)
+        Not finite at a pole.
     """
     z = np.exp(2j * np.pi * np.asarray(frequency) * system.dt)
-    return _resolvent(np.asarray(system.A), np.asarray(system.C), z) @ np.asarray(system.B) + np.asarray(system.D)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _resolvent(np.asarray(system.A), np.asarray(system.C), z) @ np.asarray(system.B) + np.asarray(system.D)
 
 
 def simulate_states(system: Any, u: Array, x0: Array | None = None) -> Array:
@@ -252,6 +279,11 @@ def simulate_states(system: Any, u: Array, x0: Array | None = None) -> Array:
     Returns
     -------
     array, (M, nx)
+
+    Raises
+    ------
+    InputError
+        When the shapes of `u` or `x0` do not fit the model.
     """
     A, B = np.asarray(system.A, dtype=float), np.asarray(system.B, dtype=float)
     u = np.asarray(u, dtype=float)
@@ -287,20 +319,20 @@ def simulate_lti(system: Any, u: Array, x0: Array | None = None) -> Array:
     return simulate_states(system, u, x0) @ np.asarray(system.C).T + np.asarray(u) @ np.asarray(system.D).T
 
 
-def unit_variance(system: Any, u: Array) -> control.StateSpace:
+def unit_variance(system: Any, u: Array | Sequence[Array]) -> control.StateSpace:
     """Scale the states so that each has unit variance under an input, Krikelis et al. (2024), Sec. 5.3.
 
     Parameters
     ----------
     system : control.StateSpace
         Discrete model.
-    u : array, (M, n_u)
-        Input, from the zero state on.
+    u : array, (M, n_u), or several of them
+        Inputs of one or several runs, each from the zero state on.
 
     Returns
     -------
     control.StateSpace
-        The same model in other coordinates. A state that the input does not move keeps its scale.
+        The same model in other coordinates. A state that the inputs do not move keeps its scale.
 
     Raises
     ------
@@ -309,8 +341,9 @@ def unit_variance(system: Any, u: Array) -> control.StateSpace:
     """
     import control
 
-    x = simulate_states(system, u)
-    std = np.std(x, axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        x = np.concatenate([simulate_states(system, run) for run in ([u] if isinstance(u, np.ndarray) else u)])
+        std = np.std(x, axis=0)
     if not np.all(np.isfinite(std)):
         raise InputError("the states of the model grow without bound under this input; give a stable model.")
     std[std <= 1e-12 * np.max(np.abs(x), axis=0, initial=0.0)] = 1.0
@@ -345,6 +378,7 @@ class _Problem:
     u_scale: Array
     y_scale: Array
     most_rows: int
+    affordable_rows: float
     size: float  # sum of squares of the (weighted) data
     too_few: str
 
@@ -354,9 +388,13 @@ class _Problem:
     def reduced(self, A: Array, C: Array) -> list[Array]:
         raise NotImplementedError
 
+    def least_rows(self, nx: int) -> int:
+        """Fewest block rows that carry a model of order `nx`."""
+        return -(-nx // len(self.y_scale)) + 1
+
     def ladder(self, nx: int, block_rows: int | None) -> list[int]:
         """Numbers of block rows to try for an order: steps of one common ladder, so that orders share them."""
-        least = -(-nx // len(self.y_scale)) + 1
+        least = self.least_rows(nx)
         if least > self.most_rows:
             raise InputError(f"{self.too_few} for order {nx}; record more or choose a lower order.")
         if block_rows is not None:
@@ -365,8 +403,8 @@ class _Problem:
                     f"block_rows is {block_rows}; for order {nx} and these data give {least} to {self.most_rows}."
                 )
             return [block_rows]
-        steps = [r for r in LADDER if least < r <= self.most_rows][:TRIALS]
-        return steps or [min(least + 1, self.most_rows)]
+        steps = [r for r in LADDER if least < r <= self.most_rows][:TRIALS] or [min(least + 1, self.most_rows)]
+        return [r for r in steps if r <= max(self.affordable_rows, steps[0])]
 
     def solve(self, orders: list[int], block_rows: int | None) -> list[_Matrices]:
         """Return the best model of each order."""
@@ -428,6 +466,7 @@ class _FrequencyProblem(_Problem):
             self.var = var + ROUNDING**2 * np.mean(np.abs(self.G) ** 2)
         self.size = max(float(np.sum(np.abs(self.G) ** 2 / self.var)), 1e-300)
         F, n_y, n_u = G.shape
+        self.affordable_rows = np.sqrt(BUDGET / (F * n_u)) / n_y
         self.most_rows = (2 * F * n_u - 1) // (n_y + n_u) if 2 * F > 2 else 0
         self.too_few = f"{F} frequencies are too few"
 
@@ -479,6 +518,7 @@ class _TimeProblem(_Problem):
         r = np.arange(1, lengths.max() // 2 + 2)
         columns = np.maximum(lengths - 2 * r[:, None] + 1, 0).sum(axis=1)
         self.most_rows = int(np.max(r[columns >= 2 * r * n], initial=0))
+        self.affordable_rows = np.sqrt(BUDGET / lengths.sum()) / (2 * n)
         self.too_few = f"{lengths.sum()} samples in {len(lengths)} recording(s) are too few"
 
     def range_space(self, r: int) -> tuple[Array, Array, Array]:

@@ -1,0 +1,42 @@
+"""Every figure of the package; the only place that knows matplotlib, so import it where a figure is made.
+
+Functions that draw one picture take an optional `ax` and return the axes (`axes.figure` is the figure); those that compose
+several return the `matplotlib.figure.Figure`.
+"""
+
+from .canvas import new_figure
+from .fitted import (
+    amplitude_density,
+    convergence,
+    linear_simulation,
+    loading_curve,
+    loop,
+    plot_fit,
+    spectrum,
+    time,
+    traces,
+    virgin_curve,
+    weights,
+)
+from .measured import best_linear_approximation, compared_spread, frequency_response, loops, operators_demo, spread
+
+__all__ = [
+    "amplitude_density",
+    "best_linear_approximation",
+    "compared_spread",
+    "convergence",
+    "frequency_response",
+    "linear_simulation",
+    "loading_curve",
+    "loop",
+    "loops",
+    "new_figure",
+    "operators_demo",
+    "plot_fit",
+    "spectrum",
+    "spread",
+    "time",
+    "traces",
+    "virgin_curve",
+    "weights",
+]

@@ -1,0 +1,114 @@
+"""What all figures share: a canvas without global state, colours, decibels, and lines that stay small however long the record.
+
+Colours are those of Okabe & Ito (2008), told apart by every kind of colour vision. Figures are made with matplotlib's object
+interface: no pyplot, no change of settings, so they work in scripts, notebooks and servers alike.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+SKY, ORANGE, INK, GREY = "#56B4E9", "#E69F00", "#222222", "#7A7A7A"
+FONT = 10.5
+MOST = 3000  # points of a line before it is thinned
+DEEPEST = 200.0  # dB below the largest value that are still drawn
+
+
+def new_figure(width: float = 6.0, height: float = 3.7) -> Figure:
+    """An empty figure of a size in inches, laid out so that nothing overlaps or is cut off."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def axes_or_new(ax: Axes | None, width: float = 6.0, height: float = 3.7) -> Axes:
+    """The axes given, or those of a new figure; `axes.figure` leads back to it."""
+    return new_figure(width, height).add_subplot() if ax is None else ax
+
+
+def finish(ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, beside: Axes | None = None) -> Axes:
+    """Labels, a light grid, and above the axes the title with a legend of whatever has a label, here and on the axes `beside`."""
+    ax.set_xlabel(plain(x), fontsize=FONT)
+    ax.set_ylabel(plain(y), fontsize=FONT)
+    ax.tick_params(labelsize=FONT - 1)
+    ax.grid(True, color="#DDDDDD", linewidth=0.6)
+    ax.set_axisbelow(True)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    handles = [h for axes in (ax, beside) if axes is not None for h in axes.get_legend_handles_labels()[0]]
+    if handles:
+        shown = ax.legend(
+            handles=handles, title=plain(title) or None, alignment="left", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
+            fontsize=FONT - 1, title_fontsize=FONT + 0.5, frameon=False, handlelength=1.6, columnspacing=1.2, borderaxespad=0.2, borderpad=0.1,
+        )
+        for handle in shown.get_lines():
+            handle.set_linewidth(max(float(handle.get_linewidth()), 2.0))
+    elif title:
+        ax.set_title(plain(title), fontsize=FONT + 0.5, loc="left")
+    return ax
+
+
+def plain(text: str) -> str:
+    """The text as it stands: a dollar sign in a name is not the beginning of a formula."""
+    return str(text).replace("$", r"\$")
+
+
+def with_unit(name: str, unit: str = "") -> str:
+    """`name [unit]`, or the name alone where the unit is not known."""
+    return f"{name} [{unit}]" if unit else name
+
+
+def scaled(values: np.ndarray, unit: str = "") -> tuple[float, str]:
+    """A power of a thousand that brings the values between 0.1 and 1000 or so, and the unit with it: (1e-3, "10⁻³ m")."""
+    size = float(np.max(np.abs(values), initial=0.0))
+    if not np.isfinite(size) or size == 0 or 0.02 <= size < 5000:
+        return 1.0, unit
+    exponent = 3 * int(np.floor(np.log10(size / 0.5) / 3))
+    power = "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return 10.0**exponent, f"{power} {unit}".strip()
+
+
+def thin(x: np.ndarray, y: np.ndarray, most: int = MOST) -> tuple[np.ndarray, np.ndarray]:
+    """At most about `most` points that draw the same picture: the smallest and the largest of each stretch, in their order.
+
+    Parameters
+    ----------
+    x, y : array, (M,)
+        A line with increasing x.
+    most : int
+        Points to keep; shorter lines come back unchanged. Gaps (nan) stay gaps as long as a stretch has nothing else.
+    """
+    if len(y) <= most:
+        return x, y
+    length = -(-2 * len(y) // most)
+    rows = -(-len(y) // length)
+    padded = np.concatenate([y, np.full(rows * length - len(y), y[-1])]).reshape(rows, length)
+    low = np.argmin(np.where(np.isnan(padded), np.inf, padded), axis=1)
+    high = np.argmax(np.where(np.isnan(padded), -np.inf, padded), axis=1)
+    index = np.sort(np.stack([low, high], axis=1), axis=1) + length * np.arange(rows)[:, None]
+    index = np.unique(np.minimum(np.concatenate([[0], index.ravel(), [len(y) - 1]]), len(y) - 1))
+    return x[index], y[index]
+
+
+def line(ax: Axes, x: np.ndarray, y: np.ndarray, label: str, colour: str, **style: Any) -> None:
+    """Draw a line, thinned where it is dense; a line with nothing to show says so in the legend."""
+    if not np.any(np.isfinite(y)):
+        label = f"{label}: nothing to draw"
+    ax.plot(*thin(np.asarray(x), np.asarray(y)), label=plain(label), color=colour, **{"linewidth": 1.2, **style})
+
+
+def decibel(power: np.ndarray) -> np.ndarray:
+    """`10 log10` of a power, (any shape); nan (a gap in the line) where it is zero or not finite."""
+    power = np.asarray(power, dtype=float)
+    usable = np.isfinite(power) & (power > 0)
+    return np.where(usable, 10 * np.log10(np.where(usable, power, 1.0)), np.nan)
+
+
+def limit_depth(ax: Axes, *curves: np.ndarray) -> None:
+    """Keep an axis in decibels readable: rounding errors hundreds of decibels down do not stretch it."""
+    values = np.concatenate([c[np.isfinite(c)] for c in curves] or [np.zeros(0)])
+    if len(values) and np.min(values) < np.max(values) - DEEPEST:
+        ax.set_ylim(np.max(values) - DEEPEST, np.max(values) + 0.05 * DEEPEST)

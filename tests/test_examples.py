@@ -1,0 +1,35 @@
+"""Every example runs and ends in an assertion; every Python snippet of the README runs."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+def test_example(path, tmp_path):
+    source = path.read_text()
+    assert source.count("\n") <= 60
+    assert isinstance(ast.parse(source).body[-1], ast.Assert)
+    done = subprocess.run([sys.executable, path], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_snippets_of_the_readme(tmp_path):
+    for name in ("train", "multisine", "sweep"):
+        shutil.copy(ROOT / "pilfr_casadi" / "demo_data" / f"{name}.csv", tmp_path)
+    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    assert snippets
+    script = tmp_path / "readme.py"
+    script.write_text("\n".join(snippets))
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
