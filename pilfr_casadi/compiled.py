@@ -34,8 +34,9 @@ from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachin
 
 # without contraction the generated step gives the very numbers of the virtual machine, and operators slip at the same samples
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
-FLAGS = (("-O3", "-march=native", *COMMON), ("-O3", *COMMON))  # the second where the compiler does not know the processor
+FLAGS = (("-O2", "-march=native", *COMMON), ("-O2", *COMMON))  # the second where the compiler does not know the processor
 PATIENCE = 600.0  # seconds for one compilation
+_failures: dict[str, str] = {}  # what did not compile is not tried again by this process
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
 _VALUES = ("constant", "p", "u", "x", "s", "z", "w", "computed")
 
@@ -54,7 +55,10 @@ def compiler() -> str | None:
 @functools.cache
 def _machine(cc: str) -> str:
     """What a compiled library depends on besides its source."""
-    version = subprocess.run([cc, "--version"], capture_output=True, text=True, check=False).stdout
+    try:
+        version = subprocess.run([cc, "--version"], capture_output=True, text=True, check=False).stdout
+    except OSError as error:
+        version = str(error)
     cpu = platform.machine() + platform.processor()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -170,8 +174,23 @@ def _digest(library: Path) -> str:
     return hashlib.sha256(library.read_bytes()).hexdigest()[:16]
 
 
+def _compile(cc: str, source: str, key: str) -> Path:
+    """Compile under another name first, so that a library is never half there."""
+    with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
+        c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
+        c_file.write_text(source, encoding="utf-8")
+        for flags in FLAGS:
+            command = [cc, *flags, str(c_file), "-o", str(partial), "-lm"]
+            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
+            if not done.returncode and partial.exists():
+                library = cache_directory() / f"{key}-{_digest(partial)}.so"
+                os.replace(partial, library)
+                return library
+    raise OSError((done.stderr.strip().splitlines() or ["it wrote no library"])[0][:300])
+
+
 def build(source: str) -> Path:
-    """Compile, or take from the cache, the library of a source; written under another name first, so never half there.
+    """The library of a source, from the cache or compiled.
 
     Raises
     ------
@@ -181,26 +200,19 @@ def build(source: str) -> Path:
     cc = compiler()
     if cc is None:
         raise InputError("No C compiler was found; install one (cc, gcc or clang) or use engine='vm'.")
-    try:
-        key = hashlib.sha256("\n".join((source, _machine(cc))).encode()).hexdigest()[:32]
-        for library in cache_directory().glob(f"{key}-*.so"):
-            if library.stem == f"{key}-{_digest(library)}":
-                return library
-            library.unlink(missing_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
-            c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
-            c_file.write_text(source, encoding="utf-8")
-            for flags in FLAGS:
-                command = [cc, *flags, str(c_file), "-o", str(partial), "-lm"]
-                done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
-                if not done.returncode and partial.exists():
-                    library = cache_directory() / f"{key}-{_digest(partial)}.so"
-                    os.replace(partial, library)
-                    return library
-        reason = (done.stderr.strip().splitlines() or ["no message"])[0][:300]
-    except (OSError, subprocess.TimeoutExpired) as error:
-        reason = str(error)
-    raise InputError(f"The C compiler {cc} could not build the model ({reason}); repair it, name another in CC, or use engine='vm'.")
+    key = hashlib.sha256("\n".join((source, _machine(cc))).encode()).hexdigest()[:32]
+    for library in cache_directory().glob(f"{key}-*.so"):
+        if library.stem == f"{key}-{_digest(library)}":
+            return library
+        library.unlink(missing_ok=True)
+    if key not in _failures:
+        try:
+            return _compile(cc, source, key)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            _failures[key] = str(error)
+    raise InputError(
+        f"The C compiler {cc} could not build the model ({_failures[key]}); repair it, name another in CC, or use engine='vm'."
+    )
 
 
 def _pointer(array: np.ndarray | None) -> ctypes.c_void_p:

@@ -107,8 +107,13 @@ def compile_constraints(
                 f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(parameters)}."
             ) from e
         size = int(g.shape[0])
-        low, high = (np.broadcast_to(np.asarray(b, dtype=float).ravel(), (size,)) for b in (c.lower, c.upper))
-        if np.any(low > high):
+        try:
+            low, high = (np.broadcast_to(np.asarray(b, dtype=float).ravel(), (size,)) for b in (c.lower, c.upper))
+        except ValueError:
+            raise InputError(
+                f"The bounds of the constraint {c.name!r} do not fit its {size} entries; give one or {size} of each."
+            ) from None
+        if not np.all(low <= high):
             raise InputError(f"The constraint {c.name!r} is infeasible: its lower bound exceeds its upper bound.")
         parts.append(g)
         lower.append(low)

@@ -1,7 +1,8 @@
 """Elements: laws with memory from a local signal z to an internal signal w.
 
-An element is anything with `channels`, `memory`, `parameters()` and `step(z, s, p) -> (w, s_next)`; `close_loop` puts it into
-a model's port. `PrandtlIshlinskii` is the layer of Krikelis et al. (2024), Eq. 16: `w_i(k) = Σ_j w_ij H_rij[z_i](k)`.
+An element is anything with `channels`, `memory`, `parameters()` and `step(z, s, p) -> (w, s_next)`; `close_loop` puts
+it into a model's port. `PrandtlIshlinskii` is the layer of Krikelis et al. (2024), Eq. 16: `w_i(k) = Σ_j w_ij
+H_rij[z_i](k)`.
 """
 
 from __future__ import annotations

@@ -141,7 +141,9 @@ def write_atomically(path: AnyPath, content: str | bytes) -> Path:
             raise
     except OSError as error:
         if error.errno == errno.ENOENT and not target.parent.is_dir():
-            raise InputError(f"The folder {target.parent} does not exist; make it first or give another path.") from error
+            raise InputError(
+                f"The folder {target.parent} does not exist; make it first or give another path."
+            ) from error
         raise InputError(f"{path} cannot be written ({error.strerror or error}); give another path.") from error
     _sync_folder(target.parent)
     return target
@@ -161,7 +163,6 @@ def _document(fit: Fit) -> dict[str, Any]:
     from . import __version__
 
     model, solution = fit.model, fit.solution
-    estimated = {label.partition("[")[2].partition("]")[0] for label in fit.labels if label.startswith("initial[")}
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -175,13 +176,11 @@ def _document(fit: Fit) -> dict[str, Any]:
         },
         "structure": None if fit.structure is None else _structure(fit.structure),
         "parameters": {
-            name: {"value": _plain(p.value), "std": _plain(fit.errors.get(name)), "unit": p.unit}
+            name: {"value": _plain(p.value), "std": _plain(fit.errors.get(name), "inf"), "unit": p.unit}
             for name, p in model.parameters.items()
         },
         "linear": None if fit.linear is None else {k: _plain(p.value) for k, p in fit.linear.parameters.items()},
-        "initial_states": [
-            {"estimated": str(i) in estimated, "value": _plain(state)} for i, state in enumerate(fit.initial)
-        ],
+        "initial_states": {recording: _plain(state) for recording, state in fit.initial.items()},
         "training": {
             "status": solution.status.name,
             "sentence": solution.status.value,
@@ -190,6 +189,7 @@ def _document(fit: Fit) -> dict[str, Any]:
             "seconds": fit.seconds,
             "active": list(fit.active),
             "solve": _solve(solution),
+            "variables": dict(zip(fit.labels, _plain(solution.theta), strict=True)),
             "multipliers": _plain(solution.multipliers),
             "history": [_plain([h.number, h.cost, h.seconds, h.step, h.damping]) for h in solution.history],
             "starts": [
@@ -233,15 +233,15 @@ def _element(element: Any) -> dict[str, Any]:
     return out
 
 
-def _plain(value: Any) -> Any:
-    """Numbers as JSON knows them, arrays as nested lists, what is not finite as null."""
+def _plain(value: Any, infinite: str | None = None) -> Any:
+    """Numbers as JSON knows them, arrays as nested lists, nan as null, and what is infinite as null or as a word."""
     if value is None:
         return None
     array = np.asarray(value, dtype=float)
     if array.ndim:
-        return [_plain(v) for v in array]
+        return [_plain(v, infinite) for v in array]
     number = float(array)
-    return number if np.isfinite(number) else None
+    return number if np.isfinite(number) else infinite if number > 0 else None
 
 
 def _text(value: Any, depth: int = 0) -> str:

@@ -2,8 +2,8 @@
 
     x⁺ = A x + B_u u + B_w w,   y = C_y x + D_yu u + D_yw w + y_0,   z = C_z x + D_zu u,   w = element(z)
 
-Krikelis et al. (2024), Eq. 15-17, with `n_z = n_w` channels, and a constant `y_0` for sensors that do not read zero at rest.
-Without an element this is a linear state-space model; `hammerstein` and `wiener` fix blocks.
+Krikelis et al. (2024), Eq. 15-17, with `n_z = n_w` channels, and a constant `y_0` for sensors that do not read zero
+at rest. Without an element this is a linear state-space model; `hammerstein` and `wiener` fix blocks.
 """
 
 from __future__ import annotations
@@ -72,6 +72,7 @@ class PILFR:
     def __post_init__(self) -> None:
         if int(self.nx) != self.nx or self.nx < 0:
             raise InputError(f"The number of states is {self.nx}; give a whole number, 0 or more.")
+        object.__setattr__(self, "nx", int(self.nx))
         known = (*BLOCKS, *(self.element.parameters() if self.element else ()))
         for name in (*self.fixed, *self.bounds, *self.priors):
             if name not in known:
@@ -82,7 +83,15 @@ class PILFR:
         """Channels of the element."""
         return 0 if self.element is None else self.element.channels
 
-    def model(self, n_u: int, n_y: int, values: Mapping[str, Any] | None = None, *, inputs: tuple[str, ...] = (), outputs: tuple[str, ...] = ()) -> Model:
+    def model(
+        self,
+        n_u: int,
+        n_y: int,
+        values: Mapping[str, Any] | None = None,
+        *,
+        inputs: tuple[str, ...] = (),
+        outputs: tuple[str, ...] = (),
+    ) -> Model:
         """The closed model for n_u inputs and n_y outputs, blocks starting at `values` (zero where not given)."""
         values, fixed = dict(values or {}), dict(self.fixed) if self.offset else {"y_0": 0.0, **self.fixed}
         shapes = block_shapes(self.nx, n_u, n_y, self.n_w)
@@ -92,15 +101,29 @@ class PILFR:
             model = close_loop(model, self.element)
         changes: dict[str, dict[str, Any]] = {}
         for name, p in model.parameters.items():
-            value = np.broadcast_to(np.asarray(fixed.get(name, values.get(name, p.value)), dtype=float), p.value.shape)
-            low, high = self.bounds.get(name, p.bounds)
-            change = {"value": value if name in fixed else np.clip(value, low, high), "bounds": (low, high)}
-            changes[name] = change | ({"fixed": True} if name in fixed else {}) | ({"prior": self.priors[name]} if name in self.priors else {})
+            value = _shaped(name, fixed.get(name, values.get(name, p.value)), p.value.shape)
+            low, high = (_shaped(name, bound, p.value.shape) for bound in self.bounds.get(name, p.bounds))
+            if name in fixed:
+                changes[name] = {"value": value, "bounds": (low, high), "fixed": True}
+            else:
+                changes[name] = {"value": np.clip(value, low, high), "bounds": (low, high)}
+            if name in self.priors:
+                changes[name]["prior"] = self.priors[name]
         return model.with_parameters(model.parameters.change(**changes))
 
     def linear(self) -> PILFR:
         """The linear model of the same order, everything free."""
         return PILFR(self.nx, offset=self.offset)
+
+
+def _shaped(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        return np.broadcast_to(np.asarray(value, dtype=float), shape)
+    except (TypeError, ValueError):
+        given = np.shape(value)
+        raise InputError(
+            f"What is given for {name!r} has the shape {given}; expected a number or an array {shape}."
+        ) from None
 
 
 def _step(x: Any, u: Any, w: Any, p: dict[str, Any]) -> tuple[Any, Any]:

@@ -1,8 +1,8 @@
 """The model: one symbolic step with a port, and closing the loop around an element.
 
-An open model is `z = h(x, u, p)`, `(x⁺, y) = f(x, u, w, p)`; an element is `(w, s⁺) = e(z, s, p)`. `z` does not depend on `w`
-(`D_zw = 0` in Krikelis et al. (2024), Eq. 15), so a step is explicit. `close_loop` joins the two; the state of the closed
-model is `[x; s]`, the element's memory included.
+An open model is `z = h(x, u, p)`, `(x⁺, y) = f(x, u, w, p)`; an element is `(w, s⁺) = e(z, s, p)`. `z` does not
+depend on `w` (`D_zw = 0` in Krikelis et al. (2024), Eq. 15), so a step is explicit. `close_loop` joins the two; the
+state of the closed model is `[x; s]`, the element's memory included.
 """
 
 from __future__ import annotations
@@ -115,12 +115,32 @@ def open_model(
     inputs: tuple[str, ...] = (),
     outputs: tuple[str, ...] = (),
 ) -> Model:
-    """An open model from Python expressions `step(x, u, w, p) -> (x_next, y)` and `port(x, u, p) -> z`; p maps names to symbols."""
+    """An open model from Python expressions `step(x, u, w, p) -> (x_next, y)` and `port(x, u, p) -> z`.
+
+    Parameters
+    ----------
+    step, port : callable
+        Expressions of CasADi symbols x (n_x, 1), u (n_u, 1), w (n_w, 1) and p, which maps names to matrices.
+    parameters : ParameterSet
+        Parameters that the expressions read.
+    n_x, n_u, n_w : int
+        States, inputs, and channels of the port (0: no port, `port` is not called).
+    states, inputs, outputs : tuple of str
+        Names; numbered where left out.
+
+    Raises
+    ------
+    InputError
+        If an expression has another number of rows than there are states or channels, or names are too few or too many.
+    """
     x, u, w = ca.SX.sym("x", n_x), ca.SX.sym("u", n_u), ca.SX.sym("w", n_w)
     vector = ca.SX.sym("p", parameters.size)
     named = parameters.symbols(vector)
-    x_next, y = step(x, u, w, named)
-    z = port(x, u, named) if n_w else ca.SX(0, 1)
+    x_next, y = (ca.SX(e) for e in step(x, u, w, named))
+    z = ca.SX(port(x, u, named)) if n_w else ca.SX(0, 1)
+    for name, expression, rows in (("next state", x_next, n_x), ("port's signal z", z, n_w)):
+        if expression.shape != (rows, 1):
+            raise InputError(f"The {name} has the shape {expression.shape}; expected ({rows}, 1).")
     z_in, s = ca.SX.sym("z", n_w), ca.SX(0, 1)
     return Model(
         step=ca.Function("step", [x, u, w, vector], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),

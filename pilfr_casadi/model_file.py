@@ -69,7 +69,9 @@ class ModelFile:
         except (OSError, ValueError) as error:
             if isinstance(error, InputError):
                 raise
-            self.fail(f"cannot be read ({getattr(error, 'strerror', None) or error}); check the path and the permissions")
+            self.fail(
+                f"cannot be read ({getattr(error, 'strerror', None) or error}); check the path and the permissions"
+            )
         try:
             return json.loads(text, parse_constant=self._no_constant)
         except json.JSONDecodeError as error:
@@ -120,7 +122,7 @@ class ModelFile:
         return float(self.array(parent[key], (), key, missing))
 
     def array(self, value: Any, shape: tuple[int, ...] | None, where: str, missing: float | None = None) -> np.ndarray:
-        """Nested lists of finite numbers as an array of a shape (any where None); null becomes `missing`, if that is given."""
+        """Nested lists of finite numbers as an array of a shape (any where None); null becomes `missing` and "inf" infinite, if that is given."""
         numbers = list(self._numbers(value, where, missing))
         if shape is not None and len(numbers) == math.prod(shape) == 0:
             return np.zeros(shape)
@@ -136,6 +138,8 @@ class ModelFile:
                 yield from self._numbers(item, where, missing, depth + 1)
         elif value is None and missing is not None:
             yield missing
+        elif value == "inf" and missing is not None:
+            yield math.inf
         elif isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1.7e308:
             self.damaged(f"{where} holds {json.dumps(value)[:20]}, which is not a finite number")
         else:
@@ -159,19 +163,21 @@ def read_fit(path: str | os.PathLike[str], given: Model | PILFR | None = None) -
     if dt <= 0:
         file.damaged(f"the step dt is {dt:g} s")
     structure, model = _model(file, names, given)
-    values = {name: file.array(file.table(file.table(file.content, "parameters"), name).get("value"), p.value.shape, f"parameter {name!r}")
-              for name, p in model.parameters.items()}
+    values = {
+        name: file.array(
+            file.table(file.table(file.content, "parameters"), name).get("value"), p.value.shape, f"parameter {name!r}"
+        )
+        for name, p in model.parameters.items()
+    }
     model = _with_values(file, model, values, structure)
     errors = _errors(file, model)
     n_state = model.n_x + model.n_s
-    states = file.rows(file.content, "initial_states")
-    initial = tuple(file.array(s.get("value") if isinstance(s, dict) else None, (n_state,), "an initial state") for s in states)
-    estimated = [i for i, s in enumerate(states) if file.entry(s, "estimated", bool, "true or false")]
-    free = model.parameters.free
-    labels = tuple(np.array(model.parameters.labels, dtype=object)[free]) + tuple(
-        f"initial[{i}].{k}" for i in estimated for k in range(n_state)
-    )
-    theta = np.concatenate([model.parameters.start[free], *(initial[i] for i in estimated)])
+    initial = {
+        recording: file.array(state, (n_state,), "an initial state")
+        for recording, state in file.table(file.content, "initial_states").items()
+    }
+    variables = file.table(training, "variables")
+    theta = file.array(list(variables.values()), (len(variables),), "a variable")
     history = tuple(
         Iteration(int(h[0]), *(float(v) for v in h[1:]))
         for h in (file.array(row, (5,), "the history", np.inf) for row in file.rows(training, "history"))
@@ -179,7 +185,14 @@ def read_fit(path: str | os.PathLike[str], given: Model | PILFR | None = None) -
     multipliers = file.array(file.rows(training, "multipliers"), None, "a multiplier", np.nan)
     solution = _solution(file, training, file.table(training, "solve"), theta, multipliers=multipliers, history=history)
     candidates = tuple(
-        Candidate(file.count(c, "seed"), model, np.zeros(0), file.number(c, "error", np.inf), _solution(file, c, c, np.zeros(0)), file.text(c, "note"))
+        Candidate(
+            file.count(c, "seed"),
+            model,
+            np.zeros(0),
+            file.number(c, "error", np.inf),
+            _solution(file, c, c, np.zeros(0)),
+            file.text(c, "note"),
+        )
         for c in file.rows(training, "starts")
     )
     return Fit(
@@ -187,9 +200,11 @@ def read_fit(path: str | os.PathLike[str], given: Model | PILFR | None = None) -
         structure=structure,
         dt=dt,
         solution=solution,
-        train_nrmse=tuple(file.array(file.rows(training, "nrmse"), None, "the training error", np.inf).ravel().tolist()),
+        train_nrmse=tuple(
+            file.array(file.rows(training, "nrmse"), None, "the training error", np.inf).ravel().tolist()
+        ),
         initial=initial,
-        labels=labels,
+        labels=tuple(variables),
         errors=errors,
         active=tuple(str(a) for a in file.rows(training, "active")),
         candidates=candidates,
@@ -209,12 +224,16 @@ def _names(file: ModelFile, signals: Mapping[str, Any], key: str) -> tuple[str, 
     return names
 
 
-def _model(file: ModelFile, names: Mapping[str, tuple[str, ...]], given: Model | PILFR | None) -> tuple[PILFR | None, Model]:
+def _model(
+    file: ModelFile, names: Mapping[str, tuple[str, ...]], given: Model | PILFR | None
+) -> tuple[PILFR | None, Model]:
     """The structure (None for a model of the user's own) and the closed model, not yet with the file's values."""
     n_u, n_y = len(names["inputs"]), len(names["outputs"])
     if isinstance(given, Model):
         if (given.n_u, given.n_y) != (n_u, n_y):
-            file.fail(f"is of a model with {n_u} inputs and {n_y} outputs and the one given has {given.n_u} and {given.n_y}; give the model it was saved from")
+            file.fail(
+                f"is of a model with {n_u} inputs and {n_y} outputs and the one given has {given.n_u} and {given.n_y}; give the model it was saved from"
+            )
         return None, given
     if given is None and file.content.get("structure") is None:
         file.fail("holds the values of a model of your own equations, not the equations; give the model as `model=`")
@@ -231,7 +250,9 @@ def _structure(file: ModelFile, n_u: int, n_y: int) -> PILFR:
     element = None if table.get("element") is None else _element(file, file.table(table, "element"), parameters)
     for name, shape in block_shapes(nx, n_u, n_y, 0 if element is None else element.channels).items():
         file.array(file.table(parameters, name).get("value"), shape, f"parameter {name!r}")
-    fixed = {name: file.array(value, None, f"the fixed block {name!r}") for name, value in file.table(table, "fixed").items()}
+    fixed = {
+        name: file.array(value, None, f"the fixed block {name!r}") for name, value in file.table(table, "fixed").items()
+    }
     pairs: dict[str, dict[str, tuple[Any, Any]]] = {}
     for key, ends in (("bounds", (-np.inf, np.inf)), ("priors", (None, None))):
         pairs[key] = {}
@@ -241,14 +262,18 @@ def _structure(file: ModelFile, n_u: int, n_y: int) -> PILFR:
             low, high = (file.array(v, None, f"the {key} of {name!r}", end) for v, end in zip(pair, ends, strict=True))
             pairs[key][name] = (low, high)
     try:
-        return PILFR(nx, element, fixed, pairs["bounds"], pairs["priors"], file.entry(table, "offset", bool, "true or false"))
+        return PILFR(
+            nx, element, fixed, pairs["bounds"], pairs["priors"], file.entry(table, "offset", bool, "true or false")
+        )
     except InputError as error:
         file.damaged(str(error).rstrip("."))
 
 
 def _element(file: ModelFile, table: dict[str, Any], parameters: dict[str, Any]) -> PrandtlIshlinskii:
     if table.get("kind") != "prandtl_ishlinskii":
-        file.fail(f"has the element {str(table.get('kind'))[:40]!r}, which a file cannot hold; give the model as `model=`")
+        file.fail(
+            f"has the element {str(table.get('kind'))[:40]!r}, which a file cannot hold; give the model as `model=`"
+        )
     name = file.text(table, "operator")
     if name not in OPERATORS:
         file.fail(f"has the unknown operator {name[:40]!r}; known are {', '.join(OPERATORS)}")
@@ -258,10 +283,14 @@ def _element(file: ModelFile, table: dict[str, Any], parameters: dict[str, Any])
     operator: Any = OPERATORS[name]()
     if name == "generalized_play":
         if file.rows(table, "expressions"):
-            file.fail("has envelopes that are expressions of your own, which a file cannot hold; give the model as `model=`")
+            file.fail(
+                "has envelopes that are expressions of your own, which a file cannot hold; give the model as `model=`"
+            )
         neurons = file.count(table, "neurons")
         for key in ("a", "b", "d"):
-            file.array(file.table(parameters, f"gamma_l_{key}").get("value"), (channels, neurons), f"parameter 'gamma_l_{key}'")
+            file.array(
+                file.table(parameters, f"gamma_l_{key}").get("value"), (channels, neurons), f"parameter 'gamma_l_{key}'"
+            )
         operator = GeneralizedPlay(neurons)
     try:
         return PrandtlIshlinskii(operator, n, channels, file.entry(table, "rounded", bool, "true or false"))
@@ -274,9 +303,14 @@ def _with_values(file: ModelFile, model: Model, values: dict[str, np.ndarray], s
     unknown = sorted(set(file.table(file.content, "parameters")) - set(values))
     if unknown:
         file.fail(f"has the parameter {unknown[0]!r}, which its model lacks; give the model it was saved from")
-    states, memory = len(file.rows(file.table(file.content, "model"), "states")), file.count(file.content["model"], "memory")
+    states, memory = (
+        len(file.rows(file.table(file.content, "model"), "states")),
+        file.count(file.content["model"], "memory"),
+    )
     if (states, memory) != (model.n_x, model.n_s):
-        file.fail(f"is of a model with {states} states and {memory} of memory, this one has {model.n_x} and {model.n_s}; give the model it was saved from")
+        file.fail(
+            f"is of a model with {states} states and {memory} of memory, this one has {model.n_x} and {model.n_s}; give the model it was saved from"
+        )
     for name, p in model.parameters.items():
         if np.any((values[name] < p.bounds[0]) | (values[name] > p.bounds[1])):
             file.damaged(f"a value of parameter {name!r} lies outside its bounds")
@@ -302,7 +336,8 @@ def _linear(file: ModelFile, structure: PILFR | None, names: Mapping[str, tuple[
     table, n_u, n_y = file.table(file.content, "linear"), len(names["inputs"]), len(names["outputs"])
     model = structure.linear().model(n_u, n_y, **names)
     values = {
-        name: file.array(table.get(name), p.value.shape, f"the linear model's {name!r}") for name, p in model.parameters.items()
+        name: file.array(table.get(name), p.value.shape, f"the linear model's {name!r}")
+        for name, p in model.parameters.items()
     }
     return model.with_parameters(model.parameters.change(**{name: {"value": value} for name, value in values.items()}))
 
@@ -314,5 +349,12 @@ def _solution(file: ModelFile, table: Any, numbers: Any, theta: np.ndarray, **mo
     message = file.text(table, "message") if "message" in table else ""
     cost, violation = (file.number(numbers, key, np.inf) for key in ("cost", "violation"))
     return Solution(
-        theta, cost, Status[status], file.count(numbers, "iterations"), file.number(numbers, "seconds"), violation, message=message, **more
+        theta,
+        cost,
+        Status[status],
+        file.count(numbers, "iterations"),
+        file.number(numbers, "seconds"),
+        violation,
+        message=message,
+        **more,
     )

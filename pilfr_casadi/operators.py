@@ -8,11 +8,14 @@ Each operator has one number of memory `q`, the play state, and maps `(z, q, r)`
 - generalized play, Eq. 7 and 13: `v = q_next = max(gl - r, min(hi, q))`, `gl = γ_l(z)`, `gr = γ_r(z)`.
 
 The generalized play is a play only where `γ_l(z) - r <= γ_r(z) + r`. This is met by construction: the upper curve is
-`hi = max(gr + r, gl - r)`, which is `γ_r + r` wherever the condition holds and closes the loop (no width) where it does not.
+`hi = max(gr + r, gl - r)`, which is `γ_r + r` wherever the condition holds and closes the loop (no width) where it
+does not.
 
 All work on numbers, NumPy arrays and CasADi symbols alike. The derivative at a kink is the one of the sticking side.
-`eps > 0` rounds min and max over a band of half-width eps (compact support: outside the band nothing changes, so no memory
-leaks; softplus would lose memory at every step). The rounded value is off by at most eps/4 for each min or max.
+`eps > 0` rounds min and max over a band of half-width eps (compact support: outside the band nothing changes, so no
+memory leaks; softplus would lose memory at every step). One rounded min, max or step of an operator is off by at most
+eps/4. In the band a rounded play creeps, sample by sample, so over a record it is off by at most eps, and rate
+independence holds outside the band only.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ import casadi as ca
 import numpy as np
 
 from .parameters import Parameter, ParameterSet
+from .recording import InputError
 
 _TINY = 1e-300
 _SYMBOLIC = (ca.SX, ca.MX, ca.DM)
@@ -116,6 +120,11 @@ class GeneralizedPlay:
         Expressions `γ(z, p)` of the signal and the parameters by name, in place of the networks; non-decreasing in z.
     extra : ParameterSet, optional
         Parameters that the user's expressions read.
+
+    Raises
+    ------
+    InputError
+        If the number of neurons is negative or not whole.
     """
 
     neurons: int = 3
@@ -124,8 +133,12 @@ class GeneralizedPlay:
     extra: ParameterSet | None = None
     name = "generalized_play"
 
+    def __post_init__(self) -> None:
+        if self.neurons != int(self.neurons) or self.neurons < 0:
+            raise InputError(f"An envelope with {self.neurons} neurons was asked for; give a whole number, 0 or more.")
+
     def parameters(self, channels: int) -> ParameterSet:
-        """Envelope parameters, each with one row a channel; start: both envelopes are the identity."""
+        """Envelope parameters, one row a channel; start: nearly the identity, with a little of every neuron."""
         entries: dict[str, Parameter] = dict(self.extra or {})
         for side, own in (("l", self.gamma_l), ("r", self.gamma_r)):
             if own is not None:

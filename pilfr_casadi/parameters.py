@@ -34,7 +34,8 @@ class Parameter:
     fixed : bool or bool array
         Entries that are not estimated.
     prior : (mean, std), optional
-        A quadratic prior: `((value - mean) / std)²` is added to the sum of squared errors, each error in units of the noise.
+        A quadratic prior: `((value - mean) / std)²` is added to the sum of squared errors, each error in units of the
+        noise.
 
     Raises
     ------
@@ -49,24 +50,25 @@ class Parameter:
     prior: tuple[Any, Any] | None = None
 
     def __post_init__(self) -> None:
-        value = np.array(self.value, dtype=float)
+        try:
+            value = np.array(self.value, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"A parameter's value is {self.value!r}; give a number or an array of numbers.") from None
         if value.ndim > 2:
             raise InputError(f"A parameter has {value.ndim} dimensions; give a scalar, a vector or a matrix.")
         if not np.all(np.isfinite(value)):
             raise InputError("A parameter's value is not finite; give a number.")
-        lower = np.array(np.broadcast_to(np.asarray(self.bounds[0], dtype=float), value.shape))
-        upper = np.array(np.broadcast_to(np.asarray(self.bounds[1], dtype=float), value.shape))
-        fixed = np.array(np.broadcast_to(np.asarray(self.fixed, dtype=bool), value.shape))
-        if np.any(np.isnan(lower)) or np.any(np.isnan(upper)) or np.any(lower > upper):
-            raise InputError(
-                f"The bounds ({self.bounds[0]}, {self.bounds[1]}) are infeasible: the lower bound exceeds the upper one; swap or widen them."
-            )
+        lower, upper = (_filled(bound, value.shape, "bounds") for bound in _pair(self.bounds, "bounds (lower, upper)"))
+        fixed = _filled(self.fixed, value.shape, "fixed flags").astype(bool)
+        between = f"({self.bounds[0]}, {self.bounds[1]})"
+        if not np.all(lower <= upper):
+            raise InputError(f"The bounds {between} are infeasible: the lower one must not exceed the upper one.")
         if np.any((value < lower) | (value > upper)):
-            raise InputError(
-                f"The start value {self.value} lies outside its bounds ({self.bounds[0]}, {self.bounds[1]}); move it inside or widen them."
-            )
-        if self.prior is not None and not np.all(np.asarray(self.prior[1], dtype=float) > 0):
-            raise InputError(f"The prior's standard deviation is {self.prior[1]}; it must be positive.")
+            raise InputError(f"The value {self.value} lies outside its bounds {between}; move it inside or widen them.")
+        if self.prior is not None:
+            mean, std = (_filled(part, value.shape, "prior") for part in _pair(self.prior, "prior (mean, std)"))
+            if not (np.all(np.isfinite(mean)) and np.all(std > 0)):
+                raise InputError(f"The prior {self.prior} needs a finite mean and a positive standard deviation.")
         for array in (value, lower, upper, fixed):
             array.setflags(write=False)
         object.__setattr__(self, "value", value)
@@ -83,6 +85,24 @@ class Parameter:
     def size(self) -> int:
         """Number of entries."""
         return int(self.value.size)
+
+
+def _pair(given: Any, what: str) -> tuple[Any, Any]:
+    try:
+        first, second = given
+    except (TypeError, ValueError):
+        raise InputError(f"A parameter's {what} were given as {given!r}; give a pair.") from None
+    return first, second
+
+
+def _filled(given: Any, shape: tuple[int, ...], what: str) -> Array:
+    """Numbers of a parameter's shape, a copy."""
+    try:
+        return np.array(np.broadcast_to(np.asarray(given, dtype=float), shape))
+    except (TypeError, ValueError):
+        raise InputError(
+            f"The {what} {given!r} do not fit a parameter of shape {shape}; give a number or such an array."
+        ) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +191,9 @@ class ParameterSet(Mapping[str, Parameter]):
         full = {}
         for n, p in self.items():
             value = np.asarray(values.get(n, p.value), dtype=float)
-            if value.size != p.size:
+            if np.squeeze(value).shape != np.squeeze(p.value).shape:
                 raise InputError(f"Parameter {n!r} was given with shape {value.shape}; expected {p.value.shape}.")
-            full[n] = value.reshape(p.value.shape, order="F")
+            full[n] = value
         return self._stack(full)
 
     def unpack(self, vector: Array) -> dict[str, Array]:
@@ -188,7 +208,7 @@ class ParameterSet(Mapping[str, Parameter]):
         return {n: ca.reshape(vector[self.position(n)], *p.shape) for n, p in self.items()}
 
     def at(self, vector: Array) -> ParameterSet:
-        """The same set with start values taken from a vector, moved onto the bounds where rounding left them outside."""
+        """The same set with start values from a vector, moved onto the bounds where rounding left them outside."""
         values = self.unpack(np.clip(vector, self.lower, self.upper))
         return ParameterSet({n: replace(p, value=values[n]) for n, p in self.items()})
 

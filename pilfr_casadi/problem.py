@@ -23,7 +23,7 @@ from .nlp import Horizon, to_nlp
 from .recording import InputError, Recording, as_recordings
 from .sensitivities import Engine
 
-STRETCH = 2048
+STRETCH = 2_000_000  # numbers in the piece of the Jacobian that is held at a time
 
 
 @dataclass(frozen=True)
@@ -200,16 +200,16 @@ class Problem:
             if part.first is not None:
                 seed[:, n_free:] = np.eye(n_state)
                 columns = np.concatenate([columns, part.first + np.arange(n_state)])
-            for a in range(0, len(part.warm_up), STRETCH):
-                _, _, state, seed = self.engine.sensitivity(part.warm_up[a : a + STRETCH], p, state, seed, self._columns)
+            length = max(1, STRETCH // max(1, seed.shape[1] * self.model.n_y))
+            for a in range(0, len(part.warm_up), length):
+                _, _, state, seed = self.engine.sensitivity(part.warm_up[a : a + length], p, state, seed, self._columns)
             r = part.recording
-            for a in range(0, len(r), STRETCH):
-                b = min(a + STRETCH, len(r))
+            for a in range(0, len(r), length):
+                b = min(a + length, len(r))
                 y, jac, state, seed = self.engine.sensitivity(r.u[a:b], p, state, seed, self._columns)
                 cut = min(max(r.skip - a, 0), b - a)
                 e = ((y - r.y[a:b]) / self.scale)[cut:].ravel()
-                if not np.all(self.scale == 1.0):
-                    jac = jac / self.scale[None, :, None]
+                jac /= self.scale[:, None]
                 yield e, jac[cut:].reshape(e.size, -1), columns
 
     def jacobian(self, theta: np.ndarray) -> np.ndarray:
@@ -226,7 +226,8 @@ class Problem:
         for e, jac, columns in self.stretches(theta):
             value += float(e @ e)
             gradient[columns] += e @ jac
-            hessian[np.ix_(columns, columns)] += jac.T @ jac
+            square = np.ix_(columns, columns) if len(columns) < self.size else ...
+            hessian[square] += jac.T @ jac
         m = self._residuals
         gradient = gradient / m + self._prior_weight * (theta - self._prior_mean) + self._l1
         return 0.5 * value / m + self._penalty(theta), gradient, hessian / m + np.diag(self._prior_weight)

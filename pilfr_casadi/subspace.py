@@ -8,10 +8,11 @@ squares. These are the start values of Krikelis et al. (2024), Sec. 5.3; refinin
 
 :func:`frequency_subspace` follows McKelvey, Akçay & Ljung (1996), Subspace-based multivariable system identification
 from frequency response data, IEEE Trans. Automatic Control 41(7), 960-979, algorithm 2 (any frequency grid, noise
-weighting), with one change: where they stack powers ``1, z, ..., z^(r-1)``, whose rows are nearly dependent unless the
-frequencies fill the unit circle, polynomials in ``z`` are used that are orthonormal on the weighted grid (Arnoldi;
-Brubeck, Nakatsukasa & Trefethen (2021), Vandermonde with Arnoldi, SIAM Review 63(2), 405-415). Then the shift structure
-is the Arnoldi recurrence, the rows of the input need no factorization, and weighted noise stays white.
+weighting), with two changes. Where they stack powers ``1, z, ..., z^(r-1)``, which are nearly dependent unless the
+frequencies fill the unit circle, polynomials in ``z`` are used that are orthonormal on the grid (Brubeck, Nakatsukasa &
+Trefethen (2021), Vandermonde with Arnoldi, SIAM Review 63(2), 405-415); the shift structure then is the recurrence of
+the polynomials. And with several outputs `C`, `D` and `B`, `D` are solved for in turn a few times, as `C` from the
+singular vectors alone is the least certain part.
 
 :func:`time_subspace` is PO-MOESP, past inputs and outputs as instruments: Verhaegen (1994), Identification of the
 deterministic part of MIMO state space models given in innovations form, Automatica 30(1), 61-74.
@@ -21,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -37,8 +38,9 @@ Data = BLA | Recording | Iterable[Recording]
 CHUNK = 8192  # rows handled at once in a sequential QR
 ROUNDING = 1e-8  # relative errors below are rounding
 LADDER = tuple(round(4 * 1.5**k) for k in range(12))  # numbers of block rows to try: 4, 6, 9, 14, 20, 30, ...
-TRIALS = 4  # how many of them for each order
-BUDGET = 4e9  # and none above the first that takes more multiplications than this (samples times rows squared)
+TRIALS = 4  # how many of them for each order, besides the least
+BUDGET = 4e9  # none above the first that takes more multiplications than this (samples times rows squared)
+SWEEPS = 2  # turns of solving for C, D and for B, D
 
 
 def frequency_subspace(bla: BLA, nx: int, weight: bool = True, block_rows: int | None = None) -> control.StateSpace:
@@ -157,7 +159,7 @@ def singular_values(data: Data, block_rows: int | None = None, weight: bool = Tr
         When the data are too few.
     """
     problem = _FrequencyProblem(data, weight) if isinstance(data, BLA) else _TimeProblem(data, offset)
-    return problem.range_space(problem.ladder(1, block_rows or min(20, max(2, problem.most_rows)))[0])[2]
+    return problem.range_space(problem.ladder(1, block_rows or min(20, max(2, problem.most_rows)))[0]).values
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -240,7 +242,7 @@ def select_order(
     train_error, error = (np.array([part.error(m) for m in models]) for part in (train, held))
     good_enough = max((1 + margin) * np.min(error), ROUNDING)
     recommended = next(n for n, e in zip(tried, error, strict=True) if e <= good_enough)
-    values = train.range_space(min(20, train.most_rows))[2]
+    values = train.range_space(min(20, train.most_rows)).values
     return OrderSelection(tuple(tried), train_error, error, recommended, margin, values)
 
 
@@ -366,12 +368,20 @@ class _Matrices:
         return control.StateSpace(self.A, self.B, self.C, self.D, dt)
 
 
+class _RangeSpace(NamedTuple):
+    rows: Array
+    shifted: Array
+    C: Array
+    values: Array
+
+
 class _Problem:
     """What the two ways share: from range spaces to models, the best over a few numbers of block rows.
 
-    A problem supplies `range_space(r)`: the observability matrix up to a basis change, the same shifted by one step
-    (one block row less), and the singular values, in outputs divided by `y_scale`; and `reduced(A, C)`: triangular
-    factors ``[K y]`` of the least-squares problems ``K theta = y`` for `B` and `D`, input after input.
+    A problem supplies `range_space(r)`: with as many columns as singular values, the observability matrix without its
+    last block row, the same shifted by one step (both weighted alike), its first block row `C` in outputs divided by
+    `y_scale`, and the singular values; and `reduced(A, C)`: triangular factors ``[K y]`` of the least-squares problems
+    ``K theta = y`` for `B` and `D`, input after input.
     """
 
     dt: float
@@ -382,7 +392,7 @@ class _Problem:
     size: float  # sum of squares of the (weighted) data
     too_few: str
 
-    def range_space(self, r: int) -> tuple[Array, Array, Array]:
+    def range_space(self, r: int) -> _RangeSpace:
         raise NotImplementedError
 
     def reduced(self, A: Array, C: Array) -> list[Array]:
@@ -403,21 +413,22 @@ class _Problem:
                     f"block_rows is {block_rows}; for order {nx} and these data give {least} to {self.most_rows}."
                 )
             return [block_rows]
-        steps = [r for r in LADDER if least < r <= self.most_rows][:TRIALS] or [min(least + 1, self.most_rows)]
-        return [r for r in steps if r <= max(self.affordable_rows, steps[0])]
+        first = min(least + 1, self.most_rows)
+        steps = [r for r in LADDER if first < r <= self.most_rows][:TRIALS]
+        return [first, *steps[:1], *(r for r in steps[1:] if r <= self.affordable_rows)]
 
     def solve(self, orders: list[int], block_rows: int | None) -> list[_Matrices]:
         """Return the best model of each order."""
-        spaces: dict[int, tuple[Array, Array, Array]] = {}
+        spaces: dict[int, _RangeSpace] = {}
         models = []
         for nx in orders:
             trials = []
             for r in self.ladder(nx, block_rows):
                 if r not in spaces:
                     spaces[r] = self.range_space(r)
-                basis, shifted, _ = spaces[r]
-                A = np.linalg.lstsq(basis[: len(shifted), :nx], shifted[:, :nx], rcond=None)[0]
-                trials.append(self.complete(_reflected(A), basis[: len(self.y_scale), :nx]))
+                rows, shifted, C = (x[:, :nx] for x in spaces[r][:3])
+                A = np.linalg.lstsq(rows, shifted, rcond=None)[0]
+                trials.append(self.complete(_reflected(A), C))
             models.append(min(trials, key=lambda trial: trial[1])[0])
         return models
 
@@ -470,14 +481,14 @@ class _FrequencyProblem(_Problem):
         self.most_rows = (2 * F * n_u - 1) // (n_y + n_u) if 2 * F > 2 else 0
         self.too_few = f"{F} frequencies are too few"
 
-    def range_space(self, r: int) -> tuple[Array, Array, Array]:
-        F, n_y, _ = self.G.shape
-        s = 1 / np.sqrt(np.mean(self.var, axis=(1, 2)))
-        Q, H = _orthonormal_polynomials(self.z, s, r)
-        T = (Q[:, None, None, :] * self.G.transpose(1, 2, 0)).reshape(-1, F)
-        for _ in range(2):  # project off the rows of the input, which are orthonormal
-            T -= (T @ Q.conj().T).real @ Q
-        T = np.stack([T.real, T.imag], axis=-1).reshape(r * n_y, -1)
+    def range_space(self, r: int) -> _RangeSpace:
+        F, n_y, n_u = self.G.shape
+        P, H = _orthonormal_polynomials(self.z, r)
+        Q = P * np.sqrt(np.mean(1 / self.var, axis=(1, 2)))
+        T = _real((Q[:, None, None, :] * self.G.transpose(1, 2, 0)).reshape(-1, F))
+        inputs = np.linalg.qr(_real(Q).T)[0].T
+        T -= (T @ inputs.T) @ inputs  # project off the rows of the input, the same for every input
+        T = T.reshape(r * n_y, n_u * 2 * F)
         K = np.eye(r * n_y)
         if self.weighted:  # covariance of the noise in T is K K'
             for i in range(n_y):
@@ -485,21 +496,23 @@ class _FrequencyProblem(_Problem):
                 K[i::n_y, i::n_y] = np.linalg.cholesky(covariance)
             T = np.linalg.solve(K, T)
         left, values, _ = np.linalg.svd(_triangle(T.T).T)
-        basis = np.linalg.norm(s) * (K @ left)
-        shifted = np.einsum("ij,iok->jok", H, basis.reshape(r, n_y, -1)).reshape((r - 1) * n_y, -1)
-        return basis, shifted, values
+        basis = (K @ left).reshape(r, n_y, -1)
+        shifted = np.einsum("ij,iok->jok", H, basis).reshape((r - 1) * n_y, -1)
+        m = len(shifted)
+        return _RangeSpace(left[:m], np.linalg.solve(K[:m, :m], shifted), basis[0] / P[0, 0].real, values)
 
     def reduced(self, A: Array, C: Array) -> list[Array]:
-        F, n_y, n_u = self.G.shape
-        K = np.empty((F, n_y, len(A) + n_y + 1), dtype=complex)
-        K[..., : len(A)] = _resolvent(A, C, self.z)
-        K[..., len(A) : -1] = np.eye(n_y)
-        blocks = []
-        for j in range(n_u):
-            K[..., -1] = self.G[..., j]
-            rows = (K / np.sqrt(self.var[..., j, None])).reshape(F * n_y, -1)
-            blocks.append(_triangle(np.concatenate([rows.real, rows.imag])))
-        return blocks
+        return _response_problems(A, C, self.z, self.G, self.var)
+
+    def complete(self, A: Array, C: Array) -> tuple[_Matrices, float]:
+        model, error = super().complete(A, C)
+        if len(self.y_scale) > 1:
+            G, var = self.G.swapaxes(1, 2), self.var.swapaxes(1, 2)
+            for _ in range(SWEEPS):  # C and D are to the transposed response what B and D are to the response
+                blocks = _response_problems(A.T, (model.B * self.u_scale).T, self.z, G, var)
+                C = np.array([_least_squares(R[:, :-1], R[:, -1])[: len(A)] for R in blocks])
+                model, error = super().complete(A, C)
+        return model, error
 
 
 class _TimeProblem(_Problem):
@@ -521,7 +534,7 @@ class _TimeProblem(_Problem):
         self.affordable_rows = np.sqrt(BUDGET / lengths.sum()) / (2 * n)
         self.too_few = f"{lengths.sum()} samples in {len(lengths)} recording(s) are too few"
 
-    def range_space(self, r: int) -> tuple[Array, Array, Array]:
+    def range_space(self, r: int) -> _RangeSpace:
         n_u, n_y = len(self.u_scale), len(self.y_scale)
         R = None
         for u, y in self.records:
@@ -543,7 +556,7 @@ class _TimeProblem(_Problem):
         assert R is not None
         past = r * (2 * n_u + n_y)
         left, values, _ = np.linalg.svd(R[r * n_u : past, past:].T)
-        return left, left[n_y:], values
+        return _RangeSpace(left[:-n_y], left[n_y:], left[:n_y], values)
 
     def reduced(self, A: Array, C: Array) -> list[Array]:
         n_u, n_y, nx = len(self.u_scale), len(self.y_scale), len(A)
@@ -594,22 +607,40 @@ def _balanced_units(size: Array) -> tuple[Array, Array]:
     return rows, columns
 
 
-def _orthonormal_polynomials(z: Array, s: Array, r: int) -> tuple[Array, Array]:
-    """Polynomials of degree 0 to r - 1 at `z`, times `s`, orthonormal over `z` and its conjugates.
+def _orthonormal_polynomials(z: Array, r: int) -> tuple[Array, Array]:
+    """Polynomials of degree 0 to r - 1 at `z`, orthonormal over `z` and its conjugates.
 
-    Returns the values, (r, F), and the real recurrence `H`, (r, r - 1): ``z q_j = sum_i H[i, j] q_i``.
+    Returns the values, (r, F), and the real recurrence `H`, (r, r - 1): ``z p_j = sum_i H[i, j] p_i``.
     """
-    Q, H = np.empty((r, len(z)), dtype=complex), np.zeros((r, r - 1))
-    Q[0] = s / np.linalg.norm(s)
+    P, H = np.empty((r, len(z)), dtype=complex), np.zeros((r, r - 1))
+    P[0] = 1 / np.sqrt(len(z))
     for j in range(r - 1):
-        v = z * Q[j]
+        v = z * P[j]
         for _ in range(2):
-            h = (Q[: j + 1].conj() @ v).real
+            h = (P[: j + 1].conj() @ v).real
             H[: j + 1, j] += h
-            v -= h @ Q[: j + 1]
+            v -= h @ P[: j + 1]
         H[j + 1, j] = np.linalg.norm(v)
-        Q[j + 1] = v / H[j + 1, j]
-    return Q, H
+        P[j + 1] = v / H[j + 1, j]
+    return P, H
+
+
+def _real(X: Array) -> Array:
+    return np.concatenate([X.real, X.imag], axis=1)
+
+
+def _response_problems(A: Array, C: Array, z: Array, G: Array, var: Array) -> list[Array]:
+    """Triangular factors ``[K y]`` of ``(C (z I - A)⁻¹ b + d) / std = G[:, :, j] / std``, one for each input j."""
+    F, n_y, n_u = G.shape
+    K = np.empty((F, n_y, len(A) + n_y + 1), dtype=complex)
+    K[..., : len(A)] = _resolvent(A, C, z)
+    K[..., len(A) : -1] = np.eye(n_y)
+    blocks = []
+    for j in range(n_u):
+        K[..., -1] = G[..., j]
+        rows = (K / np.sqrt(var[..., j, None])).reshape(F * n_y, -1)
+        blocks.append(_triangle(np.concatenate([rows.real, rows.imag])))
+    return blocks
 
 
 def _resolvent(A: Array, C: Array, z: Array) -> Array:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -124,13 +124,14 @@ def lti(seed: int = 0) -> Case:
     u = _excitation(rng, 1000, f_max=20.0)
     y = simulate_lfr(linear | none, u, lambda z, q: (z, q))
     start = {k: v * (1 + 0.1 * rng.uniform(-1, 1, v.shape)) for k, v in linear.items()}
+    start["A"] = 0.95 * start["A"]
     return Case(PILFR(3).model(1, 2, start), (_record(u, y, rng, 0.01),), (y,))
 
 
 def backlash_loop(seed: int = 0) -> Case:
     """A position servo that measures its load behind a backlash: `z` the motor, `w` the load, closed by the controller."""
     rng = np.random.default_rng(seed)
-    gain, r = 0.3, 0.3
+    gain, r = 0.3, 0.1
     blocks = {
         "A": np.array([[0.85, 0.0], [0.12, 1.0]]),
         "B_u": np.array([[gain], [0.0]]),
@@ -169,9 +170,9 @@ def _layer(rng: np.random.Generator, n: int, reach: float, channels: int = 1) ->
 
 
 def pi_hammerstein(seed: int = 0) -> Case:
-    """An actuator with hysteresis before a resonance; five plays, fitted by five from a grid."""
+    """An actuator with hysteresis before a resonance; three plays, fitted by three from a grid."""
     rng = np.random.default_rng(seed)
-    w, r = _layer(rng, 5, 1.5)
+    w, r = _layer(rng, 3, 1.5)
     blocks = {
         "A": np.array([[0.9, 0.3], [-0.3, 0.9]]),
         "B_u": np.zeros((2, 1)),
@@ -185,13 +186,14 @@ def pi_hammerstein(seed: int = 0) -> Case:
     u = _excitation(rng, 1200)
     y = simulate_lfr(blocks, u, plays(w, r))
     record = _record(u, y, rng, 0.01)
-    return Case(identified(hammerstein(2, PrandtlIshlinskii(Play, 5), offset=False), record, rng), (record,), (y,))
+    return Case(identified(hammerstein(2, PrandtlIshlinskii(Play, 3), offset=False), record, rng), (record,), (y,))
 
 
 def pi_wiener(seed: int = 0) -> Case:
-    """A resonance read through a sensor with hysteresis; five plays, fitted by five from a grid."""
+    """A resonance read through a sensor with hysteresis; six plays at known thresholds, two of them idle."""
     rng = np.random.default_rng(seed)
-    w, r = _layer(rng, 5, 1.5)
+    r = np.array([[0.0, 0.1, 0.25, 0.5, 0.8, 1.2]])
+    w = np.array([[0.3, 0.3, 0.0, 0.2, 0.3, 0.0]])
     blocks = {
         "A": np.array([[0.9, 0.3], [-0.3, 0.9]]),
         "B_u": np.array([[0.1], [0.3]]),
@@ -205,13 +207,15 @@ def pi_wiener(seed: int = 0) -> Case:
     u = _excitation(rng, 1200)
     y = simulate_lfr(blocks, u, plays(w, r))
     record = _record(u, y, rng, 0.01)
-    return Case(identified(wiener(2, PrandtlIshlinskii(Play, 5), offset=False), record, rng), (record,), (y,))
+    structure = wiener(2, PrandtlIshlinskii(Play, 6), offset=False)
+    structure = replace(structure, fixed={**structure.fixed, "r": r})
+    return Case(identified(structure, record, rng), (record,), (y,), {"w": w})
 
 
 def mimo_lfr(seed: int = 0) -> Case:
     """Two inputs, two outputs, two channels of hysteresis in feedback around two coupled resonances."""
     rng = np.random.default_rng(seed)
-    w, r = _layer(rng, 4, 2.0, channels=2)
+    w, r = _layer(rng, 2, 1.0, channels=2)
     a = np.zeros((4, 4))
     for i, (radius, angle) in enumerate(((0.93, 0.15), (0.9, 0.35))):
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
@@ -230,18 +234,20 @@ def mimo_lfr(seed: int = 0) -> Case:
     u = _excitation(rng, 1500, n_u=2)
     y = simulate_lfr(blocks, u, plays(w, r))
     record = _record(u, y, rng, 0.01)
-    return Case(identified(PILFR(4, PrandtlIshlinskii(Play, 4, channels=2), offset=False), record, rng), (record,), (y,))
+    return Case(identified(PILFR(4, PrandtlIshlinskii(Play, 2, channels=2), offset=False), record, rng), (record,), (y,))
 
 
 def asymmetric(seed: int = 0) -> Case:
-    """A static actuator whose loop saturates on one side only: generalized plays between two unlike envelopes, Eq. 7."""
+    """A static actuator whose loop bends on one side only: generalized plays between two unlike envelopes, Eq. 7."""
     rng = np.random.default_rng(seed)
     w, r = _layer(rng, 3, 0.8)
+    truth = {"left": 0.5, "right": 0.1, "knee": 1.5, "shift": 0.4}
 
     def law(z: np.ndarray, q: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         q = np.zeros_like(r) if q is None else q
-        low = (0.2 + 0.6 * z + 0.5 * np.tanh(1.5 * z - 0.5))[:, None] - r
-        high = (0.1 + 0.7 * z + 0.3 * np.tanh(2.0 * z + 1.0))[:, None] + r
+        bend = np.tanh(truth["knee"] * z - truth["shift"])[:, None]
+        low = z[:, None] + truth["left"] * bend - r
+        high = z[:, None] + truth["right"] * bend + r
         q = np.maximum(low, np.minimum(np.maximum(high, low), q))
         return np.sum(w * q, axis=1), q
 
@@ -249,10 +255,23 @@ def asymmetric(seed: int = 0) -> Case:
     empty = {"A": np.zeros((0, 0)), "B_u": np.zeros((0, 1)), "B_w": np.zeros((0, 1)), "C_y": np.zeros((1, 0))}
     u = _excitation(rng, 1000)
     y = simulate_lfr(through | empty, u, law)
-    element = PrandtlIshlinskii(GeneralizedPlay(neurons=1), 3)
+    extra = ParameterSet(
+        {
+            "left": Parameter(0.2, bounds=(0.0, 2.0)),
+            "right": Parameter(0.2, bounds=(0.0, 2.0)),
+            "knee": Parameter(1.0, bounds=(0.1, 5.0)),
+            "shift": Parameter(0.0, bounds=(-2.0, 2.0)),
+        }
+    )
+    operator = GeneralizedPlay(
+        gamma_l=lambda z, p: z + p["left"] * ca.tanh(p["knee"] * z - p["shift"]),
+        gamma_r=lambda z, p: z + p["right"] * ca.tanh(p["knee"] * z - p["shift"]),
+        extra=extra,
+    )
     start = {"w": np.full((1, 3), 1 / 3), "r": np.array([[0.0, 0.3, 0.6]])}
     fixed = {"D_zu": 1.0, "D_yw": 1.0, "D_yu": 0.0}
-    return Case(PILFR(0, element, fixed, offset=False).model(1, 1, start), (_record(u, y, rng, 0.01),), (y,))
+    model = PILFR(0, PrandtlIshlinskii(operator, 3), fixed, offset=False).model(1, 1, start)
+    return Case(model, (_record(u, y, rng, 0.01),), (y,), truth | {"w": w, "r": r})
 
 
 def rig_with_open_spring(stops: int = 10) -> Model:

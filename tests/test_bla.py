@@ -106,7 +106,7 @@ def cubic(n_periods, rng, noise=1e-3, n=256):
 
 
 def test_total_variance_of_a_cubic_matches_monte_carlo():
-    """Static y = u + 0.1 u³: the BLA is 1 + 0.3 (2 - 1 / F) / 2 for F equal lines; distortion dominates the noise."""
+    """Static y = u + 0.1 u³ under F equal lines of unit power: the BLA is 1 + 0.3 (1 - 1 / 2F); distortion rules."""
     rng, runs = np.random.default_rng(7), 150
     blas = [robust_bla([cubic(2, rng) for _ in range(4)]) for _ in range(runs)]
     G = np.array([b.G for b in blas])[..., 0, 0]
@@ -214,6 +214,19 @@ def test_plain_bla_averages_periods_and_agrees_with_the_robust_one():
     at = np.isin(robust.frequency, plain.frequency)
     assert at.sum() == len(plain.frequency)
     assert np.linalg.norm(plain.G - robust.G[at]) < 0.02 * np.linalg.norm(plain.G)
+
+
+def test_plain_bla_trusts_a_recording_by_its_periods():
+    """One noisy period and sixteen of them: 1/17 of the variance of one, where equal trust would leave a quarter."""
+    rng, model, lines = np.random.default_rng(11), system(), np.arange(1, 1000)
+    squares = []
+    for _ in range(20):
+        inputs = [multisine(2048, lines, rng)[:, None] for _ in range(2)]
+        few, many = (periodic(u, steady(model, u), p, rng, 0.2) for u, p in zip(inputs, (1, 16), strict=True))
+        both, alone = (plain_bla(r, window=20) for r in ([few, many], few))
+        squares.append([np.mean(np.abs(b.G - frequency_response(model, b.frequency)) ** 2) for b in (both, alone)])
+    both, alone = np.mean(squares, axis=0)
+    assert both < 0.1 * alone
 
 
 def test_plain_bla_returns_few_frequencies_and_leaves_out_what_is_not_excited():

@@ -13,7 +13,7 @@ LAYERS = {
     1: ("operators", "elements"),
     2: ("model", "simulator"),
     3: ("simulate", "sensitivities", "compiled", "bla", "subspace"),
-    4: ("lfr", "gauge", "start", "problem", "nlp", "constraints", "baselines"),
+    4: ("lfr", "conversion", "gauge", "normal_form", "start", "problem", "nlp", "constraints", "baselines"),
     5: ("gauss_newton", "ipopt", "solution"),
     6: ("fit", "multistart", "export", "plots"),
     7: ("diagnose",),

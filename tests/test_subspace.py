@@ -172,6 +172,20 @@ def test_weights_use_the_frequencies_that_are_certain():
     assert error[0] < 1e-3 * np.sqrt(low.sum() * 4)  # below the noise that was averaged
 
 
+def test_a_noisy_output_does_not_spoil_a_clean_one():
+    """The clean output's response is known far better than by its single lines, whatever the other one's noise."""
+    rng = np.random.default_rng(17)
+    true = random_system(4, 2, 2, rng)
+    frequency = np.linspace(0.01, 4.99, 300)
+    G = frequency_response(true, frequency)
+    std = np.array([[1e-3], [3.0]]) * np.ones(G.shape)
+    noise = std * (rng.standard_normal(G.shape) + 1j * rng.standard_normal(G.shape)) / np.sqrt(2)
+    model = frequency_subspace(BLA(frequency, G + noise, None, std**2, DT), 4, block_rows=9)
+    error = np.abs(frequency_response(model, frequency) - G)
+    assert np.sqrt(np.mean(error[:, 0] ** 2)) < 1e-3 / 3
+    assert np.sqrt(np.mean(error[:, 1] ** 2)) < 3.0 / 3
+
+
 def test_models_do_not_depend_on_units():
     rng = np.random.default_rng(9)
     true = random_system(4, 2, 2, rng)

@@ -19,14 +19,14 @@ MOST = 3000  # points of a line before it is thinned
 DEEPEST = 200.0  # dB below the largest value that are still drawn
 
 
-def new_figure(width: float = 6.0, height: float = 3.7) -> Figure:
+def new_figure(width: float = 5.2, height: float = 3.5) -> Figure:
     """An empty figure of a size in inches, laid out so that nothing overlaps or is cut off."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def axes_or_new(ax: Axes | None, width: float = 6.0, height: float = 3.7) -> Axes:
+def axes_or_new(ax: Axes | None) -> Axes:
     """The axes given, or those of a new figure; `axes.figure` leads back to it."""
-    return new_figure(width, height).add_subplot() if ax is None else ax
+    return new_figure().add_subplot() if ax is None else ax
 
 
 def finish(ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, beside: Axes | None = None) -> Axes:
@@ -41,8 +41,19 @@ def finish(ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, besid
     handles = [h for axes in (ax, beside) if axes is not None for h in axes.get_legend_handles_labels()[0]]
     if handles:
         shown = ax.legend(
-            handles=handles, title=plain(title) or None, alignment="left", loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
-            fontsize=FONT - 1, title_fontsize=FONT + 0.5, frameon=False, handlelength=1.6, columnspacing=1.2, borderaxespad=0.2, borderpad=0.1,
+            handles=handles,
+            title=plain(title) or None,
+            alignment="left",
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=columns,
+            fontsize=FONT - 1,
+            title_fontsize=FONT + 0.5,
+            frameon=False,
+            handlelength=1.6,
+            columnspacing=1.2,
+            borderaxespad=0.2,
+            borderpad=0.1,
         )
         for handle in shown.get_lines():
             handle.set_linewidth(max(float(handle.get_linewidth()), 2.0))

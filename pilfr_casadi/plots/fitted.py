@@ -16,7 +16,23 @@ from ..bla import output_spectra
 from ..metrics import nrmse
 from ..recording import InputError, Recording, as_recordings
 from ..start import density
-from .canvas import BLUE, GREEN, GREY, INK, PURPLE, SKY, VERMILLION, axes_or_new, decibel, finish, limit_depth, line, new_figure, scaled, with_unit
+from .canvas import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    axes_or_new,
+    decibel,
+    finish,
+    limit_depth,
+    line,
+    new_figure,
+    scaled,
+    with_unit,
+)
 
 if TYPE_CHECKING:
     from ..fit import Fit
@@ -24,7 +40,9 @@ if TYPE_CHECKING:
 Curve = Callable[[np.ndarray], np.ndarray]
 
 
-def plot_fit(fit: Fit, recordings: Recording | Sequence[Recording], *, steady: Sequence[Recording] | None = None) -> Figure:
+def plot_fit(
+    fit: Fit, recordings: Recording | Sequence[Recording], *, steady: Sequence[Recording] | None = None
+) -> Figure:
     """One figure: time and spectrum of every recording and output, then the loop, loading curve and weights of every channel.
 
     Parameters
@@ -77,17 +95,33 @@ def time(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = N
     return finish(ax, "time [s]", with_unit(recording.outputs[output], unit), recording.name)
 
 
-def traces(fit: Fit, recording: Recording, *, output: int = 0, between: tuple[float, float] | None = None, ax: Axes | None = None) -> Axes:
+def traces(
+    fit: Fit,
+    recording: Recording,
+    *,
+    output: int = 0,
+    between: tuple[float, float] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
     """Measured and simulated output over a stretch of time, in s; by default some swings around the largest excursion."""
     ax, y = axes_or_new(ax), recording.y[:, output]
     begin, end = between or _busiest(y - np.mean(y), recording)
     part = slice(*np.clip(np.round(np.array([begin, end]) / recording.dt).astype(int), 0, len(y)))
     if part.stop - part.start < 2:
-        raise InputError(f"From {begin:g} to {end:g} s there are no two samples; the recording lasts {len(y) * recording.dt:g} s.")
+        raise InputError(
+            f"From {begin:g} to {end:g} s there are no two samples; the recording lasts {len(y) * recording.dt:g} s."
+        )
     size, unit = scaled(y[part], _unit(fit, recording, recording.outputs[output]))
     line(ax, recording.t[part], y[part] / size, "measured", BLUE, linewidth=3.2, alpha=0.55)
     if _compares(fit):
-        line(ax, recording.t[part], linear_simulation(fit, recording)[part, output] / size, "linear model", VERMILLION, linewidth=1.2)
+        line(
+            ax,
+            recording.t[part],
+            linear_simulation(fit, recording)[part, output] / size,
+            "linear model",
+            VERMILLION,
+            linewidth=1.2,
+        )
     line(ax, recording.t[part], fit.simulate(recording)[part, output] / size, "this model", INK, linewidth=1.2)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", with_unit(recording.outputs[output], unit), recording.name, 3)
@@ -104,7 +138,45 @@ def _busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
     return begin * recording.dt, max(end, begin + 2) * recording.dt
 
 
-def spectrum(fit: Fit, recording: Recording, *, output: int = 0, steady: Sequence[Recording] | None = None, ax: Axes | None = None) -> Axes:
+def remains(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
+    """What the fit leaves over, alone over time and in its own scale."""
+    ax, residual = axes_or_new(ax), (fit.simulate(recording) - recording.y)[:, output]
+    size, unit = scaled(residual, _unit(fit, recording, recording.outputs[output]))
+    scored = residual[recording.skip :] / size
+    line(
+        ax,
+        recording.t,
+        residual / size,
+        f"residual, this model (rms {np.sqrt(np.mean(scored**2)):.3g}{' ' + unit if unit else ''})",
+        INK,
+        linewidth=0.8,
+    )
+    if recording.skip:
+        ax.axvspan(0, recording.skip * recording.dt, color="#EEEEEE", label="not scored")
+    ax.margins(x=0.01)
+    return finish(ax, "time [s]", with_unit(f"simulated − measured {recording.outputs[output]}", unit), recording.name)
+
+
+def output_over_input(
+    fit: Fit, recording: Recording, *, input: int = 0, output: int = 0, ax: Axes | None = None
+) -> Axes:
+    """Measured and simulated output over an input: the nested loops of a quasi-static device."""
+    ax, u, name = axes_or_new(ax), recording.u[:, input], recording.outputs[output]
+    size, unit = scaled(recording.y[:, output], _unit(fit, recording, name))
+    ax.plot(u, recording.y[:, output] / size, color=BLUE, linewidth=2.6, alpha=0.5, label="measured", rasterized=True)
+    ax.plot(u, fit.simulate(recording)[:, output] / size, color=INK, linewidth=0.8, label="this model", rasterized=True)
+    across = recording.inputs[input]
+    return finish(ax, with_unit(across, _unit(fit, recording, across)), with_unit(name, unit), recording.name)
+
+
+def spectrum(
+    fit: Fit,
+    recording: Recording,
+    *,
+    output: int = 0,
+    steady: Sequence[Recording] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
     """Amplitude densities of output and residuals over frequency, with noise and total distortion where known, as Fig. 9 (right).
 
     All lines are densities (per root hertz) of the signals as recorded, so records of any length and levels from periods can be
@@ -125,7 +197,10 @@ def spectrum(fit: Fit, recording: Recording, *, output: int = 0, steady: Sequenc
     ax = axes_or_new(ax)
     name = recording.outputs[output]
     curves: list[np.ndarray] = []
-    for label, signal, colour in [("measured output", recording.y[:, output], BLUE), *_residuals(fit, recording, output)]:
+    for label, signal, colour in [
+        ("measured output", recording.y[:, output], BLUE),
+        *_residuals(fit, recording, output),
+    ]:
         f, power = amplitude_density(signal, recording)
         curves.append(decibel(power))
         line(ax, f, curves[-1], label, colour, linewidth=1.1)
@@ -154,24 +229,39 @@ def amplitude_density(x: np.ndarray, recording: Recording) -> tuple[np.ndarray, 
     return f[1:], power[1:]
 
 
-def loop(fit: Fit, recording: Recording, *, channel: int = 0, ax: Axes | None = None) -> Axes:
-    """The identified hysteresis: the element's output w over its input z along a recording, as Fig. 15."""
+def loop(fit: Fit, recording: Recording, *, channel: int = 0, bare: bool = False, ax: Axes | None = None) -> Axes:
+    """The identified hysteresis: the element's output w over its input z along a recording, as Fig. 15.
+
+    With `bare` the straight line through the origin that fits w best is taken off, so that the hysteresis alone is seen.
+    """
     _check_channel(fit, channel)
-    signals = fit.signals(recording)
-    ax = axes_or_new(ax, 4.6, 3.7)
-    ax.plot(signals["z"][:, channel], signals["w"][:, channel], color=BLUE, linewidth=0.7, rasterized=True)
-    return finish(ax, f"z{_index(fit, channel)} (model scale)", f"w{_index(fit, channel)} (model scale)", ", ".join(filter(None, ("identified loop", recording.name))))
+    signals, index = fit.signals(recording), _index(fit, channel)
+    z, w = (signals[key][:, channel] for key in "zw")
+    what, title = f"w{index}", "identified loop"
+    if bare:
+        slope = float(z @ w / (z @ z)) if np.any(z) else 0.0
+        w, what, title = w - slope * z, f"w{index} − {slope:.3g} z{index}", "identified loop without its slope"
+    ax = axes_or_new(ax)
+    ax.plot(z, w, color=BLUE, linewidth=0.7, rasterized=True)
+    return finish(
+        ax, f"z{index} (model scale)", f"{what} (model scale)", ", ".join(filter(None, (title, recording.name)))
+    )
 
 
 def loading_curve(
-    fit: Fit, recordings: Recording | Sequence[Recording] | None = None, *, channel: int = 0, reference: Curve | None = None, ax: Axes | None = None
+    fit: Fit,
+    recordings: Recording | Sequence[Recording] | None = None,
+    *,
+    channel: int = 0,
+    reference: Curve | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """The element's response to z growing from rest (virgin curve); the range that the recordings visit is shaded.
 
     `reference` is a curve to compare with, from z (G,) to w (G,), in the scale of the model.
     """
     _check_channel(fit, channel)
-    ax, reach, limit = axes_or_new(ax, 4.6, 3.7), _reach(fit, recordings, channel), _range(fit, recordings, channel)
+    ax, reach, limit = axes_or_new(ax), _reach(fit, recordings, channel), _range(fit, recordings, channel)
     z = np.linspace(0.0, limit, 300)
     if reach:
         ax.axvspan(0, reach, color="#E8F1F7", linewidth=0, label="|z| in the recordings")
@@ -179,7 +269,9 @@ def loading_curve(
     if reference is not None:
         ax.plot(z, reference(z), color=INK, linewidth=1.4, linestyle="--", label="reference")
     ax.margins(x=0)
-    return finish(ax, f"z{_index(fit, channel)} (model scale)", f"w{_index(fit, channel)} (model scale)", "loading curve")
+    return finish(
+        ax, f"z{_index(fit, channel)} (model scale)", f"w{_index(fit, channel)} (model scale)", "loading curve"
+    )
 
 
 def virgin_curve(fit: Fit, z: np.ndarray, channel: int = 0) -> np.ndarray:
@@ -193,7 +285,12 @@ def virgin_curve(fit: Fit, z: np.ndarray, channel: int = 0) -> np.ndarray:
 
 
 def weights(
-    fit: Fit, recordings: Recording | Sequence[Recording] | None = None, *, channel: int = 0, reference: Curve | None = None, ax: Axes | None = None
+    fit: Fit,
+    recordings: Recording | Sequence[Recording] | None = None,
+    *,
+    channel: int = 0,
+    reference: Curve | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Weight over threshold of every operator, and the density of weights over thresholds that they stand for.
 
@@ -202,8 +299,10 @@ def weights(
     _check_channel(fit, channel)
     values = fit.parameters
     if not {"r", "w"} <= set(values):
-        raise InputError("The element has no thresholds r and weights w; only a Prandtl-Ishlinskii element has a density of weights.")
-    ax = axes_or_new(ax, 4.6, 3.7)
+        raise InputError(
+            "The element has no thresholds r and weights w; only a Prandtl-Ishlinskii element has a density of weights."
+        )
+    ax = axes_or_new(ax)
     r, w = values["r"][channel], values["w"][channel]
     order, limit = np.argsort(r), _range(fit, recordings, channel)
     r, w = r[order], w[order]
@@ -219,7 +318,9 @@ def weights(
     finish(right, "", "density dw/dr").grid(False)
     right.get_legend().remove()
     right.spines["right"].set_visible(True)
-    finish(ax, f"threshold r{_index(fit, channel)} (model scale)", "weight w", "weights over thresholds", 1, beside=right)
+    finish(
+        ax, f"threshold r{_index(fit, channel)} (model scale)", "weight w", "weights over thresholds", 1, beside=right
+    )
     right.set_ylim(bottom=0)
     ax.set_ylim(bottom=0)
     ax.set_xlim(-0.02 * limit, limit)
@@ -231,9 +332,22 @@ def convergence(fit: Fit, *, ax: Axes | None = None) -> Axes:
     ax = axes_or_new(ax)
     histories = [c.solution.history for c in fit.candidates if c.solution.history]
     for k, history in enumerate(histories):
-        ax.plot([h.number for h in history], _error(history), color=GREY, linewidth=0.9, alpha=0.7, label="starts" if k == 0 else None)
+        ax.plot(
+            [h.number for h in history],
+            _error(history),
+            color=GREY,
+            linewidth=0.9,
+            alpha=0.7,
+            label="starts" if k == 0 else None,
+        )
     if fit.solution.history:
-        ax.plot([h.number for h in fit.solution.history], _error(fit.solution.history), color=VERMILLION, linewidth=2.0, label="last solve of the best")
+        ax.plot(
+            [h.number for h in fit.solution.history],
+            _error(fit.solution.history),
+            color=VERMILLION,
+            linewidth=2.0,
+            label="last solve of the best",
+        )
     ax.set_yscale("log")
     return finish(ax, "iteration", "training error √(2 · cost)", "convergence")
 
@@ -260,7 +374,7 @@ def _residuals(fit: Fit, recording: Recording, output: int) -> list[tuple[str, n
 def _named(model: str, recording: Recording, simulated: np.ndarray, output: int) -> tuple[str, np.ndarray]:
     y, y_hat = recording.y[:, output], simulated[:, output]
     try:
-        share = f" ({100 * nrmse(y, y_hat, recording.skip):.3g} %)"
+        share = f" {100 * nrmse(y, y_hat, recording.skip):.3g} %"
     except InputError:  # a constant output has no relative error
         share = ""
     return f"residual, {model}{share}", y_hat - y
@@ -279,7 +393,9 @@ def linear_simulation(fit: Fit, recording: Recording) -> np.ndarray:
     if fit.linear is None:
         raise InputError("The fit holds no linear model to compare with.")
     given = not isinstance(recording.initial, str)
-    return replace(fit, model=fit.linear, linear=None).simulate(recording.with_(initial="estimate") if given else recording)
+    return replace(fit, model=fit.linear, linear=None).simulate(
+        recording.with_(initial="estimate") if given else recording
+    )
 
 
 def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.ndarray, np.ndarray, str]]:
@@ -295,13 +411,17 @@ def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.nd
         out.append(("noise", levels.frequency, levels.var_noise[:, output] * averaged * density_of, GREEN))
     if levels.var_total is not None:
         noise = 0.0 if levels.var_noise is None else levels.var_noise[:, output] * (averaged - 1)
-        out.append(("noise and distortion", levels.frequency, (levels.var_total[:, output] + noise) * density_of, PURPLE))
+        out.append(
+            ("noise and distortion", levels.frequency, (levels.var_total[:, output] + noise) * density_of, PURPLE)
+        )
     return out
 
 
 def _check_channel(fit: Fit, channel: int) -> None:
     if not 0 <= channel < fit.model.n_w:
-        raise InputError(f"Channel {channel} of the element was asked for; the model has {fit.model.n_w}, counted from 0.")
+        raise InputError(
+            f"Channel {channel} of the element was asked for; the model has {fit.model.n_w}, counted from 0."
+        )
 
 
 def _index(fit: Fit, channel: int) -> str:
@@ -323,4 +443,3 @@ def _range(fit: Fit, recordings: Recording | Sequence[Recording] | None, channel
 
 def _unit(fit: Fit, recording: Recording, name: str) -> str:
     return recording.units.get(name, fit.units.get(name, ""))
-

@@ -16,10 +16,28 @@ from ..bla import BLA
 from ..model import Model
 from ..operators import generalized_play, play, stop
 from ..recording import InputError
-from .canvas import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILLION, axes_or_new, decibel, finish, limit_depth, line, new_figure, plain, with_unit
+from .canvas import (
+    BLUE,
+    FONT,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    VERMILLION,
+    axes_or_new,
+    decibel,
+    finish,
+    limit_depth,
+    line,
+    new_figure,
+    plain,
+    with_unit,
+)
 
 
-def best_linear_approximation(bla: BLA, model: Any = None, *, output: int = 0, input: int = 0, unit: str = "", ax: Axes | None = None) -> Axes:
+def best_linear_approximation(
+    bla: BLA, model: Any = None, *, output: int = 0, input: int = 0, unit: str = "", ax: Axes | None = None
+) -> Axes:
     """Magnitude of the BLA with a parametric model, the error between them, and the deviations of the estimate, as Fig. 8.
 
     Parameters
@@ -43,7 +61,10 @@ def best_linear_approximation(bla: BLA, model: Any = None, *, output: int = 0, i
         curves += [decibel(np.abs(response) ** 2), decibel(np.abs(response - G) ** 2)]
         line(ax, f, curves[1], "linear model", VERMILLION, linestyle="--")
         line(ax, f, curves[2], "error of the linear model", ORANGE)
-    for label, var, colour, style in (("noise and distortion", bla.var_total, PURPLE, ":"), ("noise", bla.var_noise, GREEN, "--")):
+    for label, var, colour, style in (
+        ("noise and distortion", bla.var_total, PURPLE, ":"),
+        ("noise", bla.var_noise, GREEN, "--"),
+    ):
         if var is not None:
             curves.append(decibel(var[:, output, input]))
             line(ax, f, curves[-1], f"deviation by {label}", colour, linestyle=style, linewidth=1.4)
@@ -76,7 +97,9 @@ def frequency_response(model: Any, frequency: np.ndarray, dt: float) -> np.ndarr
     return c @ np.linalg.solve(shift - a, np.broadcast_to(b, (len(frequency), *b.shape))) + d
 
 
-def loops(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], x: str, y: str, *, title: str = "", ax: Axes | None = None) -> Axes:
+def loops(
+    curves: Mapping[str, tuple[np.ndarray, np.ndarray]], x: str, y: str, *, title: str = "", ax: Axes | None = None
+) -> Axes:
     """Loops of one signal over another, for example at several frequencies, dark to light in the order given, as Fig. 7.
 
     Parameters
@@ -88,16 +111,25 @@ def loops(curves: Mapping[str, tuple[np.ndarray, np.ndarray]], x: str, y: str, *
     """
     from matplotlib import colormaps
 
-    ax = axes_or_new(ax, 5.0, 4.0)
+    ax = axes_or_new(ax)
     for k, (label, (horizontal, vertical)) in enumerate(curves.items()):
         colour = colormaps["viridis"](0.88 * k / max(len(curves) - 1, 1))
-        ax.plot(horizontal, vertical, color=colour, linewidth=1.3, label=plain(label), rasterized=len(horizontal) > 2000)
-    return finish(ax, x, y, title)
+        ax.plot(
+            horizontal, vertical, color=colour, linewidth=1.3, label=plain(label), rasterized=len(horizontal) > 2000
+        )
+    return finish(ax, x, y, title, 3)
 
 
 def spread(
-    errors: Mapping[str, Sequence[float] | np.ndarray], y: str = "NRMSE", *, published: Mapping[str, float] | None = None, floor: float | None = None,
-    source: str = "published", title: str = "", x: str = "", ax: Axes | None = None,
+    errors: Mapping[str, Sequence[float] | np.ndarray],
+    y: str = "NRMSE",
+    *,
+    published: Mapping[str, float] | None = None,
+    floor: float | None = None,
+    source: str = "published",
+    title: str = "",
+    x: str = "",
+    ax: Axes | None = None,
 ) -> Axes:
     """Box plots of the errors of many fits, as Fig. 11: median, quartiles, whiskers to 1.5 interquartile ranges, the rest as crosses.
 
@@ -116,21 +148,41 @@ def spread(
     groups = [np.asarray(e, dtype=float).ravel() for e in errors.values()]
     finite = [g[np.isfinite(g)] for g in groups]
     ax.boxplot(
-        finite, positions=range(len(groups)), widths=0.5, patch_artist=True,
-        boxprops={"facecolor": "#D6E8F4", "edgecolor": BLUE}, whiskerprops={"color": BLUE}, capprops={"color": BLUE},
-        medianprops={"color": VERMILLION, "linewidth": 2}, flierprops={"marker": "x", "markeredgecolor": INK, "markersize": 5},
+        finite,
+        positions=range(len(groups)),
+        widths=0.5,
+        patch_artist=True,
+        boxprops={"facecolor": "#D6E8F4", "edgecolor": BLUE},
+        whiskerprops={"color": BLUE},
+        capprops={"color": BLUE},
+        medianprops={"color": VERMILLION, "linewidth": 2},
+        flierprops={"marker": "x", "markeredgecolor": INK, "markersize": 5},
     )
     ax.plot([], [], color=VERMILLION, linewidth=2, label="median; box: quartiles")
     if published:
         at = {name: k for k, name in enumerate(errors)}
-        ax.plot([at[n] for n in published if n in at], [v for n, v in published.items() if n in at], "D", color=INK, markersize=6, label=plain(source))
+        ax.plot(
+            [at[n] for n in published if n in at],
+            [v for n, v in published.items() if n in at],
+            "D",
+            color=INK,
+            markersize=6,
+            label=plain(source),
+        )
     if floor is not None:
         ax.axhline(floor, color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
     ax.set_yscale("log")
     ax.set_xticks(range(len(groups)), [plain(name) for name in errors])
     for k, (group, drawn) in enumerate(zip(groups, finite, strict=True)):
         if len(drawn) < len(group):
-            ax.annotate(f"{len(group) - len(drawn)} ran\naway", (k, 0.99), xycoords=("data", "axes fraction"), ha="center", va="top", fontsize=9)
+            ax.annotate(
+                f"{len(group) - len(drawn)} ran\naway",
+                (k, 0.01),
+                xycoords=("data", "axes fraction"),
+                ha="center",
+                va="bottom",
+                fontsize=9,
+            )
     return finish(ax, x, y, title, 3)
 
 
@@ -162,8 +214,13 @@ def operators_demo(r: float = 1.0, amplitude: float = 4.0, samples: int = 2000) 
 
 
 def compared_spread(
-    sets: Mapping[str, Mapping[str, Sequence[float]]], *, published: Mapping[str, Mapping[str, float]] | None = None, floor: float | None = None,
-    source: str = "published", x: str = "", y: str = "NRMSE",
+    sets: Mapping[str, Mapping[str, Sequence[float]]],
+    *,
+    published: Mapping[str, Mapping[str, float]] | None = None,
+    floor: float | None = None,
+    source: str = "published",
+    x: str = "",
+    y: str = "NRMSE",
 ) -> Figure:
     """Box plots of several data sets beside each other, one `spread` each, on one scale; keys are titles, then groups."""
     figure = new_figure(3.6 * max(len(sets), 1) + 0.6, 4.0)
@@ -175,6 +232,7 @@ def compared_spread(
         first = first or ax
         if legend := ax.get_legend():
             legend.remove()
+            ax.set_title(plain(title), fontsize=FONT + 0.5, loc="left")
     if first is not None:
         handles, labels = first.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=10)
