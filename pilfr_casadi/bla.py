@@ -1,4 +1,4 @@
-r"""Best linear approximation (BLA): frequency response functions with their variances, from recordings.
+r"""Best linear approximation (BLA): frequency response functions with their variances, from periodic recordings.
 
 The BLA is the linear model that explains the output best in the least-squares sense for the given class of inputs,
 Krikelis et al. (2024), Eq. 21,
@@ -9,8 +9,6 @@ Krikelis et al. (2024), Eq. 21,
 input (what differs between them beyond the noise is nonlinear distortion); with several inputs each realization takes
 ``n_u`` experiments, best orthogonal multisines: with the spectra of the experiments side by side, ``G = Y U⁻¹``
 (Pintelon & Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., 2012, chapters 3, 4 and 7).
-:func:`plain_bla` takes any recordings: in a window around each frequency the response and the transient (leakage) are
-polynomials of the frequency, fitted by least squares (the local polynomial method, same book, chapter 7).
 
 All spectra are Fourier coefficients, ``DFT / N``: a line of amplitude ``a`` has the modulus ``a / 2``.
 """
@@ -215,84 +213,6 @@ def output_spectra(
     return OutputSpectra(spectra.frequency, np.mean(np.abs(Y) ** 2, axis=(0, 1)), var_noise, var_total)
 
 
-def plain_bla(
-    recordings: Recording | Iterable[Recording],
-    order: int = 2,
-    window: int | None = None,
-    n_frequencies: int = 1000,
-    floor: float = 0.01,
-) -> BLA:
-    """Estimate the BLA from any recordings by the local polynomial method.
-
-    Parameters
-    ----------
-    recordings : Recording or iterable of Recording
-        Of any length and with any input; samples up to `skip` are left out. Periodic ones that hold a whole number of
-        periods are averaged over them first.
-    order : int
-        Order of the local polynomials of the response and the transient.
-    window : int, optional
-        Excited lines in a window, in the shortest recording (more in proportion in longer ones); left out, what the
-        polynomials need and at least 10 degrees of freedom, and at least the distance of the frequencies returned.
-    n_frequencies : int
-        At most so many frequencies are returned, spread over the excited lines of the shortest recording.
-    floor : float
-        Lines at which no input reaches this share of its largest amplitude do not count as excited.
-
-    Returns
-    -------
-    BLA
-        `var_total` is from the residual of the local fits: noise, nonlinear distortion and what the polynomials cannot
-        follow. Neighbours share data, so their errors are correlated. `var_noise` is ``None``.
-
-    Raises
-    ------
-    InputError
-        When samples are too few for the window, or the inputs cannot be told apart.
-
-    References
-    ----------
-    Pintelon & Schoukens (2012), Sec. 7.2.2 and 7.3.5; Krikelis et al. (2024), Eq. 21.
-    """
-    if order < 0 or n_frequencies < 1 or (window is not None and window < 1):
-        raise InputError(
-            f"order {order}, window {window} and n_frequencies {n_frequencies} must not be negative, nor the last two "
-            "zero; leave them out for the defaults."
-        )
-    records = check_for_identification(recordings)
-    scale = np.sqrt(np.mean([np.var(r.u[r.skip :], axis=0) for r in records], axis=0))
-    if np.any(scale == 0):
-        raise InputError(
-            f"the input {records[0].inputs[int(np.argmin(scale))]!r} never changes in any recording; its response "
-            "cannot be estimated, leave it out."
-        )
-    lines = [_excited_spectrum(r, scale, floor) for r in records]
-    shortest = min(range(len(lines)), key=lambda r: len(lines[r][0]))
-    available = len(lines[shortest][0])
-    n_u, n_rec, n_poly = len(scale), len(records), order + 1
-    step = max(1, -(-available // n_frequencies))
-    if window is None:
-        need = n_poly + -(-(n_poly * n_u + max(10, (n_poly * (n_u + n_rec)) // 2)) // n_rec)
-        window = max(need, step)
-    if window > available or n_rec * window <= n_poly * (n_u + n_rec):
-        raise InputError(
-            f"{n_rec} recording(s) with at least {available} excited lines cannot fill windows of {window} lines for "
-            f"polynomials of order {order} and {n_u} input(s); record longer or lower the order."
-        )
-    grid = lines[shortest][0][step // 2 :: step]
-    share = [max(window, min(len(f), round(window * len(f) / available))) for f, _, _ in lines]
-    per_frequency = sum(share) * n_poly * (n_u + n_rec)
-    chunk = max(1, int(4e6) // per_frequency)
-    parts = [_local_polynomials(grid[k : k + chunk], lines, share, order) for k in range(0, len(grid), chunk)]
-    G, var, good = (np.concatenate(p) for p in zip(*parts, strict=True))
-    if not good.any():
-        raise InputError(
-            f"the {n_u} inputs {', '.join(records[0].inputs)} move together at every frequency; excite them "
-            "independently or add recordings with other inputs."
-        )
-    return BLA(grid[good], G[good] / scale, None, var[good] / scale**2, records[0].dt)
-
-
 def _periodic_spectra(
     recordings: Recording | Iterable[Recording], period: int | None, lines: Sequence[int] | Array | None
 ) -> _Spectra:
@@ -359,67 +279,16 @@ def _find_lines(U: Array) -> Array:
     limit = EXCITED**2 * power[1:].max(axis=0, initial=0.0) * np.ones_like(power)
     if n_periods > 1:
         noise = np.mean(np.var(U, axis=2, ddof=1), axis=(0, 1)) / n_periods
-        smooth = np.stack([_moving_mean(x, 10) for x in noise.T], axis=1)
+        smooth = np.stack([moving_mean(x, 10) for x in noise.T], axis=1)
         limit = np.maximum(limit, 20 * smooth)
     excited = np.all(power > limit, axis=1)
     excited[0] = False
     return np.flatnonzero(excited)
 
 
-def _moving_mean(x: Array, half: int) -> Array:
+def moving_mean(x: Array, half: int) -> Array:
     """Mean over the neighbours up to `half` away, along the first axis, fewer at the ends."""
     total = np.concatenate([np.zeros((1, *x.shape[1:])), np.cumsum(x, axis=0)])
     k = np.arange(len(x))
     first, last = np.maximum(k - half, 0), np.minimum(k + half + 1, len(x))
     return (total[last] - total[first]) / (last - first).reshape(-1, *(1,) * (x.ndim - 1))
-
-
-def _excited_spectrum(r: Recording, scale: Array, floor: float) -> tuple[Array, Array, Array]:
-    """Frequencies and spectra of one recording where any input is excited; equal noise in recordings of any length."""
-    u, y = r.u[r.skip :] / scale, r.y[r.skip :]
-    weight = 1.0
-    if r.period is not None and len(u) % r.period == 0:
-        weight = np.sqrt(len(u) // r.period)
-        u, y = (x.reshape(-1, r.period, x.shape[1]).mean(axis=0) for x in (u, y))
-    N = len(u)
-    U, Y = (weight * np.fft.rfft(x - x.mean(axis=0), axis=0)[: (N + 1) // 2] / np.sqrt(N) for x in (u, y))
-    size = np.abs(U)
-    excited = np.flatnonzero(np.any(size > floor * size.max(axis=0), axis=1))
-    return excited / (N * r.dt), U[excited], Y[excited]
-
-
-def _local_polynomials(
-    grid: Array, lines: list[tuple[Array, Array, Array]], share: list[int], order: int
-) -> tuple[Array, Array, Array]:
-    """Local least squares at the frequencies `grid`: response, its variance, and whether it can be told."""
-    n_u, n_y, n_rec, n_poly = lines[0][1].shape[1], lines[0][2].shape[1], len(lines), order + 1
-    ends = np.concatenate([[0], np.cumsum(share)])
-    K = np.zeros((len(grid), ends[-1], n_poly * (n_u + n_rec)), dtype=complex)
-    Y = np.empty((len(grid), ends[-1], n_y), dtype=complex)
-    x = np.empty((len(grid), ends[-1]))
-    for r, (f, _, _) in enumerate(lines):
-        first = np.clip(np.searchsorted(f, grid) - share[r] // 2, 0, len(f) - share[r])
-        index = first[:, None] + np.arange(share[r])
-        x[:, ends[r] : ends[r + 1]] = f[index] - grid[:, None]
-        Y[:, ends[r] : ends[r + 1]] = lines[r][2][index]
-        K[:, ends[r] : ends[r + 1], :n_u] = lines[r][1][index]
-    size = np.max(np.abs(x), axis=1)
-    powers = (x / size[:, None])[..., None] ** np.arange(n_poly)
-    U = K[..., :n_u].copy()
-    for p in range(n_poly):
-        K[..., p * n_u : (p + 1) * n_u] = U * powers[..., p, None]
-        for r in range(n_rec):
-            K[:, ends[r] : ends[r + 1], n_poly * n_u + r * n_poly + p] = powers[:, ends[r] : ends[r + 1], p]
-    length = np.linalg.norm(K, axis=1)
-    length[length == 0] = 1.0
-    Q, R = np.linalg.qr(K / length[:, None, :])
-    diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
-    good = diagonal.min(axis=1) > 1e-8 * diagonal.max(axis=1)
-    R[~good] = np.eye(R.shape[1])
-    inverse = np.linalg.inv(R) / length[:, :, None]
-    coefficients = Q.conj().swapaxes(1, 2) @ Y
-    dof = ends[-1] - K.shape[2]
-    var = (np.sum(np.abs(Y) ** 2, axis=1) - np.sum(np.abs(coefficients) ** 2, axis=1)) / dof
-    response = (inverse[:, :n_u] @ coefficients).swapaxes(1, 2)
-    gain = np.sum(np.abs(inverse[:, :n_u]) ** 2, axis=2)
-    return response, np.maximum(var, 0.0)[:, :, None] * gain[:, None, :], good

@@ -256,7 +256,7 @@ def _share_of_range(result: Any, recording: Recording) -> str:
 
 
 def _choose_order(train: Sequence[Recording]) -> int:
-    from .subspace import select_order
+    from .order_selection import select_order
 
     choice = select_order(train, range(1, 9))
     print(f"order chosen on the training data: {choice.recommended}")

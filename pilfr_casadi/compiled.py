@@ -1,12 +1,12 @@
 """The engine that runs generated C: the symbolic step, written out by CasADi, inside the time loops of `_kernel.c`.
 
-A library is built once a structure and kept in a private per-user cache, keyed by source, compiler, processor and CasADi
-version; its file name holds a digest of its content, so that a damaged one is built anew. A cache directory that others can
-write to is not used. Without a working C compiler `make_engine` falls back to `sensitivities.VirtualMachine`, which gives the
-same numbers.
+A library is built once a structure and kept in a private per-user cache, keyed by source, compiler, processor and
+CasADi version; its file name holds a digest of its content, so that a damaged one is built anew. A cache directory that
+others can write to is not used. Without a working C compiler `make_engine` falls back to the virtual machine of
+`sensitivities`, which gives the same numbers.
 
-Most partial derivatives of a state-space model are parameters, signals or constants themselves. The kernel looks these up; only the
-others are written out as code, so that the code does not grow with the square of the number of states.
+Most partial derivatives of a state-space model are parameters, signals or constants themselves. The kernel looks these
+up; only the others are written out as code.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from .model import Model
 from .recording import InputError
 from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
 
-# without contraction the generated step gives the very numbers of the virtual machine, and operators slip at the same samples
+# without contraction the generated step gives the very numbers of the virtual machine: what slips, slips in both
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
-FLAGS = (("-O2", "-march=native", *COMMON), ("-O2", *COMMON))  # the second where the compiler does not know the processor
+FLAGS = (("-O2", "-march=native", *COMMON), ("-O2", *COMMON))  # the second where the first is not understood
 PATIENCE = 600.0  # seconds for one compilation
 _failures: dict[str, str] = {}  # what did not compile is not tried again by this process
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
@@ -75,17 +75,17 @@ def _private(directory: Path) -> bool:
         return False
     others = stat.S_IWGRP | stat.S_IWOTH
     mine = not hasattr(os, "getuid") or info.st_uid == os.getuid()
-    kept = not above.st_mode & others or above.st_mode & stat.S_ISVTX
+    kept = not above.st_mode & stat.S_IWOTH or above.st_mode & stat.S_ISVTX
     return stat.S_ISDIR(info.st_mode) and mine and not info.st_mode & others and bool(kept)
 
 
 @functools.cache
 def cache_directory() -> Path:
-    """The private cache, `$XDG_CACHE_HOME/pilfr_casadi` or `~/.cache/pilfr_casadi`; one for this process where that is not safe."""
+    """The private cache, `$XDG_CACHE_HOME/pilfr_casadi` or `~/.cache/pilfr_casadi`; else one for this process alone."""
     try:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         directory = base / "pilfr_casadi"
-        base.mkdir(parents=True, exist_ok=True)
+        base.mkdir(mode=0o700, parents=True, exist_ok=True)
         directory.mkdir(mode=0o700, exist_ok=True)
         if _private(directory) and os.access(directory, os.W_OK | os.X_OK):
             return directory
@@ -99,8 +99,8 @@ def cache_directory() -> Path:
 def _values(linear: Linearization) -> tuple[list[float], ca.Function, dict[str, int], dict[tuple[str, str], list[int]]]:
     """Where the kernel finds the nonzeros of each block.
 
-    Returns the constants; the Function of those that have to be computed, each once; where each of `_VALUES` begins in their stack;
-    and the place in the stack of each nonzero, in the order of the block's pattern.
+    Returns the constants; the Function of those that have to be computed, each once; where each of `_VALUES` begins in
+    their stack; and the place in the stack of each nonzero, in the order of the block's pattern.
     """
     symbol = linear.symbols()
     blocks = linear.blocks(symbol)
@@ -132,7 +132,8 @@ def source_code(linear: Linearization) -> str:
     constants, computed, at, entries = _values(linear)
     options = {"with_header": False, "main": False, "indent": 0, "casadi_int": "long long"}
     generator = ca.CodeGenerator("generated", options)
-    lines = ["typedef struct { int source, index, value; } term_t;", "typedef struct { int parameter, value; } direct_t;"]
+    lines = ["typedef struct { int source, index, value; } term_t;"]
+    lines += ["typedef struct { int parameter, value; } direct_t;"]
     for function in (linear.step, computed):
         generator.add(function)
     for key in ("iw", "w", "arg", "res"):
@@ -167,7 +168,8 @@ def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[st
     """C tables of the entries of all rows, one after the other, and of where each row begins."""
     first = np.cumsum([0, *map(len, rows)]).tolist()
     flat = ",".join(entry for row in rows for entry in row) or "{0}"
-    return f"static const {kind} {name}[] = {{{flat}}};", f"static const int {starts}[] = {{{','.join(map(str, first))}}};"
+    begins = ",".join(map(str, first))
+    return f"static const {kind} {name}[] = {{{flat}}};", f"static const int {starts}[] = {{{begins}}};"
 
 
 def _digest(library: Path) -> str:
@@ -211,7 +213,8 @@ def build(source: str) -> Path:
         except (OSError, subprocess.TimeoutExpired) as error:
             _failures[key] = str(error)
     raise InputError(
-        f"The C compiler {cc} could not build the model ({_failures[key]}); repair it, name another in CC, or use engine='vm'."
+        f"The C compiler {cc} could not build the model ({_failures[key]}); "
+        "repair it, name another in CC, or use engine='vm'."
     )
 
 

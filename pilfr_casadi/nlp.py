@@ -5,8 +5,8 @@ The record is simulated from its initial state by `mapaccum` of the model's symb
     f(θ) = 1/2 mean(e²) + 1/2 Σ ((θ_i - m_i) / s_i)² v/R + l1 Σ |w|,      e = (y_hat(θ) - y) / σ_y
 
 (Krikelis et al. (2024), Eq. 20, with the penalties of `problem`), the residual e, the simulated outputs and the
-constraints are CasADi expressions of θ. CasADi differentiates them as they stand: for long records this costs some
-forty times the time and the memory of the recursion that `GaussNewton` and `Ipopt` run on, so this form is for what those two
+constraints are CasADi expressions of θ. CasADi differentiates them as they stand: for long records this costs many
+times the time and the memory of the recursion that `GaussNewton` and `Ipopt` run on, so this form is for what those two
 cannot express.
 """
 

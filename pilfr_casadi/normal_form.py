@@ -2,7 +2,8 @@
 
 Channels first: z has unit standard deviation (or reach), the weights of a channel sum to one, its thresholds ascend,
 and the largest entry of the impulse response from u to z is positive. A generalized play's output has a scale of its
-own, such that the two envelopes rise by two on average over -1 <= z <= 1. Channels ascend by their mean threshold.
+own, such that the two envelopes rise by two on average over -1 <= z <= 1; its smallest threshold is zero. Channels
+ascend by their mean threshold.
 
 Then the states, in the input-normal basis ordered by Hankel singular values (Moore 1981): driven by white u and w of
 given standard deviations (w: one), they are uncorrelated with unit variance, and their energies in y and z are
@@ -22,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from .elements import PrandtlIshlinskii
-from .gauge import ENVELOPE
 from .lfr import PILFR
 from .operators import GeneralizedPlay
+from .orbit import ENVELOPE
 from .recording import InputError
 
 Array = np.ndarray
@@ -83,6 +84,7 @@ def normalise(
         for i in range(element.channels):
             scales = _scales(structure, element, out, i, float(size[i]), u_std)
             _rescale(element, out, i, *scales)
+            _lower_thresholds(structure, element, out, i)
             blocks.append(scales[0] * scales[2] * np.eye(element.n)[_sort(structure, element, out, i)])
         memory = np.zeros((element.channels, element.n, element.memory))
         for i, block in enumerate(blocks):
@@ -130,7 +132,7 @@ def _scales(
     """Sign, and what z, the operators' output, and the weights of channel i are to be multiplied with."""
     operator = element.operator
     general = isinstance(operator, GeneralizedPlay)
-    free = not general or (operator.gamma_l is None and operator.gamma_r is None)
+    free = not general or operator.networks
     envelopes = tuple(name for name in out if name.startswith("gamma_")) if general else ()
     w_held, after_held = _held(structure, "w"), _held(structure, "B_w", "D_yw")
     v_free = free and not _held(structure, "r", *envelopes) and not (w_held and after_held)
@@ -168,7 +170,7 @@ def _rescale(
         out[name][:, i] /= sign * of_v * of_w
     out["r"][i] *= of_v
     out["w"][i] *= of_w
-    if isinstance(element.operator, GeneralizedPlay) and "gamma_l_c" in out and "gamma_r_c" in out:
+    if isinstance(element.operator, GeneralizedPlay) and element.operator.networks:
         old = {key: out[key][i].copy() for key in out if key.startswith("gamma_")}
         for side, other in (("l", "r"), ("r", "l")):
             for name, (p_z, p_v) in ENVELOPE.items():
@@ -176,6 +178,17 @@ def _rescale(
                 mirrored = sign if name in ("c", "d") else 1.0
                 source = old[f"gamma_{side if sign > 0 else other}_{name}"]
                 out[f"gamma_{side}_{name}"][i] = mirrored * source * of_z**p_z * of_v**p_v
+
+
+def _lower_thresholds(structure: PILFR, element: PrandtlIshlinskii, out: Values, i: int) -> None:
+    """Give the smallest threshold of a generalized play to its envelopes, in place."""
+    names = ("r", "gamma_l_c", "gamma_r_c")
+    if not isinstance(element.operator, GeneralizedPlay) or not element.operator.networks:
+        return
+    if not set(names) & set(structure.fixed):
+        least = out["r"][i].min()
+        for name, sign in zip(names, (-1.0, -1.0, 1.0), strict=True):
+            out[name][i] += sign * least
 
 
 def _sort(structure: PILFR, element: PrandtlIshlinskii, out: Values, i: int) -> Array:

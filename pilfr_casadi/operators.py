@@ -137,6 +137,11 @@ class GeneralizedPlay:
         if self.neurons != int(self.neurons) or self.neurons < 0:
             raise InputError(f"An envelope with {self.neurons} neurons was asked for; give a whole number, 0 or more.")
 
+    @property
+    def networks(self) -> bool:
+        """Whether both envelopes are networks."""
+        return self.gamma_l is None and self.gamma_r is None
+
     def parameters(self, channels: int) -> ParameterSet:
         """Envelope parameters, one row a channel; start: nearly the identity, with a little of every neuron."""
         entries: dict[str, Parameter] = dict(self.extra or {})

@@ -1,14 +1,14 @@
 """Sensitivities of the simulated output by a matrix-form recursion, from one linearised symbolic step.
 
-With `z = h(x, u, p)`, `(w, s⁺) = e(z, s, p)`, `(x⁺, y) = f(x, u, w, p)` and capitals for derivatives with respect to the
-estimated parameters and the initial state:
+With `z = h(x, u, p)`, `(w, s⁺) = e(z, s, p)`, `(x⁺, y) = f(x, u, w, p)` and capitals for derivatives with respect to
+the estimated parameters and the initial state:
 
     Z  = h_x X + h_p,          W = e_z Z + e_s S + e_p,      S⁺ = g_z Z + g_s S + g_p,
     X⁺ = f_x X + f_w W + f_p,  Y = y_x X + y_w W + y_p.
 
-`Linearization` holds the step and its partial derivatives; both engines run on it: `VirtualMachine` here (CasADi only, a few
-samples unrolled at a time) and the generated C of `compiled.py`. The record is never differentiated as a whole: time and
-memory are linear in its length.
+`Linearization` holds the step and its partial derivatives; both engines run on it: `VirtualMachine` here (CasADi only,
+a few samples unrolled at a time) and the generated C of `compiled.py`. The record is never differentiated as a whole:
+time and memory are linear in its length.
 """
 
 from __future__ import annotations
@@ -61,9 +61,7 @@ def linearize(model: Model) -> Linearization:
     w_now, s_now = model.memory(z_now, s, p)
     x_now, y_now = model.step(x, u, w_now, p)
     outputs = ca.cse([x_now, s_now, y_now, z_now, w_now])
-    step = ca.Function(
-        "pilfr_step", [x, s, u, p], outputs, ["x", "s", "u", "p"], ["x_next", "s_next", "y", "z", "w"]
-    )
+    step = ca.Function("pilfr_step", [x, s, u, p], outputs, ["x", "s", "u", "p"], ["x_next", "s_next", "y", "z", "w"])
     z, w = ca.SX.sym("z", model.n_w), ca.SX.sym("w", model.n_w)
     w_out, s_next = model.memory(z, s, p)
     x_next, y = model.step(x, u, w, p)
@@ -90,7 +88,7 @@ class Engine(Protocol):
         """As `simulate`, with derivatives.
 
         seed (n_x + n_s, n_c) is the state's derivative, columns (n_p,) gives each parameter's column or -1
-        -> y, J (M, n_y, n_c), next state, next seed.
+        -> y, J (M, n_y, n_c), next state, next seed; all are the caller's to change.
         """
 
 
@@ -131,7 +129,7 @@ class VirtualMachine:
             slope = {"x": slopes[:, : n["x"]], "s": slopes[:, n["x"] :]}
             for k in range(length):
                 x, s, y_k, *found = linear(x, s, u[:, k], p)
-                block, following = dict(zip(BLOCKS, found, strict=True)), {}
+                block, following = dict(zip(BLOCKS, found, strict=True)), dict[str, Any]()
                 for target, sources in TARGETS.items():
                     total = ca.densify(block[target, "p"])
                     for source in sources[:-1]:
@@ -146,7 +144,7 @@ class VirtualMachine:
         return self._functions[key]
 
     def _transposed(self, n_c: int, columns: np.ndarray) -> ca.Function:
-        """`(x, s, u, p) -> (x_next, s_next, y, blocks)`, the blocks transposed, the parameters' with one row a column of J."""
+        """`(x, s, u, p) -> (x_next, s_next, y, blocks)`, transposed; those of p have one row a column of J."""
         value, used = self.linear.symbols(), np.flatnonzero(columns >= 0)
         select = ca.DM.triplet(columns[used].tolist(), used.tolist(), ca.DM.ones(len(used)), n_c, len(columns))
         arguments = [value[k] for k in ("x", "s", "u", "p")]
@@ -156,7 +154,12 @@ class VirtualMachine:
         return ca.Function("linear", arguments, ca.cse([*following, *turned]))
 
     def _run(
-        self, build: Callable[[int], ca.Function], u: np.ndarray, p: np.ndarray, out: list[np.ndarray], carried: list[np.ndarray]
+        self,
+        build: Callable[[int], ca.Function],
+        u: np.ndarray,
+        p: np.ndarray,
+        out: list[np.ndarray],
+        carried: list[np.ndarray],
     ) -> list[np.ndarray]:
         """Fill `out`, one row a sample, block by block, and return what is carried from one block to the next."""
         u, p = np.ascontiguousarray(u, dtype=float), np.ascontiguousarray(p, dtype=float)
@@ -165,14 +168,14 @@ class VirtualMachine:
             if at + length > len(u):
                 continue
             buffer, evaluate = build(length).buffer()
-            buffer.set_arg(1, memoryview(p))
+            buffer.set_arg(1, p.data)
             while at + length <= len(u):
-                buffer.set_arg(0, memoryview(u[at : at + length]))
+                buffer.set_arg(0, u[at : at + length].data)
                 for i, array in enumerate(out):
-                    buffer.set_res(i, memoryview(array[at : at + length]))
+                    buffer.set_res(i, array[at : at + length].data)
                 for i, (before, after) in enumerate(zip(carried, following, strict=True)):
-                    buffer.set_arg(2 + i, memoryview(before))
-                    buffer.set_res(len(out) + i, memoryview(after))
+                    buffer.set_arg(2 + i, before.data)
+                    buffer.set_res(len(out) + i, after.data)
                 evaluate()
                 carried, following = following, carried
                 at += length

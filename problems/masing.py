@@ -1,6 +1,6 @@
 r"""The paper's benchmark as an exact simulator: a two-mass rig on a hysteretic (extended Masing) spring.
 
-Source: Krikelis et al. (2024), Sec. 6: rig Eq. 25, spring Eq. 26 with n = 1, numbers Table 1, data Sec. 6.2.
+Source: Krikelis et al. (2024), Sec. 6: rig Eq. 25, spring Eq. 26 with n = 1, numbers Table 1.
 
 The spring. Eq. 26 integrates in closed form. Virgin loading follows the odd curve ``f(x) = r_u (1 - exp(-K x / r_u))``,
 x >= 0, and a branch that leaves a reversal point (x_r, f_r) is the same curve doubled, ``f_r + 2 f((x - x_r) / 2)``
@@ -17,18 +17,13 @@ step that stays on one branch is of fourth order; the few steps with an event in
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.signals import sine_sweep, steady_periods, tukey_realizations
+from pilfr_casadi.recording import InputError
 
-FS = 120.0  # Hz
-F_MAX = 30.0  # Hz
-N_PERIOD = 1024
-N_REALIZATIONS = 3
 MAX_EVENTS = 20  # within one substep
 
 
@@ -325,84 +320,3 @@ def simulate(u: ArrayLike, fs: float, *, rig: MasingRig | None = None, substeps:
     except OverflowError as error:
         raise InputError(f"steps of {h:g} s are too long for this rig and input; take more substeps.") from error
     return Motion(*np.array(rows).T.copy())
-
-
-@dataclass(frozen=True, eq=False)
-class Benchmark:
-    """The records of one seed and the truth behind them.
-
-    Attributes
-    ----------
-    records : dict of str to Recording
-        ``train``, ``multisine`` and ``sweep``: what an identification may see.
-    steady : tuple of Recording
-        The flat period of each training realization, for the best linear approximation (Sec. 6.3). Half a period of
-        ramp does not settle the rig: the flat period differs from the steady state by 1.3 % of the output's standard
-        deviation in the median, 6 % at worst (36 periods), so ``initial`` is "estimate".
-    truth : dict of str to Motion
-        Noise-free motion under each of the three inputs.
-    rig : MasingRig
-        The parameters.
-    """
-
-    records: dict[str, Recording]
-    steady: tuple[Recording, ...]
-    truth: dict[str, Motion]
-    rig: MasingRig
-
-
-def benchmark(
-    seed: int,
-    *,
-    snr_db: float = 50.0,
-    normalize: Literal["record", "steady"] = "steady",
-    rig: MasingRig | None = None,
-) -> Benchmark:
-    """Data sets of Krikelis et al. (2024), Sec. 6.2, for one seed, and the truth.
-
-    The training record is 3 realizations of a multisine of 1024 samples at 120 Hz, excited up to 30 Hz: half a period
-    ramped up, one flat period, half a period ramped down. The multisine test is another such record, ramps included,
-    with phases of its own. The sweep runs from 0.1 to 30 Hz at 1.17 Hz/s with unit amplitude. Each output is x2 plus
-    white Gaussian noise, the rig starts at rest, and the force is held between samples.
-
-    The paper leaves open whether the multisine or the shaped record has unit standard deviation. Only the former brings
-    a linear fit to the published 0.48 on the sweep (0.42 to 0.51 over 12 seeds, the latter 0.34 to 0.42).
-
-    Parameters
-    ----------
-    seed : int
-        Not negative; equal seeds give equal data.
-    snr_db : float
-        Variance of x2 over variance of the noise, dB, in each record; ``inf`` for no noise.
-    normalize : {"record", "steady"}
-        What has unit standard deviation, see :func:`pilfr_casadi.signals.tukey_realizations`.
-    rig : MasingRig, optional
-        Parameters; those of Table 1 by default.
-
-    Returns
-    -------
-    Benchmark
-    """
-    rig = rig or MasingRig()
-    phases, fresh_phases, *noises = np.random.default_rng(seed).spawn(5)
-    inputs = {
-        "train": tukey_realizations(N_REALIZATIONS, N_PERIOD, F_MAX, FS, phases, normalize=normalize),
-        "multisine": tukey_realizations(N_REALIZATIONS, N_PERIOD, F_MAX, FS, fresh_phases, normalize=normalize),
-        "sweep": sine_sweep(0.1, F_MAX, FS, rate=1.17),
-    }
-    truth, data = {}, {}
-    for (name, u), noise in zip(inputs.items(), noises, strict=True):
-        truth[name] = motion = simulate(u, FS, rig=rig)
-        y = motion.x2 + 10.0 ** (-snr_db / 20.0) * motion.x2.std() * noise.standard_normal(u.size)
-        units = {"u": "N", "x2": "m"}
-        data[name] = Recording(u, y, 1.0 / FS, ("u",), ("x2",), units, initial="zero", hold="zero", name=name)
-    steady = tuple(
-        data["train"].slice(part.start, part.stop).with_(period=N_PERIOD, initial="estimate", name=f"steady {i}")
-        for i, part in enumerate(steady_periods(N_REALIZATIONS, N_PERIOD), 1)
-    )
-    return Benchmark(data, steady, truth, rig)
-
-
-def records(seed: int) -> dict[str, Recording]:
-    """Training, multisine test and sweep test record of one seed; see :func:`benchmark`."""
-    return benchmark(seed).records

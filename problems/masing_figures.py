@@ -12,7 +12,7 @@ from pilfr_casadi.bla import robust_bla
 from pilfr_casadi.demo import FLOOR, PUBLISHED, SETS
 from pilfr_casadi.fit import Fit
 
-from .masing import FS, Benchmark, benchmark
+from .masing_data import FS, Benchmark, benchmark
 
 FREQUENCIES = (0.5, 1.5, 3.0, 6.0, 12.0, 24.0)  # Hz, Fig. 7
 

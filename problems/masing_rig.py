@@ -21,7 +21,7 @@ from pilfr_casadi.fit import Fit, fit
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import Recording
 
-from .masing import benchmark
+from .masing_data import benchmark
 
 DEMO_SEED = 2024
 

@@ -24,7 +24,14 @@ def random_lfr(seed, nx=3, n_u=1, n_y=1, n_w=1, n=4, operator=Play, radius=0.8, 
         for name in values:
             if name.startswith("gamma_"):
                 values[name] = values[name] + rng.uniform(0.0, 0.3, values[name].shape)
+        while nx and _slipping(values) > max(radius, 0.9):
+            values["B_w"] = values["B_w"] / 2
     return structure, values
+
+
+def _slipping(values):
+    """Spectral radius with all operators slipping, or for stops all sticking."""
+    return np.max(np.abs(np.linalg.eigvals(values["A"] + values["B_w"] * values["w"].sum(axis=1) @ values["C_z"])))
 
 
 def random_input(seed, length=200, n_u=1):

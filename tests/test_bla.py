@@ -4,9 +4,10 @@ import control
 import numpy as np
 import pytest
 
-from pilfr_casadi.bla import BLA, output_spectra, plain_bla, robust_bla
+from pilfr_casadi.bla import BLA, output_spectra, robust_bla
+from pilfr_casadi.local_polynomial import plain_bla
+from pilfr_casadi.lti import frequency_response, simulate_lti
 from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.subspace import frequency_response, simulate_lti
 
 DT = 0.01
 

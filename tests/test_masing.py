@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from pilfr_casadi.metrics import nrmse
 from pilfr_casadi.recording import InputError
-from problems.masing import FS, MasingRig, MasingSpring, benchmark, records, simulate, stop_density, stop_elements
+from problems.masing import MasingRig, MasingSpring, simulate, stop_density, stop_elements
+from problems.masing_data import FS, benchmark, records
 
 RIG = MasingRig()
 K, R_U = RIG.K, RIG.r_u

@@ -6,18 +6,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pilfr_casadi.bla import BLA, plain_bla, robust_bla
+from pilfr_casadi.bla import BLA, robust_bla
+from pilfr_casadi.local_polynomial import plain_bla
+from pilfr_casadi.lti import frequency_response, simulate_lti, simulate_states, unit_variance
+from pilfr_casadi.order_selection import select_order
 from pilfr_casadi.recording import InputError, Recording
 from pilfr_casadi.subspace import (
-    frequency_response,
     frequency_subspace,
-    select_order,
-    simulate_lti,
-    simulate_states,
     singular_values,
     subspace_matrices,
     time_subspace,
-    unit_variance,
 )
 
 DT = 0.1

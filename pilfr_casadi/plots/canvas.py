@@ -1,7 +1,7 @@
-"""What all figures share: a canvas without global state, colours, decibels, and lines that stay small however long the record.
+"""What all figures share: a canvas without global state, colours, decibels, and lines that stay small in long records.
 
-Colours are those of Okabe & Ito (2008), told apart by every kind of colour vision. Figures are made with matplotlib's object
-interface: no pyplot, no change of settings, so they work in scripts, notebooks and servers alike.
+Colours are those of Okabe & Ito (2008), told apart by every kind of colour vision. Figures are made with matplotlib's
+object interface: no pyplot, no change of settings, so they work in scripts, notebooks and servers alike.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.textpath import TextPath
 
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 SKY, ORANGE, INK, GREY = "#56B4E9", "#E69F00", "#222222", "#7A7A7A"
 FONT = 10.5
 MOST = 3000  # points of a line before it is thinned
+LONGEST = 46  # letters of a title
 DEEPEST = 200.0  # dB below the largest value that are still drawn
 
 
@@ -29,24 +31,27 @@ def axes_or_new(ax: Axes | None) -> Axes:
     return new_figure().add_subplot() if ax is None else ax
 
 
-def finish(ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, beside: Axes | None = None) -> Axes:
-    """Labels, a light grid, and above the axes the title with a legend of whatever has a label, here and on the axes `beside`."""
+def finish(
+    ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, beside: Axes | None = None, legend: bool = True
+) -> Axes:
+    """Labels, a light grid, and above the axes the title with a legend of what has a label here or on `beside`."""
     ax.set_xlabel(plain(x), fontsize=FONT)
     ax.set_ylabel(plain(y), fontsize=FONT)
+    title = plain(title if len(title) <= LONGEST else title[: LONGEST - 1] + "…")
     ax.tick_params(labelsize=FONT - 1)
     ax.grid(True, color="#DDDDDD", linewidth=0.6)
     ax.set_axisbelow(True)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
     handles = [h for axes in (ax, beside) if axes is not None for h in axes.get_legend_handles_labels()[0]]
-    if handles:
+    if handles and legend:
         shown = ax.legend(
             handles=handles,
-            title=plain(title) or None,
+            title=title or None,
             alignment="left",
             loc="lower left",
             bbox_to_anchor=(0.0, 1.0),
-            ncols=columns,
+            ncols=_columns_that_fit(ax, [str(h.get_label()) for h in handles], columns),
             fontsize=FONT - 1,
             title_fontsize=FONT + 0.5,
             frameon=False,
@@ -58,8 +63,20 @@ def finish(ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, besid
         for handle in shown.get_lines():
             handle.set_linewidth(max(float(handle.get_linewidth()), 2.0))
     elif title:
-        ax.set_title(plain(title), fontsize=FONT + 0.5, loc="left")
+        ax.set_title(title, fontsize=FONT + 0.5, loc="left")
     return ax
+
+
+def _columns_that_fit(ax: Axes, labels: list[str], most: int) -> int:
+    """Columns of a legend that is not wider than its axes will be."""
+    em = (FONT - 1) / 72
+    room = 1.1 * ax.get_position().width * ax.figure.bbox.width / ax.figure.dpi
+    widths = [TextPath((0, 0), label, size=FONT - 1).get_extents().width / 72 + 2.4 * em for label in labels]
+    for columns in range(min(most, len(labels)), 1, -1):
+        length = -(-len(labels) // columns)
+        if sum(max(widths[k : k + length]) for k in range(0, len(labels), length)) + 1.2 * em * (columns - 1) <= room:
+            return columns
+    return 1
 
 
 def plain(text: str) -> str:
@@ -73,7 +90,7 @@ def with_unit(name: str, unit: str = "") -> str:
 
 
 def scaled(values: np.ndarray, unit: str = "") -> tuple[float, str]:
-    """A power of a thousand that brings the values between 0.1 and 1000 or so, and the unit with it: (1e-3, "10⁻³ m")."""
+    """A power of a thousand that brings the values near one, and the unit with it: (1e-3, "10⁻³ m")."""
     size = float(np.max(np.abs(values), initial=0.0))
     if not np.isfinite(size) or size == 0 or 0.02 <= size < 5000:
         return 1.0, unit
@@ -83,7 +100,7 @@ def scaled(values: np.ndarray, unit: str = "") -> tuple[float, str]:
 
 
 def thin(x: np.ndarray, y: np.ndarray, most: int = MOST) -> tuple[np.ndarray, np.ndarray]:
-    """At most about `most` points that draw the same picture: the smallest and the largest of each stretch, in their order.
+    """At most about `most` points that draw the same picture: the smallest and largest of each stretch, in their order.
 
     Parameters
     ----------
@@ -102,6 +119,12 @@ def thin(x: np.ndarray, y: np.ndarray, most: int = MOST) -> tuple[np.ndarray, np
     index = np.sort(np.stack([low, high], axis=1), axis=1) + length * np.arange(rows)[:, None]
     index = np.unique(np.minimum(np.concatenate([[0], index.ravel(), [len(y) - 1]]), len(y) - 1))
     return x[index], y[index]
+
+
+def drawable(values: np.ndarray, span: float) -> np.ndarray:
+    """The values with gaps where a simulation runs away, a thousand times beyond the span of the measured signal."""
+    with np.errstate(invalid="ignore"):
+        return np.where(np.abs(values) <= 1e3 * span, values, np.nan)
 
 
 def line(ax: Axes, x: np.ndarray, y: np.ndarray, label: str, colour: str, **style: Any) -> None:

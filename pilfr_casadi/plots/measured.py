@@ -1,6 +1,6 @@
-"""Figures of data and of whole studies: best linear approximation, loops at several frequencies, operators, spread of many fits.
+"""Figures of data and of studies: best linear approximation, loops at several frequencies, operators, spread of fits.
 
-Krikelis et al. (2024), Fig. 3 (operators), 7 (loops), 8 and 13 (best linear approximation), 11 (spread over random starts).
+Krikelis et al. (2024), Fig. 3 (operators), 7 (loops), 8 and 13 (best linear approximation), 11 (spread over starts).
 """
 
 from __future__ import annotations
@@ -31,20 +31,19 @@ from .canvas import (
     line,
     new_figure,
     plain,
-    with_unit,
 )
 
 
 def best_linear_approximation(
     bla: BLA, model: Any = None, *, output: int = 0, input: int = 0, unit: str = "", ax: Axes | None = None
 ) -> Axes:
-    """Magnitude of the BLA with a parametric model, the error between them, and the deviations of the estimate, as Fig. 8.
+    """Magnitude of the BLA with a parametric model, the error between them, and the estimate's deviations, as Fig. 8.
 
     Parameters
     ----------
     bla : BLA
-        From `robust_bla` or `plain_bla`. Its deviations are those of the mean over realizations, so an error of the model that
-        lies on the total deviation is within what the data can tell.
+        From `robust_bla` or `plain_bla`. Its deviations are those of the mean over realizations: an error of the model
+        that lies on the total deviation is within what the data can tell.
     model : Model, control.StateSpace or complex array (F, n_y, n_u), optional
         A linear model (without an element), or its response at `bla.frequency`.
     output, input : int
@@ -100,7 +99,7 @@ def frequency_response(model: Any, frequency: np.ndarray, dt: float) -> np.ndarr
 def loops(
     curves: Mapping[str, tuple[np.ndarray, np.ndarray]], x: str, y: str, *, title: str = "", ax: Axes | None = None
 ) -> Axes:
-    """Loops of one signal over another, for example at several frequencies, dark to light in the order given, as Fig. 7.
+    """Loops of one signal over another, for example at several frequencies, dark to light as given, as Fig. 7.
 
     Parameters
     ----------
@@ -131,12 +130,12 @@ def spread(
     x: str = "",
     ax: Axes | None = None,
 ) -> Axes:
-    """Box plots of the errors of many fits, as Fig. 11: median, quartiles, whiskers to 1.5 interquartile ranges, the rest as crosses.
+    """Box plots of the errors of many fits, as Fig. 11: median, quartiles, whiskers to 1.5 box heights, then crosses.
 
     Parameters
     ----------
     errors : mapping
-        Label of the group to its errors; infinite ones (simulations that ran away) are counted under the box, not drawn.
+        Label of the group to its errors; infinite ones (simulations that ran away) are counted, not drawn.
     y, x, title : str
         Axis labels and title.
     published : mapping, optional
@@ -187,7 +186,7 @@ def spread(
 
 
 def operators_demo(r: float = 1.0, amplitude: float = 4.0, samples: int = 2000) -> Figure:
-    """Stop, play and generalized play of threshold r from zero memory, over an input that swings less and less, as Fig. 3."""
+    """Stop, play and generalized play of threshold r from zero memory, over a fading swing of the input, as Fig. 3."""
     t = np.linspace(0.0, 1.0, samples)
     u = amplitude * (1 - 0.75 * t) * np.sin(6 * np.pi * t)
 
@@ -222,7 +221,7 @@ def compared_spread(
     x: str = "",
     y: str = "NRMSE",
 ) -> Figure:
-    """Box plots of several data sets beside each other, one `spread` each, on one scale; keys are titles, then groups."""
+    """Box plots of several data sets on one scale, one `spread` each; keys are titles, then groups."""
     figure = new_figure(3.6 * max(len(sets), 1) + 0.6, 4.0)
     first: Axes | None = None
     for k, (title, errors) in enumerate(sets.items()):
@@ -232,7 +231,7 @@ def compared_spread(
         first = first or ax
         if legend := ax.get_legend():
             legend.remove()
-            ax.set_title(plain(title), fontsize=FONT + 0.5, loc="left")
+        ax.set_title(plain(title), fontsize=FONT + 0.5, loc="left")
     if first is not None:
         handles, labels = first.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=10)

@@ -1,0 +1,59 @@
+"""Writing files so that none is ever half there."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+from pathlib import Path
+
+from ..recording import InputError
+
+
+def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
+    """Write a file so that at any moment either the old or the whole new one is there.
+
+    The content goes to a temporary file in the same folder, is forced to disk, and takes the name in one step. On any
+    failure the temporary file is removed and an existing file is left untouched.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist or the file cannot be written there.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
+        raise InputError(f"{path} is a folder; give the name of a file in it.")
+    data = content.encode() if isinstance(content, str) else content
+    partial = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.tmp")
+    try:
+        handle = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(partial, target)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                partial.unlink()
+            raise
+    except OSError as error:
+        if error.errno == errno.ENOENT and not target.parent.is_dir():
+            raise InputError(
+                f"The folder {target.parent} does not exist; make it first or give another path."
+            ) from error
+        raise InputError(f"{path} cannot be written ({error.strerror or error}); give another path.") from error
+    _sync_folder(target.parent)
+    return target
+
+
+def _sync_folder(folder: Path) -> None:
+    """Force the new name to disk too, where the system can do that."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

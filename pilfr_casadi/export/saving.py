@@ -1,0 +1,141 @@
+"""Models on disk: the writing side.
+
+A model file is standard JSON: format and version, structure, parameter values by name with units and standard errors,
+sampling, names, and a summary of the training. It holds no code, and every number comes back to the last digit.
+Only the equations of a PI-LFR (Krikelis et al. 2024, Eq. 15-17) can be rebuilt from a file; of a model of the user's
+own equations the file holds the values.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from ..elements import PrandtlIshlinskii
+from ..operators import GeneralizedPlay
+from .files import write_atomically
+
+if TYPE_CHECKING:
+    from ..fit import Fit
+    from ..lfr import PILFR
+
+FORMAT = "pilfr_casadi model"
+VERSION = 1
+HISTORY = ("number", "cost", "seconds", "step", "damping")  # columns of a solver's history
+
+
+def save(fit: Fit, path: str | os.PathLike[str]) -> None:
+    """Write a fit as JSON, atomically: an existing file stays as it is until the new one is complete on disk.
+
+    Parameters
+    ----------
+    fit : Fit
+        What to save. A model of the user's own equations is saved by its values alone; see `load`.
+    path : path
+        The file, usually `*.json`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    write_atomically(path, _text(_document(fit)) + "\n")
+
+
+def _document(fit: Fit) -> dict[str, Any]:
+    from .. import __version__
+
+    model, solution = fit.model, fit.solution
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "written_by": {"pilfr_casadi": __version__, "casadi": ca.__version__},
+        "model": {
+            "dt": fit.dt,
+            "inputs": _channels(model.inputs, fit.units),
+            "outputs": _channels(model.outputs, fit.units),
+            "states": list(model.states),
+            "memory": model.n_s,
+        },
+        "structure": None if fit.structure is None else _structure(fit.structure),
+        "parameters": {
+            name: {"value": _plain(p.value), "std": _plain(fit.errors.get(name), "inf"), "unit": p.unit}
+            for name, p in model.parameters.items()
+        },
+        "linear": None if fit.linear is None else {k: _plain(p.value) for k, p in fit.linear.parameters.items()},
+        "initial_states": {recording: _plain(state) for recording, state in fit.initial.items()},
+        "training": {
+            "status": solution.status.name,
+            "sentence": solution.status.value,
+            "message": solution.message,
+            "nrmse": _plain(fit.train_nrmse),
+            "seconds": fit.seconds,
+            "active": list(fit.active),
+            "solve": _solve(solution),
+            "variables": dict(zip(fit.labels, _plain(solution.theta), strict=True)),
+            "multipliers": _plain(solution.multipliers),
+            "history": {key: _plain([getattr(h, key) for h in solution.history]) for key in HISTORY},
+            "starts": [
+                {"seed": c.seed, "error": _plain(c.error), "status": c.solution.status.name, "note": c.note}
+                | _solve(c.solution)
+                for c in fit.candidates
+            ],
+        },
+    }
+
+
+def _solve(solution: Any) -> dict[str, Any]:
+    numbers = {"cost": solution.cost, "violation": solution.violation, "seconds": solution.seconds}
+    return {"iterations": int(solution.iterations), **{k: _plain(v) for k, v in numbers.items()}}
+
+
+def _channels(names: tuple[str, ...], units: Mapping[str, str]) -> list[dict[str, str]]:
+    return [{"name": name, "unit": units.get(name, "")} for name in names]
+
+
+def _structure(structure: PILFR) -> dict[str, Any]:
+    pairs = {"bounds": structure.bounds, "priors": structure.priors}
+    return {
+        "nx": int(structure.nx),
+        "offset": bool(structure.offset),
+        "element": None if structure.element is None else _element(structure.element),
+        "fixed": {name: _plain(value) for name, value in structure.fixed.items()},
+        **{key: {name: [_plain(v) for v in pair] for name, pair in table.items()} for key, table in pairs.items()},
+    }
+
+
+def _element(element: Any) -> dict[str, Any]:
+    if not isinstance(element, PrandtlIshlinskii):
+        return {"kind": type(element).__name__}
+    operator = element.operator
+    out = {"kind": element.kind, "operator": operator.name, "n": element.n, "channels": element.channels}
+    out["rounded"] = element.rounded
+    if isinstance(operator, GeneralizedPlay):
+        own = [side for side in ("l", "r") if getattr(operator, f"gamma_{side}") is not None]
+        out |= {"neurons": operator.neurons, "expressions": own}
+    return out
+
+
+def _plain(value: Any, infinite: str | None = None) -> Any:
+    """Numbers as JSON knows them, arrays as nested lists, nan as null, and what is infinite as null or as a word."""
+    if value is None:
+        return None
+    array = np.asarray(value, dtype=float)
+    if array.ndim:
+        return [_plain(v, infinite) for v in array]
+    number = float(array)
+    return number if np.isfinite(number) else infinite if number > 0 else None
+
+
+def _text(value: Any, depth: int = 0) -> str:
+    """JSON with one line for each entry of the outer tables, so that people can read and compare files."""
+    if isinstance(value, dict) and value and depth < 2:
+        pad = " " * (depth + 1)
+        rows = [f"{pad}{json.dumps(key)}: {_text(item, depth + 1)}" for key, item in value.items()]
+        return "{\n" + ",\n".join(rows) + "\n" + " " * depth + "}"
+    return json.dumps(value, allow_nan=False)

@@ -1,0 +1,197 @@
+r"""Discrete linear state-space models: response, simulation, scaling of the states, reflection of the poles.
+
+.. math:: x(k+1) = A x(k) + B u(k), \qquad y(k) = C x(k) + D u(k), \qquad G(z) = C (z I - A)^{-1} B + D
+
+The states scaled to unit variance are those of Krikelis et al. (2024), Sec. 5.3. The response takes one complex Schur
+form of `A` for all frequencies; the simulation cuts the record into pieces that run side by side, joined by powers of
+`A`; both in plain NumPy, for any number of samples and lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .recording import InputError
+
+if TYPE_CHECKING:
+    import control
+
+Array = np.ndarray
+
+
+def frequency_response(system: Any, frequency: Array) -> Array:
+    """Frequency response of a discrete state-space model, fast for many frequencies.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Or anything with `A`, `B`, `C`, `D` and `dt`.
+    frequency : array, (F,)
+        Frequencies in Hz.
+
+    Returns
+    -------
+    complex array, (F, n_y, n_u)
+        Not finite at a pole.
+    """
+    z = np.exp(2j * np.pi * np.asarray(frequency) * system.dt)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return resolvent(np.asarray(system.A), np.asarray(system.C), z) @ np.asarray(system.B) + np.asarray(system.D)
+
+
+def simulate_states(system: Any, u: Array, x0: Array | None = None) -> Array:
+    """State trajectory of a discrete state-space model.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Or anything with `A` (nx, nx) and `B` (nx, n_u).
+    u : array, (M, n_u)
+        Inputs.
+    x0 : array, (nx,), optional
+        State at the first sample; zero if left out.
+
+    Returns
+    -------
+    array, (M, nx)
+
+    Raises
+    ------
+    InputError
+        When the shapes of `u` or `x0` do not fit the model.
+    """
+    A, B = np.asarray(system.A, dtype=float), np.asarray(system.B, dtype=float)
+    u = np.asarray(u, dtype=float)
+    if u.ndim != 2 or u.shape[1] != B.shape[1]:
+        raise InputError(f"u has the shape {u.shape}; the model needs (samples, {B.shape[1]}).")
+    start = np.zeros(len(A)) if x0 is None else np.asarray(x0, dtype=float)
+    if start.shape != (len(A),):
+        raise InputError(f"x0 has the shape {start.shape}; the model has {len(A)} states.")
+    return propagate(A.T, (u @ B.T)[None], start[None])[0][0]
+
+
+def simulate_lti(system: Any, u: Array, x0: Array | None = None) -> Array:
+    """Output of a discrete state-space model.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Or anything with `A`, `B`, `C` and `D`.
+    u : array, (M, n_u)
+        Inputs.
+    x0 : array, (nx,), optional
+        State at the first sample; zero if left out.
+
+    Returns
+    -------
+    array, (M, n_y)
+
+    Raises
+    ------
+    InputError
+        When the shapes of `u` or `x0` do not fit the model.
+    """
+    return simulate_states(system, u, x0) @ np.asarray(system.C).T + np.asarray(u) @ np.asarray(system.D).T
+
+
+def unit_variance(system: Any, u: Array | Sequence[Array]) -> control.StateSpace:
+    """Scale the states so that each has unit variance under an input, Krikelis et al. (2024), Sec. 5.3.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Discrete model.
+    u : array, (M, n_u), or several of them
+        Inputs of one or several runs, each from the zero state on.
+
+    Returns
+    -------
+    control.StateSpace
+        The same model in other coordinates. A state that the inputs do not move keeps its scale.
+
+    Raises
+    ------
+    InputError
+        When `u` does not fit the model, or the states grow without bound under it.
+    """
+    import control
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        x = np.concatenate([simulate_states(system, run) for run in ([u] if isinstance(u, np.ndarray) else u)])
+        std = np.std(x, axis=0)
+    if not np.all(np.isfinite(std)):
+        raise InputError("the states of the model grow without bound under this input; give a stable model.")
+    std[std <= 1e-12 * np.max(np.abs(x), axis=0, initial=0.0)] = 1.0
+    A, B, C = (np.asarray(M) for M in (system.A, system.B, system.C))
+    return control.StateSpace(A * std / std[:, None], B / std[:, None], C * std, system.D, system.dt)
+
+
+def resolvent(A: Array, C: Array, z: Array) -> Array:
+    """``C (z I - A)⁻¹`` at every `z`, (F,) -> (F, n_y, nx), by one Schur form and substitution."""
+    from scipy.linalg import schur
+
+    T, V = schur(A, output="complex")
+    c = C @ V
+    X = np.empty((len(z), *C.shape), dtype=complex)
+    for j in range(len(A)):
+        X[..., j] = (c[:, j] + X[..., :j] @ T[:j, j]) / (z - T[j, j])[:, None]
+    return X @ V.conj().T
+
+
+def reflected(A: Array) -> Array:
+    """Move eigenvalues outside the unit circle (or on it) to ``1 / conj(lambda)``, strictly inside."""
+    from scipy.linalg import schur
+
+    if np.max(np.abs(np.linalg.eigvals(A))) < 1:
+        return A
+    T, V = schur(A, output="real")
+    k = 0
+    while k < len(T):
+        two = k + 1 < len(T) and T[k + 1, k] != 0
+        block = T[k : k + 2, k : k + 2] if two else T[k : k + 1, k : k + 1]
+        radius = np.sqrt(abs(np.linalg.det(block))) if two else abs(block[0, 0])
+        if radius >= 1:
+            block *= min(radius**-2, (1 - 1e-6) / radius)
+        k += 2 if two else 1
+    return V @ T @ V.T
+
+
+def propagate(At: Array, v: Array, x0: Array) -> tuple[Array, Array]:
+    """States of ``x(k+1) = x(k) At + v(k)`` (rows) for several runs at once, and the state after the last sample.
+
+    The samples are cut into about sqrt(M) pieces that are run side by side, so that Python loops over sqrt(M) steps.
+
+    Parameters
+    ----------
+    At : array, (nx, nx)
+    v : array, (runs, M, nx)
+    x0 : array, (runs, nx)
+
+    Returns
+    -------
+    X, last : array, (runs, M, nx), (runs, nx)
+    """
+    runs, M, nx = v.shape
+    length = int(np.ceil(np.sqrt(M)))
+    pieces = -(-M // length)
+    V = np.zeros((runs, pieces, length, nx))
+    V.reshape(runs, -1, nx)[:, :M] = v
+    gained = np.zeros((runs, pieces, nx))
+    for i in range(length):
+        gained = gained @ At + V[:, :, i]
+    power = np.linalg.matrix_power(At, length)
+    start = np.empty((runs, pieces, nx))
+    x = x0
+    for k in range(pieces):
+        start[:, k] = x
+        x = x @ power + gained[:, k]
+    X = np.empty_like(V)
+    x = start
+    for i in range(length):
+        X[:, :, i] = x
+        x = x @ At + V[:, :, i]
+    X = X.reshape(runs, -1, nx)[:, :M]
+    return X, X[:, -1] @ At + v[:, -1]

@@ -1,0 +1,142 @@
+"""Figures of the identified element: its loop, its loading curve, its weights over thresholds.
+
+Krikelis et al. (2024), Eq. 16 and Fig. 15.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ..recording import InputError, Recording, as_recordings
+from ..start import density
+from .canvas import BLUE, INK, SKY, VERMILLION, axes_or_new, finish
+
+if TYPE_CHECKING:
+    from ..fit import Fit
+
+Curve = Callable[[np.ndarray], np.ndarray]
+
+
+def loop(fit: Fit, recording: Recording, *, channel: int = 0, bare: bool = False, ax: Axes | None = None) -> Axes:
+    """The identified hysteresis: the element's output w over its input z along a recording, as Fig. 15.
+
+    With `bare` the line through the origin that fits w best is taken off, so that the hysteresis alone is seen.
+    """
+    _check_channel(fit, channel)
+    signals, index = fit.signals(recording), _index(fit, channel)
+    z, w = (signals[key][:, channel] for key in "zw")
+    what, title = f"w{index}", "loop"
+    if bare:
+        slope = float(z @ w / (z @ z)) if np.any(z) else 0.0
+        w, what, title = w - slope * z, f"w{index} − {slope:.3g} z{index}", "loop without its slope"
+    ax = axes_or_new(ax)
+    ax.plot(z, w, color=BLUE, linewidth=0.7, rasterized=True)
+    return finish(
+        ax, f"z{index} (model scale)", f"{what} (model scale)", ", ".join(filter(None, (title, recording.name)))
+    )
+
+
+def loading_curve(
+    fit: Fit,
+    recordings: Recording | Sequence[Recording] | None = None,
+    *,
+    channel: int = 0,
+    reference: Curve | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """The element's response to z growing from rest (virgin curve); the range that the recordings visit is shaded.
+
+    `reference` is a curve to compare with, from z (G,) to w (G,), in the scale of the model.
+    """
+    _check_channel(fit, channel)
+    ax, reach, limit = axes_or_new(ax), _reach(fit, recordings, channel), _range(fit, recordings, channel)
+    z = np.linspace(0.0, limit, 300)
+    if reach:
+        ax.axvspan(0, reach, color="#E8F1F7", linewidth=0, label="|z| in the recordings")
+    ax.plot(z, virgin_curve(fit, z, channel), color=BLUE, linewidth=1.8, label="fitted")
+    if reference is not None:
+        ax.plot(z, reference(z), color=INK, linewidth=1.4, linestyle="--", label="reference")
+    ax.margins(x=0)
+    return finish(
+        ax, f"z{_index(fit, channel)} (model scale)", f"w{_index(fit, channel)} (model scale)", "loading curve"
+    )
+
+
+def virgin_curve(fit: Fit, z: np.ndarray, channel: int = 0) -> np.ndarray:
+    """w (G,) while one channel's z runs through the values given (G,), from empty memory."""
+    model, p = fit.model, fit.model.parameters.start
+    memory, out = np.zeros(model.n_s), np.empty(len(z))
+    for k, value in enumerate(z):
+        w, memory = model.memory(value * np.eye(model.n_w)[channel], memory, p)
+        out[k] = w[channel]
+    return out
+
+
+def weights(
+    fit: Fit,
+    recordings: Recording | Sequence[Recording] | None = None,
+    *,
+    channel: int = 0,
+    reference: Curve | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Weight over threshold of every operator, and the density of weights over thresholds that they stand for.
+
+    `reference` is a density to compare with, from r (G,) to weight per unit of r (G,), in the scale of the model.
+    """
+    _check_channel(fit, channel)
+    values = fit.parameters
+    if not {"r", "w"} <= set(values):
+        raise InputError(
+            "The element has no thresholds r and weights w; only a Prandtl-Ishlinskii element has a density of weights."
+        )
+    ax = axes_or_new(ax)
+    r, w = values["r"][channel], values["w"][channel]
+    order, limit = np.argsort(r), _range(fit, recordings, channel)
+    r, w = r[order], w[order]
+    ax.vlines(r, 0, w, color=SKY, linewidth=1.5)
+    errors = fit.errors.get("w")
+    spread = None if errors is None else np.nan_to_num(errors[channel][order])
+    ax.errorbar(r, w, yerr=spread, fmt="o", markersize=4, color=BLUE, elinewidth=1, label="weights w (left)")
+    right = ax.twinx()
+    grid = np.linspace(0.0, limit, 300)
+    right.plot(grid, density(r, w, grid, limit / 12), color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
+    if reference is not None:
+        right.plot(grid, reference(grid), color=INK, linestyle="--", linewidth=1.4, label="reference density (right)")
+    finish(right, "", "density dw/dr", legend=False).grid(False)
+    right.spines["right"].set_visible(True)
+    finish(
+        ax, f"threshold r{_index(fit, channel)} (model scale)", "weight w", "weights over thresholds", 1, beside=right
+    )
+    right.set_ylim(bottom=0)
+    ax.set_ylim(bottom=0)
+    ax.set_xlim(-0.02 * limit, limit)
+    return ax
+
+
+def _check_channel(fit: Fit, channel: int) -> None:
+    if not 0 <= channel < fit.model.n_w:
+        raise InputError(
+            f"Channel {channel} of the element was asked for; the model has {fit.model.n_w}, counted from 0."
+        )
+
+
+def _index(fit: Fit, channel: int) -> str:
+    return str(channel + 1) if fit.model.n_w > 1 else ""
+
+
+def _reach(fit: Fit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:
+    records = () if recordings is None else as_recordings(recordings)
+    return max((float(np.nanmax(np.abs(fit.signals(r)["z"][:, channel]))) for r in records), default=0.0)
+
+
+def _range(fit: Fit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:
+    """Up to where an element is drawn: what is visited, and the thresholds where they lie not far beyond."""
+    reach, r = _reach(fit, recordings, channel), fit.parameters.get("r")
+    far = 0.0 if r is None else float(np.max(r[channel]))
+    limit = 1.05 * (max(reach, min(far, 1.5 * reach)) if reach else far)
+    return limit if limit > 0 and np.isfinite(limit) else 1.0

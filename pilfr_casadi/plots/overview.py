@@ -1,0 +1,90 @@
+"""One figure of a whole fit, and the way that led to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..recording import Recording, as_recordings
+from ..solution import Iteration
+from .canvas import GREY, VERMILLION, axes_or_new, finish, new_figure
+from .law import loading_curve, loop, weights
+from .signals import spectrum, time
+
+if TYPE_CHECKING:
+    from ..fit import Fit
+
+
+def plot_fit(
+    fit: Fit, recordings: Recording | Sequence[Recording], *, steady: Sequence[Recording] | None = None
+) -> Figure:
+    """One figure: time and spectrum of every recording and output; loop, loading curve and weights of every channel.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fitted model.
+    recordings : Recording or sequence of Recording
+        What to simulate and compare.
+    steady : sequence of Recording, optional
+        Periodic recordings that noise and distortion levels are taken from; see `spectrum`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Save it with `figure.savefig("fit.png")`.
+
+    Raises
+    ------
+    InputError
+        If a recording does not fit the model.
+    """
+    records = as_recordings(recordings)
+    rows = [(r, i) for r in records for i in range(r.n_y)]
+    channels = fit.model.n_w
+    figure = new_figure(11.0, 3.4 * (len(rows) + channels + (not channels)))
+    grid = figure.add_gridspec(len(rows) + max(channels, 1), 6)
+    for k, (r, i) in enumerate(rows):
+        time(fit, r, output=i, ax=figure.add_subplot(grid[k, :3]))
+        spectrum(fit, r, output=i, steady=steady, ax=figure.add_subplot(grid[k, 3:]))
+    for c in range(channels):
+        row = len(rows) + c
+        loop(fit, records[0], channel=c, ax=figure.add_subplot(grid[row, :2]))
+        loading_curve(fit, records, channel=c, ax=figure.add_subplot(grid[row, 2:4]))
+        weights(fit, records, channel=c, ax=figure.add_subplot(grid[row, 4:]))
+    if not channels:
+        convergence(fit, ax=figure.add_subplot(grid[len(rows), :]))
+    return figure
+
+
+def convergence(fit: Fit, *, ax: Axes | None = None) -> Axes:
+    """Training error over iterations, of every start and of the solve that won."""
+    ax = axes_or_new(ax)
+    histories = [c.solution.history for c in fit.candidates if c.solution.history]
+    for k, history in enumerate(histories):
+        ax.plot(
+            [h.number for h in history],
+            _error(history),
+            color=GREY,
+            linewidth=0.9,
+            alpha=0.7,
+            label="starts" if k == 0 else None,
+        )
+    if fit.solution.history:
+        ax.plot(
+            [h.number for h in fit.solution.history],
+            _error(fit.solution.history),
+            color=VERMILLION,
+            linewidth=2.0,
+            label="last solve of the best",
+        )
+    ax.set_yscale("log")
+    return finish(ax, "iteration", "training error √(2 · cost)", "convergence")
+
+
+def _error(history: Sequence[Iteration]) -> np.ndarray:
+    return np.sqrt(2 * np.maximum([h.cost for h in history], 0.0))

@@ -1,0 +1,247 @@
+"""Figures of a recording beside its simulation: over time, over frequency, over an input.
+
+Krikelis et al. (2024), Fig. 9, 10 and 14.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ..bla import output_spectra
+from ..metrics import nrmse
+from ..recording import InputError, Recording
+from .canvas import (
+    BLUE,
+    GREEN,
+    INK,
+    PURPLE,
+    VERMILLION,
+    axes_or_new,
+    decibel,
+    drawable,
+    finish,
+    limit_depth,
+    line,
+    scaled,
+    with_unit,
+)
+
+if TYPE_CHECKING:
+    from ..fit import Fit
+
+
+def time(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
+    """Measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
+    ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
+    size, unit = scaled(y, _unit(fit, recording, recording.outputs[output]))
+    line(ax, t, y / size, "measured output", BLUE, linewidth=0.9)
+    for label, residual, colour in _residuals(fit, recording, output):
+        line(ax, t, drawable(residual, np.ptp(y)) / size, label, colour, linewidth=1.1)
+    if recording.skip:
+        ax.axvspan(0, recording.skip * recording.dt, color="#EEEEEE", label="not scored")
+    ax.margins(x=0.01)
+    return finish(ax, "time [s]", with_unit(recording.outputs[output], unit), recording.name)
+
+
+def traces(
+    fit: Fit,
+    recording: Recording,
+    *,
+    output: int = 0,
+    between: tuple[float, float] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Measured and simulated output over a stretch of time in s, by default a few swings around the largest one."""
+    ax, y = axes_or_new(ax), _column(recording.y, output, "output")
+    begin, end = between or _busiest(y - np.mean(y), recording)
+    part = slice(*np.clip(np.round(np.array([begin, end]) / recording.dt).astype(int), 0, len(y)))
+    if part.stop - part.start < 2:
+        raise InputError(
+            f"From {begin:g} to {end:g} s there are no two samples; the recording lasts {len(y) * recording.dt:g} s."
+        )
+    size, unit = scaled(y[part], _unit(fit, recording, recording.outputs[output]))
+    line(ax, recording.t[part], y[part] / size, "measured", BLUE, linewidth=3.2, alpha=0.55)
+    models = [("this model", fit.simulate(recording), INK)]
+    if _compares(fit):
+        models.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
+    for label, simulated, colour in models:
+        line(ax, recording.t[part], drawable(simulated[part, output], np.ptp(y)) / size, label, colour)
+    ax.margins(x=0.01)
+    return finish(ax, "time [s]", with_unit(recording.outputs[output], unit), recording.name, 3)
+
+
+def _busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
+    """Start and end of a stretch around the largest excursion with about eight swings; small ripple is not counted."""
+    peak = int(np.argmax(np.abs(y)))
+    large = np.flatnonzero(np.abs(y) >= 0.2 * np.abs(y[peak]))
+    swings = large[1:][np.diff(np.signbit(y[large]))]
+    before, after = swings[swings <= peak][-4:], swings[swings > peak][:4]
+    begin = int(before[0]) if len(before) == 4 else 0
+    end = int(after[-1]) if len(after) == 4 else len(y)
+    return begin * recording.dt, max(end, begin + 2) * recording.dt
+
+
+def remains(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
+    """What the fit leaves over, alone over time and in its own scale."""
+    ax, y = axes_or_new(ax), _column(recording.y, output, "output")
+    residual = drawable(fit.simulate(recording)[:, output] - y, np.ptp(y))
+    size, unit = scaled(residual[np.isfinite(residual)], _unit(fit, recording, recording.outputs[output]))
+    rms = float(np.sqrt(np.mean((residual[recording.skip :] / size) ** 2)))
+    line(
+        ax,
+        recording.t,
+        residual / size,
+        f"residual, this model (rms {rms:.3g} {unit}".rstrip() + ")",
+        INK,
+        linewidth=0.8,
+    )
+    if recording.skip:
+        ax.axvspan(0, recording.skip * recording.dt, color="#EEEEEE", label="not scored")
+    ax.margins(x=0.01)
+    return finish(ax, "time [s]", with_unit(f"simulated − measured {recording.outputs[output]}", unit), recording.name)
+
+
+def output_over_input(
+    fit: Fit, recording: Recording, *, input: int = 0, output: int = 0, ax: Axes | None = None
+) -> Axes:
+    """Measured and simulated output over an input: the nested loops of a quasi-static device."""
+    ax, u, y = axes_or_new(ax), _column(recording.u, input, "input"), _column(recording.y, output, "output")
+    name, simulated = recording.outputs[output], fit.simulate(recording)[:, output]
+    size, unit = scaled(y, _unit(fit, recording, name))
+    ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
+    ax.plot(u, drawable(simulated, np.ptp(y)) / size, color=INK, linewidth=0.5, label="this model", rasterized=True)
+    across = recording.inputs[input]
+    return finish(ax, with_unit(across, _unit(fit, recording, across)), with_unit(name, unit), recording.name)
+
+
+def spectrum(
+    fit: Fit,
+    recording: Recording,
+    *,
+    output: int = 0,
+    steady: Sequence[Recording] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Amplitude densities of output and residuals over frequency, with noise and total distortion, as Fig. 9 (right).
+
+    All lines are densities (per root hertz) of the signals as recorded, so records of any length and levels from
+    periods can be compared: a residual that lies on the noise line cannot be improved.
+
+    Parameters
+    ----------
+    fit, recording, output
+        Model, data and index of the output. A recording with a period is transformed period by period after its `skip`,
+        any other in overlapping windowed stretches.
+    steady : sequence of Recording, optional
+        Periodic steady-state recordings of the same signals under the same kind of input, one for each realization. The
+        noise level is estimated from several periods, the total distortion (noise and nonlinear distortion) from
+        several realizations. By default `recording` itself, if it is periodic.
+    ax : Axes, optional
+        Where to draw.
+    """
+    ax, y = axes_or_new(ax), _column(recording.y, output, "output")
+    name = recording.outputs[output]
+    curves: list[np.ndarray] = []
+    for label, signal, colour in [
+        ("measured output", y, BLUE),
+        *_residuals(fit, recording, output),
+    ]:
+        f, power = amplitude_density(signal, recording)
+        curves.append(decibel(power))
+        line(ax, f, curves[-1], label, colour, linewidth=1.1)
+    periodic = steady if steady is not None else [recording] if recording.period else []
+    for label, f_level, level, colour in _levels(periodic, output):
+        curves.append(decibel(level))
+        line(ax, f_level, curves[-1], label, colour, linewidth=1.4, linestyle="--" if colour == GREEN else ":")
+    ax.set_xscale("log")
+    limit_depth(ax, *curves)
+    unit = _unit(fit, recording, name)
+    return finish(ax, "frequency [Hz]", f"{name} [dB re {unit or '1'}/√Hz]", recording.name)
+
+
+def amplitude_density(x: np.ndarray, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (F,) above zero in Hz and one-sided power density (F,) of a signal (M,) sampled as the recording."""
+    x, period = x[recording.skip :], recording.period
+    if not np.all(np.isfinite(x)):
+        x = np.full(len(x), np.nan)
+    if period:
+        blocks = x[: len(x) // period * period].reshape(-1, period)
+        power = np.mean(np.abs(np.fft.rfft(blocks, axis=1)) ** 2, axis=0) * 2 * recording.dt / period
+        return np.fft.rfftfreq(period, recording.dt)[1:], power[1:]
+    from scipy.signal import welch
+
+    f, power = welch(x, 1 / recording.dt, nperseg=min(len(x), max(256, len(x) // 8)), detrend="constant")
+    return f[1:], power[1:]
+
+
+def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.ndarray, np.ndarray, str]]:
+    """(label, frequency, power density, colour) of noise and total distortion, as in a single period."""
+    if not periodic:
+        return []
+    levels = output_spectra(periodic)
+    period = periodic[0].period or 2
+    averaged = (len(periodic[0]) - periodic[0].skip) // period
+    density_of = 2 * period * periodic[0].dt
+    out = []
+    if levels.var_noise is not None:
+        out.append(("noise", levels.frequency, levels.var_noise[:, output] * averaged * density_of, GREEN))
+    if levels.var_total is not None:
+        noise = 0.0 if levels.var_noise is None else levels.var_noise[:, output] * (averaged - 1)
+        out.append(
+            ("noise and distortion", levels.frequency, (levels.var_total[:, output] + noise) * density_of, PURPLE)
+        )
+    return out
+
+
+def linear_simulation(fit: Fit, recording: Recording) -> np.ndarray:
+    """Outputs (M, n_y) of the linear model that the fit began with, from its own initial state.
+
+    Raises
+    ------
+    InputError
+        If the fit holds no linear model.
+    """
+    if fit.linear is None:
+        raise InputError("The fit holds no linear model to compare with.")
+    given = not isinstance(recording.initial, str)
+    return replace(fit, model=fit.linear, linear=None, initial={}).simulate(
+        recording.with_(initial="estimate") if given else recording
+    )
+
+
+def _compares(fit: Fit) -> bool:
+    """Whether there is a linear model beside the fit."""
+    return fit.linear is not None and fit.model.n_w > 0
+
+
+def _column(values: np.ndarray, index: int, role: str) -> np.ndarray:
+    """One of the recording's inputs or outputs, (M,)."""
+    if not 0 <= index < values.shape[1]:
+        raise InputError(f"The {role} {index} was asked for; the recording has {values.shape[1]}, counted from 0.")
+    return values[:, index]
+
+
+def _residuals(fit: Fit, recording: Recording, output: int) -> list[tuple[str, np.ndarray, str]]:
+    """(label, residual, colour) of the linear model, where the fit has one, and of the fit."""
+    out = [(*_named("this model", recording, fit.simulate(recording), output), INK)]
+    if _compares(fit):
+        out.insert(0, (*_named("linear", recording, linear_simulation(fit, recording), output), VERMILLION))
+    return out
+
+
+def _named(model: str, recording: Recording, simulated: np.ndarray, output: int) -> tuple[str, np.ndarray]:
+    y, y_hat = recording.y[:, output], simulated[:, output]
+    try:
+        share = f" {100 * nrmse(y, y_hat, recording.skip):.3g} %"
+    except InputError:  # a constant output has no relative error
+        share = ""
+    return f"residual, {model}{share}", y_hat - y
+
+
+def _unit(fit: Fit, recording: Recording, name: str) -> str:
+    return recording.units.get(name, fit.units.get(name, ""))

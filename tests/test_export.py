@@ -1,0 +1,473 @@
+"""Models on disk come back to the last digit or not at all, and the exported function steps like the fit."""
+
+import copy
+import json
+import os
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pilfr_casadi import export
+from pilfr_casadi.compiled import compiler
+from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi.export import load, save, to_casadi, write_atomically
+from pilfr_casadi.fit import Fit, fit
+from pilfr_casadi.lfr import PILFR, hammerstein
+from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
+from pilfr_casadi.parameters import Parameter, ParameterSet
+from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi.solution import Iteration, Solution, Status
+
+CASES = {
+    "play": (PILFR(3, PrandtlIshlinskii(Play, 4)), 1, 1),
+    "stops, two channels": (
+        PILFR(
+            2,
+            PrandtlIshlinskii(Stop, 3, 2),
+            bounds={"w": (0, 2), "A": (-3.0, np.inf)},
+            priors={"C_z": (0.0, 1.0)},
+            offset=False,
+        ),
+        2,
+        3,
+    ),
+    "generalized play": (PILFR(1, PrandtlIshlinskii(GeneralizedPlay(2), 3)), 1, 2),
+    "rounded": (PILFR(2, PrandtlIshlinskii(Play, 3, rounded=True)), 1, 1),
+    "linear": (PILFR(3), 2, 1),
+    "hammerstein": (hammerstein(2, PrandtlIshlinskii(Play, 2)), 1, 1),
+    "no states": (PILFR(0, PrandtlIshlinskii(Play, 3), fixed={"D_yu": 0.5}), 1, 1),
+}
+
+
+def some_fit(case="play", seed=0, engine="vm", **more):
+    """A fit with random values, as if it had been estimated."""
+    structure, n_u, n_y = CASES[case]
+    rng = np.random.default_rng(seed)
+    start = structure.model(n_u, n_y, inputs=tuple("ab"[:n_u]), outputs=tuple("xyz"[:n_y]))
+    values = {name: np.clip(rng.normal(size=p.value.shape) / 3, *p.bounds) for name, p in start.parameters.items()}
+    values |= {
+        name: np.abs(rng.normal(size=p.value.shape)) for name, p in start.parameters.items() if name in ("w", "r")
+    }
+    values |= {name: p.value for name, p in start.parameters.items() if name in structure.fixed or name == "y_0"}
+    model = structure.model(n_u, n_y, values, inputs=start.inputs, outputs=start.outputs)
+    size = model.n_x + model.n_s
+    labels = (
+        *np.array(model.parameters.labels, dtype=object)[model.parameters.free],
+        *(f"initial[0].{k}" for k in range(size)),
+    )
+    state = rng.normal(size=size)
+    theta = np.concatenate([model.parameters.start[model.parameters.free], state])
+    solution = Solution(
+        theta,
+        1e-5,
+        Status.MAX_ITERATIONS,
+        7,
+        0.5,
+        multipliers=rng.normal(size=theta.size),
+        history=(Iteration(0, 1.0, 0.1), Iteration(1, np.inf, 0.2, 0.3, 1e-3)),
+        message="told",
+    )
+    errors = {name: rng.uniform(size=p.value.shape) for name, p in model.parameters.items()}
+    errors["C_y"] = np.full(errors["C_y"].shape, np.nan)
+    errors["D_yu"] = np.full(errors["D_yu"].shape, np.inf)
+    fields = dict(
+        train_nrmse=(0.01, np.inf),
+        initial={"0123456789abcdef": state},
+        labels=labels,
+        errors=errors,
+        active=("w[0] = 0",),
+        units={"a": "V", "x": "µm"},
+    )
+    return Fit(model, structure, 1 / 120, solution, engine=engine, seconds=1.25, **(fields | more))
+
+
+def recording_for(fitted, samples=200, initial="zero", seed=1):
+    rng = np.random.default_rng(seed)
+    u = np.cumsum(rng.normal(size=(samples, fitted.model.n_u)), axis=0)
+    y = rng.normal(size=(samples, fitted.model.n_y))
+    return Recording(u, y, fitted.dt, fitted.model.inputs, fitted.model.outputs, initial=initial)
+
+
+@pytest.fixture(scope="module")
+def real_fit():
+    """A small identification with everything a fit has."""
+    rng = np.random.default_rng(0)
+    u = np.sin(np.arange(300) / 9.0) * np.linspace(0.2, 1.5, 300)
+    play = np.zeros(300)
+    for k in range(1, 300):
+        play[k] = max(u[k] - 0.3, min(u[k] + 0.3, play[k - 1]))
+    y = 2 * u + play + 0.01 * rng.normal(size=300)
+    train = Recording(u, y, 0.01, units={"u": "V"})
+    return fit(PILFR(1, PrandtlIshlinskii(Play, 3)), train, starts=2, engine="vm"), train
+
+
+def one_sentence(error):
+    text = str(error.value)
+    assert "\n" not in text and text.endswith(".") and not text.endswith(".."), text
+    return text
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_saved_model_simulates_to_the_last_digit(case, tmp_path):
+    before = some_fit(case)
+    save(before, tmp_path / "model.json")
+    after = replace(load(tmp_path / "model.json"), engine="vm")
+    for name, value in before.parameters.items():
+        assert np.array_equal(after.parameters[name], value)
+        assert np.array_equal(after.model.parameters[name].bounds, before.model.parameters[name].bounds)
+        assert np.array_equal(after.model.parameters[name].fixed, before.model.parameters[name].fixed)
+        assert np.array_equal(after.errors[name], before.errors[name], equal_nan=True)
+    data = recording_for(before)
+    assert np.array_equal(after.simulate(data), before.simulate(data))
+    assert after.nrmse(data) == before.nrmse(data)
+    assert after.structure.fixed.keys() == before.structure.fixed.keys()
+    assert (after.dt, after.units, after.labels, after.active) == (
+        before.dt,
+        before.units,
+        before.labels,
+        before.active,
+    )
+    assert (after.train_nrmse, after.seconds, after.model.states) == (
+        before.train_nrmse,
+        before.seconds,
+        before.model.states,
+    )
+    assert np.array_equal(after.solution.theta, before.solution.theta)
+    assert np.array_equal(after.solution.multipliers, before.solution.multipliers)
+    assert (after.solution.history, after.status, after.solution.message) == (
+        before.solution.history,
+        before.status,
+        "told",
+    )
+    assert np.array_equal(after.initial["0123456789abcdef"], before.initial["0123456789abcdef"])
+    save(after, tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "model.json").read_bytes()
+
+
+def test_a_real_fit_comes_back(real_fit, tmp_path):
+    before, train = real_fit
+    before.save(tmp_path / "model.json")
+    after = replace(load(tmp_path / "model.json"), engine="vm")
+    assert str(after) == str(before)
+    assert after.nrmse(train) == before.nrmse(train) == pytest.approx(before.train_nrmse[0], rel=1e-12)
+    assert [c.error for c in after.candidates] == [c.error for c in before.candidates]
+    assert all(np.array_equal(after.linear.parameters[k].value, p.value) for k, p in before.linear.parameters.items())
+    assert all(np.array_equal(after.errors[k], e, equal_nan=True) for k, e in before.errors.items())
+    assert after.to_casadi()(np.zeros(4), [1.0])[1] == before.to_casadi()(np.zeros(4), [1.0])[1]
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=9, max_size=9))
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_finite_number_survives(tmp_path, numbers):
+    before = some_fit()
+    values = before.model.parameters.change(A={"value": np.reshape(numbers, (3, 3))})
+    save(replace(before, model=before.model.with_parameters(values)), tmp_path / "model.json")
+    after = load(tmp_path / "model.json").parameters["A"].ravel()
+    assert after.tobytes() == np.array(numbers).tobytes()
+
+
+def test_the_file_is_standard_json_with_everything_asked_for(tmp_path):
+    save(some_fit(), tmp_path / "model.json")
+
+    def refuse(name):
+        raise AssertionError(f"{name} is not standard JSON")
+
+    content = json.loads((tmp_path / "model.json").read_text(encoding="utf-8"), parse_constant=refuse)
+    assert (content["format"], content["version"]) == (export.FORMAT, export.VERSION)
+    assert content["written_by"] == {"pilfr_casadi": "0.1.0", "casadi": ca.__version__}
+    assert content["model"]["inputs"] == [{"name": "a", "unit": "V"}]
+    assert content["structure"]["element"] == {
+        "kind": "prandtl_ishlinskii",
+        "operator": "play",
+        "n": 4,
+        "channels": 1,
+        "rounded": False,
+    }
+    assert content["training"]["nrmse"] == [0.01, None]
+    assert content["training"]["sentence"] == Status.MAX_ITERATIONS.value
+    assert set(content["parameters"]["w"]) == {"value", "std", "unit"}
+
+
+class Interruption(Exception):
+    """Whatever may interrupt a write."""
+
+
+@pytest.mark.parametrize("name", ["replace", "fsync", "fdopen"])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt(), Interruption()])
+def test_a_write_that_fails_leaves_the_old_file(name, error, tmp_path, monkeypatch):
+    path = tmp_path / "model.json"
+    save(some_fit(), path)
+    old = path.read_bytes()
+
+    def fail(*arguments):
+        if name == "fdopen":
+            os.write(arguments[0], b'{"format": "pilfr')  # half of it is on disk already
+            os.close(arguments[0])
+        raise error
+
+    monkeypatch.setattr(os, name, fail)
+    with pytest.raises(InputError if isinstance(error, OSError) else type(error)) as raised:
+        save(some_fit(seed=3), path)
+    monkeypatch.undo()
+    if isinstance(error, OSError):
+        assert "No space left" in one_sentence(raised)
+    assert path.read_bytes() == old
+    assert os.listdir(tmp_path) == ["model.json"]
+    assert load(path).nrmse
+
+
+def test_where_a_file_cannot_be_written(tmp_path):
+    for path, words in {tmp_path: "is a folder", tmp_path / "no" / "model.json": "does not exist"}.items():
+        with pytest.raises(InputError, match=words) as error:
+            save(some_fit(), path)
+        one_sentence(error)
+
+
+def test_written_files_follow_links_and_the_users_mask(tmp_path):
+    mask = os.umask(0o027)
+    try:
+        write_atomically(tmp_path / "real.txt", "one")
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "real.txt").stat().st_mode & 0o777 == 0o640
+    (tmp_path / "link.txt").symlink_to(tmp_path / "real.txt")
+    write_atomically(tmp_path / "link.txt", b"two")
+    assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "real.txt").read_text() == "two"
+
+
+def changed(content, path, value):
+    """The content with the entry at a path replaced, or taken out where the value is `...`."""
+    content = copy.deepcopy(content)
+    parent = content
+    for key in path[:-1]:
+        parent = parent[key]
+    if value is ...:
+        del parent[path[-1]]
+    else:
+        parent[path[-1]] = value
+    return content
+
+
+DAMAGE = {
+    "format": (("format",), "other", "not a model file"),
+    "version": (("version",), 2, "version 2 .* reads version 1"),
+    "no version": (("version",), ..., "version None"),
+    "operator": (
+        ("structure", "element", "operator"),
+        "preisach",
+        "unknown operator 'preisach'; known are play, stop, generalized_play",
+    ),
+    "element": (("structure", "element", "kind"), "bouc_wen", "element 'bouc_wen'"),
+    "negative weight": (("parameters", "w", "value", 0, 0), -0.1, "parameter 'w' lies outside its bounds"),
+    "infinite": (("parameters", "A", "value", 0, 0), "inf", "'A' holds \"inf\", which is not a finite number"),
+    "null": (("parameters", "A", "value", 0, 0), None, "'A' holds null"),
+    "true": (("parameters", "A", "value", 0, 0), True, "'A' holds true"),
+    "text": (("parameters", "r", "value", 0, 1), "0.1", "'r' holds"),
+    "integer beyond every float": (("parameters", "A", "value", 0, 0), 10**400, "not a finite number"),
+    "missing parameter": (("parameters", "B_w"), ..., "'B_w' is missing"),
+    "missing value": (("parameters", "B_w", "value"), ..., "'B_w' holds null"),
+    "unknown parameter": (("parameters", "k"), {"value": 1.0}, "parameter 'k', which its model lacks"),
+    "shape": (
+        ("parameters", "A", "value"),
+        [[1.0, 2.0], [3.0, 4.0]],
+        r"'A' has 4 numbers in the shape \(2, 2\), expected \(3, 3\)",
+    ),
+    "ragged": (("parameters", "A", "value"), [[1.0, 2.0, 3.0], [4.0, 5.0], [6.0, 7.0, 8.0, 9.0]], "'A' has 9 numbers"),
+    "states": (("structure", "nx"), 10**9, "expected"),
+    "operators": (("structure", "element", "n"), 10**12, "expected"),
+    "channels": (("structure", "element", "channels"), 0, "expected"),
+    "negative": (("structure", "nx"), -1, "'nx' is negative"),
+    "step": (("model", "dt"), 0.0, "the step dt is 0 s"),
+    "names": (("model", "inputs"), [], "names of inputs and outputs"),
+    "status": (("training", "status"), "FINE", "status 'FINE' is unknown"),
+    "no training": (("training",), ..., "'training' is missing"),
+    "fixed": (("structure", "fixed", "D_yu"), 0.5, "'D_yu' differs from the value that the structure fixes"),
+    "bounds": (("structure", "bounds", "w"), [1.0, 0.0], "infeasible"),
+    "unknown bound": (("structure", "bounds", "q"), [1.0, 0.0], "no parameter 'q'"),
+    "own equations": (("structure",), None, "give the model as `model=`"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_file_is_one_sentence(case, tmp_path):
+    path, value, words = DAMAGE[case]
+    save(some_fit(), tmp_path / "model.json")
+    content = changed(json.loads((tmp_path / "model.json").read_text()), path, value)
+    (tmp_path / "model.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=words) as error:
+        load(tmp_path / "model.json")
+    assert str(tmp_path / "model.json") in one_sentence(error)
+
+
+def test_what_is_not_a_model_file_is_one_sentence(tmp_path):
+    save(some_fit(), tmp_path / "good.json")
+    good = (tmp_path / "good.json").read_bytes()
+    files = {
+        "empty": (b"", "is empty"),
+        "blank": (b" \n ", "is empty"),
+        "half": (good[: len(good) // 2], "is incomplete"),
+        "binary": (bytes(range(256)), "not text"),
+        "csv": (b"t,u,y\n0,1,2\n", "not valid JSON"),
+        "list": (b"[1, 2]", "not a model file"),
+        "deep": (b"[" * 100_000, "not a model file"),
+        "nan": (good.replace(b'"dt": ', b'"dt": NaN, "old": ', 1), "holds NaN"),
+        "overflow": (good.replace(b'"dt": ', b'"dt": 1e999, "old": ', 1), "not a finite number"),
+    }
+    for name, (content, words) in files.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=words) as error:
+            load(tmp_path / name)
+        one_sentence(error)
+    for path, words in {
+        tmp_path / "missing": "does not exist",
+        tmp_path: "is a folder",
+        "a\0b": "cannot be read",
+    }.items():
+        with pytest.raises(InputError, match=words) as error:
+            load(path)
+        one_sentence(error)
+
+
+def test_an_enormous_or_forbidden_file_is_not_read(tmp_path):
+    with open(tmp_path / "huge.json", "wb") as file:
+        file.truncate(10**12)  # takes no space on disk
+    with pytest.raises(InputError, match="1000000 MB") as error:
+        load(tmp_path / "huge.json")
+    one_sentence(error)
+    if hasattr(os, "geteuid") and os.geteuid() != 0:
+        (tmp_path / "secret.json").touch(mode=0)
+        with pytest.raises(InputError, match="cannot be read") as error:
+            load(tmp_path / "secret.json")
+        one_sentence(error)
+
+
+def test_a_file_cut_off_anywhere_is_one_sentence(tmp_path):
+    save(some_fit("no states"), tmp_path / "model.json")
+    text = (tmp_path / "model.json").read_text()
+    for length in range(0, len(text.rstrip()), 61):
+        (tmp_path / "cut.json").write_text(text[:length])
+        with pytest.raises(InputError, match=r"incomplete|empty|not valid") as error:
+            load(tmp_path / "cut.json")
+        one_sentence(error)
+
+
+def leaves(content, path=()):
+    yield path
+    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    for key, value in items:
+        yield from leaves(value, (*path, key))
+
+
+JUNK = (None, True, -1, 0, 3, 1e308, 10**400, "", "x", "inf", [], {}, [[1.0]], [None], {"value": 1}, ...)
+
+
+@given(st.data())
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_tampered_file_loads_or_is_one_sentence(tmp_path, data):
+    case = data.draw(st.sampled_from(["generalized play", "stops, two channels", "linear"]))
+    if not (tmp_path / case).exists():
+        save(some_fit(case), tmp_path / case)
+    content = json.loads((tmp_path / case).read_text())
+    for _ in range(data.draw(st.integers(1, 2))):
+        paths = [p for p in leaves(content) if p]
+        content = changed(content, data.draw(st.sampled_from(paths)), data.draw(st.sampled_from(JUNK)))
+    (tmp_path / "tampered.json").write_text(json.dumps(content))
+    try:
+        fitted = load(tmp_path / "tampered.json")
+    except InputError as error:
+        assert "\n" not in str(error) and str(error).endswith(".")
+    else:
+        assert all(np.all(np.isfinite(v)) for v in fitted.parameters.values())
+        assert fitted.simulate(recording_for(replace(fitted, engine="vm"), 5)).shape == (5, fitted.model.n_y)
+
+
+def own_model(n=3):
+    """A model of the user's own equations, with units."""
+    from pilfr_casadi.model import close_loop, open_model
+
+    p = ParameterSet({"k": Parameter(2.0, unit="N/m", bounds=(0, 5)), "d": Parameter([0.1, 0.2])})
+    model = open_model(
+        lambda x, u, w, p: (0.9 * x + p["k"] * u + w, x + p["d"][0] * u), lambda x, u, p: x, p, n_x=1, n_u=1, n_w=1
+    )
+    return close_loop(model, PrandtlIshlinskii(Play, n))
+
+
+def test_a_model_of_own_equations_is_saved_by_its_values(tmp_path):
+    model = own_model()
+    fitted = model.with_parameters(
+        model.parameters.change(k={"value": 1 / 3}, r={"value": np.array([[0.1, 0.2, 0.7]])})
+    )
+    before = replace(some_fit(), model=fitted, structure=None, initial={}, errors={"k": np.array(0.1)}, linear=None)
+    before.save(tmp_path / "own.json")
+    assert json.loads((tmp_path / "own.json").read_text())["parameters"]["k"] == {
+        "value": 1 / 3,
+        "std": 0.1,
+        "unit": "N/m",
+    }
+    with pytest.raises(InputError, match="own equations, not the equations; give the model as `model=`") as error:
+        load(tmp_path / "own.json")
+    one_sentence(error)
+    after = replace(load(tmp_path / "own.json", model=own_model()), engine="vm")
+    data = recording_for(after)
+    assert after.structure is None and after.parameters["k"] == 1 / 3
+    assert np.array_equal(after.simulate(data), replace(before, engine="vm").simulate(data))
+    for wrong in (own_model(4), CASES["linear"][0].model(2, 1), CASES["linear"][0].model(1, 1)):
+        with pytest.raises(InputError, match="does not fit the model given") as error:
+            load(tmp_path / "own.json", model=wrong)
+        one_sentence(error)
+
+
+def test_envelopes_of_ones_own_need_the_structure(tmp_path):
+    operator = GeneralizedPlay(gamma_l=lambda z, p: z + z**3 / 9, gamma_r=lambda z, p: z)
+    structure = PILFR(1, PrandtlIshlinskii(operator, 2))
+    model = structure.model(1, 1, {"A": 0.5, "B_u": 1.0, "C_z": 1.0, "D_yw": 1.0, "r": [[0.1, 0.3]]})
+    before = replace(some_fit(), model=model, structure=structure, initial={}, errors={})
+    before.save(tmp_path / "model.json")
+    with pytest.raises(InputError, match="expressions of your own, which a file cannot hold") as error:
+        load(tmp_path / "model.json")
+    one_sentence(error)
+    after = replace(load(tmp_path / "model.json", model=structure), engine="vm")
+    data = recording_for(after)
+    assert after.structure is structure
+    assert np.array_equal(after.simulate(data), before.simulate(data))
+    assert np.ptp(after.simulate(data)) > 0
+
+
+@pytest.mark.parametrize(
+    "engine", ["vm", pytest.param("c", marks=pytest.mark.skipif(compiler() is None, reason="no C compiler"))]
+)
+@pytest.mark.parametrize("case", CASES)
+def test_the_exported_function_steps_like_the_fit(case, engine):
+    fitted = some_fit(case, engine=engine)
+    x0 = np.random.default_rng(5).normal(size=fitted.model.n_x + fitted.model.n_s)
+    data = recording_for(fitted, 1000, initial=x0 if len(x0) else "zero")
+    data = data.with_(u=data.u / 20)
+    step = to_casadi(fitted)
+    assert (step.name(), step.name_in(), step.name_out()) == ("model", ["x", "u"], ["x_next", "y"])
+    x, rows = fitted.initial_state(data), []
+    for u in data.u:
+        out = step(x=x, u=u)
+        x = out["x_next"]
+        rows.append(np.asarray(out["y"]).ravel())
+    expected = fitted.simulate(data)
+    assert np.max(np.abs(rows - expected)) <= 1e-12 * max(1.0, np.max(np.abs(expected)))
+
+
+def test_states_come_before_memory_channel_by_channel():
+    structure = PILFR(1, PrandtlIshlinskii(Play, 2, 2), fixed={"B_w": 0.0})
+    values = {"A": 0.5, "C_z": 0.0, "D_zu": np.array([[1.0], [-2.0]]), "r": np.array([[0.1, 0.2], [0.3, 0.4]])}
+    fitted = replace(some_fit(), model=structure.model(1, 1, values), structure=structure)
+    x_next, _ = fitted.to_casadi("rig")(np.array([8.0, 0, 0, 0, 0]), 1.0)
+    assert np.asarray(x_next).ravel() == pytest.approx([4.0, 0.9, 0.8, -1.7, -1.6], abs=1e-15)
+    assert fitted.to_casadi("rig").name() == "rig"
+
+
+@pytest.mark.parametrize("name", ["", "two words", "1st", "a__b", "null"])
+def test_a_name_that_casadi_does_not_take(name):
+    with pytest.raises(InputError, match="cannot be used") as error:
+        to_casadi(some_fit(), name)
+    one_sentence(error)

@@ -1,0 +1,549 @@
+"""Gauge freedoms: tangents, the normal form, and standard errors checked by Monte Carlo."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_models import OPERATORS, envelope, random_input, random_lfr, reference
+
+from pilfr_casadi.constraints import Constraint
+from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi.gauge import covariance, gauge_tangents, standard_errors, variance
+from pilfr_casadi.gauss_newton import GaussNewton
+from pilfr_casadi.lfr import PILFR, hammerstein, wiener
+from pilfr_casadi.model import open_model
+from pilfr_casadi.normal_form import normalise
+from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
+from pilfr_casadi.orbit import generators
+from pilfr_casadi.parameters import Parameter, ParameterSet
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi.residual_noise import gradient_covariance
+
+
+def signals(operator, values, u, state=None):
+    """Reference simulation from rest: y, z, w, last state."""
+    return reference(operator, values, u, np.zeros(len(values["A"]) + values["w"].size) if state is None else state)
+
+
+def moved(values, operator, rng, mild=1.0):
+    """The same model in another random gauge, operators and channels in another order; and the change of the state."""
+    nx, (n_w, n) = len(values["A"]), values["w"].shape
+    general = operator is GeneralizedPlay
+    t, _ = np.linalg.qr(rng.normal(size=(nx, nx)))
+    t = t * np.exp(mild * rng.uniform(-1, 1, nx)) if nx else t
+    inverse = np.linalg.inv(t)
+    sign = rng.choice([-1.0, 1.0], n_w)
+    of_z, of_v, of_w = np.exp(rng.uniform(-1, 1, (3, n_w)))
+    of_v = of_v if general else of_z
+    out = {k: np.array(v) for k, v in values.items()}
+    out["A"], out["B_u"], out["C_y"] = inverse @ values["A"] @ t, inverse @ values["B_u"], values["C_y"] @ t
+    out["C_z"] = (sign * of_z)[:, None] * (values["C_z"] @ t)
+    out["D_zu"] = (sign * of_z)[:, None] * values["D_zu"]
+    out["B_w"], out["D_yw"] = (b / (sign * of_v * of_w) for b in (inverse @ values["B_w"], values["D_yw"]))
+    out["r"], out["w"] = of_v[:, None] * values["r"], of_w[:, None] * values["w"]
+    if general:
+        shift = rng.uniform(-0.9, 2.0, (n_w, 1)) * values["r"].min(axis=1, keepdims=True)
+        out["r"] += of_v[:, None] * shift
+        values = values | {"gamma_l_c": values["gamma_l_c"] + shift, "gamma_r_c": values["gamma_r_c"] - shift}
+        for side, other in (("l", "r"), ("r", "l")):
+            for name, scale in {"c": of_v, "a0": of_v / of_z, "a": of_v, "b": 1 / of_z, "d": np.ones(n_w)}.items():
+                straight, mirror = (values[f"gamma_{s}_{name}"] * scale[:, None] for s in (side, other))
+                mirror = -mirror if name in "cd" else mirror
+                out[f"gamma_{side}_{name}"] = np.where(sign[:, None] > 0, straight, mirror)
+    memory = np.zeros((n_w, n, n_w, n))
+    for i in range(n_w):
+        order = rng.permutation(n)
+        out["r"][i], out["w"][i] = out["r"][i][order], out["w"][i][order]
+        memory[i, :, i, :] = sign[i] * of_v[i] * np.eye(n)[order]
+    channels = rng.permutation(n_w)
+    for name in out:
+        if name in ("C_z", "D_zu", "r", "w") or name.startswith("gamma_"):
+            out[name] = out[name][channels]
+        elif name in ("B_w", "D_yw"):
+            out[name] = out[name][:, channels]
+    change = np.zeros((nx + n_w * n,) * 2)
+    change[:nx, :nx] = inverse
+    change[nx:, nx:] = memory[channels].reshape(n_w * n, n_w * n)
+    return out, change
+
+
+# ---- tangents ----
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+@pytest.mark.parametrize("n_w", [1, 2])
+def test_generators_are_tangents_of_freedoms(operator, n_w):
+    """A small step along each leaves the outputs alone, to second order, from any state."""
+    structure, values = random_lfr(1, n_u=2, n_w=n_w, n=3, operator=operator)
+    if operator is Play:
+        values["r"][0, 0] = 0.0  # passes z on
+    u = random_input(1, 40, 2)
+    state = np.random.default_rng(0).normal(size=3 + 3 * n_w)
+    y = signals(operator, values, u, state)[0]
+    found = list(generators(structure, values))
+    of_a_channel = 5 if operator is GeneralizedPlay else 2
+    assert len(found) == 9 + n_w * of_a_channel + (operator is Play)
+    h = 1e-6
+    for change, move in found:
+        ahead, back = (
+            signals(operator, {k: v + s * change.get(k, 0.0) for k, v in values.items()}, u, state + s * move(state))[0]
+            for s in (h, -h)
+        )
+        slope = (ahead - back) / (2 * h)
+        assert np.max(np.abs(slope)) < 1e-7 * np.max(np.abs(y))
+
+
+def disturbance(seed, length, n_y=1, colour=0.0):
+    """Noise `e(k) = colour e(k-1) + white`, (length, n_y), independent of every input here."""
+    e = np.random.default_rng([seed, 1]).normal(size=(length + 50, n_y))
+    for k in range(1, len(e)):
+        e[k] += colour * e[k - 1]
+    return e[50:]
+
+
+def recorded(structure, values, u, noise=0.0, seed=0, state=None, colour=0.0, **options):
+    n = len(values["A"]) + (values["w"].size if "w" in values else 0)
+    model = structure.model(u.shape[1], len(values["C_y"]), values)
+    y = Problem(model, Recording(u=u, y=np.ones((len(u), model.n_y)), dt=1.0, initial="zero"), engine="vm", scale=[1.0])
+    if state is None:
+        y = y.simulate(y.start)[0]
+    else:
+        y = y.engine.simulate(u, model.parameters.start, np.resize(state, n))[0]
+    y = y + noise * disturbance(seed, *y.shape, colour)
+    return model, Recording(u=u, y=y, dt=1.0, **options)
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+@pytest.mark.parametrize("initial", ["estimate", "zero", "given"])
+def test_the_null_space_of_the_jacobian_is_the_gauge(operator, initial):
+    structure, values = random_lfr(5, nx=2, n=2, operator=operator)
+    if operator is Play:
+        values["r"][0, 0] = 0.0
+    u = random_input(5, 400)
+    state = np.array([0.5, -0.5, 0.0, 0.0])
+    z = (values["C_z"] @ state[:2] + values["D_zu"] @ u[0]).item()  # the memory lies where the first sample keeps it
+    state[2:] = z if operator is not GeneralizedPlay else sum(envelope(values, s, 0, z) for s in ("l", "r")) / 2
+    model, recording = recorded(structure, values, u, initial=state if initial == "given" else initial)
+    problem = Problem(model, recording, engine="vm")
+    theta = problem.start.copy()
+    if initial == "estimate":
+        theta[-4:] = state
+    held = theta == problem.lower
+    tangents = gauge_tangents(problem, theta, structure, held)
+    expected = {Play: 4 + 2 + 1, Stop: 4 + 2, GeneralizedPlay: 4 + 5}[operator]
+    if initial == "given":  # a state that is not to move leaves the transformations that keep it
+        expected -= 2 + 1
+    if initial != "estimate" and operator is GeneralizedPlay:
+        expected -= 1  # an offset needs another initial state
+    assert np.linalg.matrix_rank(tangents) == expected
+    jac = problem.jacobian(theta)
+    assert np.max(np.abs(jac @ tangents)) < 1e-12 * np.max(np.abs(jac))
+    usable = ~held & np.any(jac != 0, axis=0)
+    spectrum = np.linalg.svd(jac[:, usable] / np.linalg.norm(jac[:, usable], axis=0), compute_uv=False)
+    assert np.sum(spectrum < 1e-10 * spectrum[0]) == expected
+
+
+def test_fixed_blocks_leave_fewer_freedoms():
+    for build, left in ((hammerstein, 4 + 1), (wiener, 4 + 1)):
+        structure = build(2, PrandtlIshlinskii(Play, 3))
+        _, values = random_lfr(3, nx=2, n=3)
+        model, recording = recorded(structure, values, random_input(3, 300), initial="zero")
+        problem = Problem(model, recording, engine="vm")
+        tangents = gauge_tangents(problem, problem.start, structure, np.zeros(problem.size, dtype=bool))
+        assert np.linalg.matrix_rank(tangents) == left
+        assert np.max(np.abs(problem.jacobian(problem.start) @ tangents)) < 1e-11
+
+
+# ---- normal form ----
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 10**6), st.sampled_from(OPERATORS), st.integers(1, 2), st.integers(0, 4))
+def test_equal_models_normalise_to_equal_numbers(seed, operator, n_w, nx):
+    rng = np.random.default_rng(seed)
+    structure, values = random_lfr(seed % 50, nx=nx, n_u=2, n_y=2, n_w=n_w, operator=operator)
+    other, to_other = moved(values, operator, rng)
+    u = random_input(seed, 60, 2)
+    state = rng.normal(size=len(to_other))
+    y, z, _, _ = signals(operator, values, u, state)
+    y_other, z_other, _, _ = signals(operator, other, u, to_other @ state)
+    np.testing.assert_allclose(y_other, y, atol=1e-9 * np.max(np.abs(y)))  # `moved` is a gauge transformation
+    first, change_1 = normalise(structure, values, z, u=u, y=y)
+    second, change_2 = normalise(structure, other, z_other, u=u, y=y)
+    assert set(first) == set(values)
+    for name in first:
+        np.testing.assert_allclose(second[name], first[name], rtol=1e-6, atol=1e-7, err_msg=name)
+    np.testing.assert_allclose(change_2 @ to_other @ state, change_1 @ state, atol=1e-6)
+    # it is the same model, and in the form promised
+    again, z_again, _, _ = signals(operator, first, u, change_1 @ state)
+    np.testing.assert_allclose(again, y, rtol=0, atol=1e-9 * np.max(np.abs(y)))
+    np.testing.assert_allclose(np.std(z_again, axis=0), 1.0, rtol=1e-9)
+    np.testing.assert_allclose(first["w"].sum(axis=1), 1.0, rtol=1e-12)
+    assert np.all(np.diff(first["r"], axis=1) >= 0)
+    assert np.all(np.diff(np.sum(first["w"] * first["r"], axis=1)) >= 0)
+    third, change_3 = normalise(structure, first, z_again, u=u, y=y)
+    for name in first:
+        np.testing.assert_allclose(third[name], first[name], rtol=1e-6, atol=1e-8, err_msg=name)
+    np.testing.assert_allclose(change_3, np.eye(len(change_3)), atol=1e-7)
+
+
+def resonant(nx, seed=0):
+    """A lightly damped structure of nx / 2 modes with three inputs, outputs and channels, as in a large fit."""
+    rng = np.random.default_rng(seed)
+    structure, values = random_lfr(seed, nx=nx, n_u=3, n_y=3, n_w=3)
+    a = np.zeros((nx, nx))
+    for k in range(nx // 2):
+        angle, radius = 0.1 + 2.8 * (k + rng.uniform(0, 0.5)) / (nx // 2), rng.uniform(0.9, 0.99)
+        a[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = radius * np.array(
+            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        )
+    return structure, {**values, "A": a, "B_w": 0.1 * values["B_w"]}
+
+
+def test_forty_states():
+    structure, values = resonant(40)
+    rng = np.random.default_rng(1)
+    other, _ = moved(values, Play, rng, mild=3.0)
+    u = random_input(1, 300, 3)
+    y, z, _, _ = signals(Play, values, u)
+    first, _ = normalise(structure, values, z, u=u, y=y)
+    second, change = normalise(structure, other, signals(Play, other, u)[1], u=u, y=y)
+    for name in first:
+        np.testing.assert_allclose(second[name], first[name], rtol=1e-7, atol=1e-8, err_msg=name)
+    again = signals(Play, second, u, change @ np.zeros(len(change)))[0]
+    np.testing.assert_allclose(again, y, rtol=0, atol=1e-10 * np.max(np.abs(y)))
+    assert np.max(np.abs(second["A"])) <= 1.0
+
+
+def test_the_states_are_input_normal():
+    structure, values = random_lfr(4, nx=4, n_u=2, n_y=2)
+    u = random_input(4, 100, 2)
+    out, _ = normalise(structure, values, signals(Play, values, u)[1])
+    b, c = np.hstack([out["B_u"], out["B_w"]]), np.vstack([out["C_y"], out["C_z"]])
+    np.testing.assert_allclose(out["A"] @ out["A"].T + b @ b.T, np.eye(4), atol=1e-10)
+    observability, power = np.zeros((4, 4)), np.eye(4)
+    for _ in range(2000):
+        observability += power.T @ c.T @ c @ power
+        power = out["A"] @ power
+    squares = np.diag(observability)
+    np.testing.assert_allclose(observability, np.diag(squares), atol=1e-9 * squares[0])
+    assert np.all(np.diff(squares) < 0)
+
+
+@pytest.mark.parametrize("radius", [0.9999, 1.0, 1.05])
+def test_a_slow_or_unstable_linear_part_has_a_normal_form_too(radius):
+    structure, values = random_lfr(6, radius=radius, gain=0.01)
+    other, _ = moved(values, Play, np.random.default_rng(0))
+    z = np.random.default_rng(1).normal(size=(50, 1))
+    scale = (other["D_zu"] / values["D_zu"]).item()
+    first, second = normalise(structure, values, z)[0], normalise(structure, other, scale * z)[0]
+    for name in first:
+        np.testing.assert_allclose(second[name], first[name], rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("build", [hammerstein, wiener])
+def test_fixed_blocks_stay(build):
+    structure = build(3, PrandtlIshlinskii(Play, 4))
+    _, values = random_lfr(7)
+    values |= {k: np.broadcast_to(v, values[k].shape) * 1.0 for k, v in structure.fixed.items()}
+    u = random_input(7, 200)
+    y, z, _, _ = signals(Play, values, u)
+    out, _ = normalise(structure, values, z)
+    for name, value in structure.fixed.items():
+        np.testing.assert_allclose(out[name], np.broadcast_to(value, out[name].shape), atol=1e-14)
+    np.testing.assert_allclose(signals(Play, out, u)[0], y, atol=1e-11)
+    if build is hammerstein:
+        np.testing.assert_allclose(out["w"].sum(), 1.0)
+    else:
+        np.testing.assert_allclose(np.std(signals(Play, out, u)[1]), 1.0)
+
+
+def test_reach_in_place_of_deviation():
+    structure, values = random_lfr(8)
+    u = random_input(8, 100)
+    out, _ = normalise(structure, values, signals(Play, values, u)[1], by="reach")
+    assert np.max(np.abs(signals(Play, out, u)[1])) == pytest.approx(1.0)
+
+
+def test_a_linear_model_needs_no_z():
+    structure, values = random_lfr(9, n_w=0)
+    out, change = normalise(structure, values)
+    b = np.hstack([out["B_u"], out["B_w"]])
+    np.testing.assert_allclose(out["A"] @ out["A"].T + b @ b.T, np.eye(3), atol=1e-10)
+    np.testing.assert_allclose(change @ values["B_u"], out["B_u"])
+
+
+def test_what_cannot_be_normalised():
+    structure, values = random_lfr(10)
+    z = np.ones((20, 1)) * np.arange(20)[:, None]
+    for given_z, options, words in (
+        (None, {}, "For the signal z nothing was given"),
+        (z[:, 0], {}, r"shape \(20,\) was given"),
+        (0 * z, {}, "does not move"),
+        (z, {"by": "rms"}, "use 'std' or 'reach'"),
+    ):
+        with pytest.raises(InputError, match=words):
+            normalise(structure, values, given_z, **options)
+    dead = {**values, "B_u": 0 * values["B_u"], "B_w": 0 * values["B_w"]}
+    with pytest.raises(InputError, match="reaches some state"):
+        normalise(structure, dead, z)
+    rounded = PILFR(3, PrandtlIshlinskii(Play, 4, rounded=True))
+    with pytest.raises(InputError, match="rounded"):
+        normalise(rounded, {**values, "eps": np.array(0.1)}, z)
+
+
+# ---- standard errors ----
+
+
+def spring(**changes):
+    """A driven oscillator in physical parameters: no gauge freedom."""
+    parameters = ParameterSet(
+        {"k": Parameter(40.0, bounds=(1.0, 1e3)), "d": Parameter(1.5), "m": Parameter(2.0, fixed=True)}
+    )
+    h = 0.05
+
+    def step(x, u, w, p):
+        force = u - p["k"] * x[0] - p["d"] * x[1]
+        velocity = x[1] + h * force / p["m"]
+        return ca.vertcat(x[0] + h * velocity, velocity), x[0]
+
+    model = open_model(step, lambda x, u, p: x[:0], parameters, n_x=2, n_u=1, n_w=0)
+    return model.with_parameters(model.parameters.change(**changes))
+
+
+def oscillator(noise, seed, length=400, colour=0.0, initial="zero", model=None):
+    model = model or spring()
+    u = random_input(0, length)
+    clean = Problem(model, Recording(u=u, y=u, dt=0.05, initial="zero"), engine="vm", scale=[1.0])
+    y = clean.simulate(clean.start)[0] + noise * disturbance(seed, length, colour=colour)
+    return Problem(model, Recording(u=u, y=y, dt=0.05, initial=initial), engine=clean.engine)
+
+
+def test_a_grey_box_without_gauge_is_the_classical_formula():
+    problem = oscillator(2e-3, 1, length=2000)
+    solution = GaussNewton().solve(problem)
+    jac, e = problem.jacobian(solution.theta), problem.residual(solution.theta)
+    expected = np.linalg.inv(jac.T @ jac) * (e @ e) / (len(e) - 2)
+    np.testing.assert_allclose(covariance(problem, solution.theta), expected, rtol=1e-9)
+    errors = standard_errors(problem, solution.theta)
+    assert errors["k"] == pytest.approx(np.sqrt(expected[0, 0]))
+    assert errors["k"].shape == ()
+    assert np.isnan(errors["m"])
+
+
+def well_spread(pivots):
+    """Whether (estimate - truth) / reported error, shape (seeds, n), has zero mean and unit variance within four deviations."""
+    n = len(pivots)
+    return np.all(np.abs(np.mean(pivots, axis=0)) < 4 / np.sqrt(n)) and np.all(
+        np.abs(np.mean(np.square(pivots), axis=0) - 1) < 4 * np.sqrt(2 / n)
+    )
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.8])
+def test_monte_carlo_of_a_grey_box(colour):
+    """100 noise seeds; with coloured noise the classical formula would be off by a factor of up to three."""
+    pivots, classical = [], []
+    for seed in range(100):
+        problem = oscillator(2e-3, seed, colour=colour, initial="estimate")
+        solution = GaussNewton().solve(problem)
+        truth = problem.start  # the parameters that made the data, from rest
+        pivots.append((solution.theta - truth) / np.sqrt(np.diag(covariance(problem, solution.theta))))
+        jac, e = problem.jacobian(solution.theta), problem.residual(solution.theta)
+        deviation = np.sqrt(np.diag(np.linalg.inv(jac.T @ jac)) * (e @ e) / (len(e) - 4))
+        classical.append((solution.theta - truth) / deviation)
+    assert well_spread(pivots)
+    assert well_spread(classical) == (colour == 0)
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.7])
+def test_monte_carlo_of_a_pi_lfr(colour):
+    """Gauge-invariant functions by the delta method, 50 noise seeds."""
+    structure, values = random_lfr(21, nx=2, n=2, gain=0.5)
+    u = random_input(21, 1000)
+    values["r"][0] = np.std(signals(Play, values, u)[1]) * np.array([0.3, 1.0])
+    pivots = []
+    for seed in range(50):
+        model, recording = recorded(structure, values, u, noise=0.01, seed=seed, colour=colour, initial="zero")
+        problem = Problem(model, recording)
+        truth = invariant(structure, problem, problem.start)
+        theta = GaussNewton(tolerance=1e-9).solve(problem).theta
+        matrix = variance(covariance(problem, theta, structure), slopes(structure, problem, theta))
+        pivots.append((invariant(structure, problem, theta) - truth) / np.sqrt(np.diag(matrix)))
+    assert well_spread(pivots)
+
+
+def test_white_noise_is_not_taken_for_coloured():
+    """Forty parameters in a narrow band leave a notch in the residual, which is not a property of the noise."""
+    structure, values = random_lfr(18, nx=8, n=4)
+    u = random_input(18, 600)
+    u = np.cumsum(np.cumsum(u, axis=0), axis=0)
+    u = (u - u.mean()) / u.std()
+    model, recording = recorded(structure, values, u, noise=0.05, initial="zero")
+    problem = Problem(model, recording, engine="vm")
+    theta = GaussNewton(max_iterations=30).solve(problem).theta
+    _, _, hessian = problem.normal(theta)
+    size, vectors = np.linalg.eigh(hessian)
+    seen = size > 1e-9 * size[-1]
+    weights = vectors[:, seen] / np.sqrt(size[seen])
+    e = problem.residual(theta)
+    white = np.eye(seen.sum()) * (e @ e) / (len(e) - seen.sum()) / len(e)
+    np.testing.assert_allclose(gradient_covariance(problem, theta, weights), white, rtol=0.02, atol=0.02 * white[0, 0])
+
+
+def invariant(structure, problem, theta):
+    """Trace and determinant of A, static gain of the linear part, r over its mean, and the full slope's gain."""
+    p = problem.model.parameters.unpack(problem.parameters(theta))
+    gain = p["C_y"] @ np.linalg.solve(np.eye(structure.nx) - p["A"], p["B_u"]) + p["D_yu"]
+    return np.array(
+        [np.trace(p["A"]), np.linalg.det(p["A"]), gain.item(), p["r"][0, 0] / p["r"][0, 1], p["y_0"].item()]
+    )
+
+
+def slopes(structure, problem, theta, h=1e-6):
+    ends = [
+        (invariant(structure, problem, theta + d), invariant(structure, problem, theta - d))
+        for d in h * np.eye(len(theta))
+    ]
+    return np.array([(a - b) / (2 * h) for a, b in ends]).T
+
+
+def test_variance_of_functions():
+    matrix = np.array([[4.0, 1.0, 0.0], [1.0, 9.0, 0.0], [0.0, 0.0, np.inf]])
+    assert variance(matrix, [1.0, 1.0, 0.0]) == 15.0
+    assert variance(matrix, [0.0, 0.0, 1e-9]) == np.inf
+    found = variance(matrix, [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 1.0, 1.0]])
+    assert found[:2, :2].tolist() == [[4.0, 2.0], [2.0, 36.0]]
+    assert np.isinf(found[2, 2])
+
+
+def test_errors_of_invariants_do_not_depend_on_the_gauge():
+    structure, values = random_lfr(12, nx=2, n=3)
+    u = random_input(12, 500)
+    _, recording = recorded(structure, values, u, noise=0.02, initial="zero")
+    other, _ = moved(values, Play, np.random.default_rng(0))
+    found = []
+    for v in (values, other):
+        problem = Problem(structure.model(1, 1, v), recording, engine="vm")
+        matrix = covariance(problem, problem.start, structure)
+        found.append(variance(matrix, slopes(structure, problem, problem.start)))
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-4)
+
+
+def test_scale_invariance():
+    """In other units of one parameter its error is in those units; the metric knows the scales."""
+    structure, values = random_lfr(13, nx=2, n=2)
+    u = random_input(13, 300)
+    model, recording = recorded(structure, values, u, noise=0.05, initial="zero")
+    big = recording.with_(u=1000 * recording.u)
+    changed = {**values, **{k: values[k] / 1000 for k in ("B_u", "D_yu", "D_zu")}}
+    a = Problem(model, recording, engine="vm")
+    b = Problem(structure.model(1, 1, changed), big, engine="vm")
+    errors_a, errors_b = standard_errors(a, a.start, structure), standard_errors(b, b.start, structure)
+    for name in errors_a:
+        factor = 1000 if name in ("B_u", "D_yu", "D_zu") else 1
+        np.testing.assert_allclose(errors_b[name] * factor, errors_a[name], rtol=1e-6)
+
+
+def test_bounds_and_fixed_entries_have_no_error():
+    problem = oscillator(2e-3, 0, model=spring(k={"value": 45.0, "bounds": (45.0, 100.0)}, m={"fixed": False}))
+    theta = problem.start.copy()
+    errors = standard_errors(problem, theta)
+    assert np.isnan(errors["k"])
+    free = oscillator(2e-3, 0, model=spring(k={"value": 45.0, "fixed": True}, m={"fixed": False}))
+    for name in ("d", "m"):  # the others as if it were fixed
+        np.testing.assert_allclose(errors[name], standard_errors(free, free.start)[name], rtol=1e-9)
+    theta[0] += 1e-14  # within rounding of the bound
+    assert np.isnan(standard_errors(problem, theta)["k"])
+    assert np.all(covariance(problem, theta)[0] == 0)
+
+
+def test_an_active_constraint_is_projected_out():
+    model = spring(m={"fixed": False})
+    problem = oscillator(2e-3, 0, model=model)
+    tied = Problem(
+        model,
+        problem.recordings,
+        engine=problem.engine,
+        constraints=[Constraint(lambda p: p["k"] - 20 * p["m"], 0.0, 0.0)],
+    )
+    matrix = covariance(tied, tied.start)
+    np.testing.assert_allclose(np.array([1.0, 0.0, -20.0]) @ matrix, 0.0, atol=1e-12)
+    loose = Problem(
+        model, problem.recordings, engine=problem.engine, constraints=[Constraint(lambda p: p["k"], upper=60.0)]
+    )
+    np.testing.assert_allclose(covariance(loose, loose.start), covariance(problem, problem.start), rtol=1e-12)
+    assert matrix[0, 0] < covariance(problem, problem.start)[0, 0]
+
+
+def test_what_the_data_leaves_open_is_infinite():
+    structure, values = random_lfr(14, nx=2, n=3)
+    values["r"][0] = [0.2, 50.0, 0.7]  # the second play never moves
+    values["r"][0, 2] = 0.7
+    u = random_input(14, 300)
+    model, recording = recorded(structure, values, u, noise=0.01, initial="zero")
+    problem = Problem(model, recording, engine="vm")
+    errors = standard_errors(problem, problem.start, structure)
+    assert np.isinf(errors["w"][0, 1])
+    assert np.isinf(errors["r"][0, 1])
+    assert np.isfinite(errors["w"][0, [0, 2]]).all()
+    assert np.isfinite(errors["A"]).all()
+
+
+def test_two_equal_operators_are_not_told_apart():
+    structure, values = random_lfr(15, nx=2, n=3)
+    values["r"][0], values["w"][0] = [0.5, 0.5, 1.0], [0.3, 0.3, 0.4]
+    u = random_input(15, 300)
+    model, recording = recorded(structure, values, u, noise=0.01, initial="zero")
+    problem = Problem(model, recording, engine="vm")
+    errors = standard_errors(problem, problem.start, structure)
+    assert np.isinf(errors["w"][0, :2]).all()
+    assert np.isinf(errors["r"][0, :2]).all()
+    assert np.isfinite(errors["w"][0, 2])
+    assert np.isfinite(errors["C_y"]).all()
+
+
+def test_a_gauge_that_nobody_named_gives_infinite_errors():
+    structure, values = random_lfr(16, nx=2, n=2)
+    u = random_input(16, 300)
+    model, recording = recorded(structure, values, u, noise=0.01, initial="zero")
+    problem = Problem(model, recording, engine="vm")
+    without = standard_errors(problem, problem.start)
+    assert np.isinf(without["A"]).all()
+    assert np.isfinite(without["D_yu"]).all()
+    assert np.isfinite(without["y_0"]).all()
+    np.testing.assert_allclose(without["D_yu"], standard_errors(problem, problem.start, structure)["D_yu"], rtol=1e-6)
+
+
+def test_fewer_samples_than_parameters_is_not_a_crash():
+    problem = oscillator(2e-3, 0, length=3, initial="estimate", model=spring(m={"fixed": False}))
+    errors = standard_errors(problem, problem.start)
+    assert all(np.all(np.isnan(e) | np.isinf(e)) for e in errors.values())
+
+
+def test_a_prior_counts_as_the_problem_weighs_it():
+    plain, held = oscillator(2e-3, 0), oscillator(2e-3, 0, model=spring(k={"prior": (40.0, 1e-3)}))
+    loose = Problem(
+        held.model, held.recordings, engine=held.engine, noise=float(np.sqrt(np.mean(held.residual(held.start) ** 2)))
+    )
+    errors = standard_errors(loose, loose.start)
+    assert errors["k"] == pytest.approx(1e-3, rel=0.01)
+    assert standard_errors(plain, plain.start)["k"] > 10 * errors["k"]
+
+
+def test_outputs_with_noises_of_their_own():
+    """Two outputs that share no parameter: each has the errors it would have alone."""
+    structure, values = random_lfr(17, nx=0, n_u=1, n_y=2, n_w=0)
+    u = random_input(17, 500)
+    model = structure.model(1, 2, values)
+    rng = np.random.default_rng(0)
+    y = u @ values["D_yu"].T + values["y_0"] + rng.normal(size=(500, 2)) * [0.01, 0.5]
+    problem = Problem(model, Recording(u=u, y=y, dt=1.0, initial="zero"), engine="vm")
+    theta = GaussNewton().solve(problem).theta
+    errors = standard_errors(problem, theta, structure)
+    design = np.column_stack([u[:, 0], np.ones(500)])
+    for i in range(2):
+        _, rest, _, _ = np.linalg.lstsq(design, y[:, i], rcond=None)
+        alone = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * rest / (500 - 2))
+        np.testing.assert_allclose([errors["D_yu"][i, 0], errors["y_0"][i]], alone, rtol=5e-3)

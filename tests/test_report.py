@@ -1,0 +1,297 @@
+"""The page is one file that says what it should, escapes what users wrote, and works in a real browser."""
+
+import functools
+import http.server
+import io
+import json
+import re
+import shutil
+import subprocess
+import threading
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi.export import load
+from pilfr_casadi.fit import Fit
+from pilfr_casadi.lfr import PILFR, block_shapes
+from pilfr_casadi.operators import Play
+from pilfr_casadi.plots import new_figure
+from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi.report import Code, Page, Picture, Section, Table, Text, fit_report, write_report
+from pilfr_casadi.report.fit_tables import _cell
+from pilfr_casadi.report.page import number_text
+from pilfr_casadi.solution import Iteration, Solution, Status
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+EVIL = "<script>alert(1)</script>\" onload='x' & $\\frac"
+
+
+def example(nx=2, n_u=1, n_y=1, channels=1, status=Status.CONVERGED, own=False):
+    """A fit with random values and a little of everything that a page shows."""
+    rng = np.random.default_rng(0)
+    structure = PILFR(nx, PrandtlIshlinskii(Play, 3, channels))
+    values = {name: rng.normal(size=shape) for name, shape in block_shapes(nx, n_u, n_y, channels).items()}
+    values["A"] = 0.9 * values["A"] / np.max(np.abs(np.linalg.eigvals(values["A"])))
+    values["B_w"], values["D_yw"] = 0.05 * values["B_w"], 0.3 * values["D_yw"]
+    values["w"], values["r"] = rng.uniform(size=(channels, 3)), rng.uniform(0, 2, (channels, 3))
+    names = {"inputs": tuple(f"u{i}" for i in range(n_u)), "outputs": tuple(f"y{i}" for i in range(n_y))}
+    model = structure.model(n_u, n_y, values, **names)
+    errors = {name: np.full(p.value.shape, 0.01) for name, p in model.parameters.items()}
+    solution = Solution(np.zeros(0), 1e-4, status, 4, 0.1, history=(Iteration(0, 1.0, 0.1), Iteration(1, 0.1, 0.2)))
+    linear = structure.linear().model(n_u, n_y, {k: values[k] for k in ("A", "B_u", "C_y", "D_yu")}, **names)
+    kept = None if own else structure
+    return Fit(model, kept, 0.01, solution, (0.01,), {}, errors=errors, linear=linear, units={"u0": "V"}, engine="vm")
+
+
+def record(fitted, name="", samples=600, seed=1):
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(samples, fitted.model.n_u))
+    model = fitted.model
+    data = Recording(u, np.zeros((samples, model.n_y)), fitted.dt, model.inputs, model.outputs, initial="zero")
+    y = fitted.simulate(data)
+    return data.with_(y=y + 0.02 * np.std(y) * rng.normal(size=y.shape), name=name)
+
+
+def square():
+    """A small PNG file."""
+    figure = new_figure(1, 1)
+    ax = figure.add_subplot()
+    ax.plot([0, 1])
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+class Reader(HTMLParser):
+    """Tags and text of a page, and whether every tag is closed."""
+
+    VOID = ("meta", "link", "img", "br", "hr")
+
+    def __init__(self, html):
+        super().__init__()
+        self.tags, self.open, self.words = [], [], []
+        self.feed(html)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+    def all(self, tag):
+        return [attrs for name, attrs in self.tags if name == tag]
+
+
+def test_users_text_is_text():
+    blocks = [Text(EVIL), Code(EVIL, EVIL), Table([EVIL], [[EVIL]], EVIL, EVIL), Table(["a"], [[1]], EVIL, folded=True)]
+    blocks += [Picture(square(), EVIL, EVIL)]
+    page = Page(EVIL, [Section(EVIL, blocks)] * 3, EVIL, EVIL, facts={EVIL: EVIL}, footer=EVIL)
+    html = page.html()
+    reader = Reader(html)
+    assert "<script" not in html and not any("onload" in attrs for _, attrs in reader.tags)
+    assert reader.all("img")[0]["alt"] == EVIL
+    assert reader.text.count(EVIL) >= 20
+
+
+def test_a_page_needs_nothing_from_anywhere():
+    html = Page("title", [Section("part", [Picture(square(), "caption", "alt")])]).html()
+    reader = Reader(html)
+    policy = next(m["content"] for m in reader.all("meta") if m.get("http-equiv") == "Content-Security-Policy")
+    assert policy.startswith("default-src 'none'")
+    addresses = [v for _, attrs in reader.tags for k, v in attrs.items() if k in ("src", "href")]
+    assert addresses and all(a.startswith(("data:", "#")) for a in addresses)
+    assert not re.search(r"https?://|@import|url\(", html)
+
+
+def test_pictures_stand_side_by_side_unless_wide():
+    a, b, c = (Picture(square(), k, k, wide=k == "c") for k in "abc")
+    section = Section("part", [Text("t"), a, b, c, a, Text("t"), b])
+    assert [len(group) for group in section.groups] == [1, 2, 1, 1, 1, 1]
+    png = square()
+    source, width, height = Picture(png, "", "").embedded
+    assert source.startswith("data:image/png;base64,") and (width, height) == (100, 100)
+    with pytest.raises(InputError, match="not a PNG file"):
+        Page("t", [Section("s", [Picture(b"GIF89a", "", "")])]).html()
+
+
+def test_tables_write_numbers_for_people():
+    table = Table(["a", "b", "c", "d", "e", "f"], [["x", 0.012345678, -1.5e-6, None, 12, np.inf]], digits=3)
+    assert [text for text, _ in table.cells[0]] == ["x", "0.0123", "−1.5·10⁻⁶", "–", "12", "∞"]
+    assert [number for _, number in table.cells[0]] == [False, True, True, True, True, True]
+    assert number_text(np.float64(6.02214e23)) == "6.022·10²³"
+    assert _cell(1.23456, 0.0123) == "1.235\xa0±\xa00.012"
+    assert _cell(-123456.0, 250.0) == "−123456\xa0±\xa0250"
+    assert _cell(1.5e-7, 2e-9) == "1.5·10⁻⁷\xa0±\xa02·10⁻⁹"
+    assert _cell(0.25, np.nan) == "0.25"
+    with pytest.raises(InputError, match="a table has 1 cells and its head 2"):
+        Table(["a", "b"], [["x"]])
+
+
+def test_an_unknown_tone():
+    with pytest.raises(InputError, match="tone 'jolly' is unknown"):
+        Page("title", [], tone="jolly")
+
+
+def test_writing_is_atomic(tmp_path):
+    path = write_report(tmp_path / "r.html", "one", [], status="done", tone="good")
+    assert path == tmp_path / "r.html" and 'class="status good"' in path.read_text()
+    broken = Section("part", [Picture(b"no picture", "", "")])
+    with pytest.raises(InputError):
+        write_report(tmp_path / "r.html", "two", [broken])
+    assert "<h1>one</h1>" in path.read_text() and len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_page_of_a_fit(tmp_path):
+    fitted = example()
+    train, test = record(fitted), record(fitted, "slow", seed=2)
+    path = fit_report(fitted, train, [test, record(fitted, seed=3)], tmp_path / "new" / "folder")
+    assert path == tmp_path / "new" / "folder" / "report.html"
+    again = replace(load(path.with_name("model.json")), engine="vm")
+    assert again.nrmse(test) == fitted.nrmse(test)
+    html = path.read_text()
+    reader = Reader(html)
+    assert reader.all("h1") and len(reader.all("h2")) == 6
+    assert Status.CONVERGED.value in reader.text and 'class="status good"' in html
+    assert f"{fitted.nrmse(test):.3g}" in reader.text and "slow" in reader.text and "test 2" in reader.text
+    assert "Modes in small motions" in reader.text and "Operators, by threshold" in reader.text
+    assert "pilfr.load('model.json')" in reader.text
+    images = reader.all("img")
+    assert len(images) == 2 * 4 + 4 + 1 + 1 and all(i["alt"] for i in images)
+    assert len(reader.all("figcaption")) == len(images)
+    assert len(html) < 3_000_000
+
+
+def test_the_table_of_errors_is_that_of_the_fit():
+    from pilfr_casadi.metrics import rmse
+    from pilfr_casadi.plots import linear_simulation
+    from pilfr_casadi.report.fit_page import fit_page
+
+    fitted = example(n_u=2, n_y=2, channels=2)
+    test = record(fitted, "t", seed=5)
+    page = fit_page(fitted, record(fitted), test)
+    table = next(b for b in page.sections[0].blocks if isinstance(b, Table))
+    rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    assert [r["output"] for r in rows] == ["y0", "y1", "y0", "y1"]
+    assert table.emphasis == [2, 3]
+    assert np.mean([r["NRMSE, this model"] for r in rows[2:]]) == pytest.approx(fitted.nrmse(test), rel=1e-12)
+    assert np.mean([r["rms error"] for r in rows[2:]]) == pytest.approx(rmse(test.y, fitted.simulate(test)), rel=1e-12)
+    linear = np.sqrt(np.mean((test.y - linear_simulation(fitted, test))[:, 1] ** 2)) / np.std(test.y[:, 1])
+    assert rows[3]["NRMSE, linear model"] == pytest.approx(linear, rel=1e-12)
+    assert rows[2]["rms error, % of range"] == pytest.approx(100 * rows[2]["rms error"] / np.ptp(test.y[:, 0]))
+
+
+def test_modes_are_eigenvalues():
+    from pilfr_casadi.report.fit_tables import mode_tables
+
+    fitted = example()
+    rate = 2 * np.pi * 5 * complex(-0.1, np.sqrt(1 - 0.01))
+    pole = np.exp(rate * fitted.dt)
+    a = np.array([[pole.real, pole.imag], [-pole.imag, pole.real]])
+    values = fitted.model.parameters.change(A={"value": a}, B_w={"value": np.zeros((2, 1))})
+    small, large = mode_tables(replace(fitted, model=fitted.model.with_parameters(values)))
+    assert small.rows[0] == pytest.approx(["oscillation", 5.0, 0.1, 1 / (2 * np.pi * 0.5), abs(pole)])
+    assert large.rows[0] == pytest.approx(small.rows[0])
+
+
+@pytest.mark.parametrize(
+    ("status", "tone"),
+    [(Status.MAX_ITERATIONS, "warning"), (Status.INTERRUPTED, "warning"), (Status.INFEASIBLE, "bad")],
+)
+def test_a_fit_that_did_not_converge_says_so(status, tone, tmp_path):
+    fitted = example(status=status)
+    html = fit_report(fitted, record(fitted), [], tmp_path).read_text()
+    assert f'class="status {tone}">{status.value}' in html
+    assert "on its training recordings" in html
+
+
+def test_unusual_fits_have_a_page_too(tmp_path):
+    fitted = example()
+    values = fitted.model.parameters.change(A={"value": 1.6 * np.eye(2)})
+    wild = replace(fitted, model=fitted.model.with_parameters(values))
+    html = fit_report(wild, record(fitted), record(fitted), tmp_path).read_text()
+    assert "the model runs away" in html
+    linear = replace(fitted, model=fitted.linear, structure=PILFR(2), linear=None, errors={})
+    text = Reader(fit_report(linear, record(linear), [], tmp_path).read_text()).text
+    assert "Modes of the linear part" in text and "The hysteresis it found" not in text
+    own = example(nx=1, own=True)
+    own = replace(own, linear=None, candidates=())
+    assert "model=model)" in fit_report(own, record(own), [], tmp_path).read_text()
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").touch()
+    fitted = example()
+    with pytest.raises(InputError, match=r"cannot be made"):
+        fit_report(fitted, record(fitted), [], tmp_path / "file" / "folder")
+
+
+WRAPPER = """<!DOCTYPE html><html><body><iframe src="report.html" style="width:%dpx;height:900px;border:0"></iframe>
+<pre id="out"></pre><script>
+addEventListener("load", async () => {
+  const inner = document.querySelector("iframe"), page = inner.contentDocument, images = [...page.images];
+  await Promise.all(images.map(i => i.decode()));
+  const colours = images.map(image => {
+    const canvas = document.createElement("canvas"), pen = canvas.getContext("2d");
+    canvas.width = image.naturalWidth; canvas.height = image.naturalHeight; pen.drawImage(image, 0, 0);
+    return new Set(new Uint32Array(pen.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
+  });
+  const texts = [...page.querySelectorAll("p, td, th, figcaption, dt, a, summary")];
+  const root = page.documentElement;
+  document.getElementById("out").textContent = JSON.stringify({
+    images: images.length, shown: images.filter(i => i.complete && i.naturalWidth > 0 && i.clientWidth > 100).length,
+    colours: Math.min(...colours), overflow: root.scrollWidth - root.clientWidth, width: root.clientWidth,
+    font: Math.min(...texts.map(e => parseFloat(getComputedStyle(e).fontSize))),
+    columns: new Set(images.slice(0, 2).map(i => Math.round(i.getBoundingClientRect().left))).size,
+    title: page.title
+  });
+});
+</script></body></html>"""
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *arguments):
+        pass
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("width", [390, 1280])
+def test_in_a_browser(width, tmp_path):
+    fitted = example(n_u=2, n_y=2, channels=2)
+    long_name = "a_recording_with_a_name_that_goes_on_and_on_without_a_single_blank_in_it"
+    fit_report(fitted, record(fitted), [record(fitted, long_name, seed=2)], tmp_path)
+    (tmp_path / "wrapper.html").write_text(WRAPPER % width)
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=tmp_path))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
+    flags += " --disable-component-update --disable-sync --hide-scrollbars --enable-logging=stderr --dump-dom"
+    flags += f" --window-size={width + 40},1000 --virtual-time-budget=20000 --user-data-dir={tmp_path / 'profile'}"
+    address = f"http://127.0.0.1:{server.server_address[1]}/wrapper.html"
+    try:
+        done = subprocess.run(
+            [CHROMIUM, *flags.split(), address], capture_output=True, text=True, timeout=120, check=True
+        )
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert "CONSOLE" not in done.stderr, done.stderr
+    seen = json.loads(re.search(r'<pre id="out">(.*?)</pre>', done.stdout, re.S).group(1))
+    assert seen["title"] == "Identified model: u0, u1 → y0, y1"
+    assert seen["width"] == width and seen["overflow"] <= 0
+    assert seen["images"] == seen["shown"] > 10
+    assert seen["colours"] > 20
+    assert seen["font"] >= 13
+    assert seen["columns"] == (1 if width == 390 else 2)
