@@ -225,7 +225,7 @@ def _fit(options: argparse.Namespace) -> int:
     solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
     with progress_bar() as progress:
         if options.start_from:
-            result = fit(load(options.start_from).model, train, solver=solver, engine=options.engine, progress=progress)
+            result = fit(load(options.start_from), train, solver=solver, engine=options.engine, progress=progress)
         else:
             nx = options.nx if options.nx is not None else _choose_order(train)
             search = {"starts": options.starts, "seed": options.seed, "workers": options.workers}

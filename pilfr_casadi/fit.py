@@ -182,7 +182,7 @@ class Fit:
 
 
 def fit(
-    model: PILFR | Model,
+    model: PILFR | Model | Fit,
     train: Recording | Sequence[Recording],
     *,
     solver: Any = None,
@@ -202,8 +202,8 @@ def fit(
 
     Parameters
     ----------
-    model : PILFR or Model
-        A PI-LFR structure (start values are found), or a closed model of your own (started at its values).
+    model : PILFR, Model or Fit
+        A PI-LFR structure (start values are found), a closed model of your own, or an earlier fit (started at its values).
     train : Recording or sequence of Recording
         Training data; nothing else is used.
     solver : GaussNewton or Ipopt
@@ -234,18 +234,22 @@ def fit(
     """
     began = time.perf_counter()
     solver = solver or GaussNewton()
-    if isinstance(model, Model):
-        recordings = check_for_identification(train, int(model.parameters.free.sum()) + 2)
-        problem = Problem(model, recordings, constraints=constraints, l1=l1, noise=noise or 1.0, engine=engine)
+    if not isinstance(model, PILFR):
+        given, structure = (model.model, model.structure) if isinstance(model, Fit) else (model, None)
+        recordings = check_for_identification(train, int(given.parameters.free.sum()) + 2)
+        limits = _limits(structure, stable) if structure else ()
+        problem = Problem(
+            given, recordings, constraints=(*limits, *constraints), l1=l1, noise=noise or 1.0, engine=engine
+        )
         if not np.isfinite(problem.cost(problem.start)):
             raise InputError("The simulation diverges at the start values; start from a stable model.")
-        return _result(model, None, problem, solver.solve(problem), began, recordings)
+        return _result(given, structure, problem, solver.solve(problem), began, recordings)
     if starts < 1:
         raise InputError(f"{starts} starts were asked for; give 1 or more.")
     if start not in ("grid", "paper"):
         raise InputError(f"The start {start!r} is unknown; use 'grid' or 'paper'.")
     recordings = check_for_identification(train, _fewest_samples(model, train))
-    limits = stability(model, 1.0 if stable is True else float(stable)) if stable else ()
+    limits = _limits(model, stable)
     linear, problem, solution = linear_model(recordings, model, engine=engine, constraints=limits[:1])
     fitted = _fitted(linear, problem, solution)
     if solution.status is Status.INTERRUPTED:
@@ -286,6 +290,10 @@ def fit(
 
         result = replace(result, status=Status.INTERRUPTED)
     return _result(best.model, model, problem, result, began, recordings, tuple(candidates), fitted)
+
+
+def _limits(structure: PILFR, stable: bool | float) -> tuple[Constraint, ...]:
+    return stability(structure, 1.0 if stable is True else float(stable)) if stable else ()
 
 
 def fingerprint(recording: Recording) -> str:

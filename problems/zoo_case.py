@@ -79,6 +79,7 @@ def plays(w: np.ndarray, r: np.ndarray) -> Callable[[Any, Any], Any]:
 
 
 def noisy(u: np.ndarray, y: np.ndarray, rng: np.random.Generator, level: float, dt: float = 0.01) -> Recording:
+    """A recording from rest with white noise of `level` times each output's deviation."""
     noise = level * np.std(y, axis=0) * rng.standard_normal(y.shape)
     return Recording(u=u, y=y + noise, dt=dt, initial="zero", hold="zero")
 

@@ -1,4 +1,4 @@
-"""The grey-box case of the zoo: the two-mass rig's own equations, with stops in the open port of its hysteretic spring."""
+"""The grey-box case of the zoo: the rig's own equations, with stops in the open port of its hysteretic spring."""
 
 from __future__ import annotations
 
@@ -48,7 +48,10 @@ def rig_with_open_spring(stops: int = 10) -> Model:
     model = open_model(step, port, ParameterSet(physical), n_x=4, n_u=1, n_w=1, states=names, outputs=("x2",))
     model = close_loop(model, PrandtlIshlinskii(Stop, stops))
     r = 1e-3 * (np.arange(1, stops + 1) / stops) ** 1.5
-    start = {"w": {"value": np.full((1, stops), 200.0)}, "r": {"value": r[None, :], "fixed": True}}
+    start: dict[str, dict[str, Any]] = {
+        "w": {"value": np.full((1, stops), 200.0)},
+        "r": {"value": r[None, :], "fixed": True},
+    }
     return model.with_parameters(model.parameters.change(**start))
 
 

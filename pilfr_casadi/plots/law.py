@@ -100,7 +100,7 @@ def weights(
     r, w = r[order], w[order]
     ax.vlines(r, 0, w, color=SKY, linewidth=1.5)
     errors = fit.errors.get("w")
-    spread = None if errors is None else np.nan_to_num(errors[channel][order])
+    spread = None if errors is None else np.nan_to_num(errors[channel][order], posinf=0.0)
     ax.errorbar(r, w, yerr=spread, fmt="o", markersize=4, color=BLUE, elinewidth=1, label="weights w (left)")
     right = ax.twinx()
     grid = np.linspace(0.0, limit, 300)
