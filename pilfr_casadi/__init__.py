@@ -34,6 +34,7 @@ _EXPORTS = {
     "as_recordings": "recording",
     "close_loop": "model",
     "fit": "fit",
+    "fit_report": "report",
     "frequency_subspace": "subspace",
     "generalized_play": "operators",
     "hammerstein": "lfr",

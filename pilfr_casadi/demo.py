@@ -1,7 +1,7 @@
 """The demonstration: identify a two-mass rig with a hysteretic spring from recordings that come with the package.
 
-The recordings are the benchmark of Krikelis et al. (2024), Sec. 6, simulated exactly: training multisine, multisine test
-and sine-sweep test, 50 dB signal-to-noise ratio. `python -m problems.masing_rig --write-demo` writes them.
+The recordings are the benchmark of Krikelis et al. (2024), Sec. 6, simulated exactly: a training multisine, a multisine
+test and a sine-sweep test, 50 dB signal-to-noise ratio. `python -m problems.masing_rig --write-demo` writes them.
 """
 
 from __future__ import annotations
@@ -53,25 +53,18 @@ def run_demo(folder: Path, workers: int) -> int:
 
     recordings = demo_recordings()
     console = Console()
-    console.print(
-        "Identifying the rig: force on one mass -> displacement; the other mass hangs on a hysteretic spring."
-    )
-    table = Table(
-        "model",
-        *(f"{s}{unit}" for s in SETS for unit in (" here", " paper")),
-        "time",
-        title="NRMSE in simulation (Krikelis et al. 2024, Table 2)",
-    )
+    console.print("A force drives one mass, its displacement is measured; a second mass hangs on a hysteretic spring.")
+    table = Table("model", *SETS, "time", title="NRMSE in simulation, in brackets Krikelis et al. (2024), Table 2")
     best: Fit | None = None
     for row, published in PUBLISHED.items():
         n = 0 if row == "LTI" else int(row.partition("=")[2])
         with progress_bar() as progress:
             result = fit(structure(n), recordings["train"], workers=workers, progress=progress)
         errors = [result.nrmse(recordings[s]) for s in SETS]
-        cells = [text for e, p in zip(errors, published, strict=True) for text in (f"{e:.4f}", f"{p:.4f}")]
+        cells = [f"{e:.4f} ({p:.4f})" for e, p in zip(errors, published, strict=True)]
         table.add_row(row, *cells, f"{result.seconds:.1f} s")
         best = result
-    table.add_row("noise floor", *(text for _ in SETS for text in (f"{FLOOR:.4f}", f"{FLOOR:.4f}")), "")
+    table.add_row("noise floor", *(f"{FLOOR:.4f}" for _ in SETS), "")
     console.print(table)
     assert best is not None
     best.save(folder / "model.json")

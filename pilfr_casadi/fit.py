@@ -26,6 +26,7 @@ from .problem import Problem
 from .recording import InputError, Recording, as_recordings, check_for_identification
 from .sensitivities import Engine
 from .solution import Solution, Status
+from .threads import one_blas_thread
 
 Progress = Callable[[str, int, int, float], None]
 
@@ -173,14 +174,15 @@ class Fit:
             f"{self.solution.iterations} iterations in the last solve, {self.seconds:.1f} s in all",
         ]
         if self.candidates:
-            failed = sum(not c.solution.status.converged for c in self.candidates)
-            lines.append(f"{len(self.candidates)} starts, of which {failed} did not converge")
+            reached = sorted(c.error for c in self.candidates)
+            lines.append(f"{len(reached)} starts, explored to NRMSE {reached[0]:.4f} ... {reached[-1]:.4f}")
         lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
         return "\n".join(lines)
 
     __repr__ = __str__
 
 
+@one_blas_thread
 def fit(
     model: PILFR | Model | Fit,
     train: Recording | Sequence[Recording],
@@ -203,7 +205,8 @@ def fit(
     Parameters
     ----------
     model : PILFR, Model or Fit
-        A PI-LFR structure (start values are found), a closed model of your own, or an earlier fit (started at its values).
+        A PI-LFR structure (start values are found), a closed model of your own, or an earlier fit (started at its
+        values).
     train : Recording or sequence of Recording
         Training data; nothing else is used.
     solver : GaussNewton or Ipopt

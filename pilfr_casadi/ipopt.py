@@ -269,6 +269,8 @@ class _Run:
             theta[loose] -= np.linalg.lstsq(slope, excess[rows], rcond=None)[0] / scaled.s[loose]
             theta = np.clip(theta, problem.lower, problem.upper)
         self._keep(theta, problem.cost(theta), margin=self.options.tolerance)
+        inside = (self.theta > problem.lower) & (self.theta < problem.upper)
+        self.multipliers[: problem.size][inside] = 0.0  # what the barrier has left there
 
     def _solution(self, status: Status, message: str) -> Solution:
         g = self.problem.constraint(self.theta) if len(self.problem.g_lower) else np.zeros(0)

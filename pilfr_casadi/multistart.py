@@ -31,6 +31,7 @@ from .recording import InputError, Recording
 from .sensitivities import Engine
 from .solution import Solution, Status
 from .start import Blocks, grid_start, paper_start, regridded, unit_states
+from .threads import one_blas_thread
 from .subspace import subspace_matrices
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
@@ -109,6 +110,7 @@ def linear_model(
     return model, problem, solution
 
 
+@one_blas_thread
 def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Candidate:
     """One start, run until it has shown what it is worth (to the end with the paper's start)."""
     rng = np.random.default_rng(sequence)
@@ -129,6 +131,7 @@ def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, no
     return Candidate(seed, model, solution.theta, error, solution, note)
 
 
+@one_blas_thread
 def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candidate:
     """Re-grid a candidate and run it to the end; returns the better of what came out, never worse than what went in."""
     engine = make_engine(candidate.model, search.engine)

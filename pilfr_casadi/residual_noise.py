@@ -4,7 +4,7 @@ Each output's noise is an autoregression whose order BIC chooses, none for white
 residual what the parameters could follow, which looks like noise that avoids those frequencies: the residual of white
 noise has the covariance `σ² (I - P)`, `P = J H^-1 J' / R`. Its autocovariances are corrected for that before they are
 used, and the noise is never taken to be weaker in any direction of the parameters than white noise of the same
-variance.
+variance. What is left of the bias counts where coloured noise meets many parameters in a narrow band.
 """
 
 from __future__ import annotations

@@ -10,6 +10,8 @@ taken at the start and after one damped Gauss-Newton step from it, whichever is 
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import casadi as ca
 import numpy as np
 
@@ -56,7 +58,6 @@ class Scaled:
         self.g_unit = np.where(rows > 0, rows, 1.0)
         self.lower, self.upper = problem.lower * self.s, problem.upper * self.s
         self.g_lower, self.g_upper = problem.g_lower / self.g_unit, problem.g_upper / self.g_unit
-        self._bend = _curvature(problem)
 
     def theta(self, x: np.ndarray) -> np.ndarray:
         """θ at x, rounding taken back into the bounds."""
@@ -82,11 +83,20 @@ class Scaled:
             gradient, hessian = g / scale, h / scale / self.s[:, None]
         return Point(x, f / self.unit, gradient, hessian, self.constraints(self.theta(x)), self.slope(x))
 
+    @cached_property
+    def _weighted_curvature(self) -> ca.Function | None:
+        """`(p, λ) -> ∇²(λ'g)` over the model's full parameter vector; None where the constraints are linear."""
+        p, lam = ca.MX.sym("p", len(self.problem.free)), ca.MX.sym("lam", len(self.g_unit))
+        h = ca.hessian(ca.dot(lam, self.problem._g(p)), p)[0]
+        return ca.Function("curvature", [p, lam], [ca.densify(h)], ["p", "lam"], ["hessian"]) if h.nnz() else None
+
     def curvature(self, x: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
         """Hessian of the constraints weighted by their multipliers (n_g,), shape (n, n)."""
         h, free = np.zeros((len(x), len(x))), np.flatnonzero(self.problem.free)
-        if self._bend is not None:
-            dense = np.asarray(self._bend(self.problem.parameters(self.theta(x)), multipliers / self.g_unit))
+        if self._weighted_curvature is not None:
+            dense = np.asarray(
+                self._weighted_curvature(self.problem.parameters(self.theta(x)), multipliers / self.g_unit)
+            )
             s = self.s[: len(free)]
             h[: len(free), : len(free)] = dense[np.ix_(free, free)] / s / s[:, None]
         return h
@@ -104,13 +114,3 @@ def _filled(squares: np.ndarray, labels: tuple[str, ...], start: np.ndarray, uni
         known, size = squares[alike & (squares > 0)], float(np.max(np.abs(start[alike])))
         out[alike & ~(squares > 0)] = np.median(known) if len(known) else unit / (size or 1.0) ** 2
     return out
-
-
-def _curvature(problem: Problem) -> ca.Function | None:
-    """`(p, λ) -> ∇²(λ'g)` over the model's full parameter vector; None where the constraints are linear."""
-    n_g = len(problem.g_lower)
-    if not n_g:
-        return None
-    p, lam = ca.MX.sym("p", len(problem.free)), ca.MX.sym("lam", n_g)
-    h = ca.hessian(ca.dot(lam, problem._g(p)), p)[0]
-    return ca.Function("curvature", [p, lam], [ca.densify(h)], ["p", "lam"], ["hessian"]) if h.nnz() else None

@@ -51,7 +51,7 @@ def draw(seed: int, fits: Mapping[str, Fit], errors: Mapping[str, np.ndarray], f
             _sweep_loops(data), "displacement of mass 1 [mm]", "spring force [N]", title="sweep, truth"
         ).figure,
         "fig08_linear": plots.best_linear_approximation(bla, best.linear, unit="m/N").figure,
-        "fig09_multisine": plots.plot_fit(best, data.records["multisine"]),
+        "fig09_multisine": plots.plot_fit(best, data.records["multisine"], steady=data.steady),
         "fig10_sweep": plots.plot_fit(best, data.records["sweep"]),
     }
     rows = [row for row in errors if row != "LTI"]

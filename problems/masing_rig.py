@@ -89,9 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not options.no_figures:
         from .masing_figures import draw
 
-        records = benchmark(options.seed).records
-        many = options.start == "paper"  # the default pipeline's starts are not run to the end, so their spread means little
-        spread = {row: errors_of_starts(result, records) for row, (_, result) in rows.items() if many and result.candidates}
+        records, spread = benchmark(options.seed).records, {}
+        if options.start == "paper":  # the default pipeline's starts are not run to the end: their spread means little
+            spread = {row: errors_of_starts(result, records) for row, (_, result) in rows.items() if result.candidates}
         print(f"figures: {draw(options.seed, {row: result for row, (_, result) in rows.items()}, spread, options.out)}")
 
 

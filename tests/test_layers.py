@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parent.parent / "pilfr_casadi"
 
 # A file imports from its own layer and from those with a lower number. A new file takes its place here.
 LAYERS = {
-    0: ("recording", "signals", "multisines", "metrics", "parameters", "readers", "csv_table", "timebase"),
+    0: ("recording", "signals", "multisines", "metrics", "parameters", "readers", "csv_table", "timebase", "threads"),
     1: ("operators", "elements"),
     2: ("model", "simulator"),
     3: (

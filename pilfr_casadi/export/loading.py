@@ -2,8 +2,8 @@
 
 Nothing in the file is trusted and nothing in it is executed. Sizes are compared with the numbers that are really there
 before anything is built, so a few bytes cannot ask for a model of a billion operators. Every value is checked for its
-shape, for being finite, and against the bounds and fixed values of the structure: `w >= 0` and `r >= 0`, Krikelis et al.
-(2024), Eq. 16, unless the structure says otherwise.
+shape, for being finite, and against the bounds and fixed values of the structure (where it says nothing, `w >= 0` and
+`r >= 0` as in Krikelis et al. (2024), Eq. 16).
 """
 
 from __future__ import annotations
