@@ -1,6 +1,6 @@
 /* Time loops around the generated step: simulation, and the matrix-form sensitivity recursion.
  *
- * The generated part above defines pilfr_step(), pilfr_computed(), the sizes N_X N_S N_Z N_Y N_U N_P N_TERMS N_DIRECT, and
+ * The generated part above defines pilfr_step(), pilfr_computed(), the sizes N_X N_S N_Z N_Y N_U N_P N_TERMS, and
  * where the values of one sample begin in their stack: AT_CONSTANT AT_P AT_U AT_X AT_S AT_Z AT_W AT_COMPUTED, N_VALUES.
  * A row of slopes is a sum of terms. TERM_<t>[ROW_<t>[i]] .. TERM_<t>[ROW_<t>[i+1]] are those of row i of target t, each
  * {source, index, value}: the row `index` of source 0 x, 1 s, 2 z, 3 w, times a value of the stack; DIRECT_<t> likewise
@@ -25,7 +25,7 @@
 #endif
 typedef double lane_t __attribute__((vector_size(sizeof(double) * WIDTH), aligned(8), may_alias));
 typedef struct { const double *row; double value; } active_t;
-typedef struct { int first, last, keep; } span_t;
+typedef struct { int first, last, row; } span_t;
 
 /* out[from..to) = sum of the terms; out may be one of their rows. */
 static void combine(double *out, const active_t *terms, int n, long from, long to) {
@@ -68,7 +68,7 @@ static void rows(double *out, long ld, int n_rows, const int *row, const term_t 
     }
     for (long from = 0; from < ld; from += TILE) {
         const long to = from + TILE < ld ? from + TILE : ld;
-        for (int i = 0; i < m; ++i) combine(out + span[i].keep * ld, active + span[i].first, span[i].last - span[i].first, from, to);
+        for (int i = 0; i < m; ++i) combine(out + span[i].row * ld, active + span[i].first, span[i].last - span[i].first, from, to);
     }
     for (int i = 0; i < n_rows; ++i)
         for (int t = direct_row[i]; t < direct_row[i + 1]; ++t) {

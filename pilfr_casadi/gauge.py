@@ -132,6 +132,8 @@ def standard_errors(problem: Problem, theta: Array, structure: PILFR | None = No
 def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tuple[Array, Array]:
     theta = np.array(theta, dtype=float)
     _, _, hessian = problem.normal(theta)
+    if not np.all(np.isfinite(hessian)):
+        return np.diag(np.full(problem.size, np.inf)), np.zeros(problem.size, dtype=bool)
     sensitivity = np.sqrt(np.diag(hessian))
     held = _snap_to_bounds(problem, theta, sensitivity)
     tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, held)

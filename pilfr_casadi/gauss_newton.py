@@ -30,7 +30,16 @@ class _QuadraticProgram:
         quiet = {"daqp": {}, "qrqp": {"print_iter": False, "print_header": False, "print_info": False}}.get(plugin, {})
         self._solve = ca.conic("qp", plugin, structure, {**quiet, "error_on_fail": False})
 
-    def __call__(self, h: np.ndarray, g: np.ndarray, lbx: np.ndarray, ubx: np.ndarray, a: np.ndarray, lba: np.ndarray, uba: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    def __call__(
+        self,
+        h: np.ndarray,
+        g: np.ndarray,
+        lbx: np.ndarray,
+        ubx: np.ndarray,
+        a: np.ndarray,
+        lba: np.ndarray,
+        uba: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, bool]:
         out = self._solve(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
         d = np.asarray(out["x"]).ravel()
         multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])
@@ -114,7 +123,9 @@ class _Run:
                 recent.append(self.cost + self.penalty * float(violation.sum()))
                 if self.progress:
                     self.progress(self.history[-1] if self.history else Iteration(0, self.cost, 0.0))
-                calm = len(recent) > options.patience and recent[-1 - options.patience] - recent[-1] < options.tolerance * abs(recent[-1])
+                calm = len(recent) > options.patience and recent[-1 - options.patience] - recent[
+                    -1
+                ] < options.tolerance * abs(recent[-1])
                 if calm and violation.sum() <= 1e-9:
                     return Status.CONVERGED
             # a column that has been zero so far does not move, whatever its damping: the method is invariant to units
@@ -122,16 +133,22 @@ class _Run:
             damped = hessian + self.damping * np.diag(floor)
             step, good = self._step(damped, gradient, slope)
             predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)
-            trial, improvement = self._judge(step, damped, gradient, slope, violation) if good else (self.theta, -np.inf)
+            trial, improvement = (
+                self._judge(step, damped, gradient, slope, violation) if good else (self.theta, -np.inf)
+            )
             expected = predicted + self.penalty * float(violation.sum())
             fresh = bool(good and improvement > 1e-4 * expected and improvement > 0)
             length = float(np.max(np.abs(step) * np.sqrt(floor))) if good else 0.0
             if fresh:
-                ratio = improvement / max(expected, 1e-300)
+                ratio = min(improvement / max(expected, 1e-300), 2.0)  # a cube of it follows
                 self.theta = trial
                 self.damping = max(self.damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 1e-12)
                 self.growth = 2.0
-                self.history.append(Iteration(number + 1, self.cost - improvement, time.perf_counter() - self.began, length, self.damping))
+                self.history.append(
+                    Iteration(
+                        number + 1, self.cost - improvement, time.perf_counter() - self.began, length, self.damping
+                    )
+                )
             else:
                 if good and expected < 1e-3 * options.tolerance * abs(self.cost) and violation.sum() <= 1e-9:
                     return Status.CONVERGED
@@ -141,7 +158,9 @@ class _Run:
                     return Status.INFEASIBLE if violation.sum() > 1e-6 else Status.SMALL_STEP
         return Status.MAX_ITERATIONS
 
-    def _step(self, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, correction: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
+    def _step(
+        self, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, correction: np.ndarray | None = None
+    ) -> tuple[np.ndarray, bool]:
         problem = self.problem
         g = (problem.constraint(self.theta) if self.n_g else np.zeros(0)) if correction is None else correction
         low, high = problem.g_lower - g, problem.g_upper - g
@@ -149,28 +168,45 @@ class _Run:
         unit = 1.0 / np.sqrt(np.diag(damped))
         lbx, ubx = (problem.lower - self.theta) / unit, (problem.upper - self.theta) / unit
         size = max(float(np.max(np.abs(gradient * unit))), 1e-300)
-        d, multipliers, good = self.qp(damped * unit * unit[:, None], gradient * unit / size, lbx / size, ubx / size, slope * unit, low / size, high / size)
+        h, steepest, a = damped * unit * unit[:, None], gradient * unit / size, slope * unit
+        for share in (1.0, 0.5, 0.1, 0.01, 0.0) if self.n_g else (1.0,):  # of the violation that the step has to remove
+            lba = np.minimum(low, share * np.maximum(low, 0.0))
+            uba = np.maximum(high, share * np.minimum(high, 0.0))
+            d, multipliers, good = self.qp(h, steepest, lbx / size, ubx / size, a, lba / size, uba / size)
+            if good:
+                break
         if good:
             n = problem.size
             self.multipliers = np.concatenate([multipliers[:n] * size / unit, multipliers[n:] * size])
             if self.n_g:
-                self.penalty = max(self.penalty, 2.0 * float(np.max(np.abs(self.multipliers[n:]))))
+                # Powell's rule; a penalty that only grows keeps what far-off multipliers asked for, and crawls along g = 0
+                needed = 1.5 * float(np.max(np.abs(self.multipliers[n:])))
+                self.penalty = max(needed, 0.5 * (self.penalty + needed))
         return d * size * unit, good
 
-    def _judge(self, step: np.ndarray, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, violation: np.ndarray) -> tuple[np.ndarray, float]:
+    def _judge(
+        self, step: np.ndarray, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, violation: np.ndarray
+    ) -> tuple[np.ndarray, float]:
         """Trial point and the improvement of the penalised cost it brings."""
         problem = self.problem
         merit = self.cost + self.penalty * float(violation.sum())
-        trial = np.clip(self.theta + step, problem.lower, problem.upper)
+        trial = self._inside(self.theta + step)
         there = float(self.violation(trial).sum())
         if self.n_g and there > max(float(violation.sum()), 1e-12):
             linearised = problem.constraint(trial) - slope @ step
             corrected, good = self._step(damped, gradient, slope, linearised)
             if good:
-                candidate = np.clip(self.theta + corrected, problem.lower, problem.upper)
+                candidate = self._inside(self.theta + corrected)
                 if float(self.violation(candidate).sum()) < there:
                     trial, there = candidate, float(self.violation(candidate).sum())
         return trial, merit - problem.cost(trial) - self.penalty * there
+
+    def _inside(self, theta: np.ndarray) -> np.ndarray:
+        """Exactly on the bounds that the last quadratic program holds active, and inside the others."""
+        problem, force = self.problem, self.multipliers[: self.problem.size]
+        theta = np.where((force < 0) & np.isfinite(problem.lower), problem.lower, theta)
+        theta = np.where((force > 0) & np.isfinite(problem.upper), problem.upper, theta)
+        return np.asarray(np.clip(theta, problem.lower, problem.upper))
 
     def _finish(self, status: Status) -> Solution:
         violation = float(self.violation(self.theta).max(initial=0.0))

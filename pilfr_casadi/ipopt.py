@@ -234,7 +234,7 @@ class _Run:
         """History, progress, and the test for convergence at an accepted iterate; 1 tells IPOPT to stop."""
         x, f, g, lam_x, lam_g, _ = iterate
         scaled, options, cost = self.scaled, self.options, float(f[0]) * self.scaled.unit
-        step = float(np.max(np.abs(x - self.x))) * np.sqrt(scaled.unit) if self.history else 0.0
+        step = float(np.max(np.abs(x - self.x)) * np.sqrt(scaled.unit)) if self.history else 0.0
         self.x = x
         seconds = time.perf_counter() - self.began
         self.history.append(Iteration(len(self.history), cost, seconds, step, self.damping.value))

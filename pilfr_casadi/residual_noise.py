@@ -39,7 +39,7 @@ def gradient_covariance(problem: Problem, theta: Array, weights: Array) -> Array
 
     total, n_y, k = problem.residuals, problem.model.n_y, weights.shape[1]
     lags = _autocovariances(problem, theta, weights)
-    lags = np.maximum(lags, 1e-12 * lags[:, :1].max()) if np.any(lags[:, 0] <= 0) else lags
+    lags[:, 0] = np.maximum(lags[:, 0], 1e-12 * lags[:, 0].max())
     models = [_autoregression(c, total // n_y) for c in lags]
     white, coloured, informed = (np.zeros((k, k)) for _ in range(3))
     for _, jac, columns in problem.stretches(theta):
@@ -71,10 +71,10 @@ def _autocovariances(problem: Problem, theta: Array, weights: Array) -> Array:
             for lag in range(min(most, len(e) // n_y - 1) + 1):
                 a, b = slice(i, len(e) - lag * n_y, n_y), slice(i + lag * n_y, None, n_y)
                 residual[i, lag] += e[a] @ e[b]
-                taken[i, lag] += np.vdot(slope[a], slope[b])
+                taken[i, lag] += np.sum(slope[a] * slope[b])
     count = total / n_y
     variance = residual[:, :1] / np.maximum(count - taken[:, :1], 1.0)
-    return np.asarray((residual + variance * taken) / np.maximum(count, 1.0))
+    return np.asarray((residual + variance * taken) / count)
 
 
 def _autoregression(lags: Array, samples: int) -> tuple[Array, float]:

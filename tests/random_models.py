@@ -24,7 +24,7 @@ def random_lfr(seed, nx=3, n_u=1, n_y=1, n_w=1, n=4, operator=Play, radius=0.8, 
         for name in values:
             if name.startswith("gamma_"):
                 values[name] = values[name] + rng.uniform(0.0, 0.3, values[name].shape)
-        while nx and _slipping(values) > max(radius, 0.9):
+        while nx and _slipping(values) > max(1.01 * radius, 0.9):
             values["B_w"] = values["B_w"] / 2
     return structure, values
 

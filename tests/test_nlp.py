@@ -77,7 +77,7 @@ def test_layout():
         np.testing.assert_array_equal(value.ravel(), state)
 
 
-def _lag(limit=None):
+def _lag():
     """A lag of gain 2 identified from a noisy step, and the problem over the horizon."""
     rng = np.random.default_rng(3)
     u = np.concatenate([np.zeros(5), np.ones(55)])
