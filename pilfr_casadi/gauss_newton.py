@@ -4,10 +4,11 @@ Each step solves the quadratic program
 
     minimise  1/2 d'(H + λ D)d + g'd   subject to  lower <= θ + d <= upper,  lower_g <= g(θ) + ∇g d <= upper_g,
 
-with `H` the Gauss-Newton Hessian and `D` the largest diagonal of `H` seen so far (Marquardt 1963; Moré 1978): at the usual start
-(`B_w = 0`) whole columns of the Jacobian vanish and a state space is over-parametrised, so damping is needed and has to know
-the scales. Trial points are judged by simulation alone; λ follows the gain ratio (Nielsen 1999). General constraints enter an
-exact penalty `μ Σ violation`, with a second-order correction when a step along their tangent violates them.
+with `H` the Gauss-Newton Hessian and `D` the largest diagonal of `H` seen so far (Marquardt 1963; Moré 1978): at the
+usual start (`B_w = 0`) whole columns of the Jacobian vanish and a state space is over-parametrised, so damping is
+needed and has to know the scales. Trial points are judged by simulation alone; λ follows the gain ratio (Nielsen
+1999). General constraints enter an exact penalty `μ Σ violation`, with a second-order correction when a step along
+their tangent violates them.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ class _Run:
             n = problem.size
             self.multipliers = np.concatenate([multipliers[:n] * size / unit, multipliers[n:] * size])
             if self.n_g:
-                # Powell's rule; a penalty that only grows keeps what far-off multipliers asked for, and crawls along g = 0
+                # Powell's rule: a penalty that only grows keeps what far-off multipliers asked for, and crawls
                 needed = 1.5 * float(np.max(np.abs(self.multipliers[n:])))
                 self.penalty = max(needed, 0.5 * (self.penalty + needed))
         return d * size * unit, good

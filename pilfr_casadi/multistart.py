@@ -1,10 +1,12 @@
 """From recordings to a PI-LFR: linear model, many starts, and a careful polish of the best.
 
-1. `linear_model`: subspace identification refined by output error, states scaled to unit variance (Krikelis et al., Sec. 5.3).
-2. Exploration: from each seed a short Gauss-Newton run. Most of what a start will ever reach shows within some forty steps.
-3. The best few are re-gridded (`start.regrid`) and run again: thresholds that have clustered or fallen asleep are spread along
-   the density the fit has found. This is done twice, the second time with thresholds beyond the visited range and a weak prior that holds the
-   weights to the smoothed density, which decides what the data leaves open.
+1. `linear_model`: subspace identification refined by output error, states scaled to unit variance (Krikelis et al.,
+   Sec. 5.3).
+2. Exploration: from each seed a short Gauss-Newton run. Most of what a start will ever reach shows within some forty
+   steps.
+3. The best few are re-gridded (`start.regrid`) and run again: thresholds that have clustered or fallen asleep are
+   spread along the density the fit has found. This is done twice, the second time with thresholds beyond the visited
+   range and a weak prior that holds the weights to the smoothed density, which decides what the data leaves open.
 4. The smallest training error wins; a candidate with the prior wins over one without when it is within `margin` of it.
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
@@ -14,9 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from .compiled import make_engine
@@ -25,14 +28,13 @@ from .elements import PrandtlIshlinskii
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .model import Model
-from .operators import Play
 from .problem import Problem
 from .recording import InputError, Recording
 from .sensitivities import Engine
 from .solution import Solution, Status
 from .start import Blocks, grid_start, paper_start, regridded, unit_states
-from .threads import one_blas_thread
 from .subspace import subspace_matrices
+from .threads import one_blas_thread
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 
@@ -53,7 +55,14 @@ class Search:
 
     def problem(self, model: Model, engine: Engine | None = None, noise: float = 1.0) -> Problem:
         """The simulation-error problem of a model of this structure."""
-        return Problem(model, self.recordings, engine=engine or self.engine, constraints=self.constraints, l1=self.l1, noise=self.noise or noise)
+        return Problem(
+            model,
+            self.recordings,
+            engine=engine or self.engine,
+            constraints=self.constraints,
+            l1=self.l1,
+            noise=self.noise or noise,
+        )
 
     def model(self, values: dict[str, Any]) -> Model:
         """The closed model starting at `values`."""
@@ -74,24 +83,27 @@ class Candidate:
 
 
 def stability(structure: PILFR, radius: float = 1.0) -> tuple[Constraint, ...]:
-    """Bounds on the spectral radius of A, and with operators that all slip (or, for stops, all stick) of `A + B_w diag(Σw) C_z`."""
+    """Bounds on the spectral radius of A, and of A + B_w diag(Σw) C_z: no operator slips, or all (stops: sticks)."""
     if structure.nx == 0:
         return ()
-    limits = (stable(radius),)
+    limits: tuple[Constraint, ...] = (stable(radius),)
     element = structure.element
-    if isinstance(element, PrandtlIshlinskii) and not isinstance(element.operator, type(None)):
-        limits += (replace(stable(radius, _with_element), name=f"spectral radius with the element's full slope <= {radius:g}"),)
+    if isinstance(element, PrandtlIshlinskii):
+        limits += (stable(radius, _with_element, "spectral radius with the element's full slope"),)
     return limits
 
 
 def _with_element(p: Any) -> Any:
-    import casadi as ca
-
     return p["A"] + p["B_w"] @ ca.diag(ca.sum2(p["w"])) @ p["C_z"]
 
 
 def linear_model(
-    recordings: Sequence[Recording], structure: PILFR, *, engine: str = "auto", constraints: tuple[Constraint, ...] = (), solver: GaussNewton | None = None
+    recordings: Sequence[Recording],
+    structure: PILFR,
+    *,
+    engine: str = "auto",
+    constraints: tuple[Constraint, ...] = (),
+    solver: GaussNewton | None = None,
 ) -> tuple[Model, Problem, Solution]:
     """A linear state-space model: subspace identification refined by output error.
 
@@ -103,8 +115,14 @@ def linear_model(
     linear = structure.linear()
     first = recordings[0]
     offset = np.mean(np.concatenate([r.y for r in recordings]), axis=0) if structure.offset else np.zeros(first.n_y)
-    a, b, c, d = subspace_matrices(recordings, structure.nx)
-    model = linear.model(first.n_u, first.n_y, {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset}, inputs=first.inputs, outputs=first.outputs)
+    a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset)
+    model = linear.model(
+        first.n_u,
+        first.n_y,
+        {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset},
+        inputs=first.inputs,
+        outputs=first.outputs,
+    )
     problem = Problem(model, recordings, engine=engine, constraints=constraints)
     solution = (solver or GaussNewton(tolerance=1e-4)).solve(problem)
     return model, problem, solution
@@ -140,7 +158,12 @@ def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candida
     for beyond, spread in ((1.0, 0.0), (1.3, 0.05)):
         best = min(found, key=lambda c: c.error)
         values = best.model.parameters.unpack(search.problem(best.model, engine).parameters(best.theta))
-        z = np.concatenate([engine.simulate(r.u, best.model.parameters.pack(values), s, True)[2] for r, s in zip(search.recordings, plain.initial_states(best.theta), strict=True)])
+        z = np.concatenate(
+            [
+                engine.simulate(r.u, best.model.parameters.pack(values), s, True)[2]
+                for r, s in zip(search.recordings, plain.initial_states(best.theta), strict=True)
+            ]
+        )
         moved = regridded(search.structure, values, z, beyond)
         model = best.model.with_parameters(best.model.parameters.at(best.model.parameters.pack(moved)))
         if spread:
@@ -166,8 +189,13 @@ def _with_prior(model: Model, values: dict[str, Any], spread: float) -> Model:
     return model.with_parameters(model.parameters.change(**own))
 
 
-def run_tasks(function: Callable[..., Candidate], tasks: Iterable[tuple[Any, ...]], executor: Executor | None, report: Callable[[Candidate], None]) -> tuple[list[Candidate], bool]:
-    """Results in the order of the tasks, from an executor or one after the other; and whether the run was interrupted."""
+def run_tasks(
+    function: Callable[..., Candidate],
+    tasks: Iterable[tuple[Any, ...]],
+    executor: Executor | None,
+    report: Callable[[Candidate], None],
+) -> tuple[list[Candidate], bool]:
+    """Results in the order of the tasks, from an executor or one after the other; whether the run was interrupted."""
     tasks, results = list(tasks), []
     futures = [executor.submit(function, *task) for task in tasks] if executor is not None else None
     try:
@@ -184,7 +212,14 @@ def run_tasks(function: Callable[..., Candidate], tasks: Iterable[tuple[Any, ...
     return results, False
 
 
-def search_starts(search: Search, starts: int, seed: int, executor: Executor | None, report: Callable[[Candidate], None], keep: int = 3) -> tuple[list[Candidate], Candidate, bool]:
+def search_starts(
+    search: Search,
+    starts: int,
+    seed: int,
+    executor: Executor | None,
+    report: Callable[[Candidate], None],
+    keep: int = 3,
+) -> tuple[list[Candidate], Candidate, bool]:
     """All candidates of the exploration, the winner, and whether the run was interrupted.
 
     Raises
@@ -196,8 +231,14 @@ def search_starts(search: Search, starts: int, seed: int, executor: Executor | N
     found, stopped = run_tasks(explore, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
     usable = sorted((c for c in found if np.isfinite(c.error)), key=lambda c: c.error)
     if not usable:
-        raise InputError("No start gave a finite simulation; check units and the initial state, or choose another order.")
+        raise InputError(
+            "No start gave a finite simulation; check units and the initial state, or choose another order."
+        )
     if search.start == "paper" or stopped:
         return found, usable[0], stopped
     polished, stopped = run_tasks(polish, [(search, c) for c in usable[:keep]], executor, report)
-    return found, min([*polished, usable[0]], key=lambda c: c.error) if not polished else min(polished, key=lambda c: c.error), stopped
+    return (
+        found,
+        min([*polished, usable[0]], key=lambda c: c.error) if not polished else min(polished, key=lambda c: c.error),
+        stopped,
+    )

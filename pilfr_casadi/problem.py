@@ -3,10 +3,10 @@
     minimise  1/2 mean(e²) + 1/2 Σ ((θ_i - m_i) / s_i)² v/R + l1 Σ |w|      e = (y_hat(θ) - y) / σ_y,
     subject to  lower <= θ <= upper,  lower_g <= g(θ) <= upper_g.
 
-θ stacks the model's free parameters and, for each recording whose initial state is estimated, that state with the element's
-memory. The mean runs over all R scored samples and outputs; `v` is the noise variance that the priors are weighed against.
-Derivatives come from the sensitivity recursion; `normal` accumulates `JᵀJ` and `Jᵀe` over stretches of the record, so memory
-does not grow with its length.
+θ stacks the model's free parameters and, for each recording whose initial state is estimated, that state with the
+element's memory. The mean runs over all R scored samples and outputs; `v` is the noise variance that the priors are
+weighed against. Derivatives come from the sensitivity recursion; `normal` accumulates `JᵀJ` and `Jᵀe` over stretches
+of the record, so memory does not grow with its length.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ class Problem:
         for r in self.recordings:
             if r.n_u != model.n_u or r.n_y != model.n_y:
                 raise InputError(
-                    f"The recording has {r.n_u} inputs and {r.n_y} outputs, the model {model.n_u} and {model.n_y}; they must match."
+                    f"The recording has {r.n_u} inputs and {r.n_y} outputs, "
+                    f"the model {model.n_u} and {model.n_y}; they must match."
                 )
         self.scale = _output_scale(self.recordings) if scale is None else np.asarray(scale, dtype=float)
         self._parts = list(self._lay_out(n_free, periods))
@@ -119,12 +120,16 @@ class Problem:
                     at += n_state
                 else:
                     if r.period is None:
-                        raise InputError("A recording in periodic steady state needs its period in samples; give `period=`.")
+                        raise InputError(
+                            "A recording in periodic steady state needs its period in samples; give `period=`."
+                        )
                     yield _Part(r, None, zero, np.tile(r.u[: r.period], (periods, 1)))
             else:
                 given = np.asarray(r.initial, dtype=float).ravel()
                 if given.size not in (self.model.n_x, n_state):
-                    raise InputError(f"An initial state of {given.size} numbers was given; expected {self.model.n_x} or {n_state}.")
+                    raise InputError(
+                        f"An initial state of {given.size} numbers was given; expected {self.model.n_x} or {n_state}."
+                    )
                 yield _Part(r, None, np.concatenate([given, zero[given.size :]]), nothing)
 
     def _set_penalties(self, l1: dict[str, float], noise: float) -> None:
@@ -133,7 +138,9 @@ class Problem:
         for name, strength in l1.items():
             where = parameters.position(name)
             if np.any(parameters.lower[where] < 0):
-                raise InputError(f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior.")
+                raise InputError(
+                    f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior."
+                )
             slope[where] = strength
         for name, p in parameters.items():
             if p.prior is not None:
@@ -142,7 +149,9 @@ class Problem:
                 std = np.broadcast_to(np.asarray(p.prior[1], dtype=float), p.value.shape).ravel(order="F")
                 weight[where] = noise**2 / std**2 / self._residuals
         pad = np.zeros(self.size - int(self.free.sum()))
-        self._prior_weight, self._prior_mean, self._l1 = (np.concatenate([a[self.free], pad]) for a in (weight, mean, slope))
+        self._prior_weight, self._prior_mean, self._l1 = (
+            np.concatenate([a[self.free], pad]) for a in (weight, mean, slope)
+        )
 
     @property
     def size(self) -> int:
@@ -249,7 +258,8 @@ class Problem:
         Returns
         -------
         Horizon
-            What `casadi.nlpsol` takes (`x, f, g`, bounds, start), with residual, simulated outputs and named parameters.
+            What `casadi.nlpsol` takes (`x, f, g`, bounds, start), with residual, simulated outputs and named
+            parameters.
         """
         return to_nlp(self)
 
@@ -258,7 +268,9 @@ class Problem:
         out = []
         for part, y in zip(self._parts, self.simulate(theta), strict=True):
             e = (y - part.recording.y)[part.recording.skip :]
-            out.append(float(np.mean(np.sqrt(np.mean(e**2, axis=0)) / np.std(part.recording.y[part.recording.skip :], axis=0))))
+            out.append(
+                float(np.mean(np.sqrt(np.mean(e**2, axis=0)) / np.std(part.recording.y[part.recording.skip :], axis=0)))
+            )
         return out
 
 

@@ -1,10 +1,10 @@
 """Start values: from a linear approximation to a PI-LFR worth optimising.
 
-`paper_start` is Krikelis et al. (2024), Eq. 22-24. `grid_start` keeps its random direction of z but spreads the thresholds over
-the range that z visits, instead of drawing them from `U(0, R)`: idle or identical thresholds hardly separate again.
-`regrid` takes a fitted element, smooths its density of weights, and places the thresholds anew so that each stands for an
-equal share of `density^0.4` (the knots of a good piecewise-linear approximation of the loading curve). It continues the tail
-of the density beyond the visited range, where data alone says nothing.
+`paper_start` is Krikelis et al. (2024), Eq. 22-24. `grid_start` keeps its random direction of z but spreads the
+thresholds over the range that z visits, instead of drawing them from `U(0, R)`: idle or identical thresholds hardly
+separate again. `regrid` takes a fitted element, smooths its density of weights, and places the thresholds anew so
+that each stands for an equal share of `density^0.4` (the knots of a good piecewise-linear approximation of the
+loading curve). It continues the tail of the density beyond the visited range, where data alone says nothing.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def states_of(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:
 
 
 def unit_states(blocks: Mapping[str, np.ndarray], inputs: list[np.ndarray]) -> tuple[Blocks, list[np.ndarray]]:
-    """Scale each state to unit variance (Sec. 5.3); returns the blocks and the states of each recording, scaled alike."""
+    """Scale each state to unit variance (Sec. 5.3); returns the blocks, and the states of each recording."""
     states = [states_of(blocks, u) for u in inputs]
     spread = np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0))
     spread = np.where(spread > 0, spread, 1.0)
@@ -43,24 +43,33 @@ def unit_states(blocks: Mapping[str, np.ndarray], inputs: list[np.ndarray]) -> t
     return scaled, [x / spread for x in states]
 
 
-def paper_start(structure: PILFR, linear: Mapping[str, np.ndarray], rng: np.random.Generator, spread: float = 0.1) -> Blocks:
-    """The start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)` with `R = spread`, `B_w = D_yw = 0`."""
+def paper_start(
+    structure: PILFR, linear: Mapping[str, np.ndarray], rng: np.random.Generator, spread: float = 0.1
+) -> Blocks:
+    """Start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)`, R = `spread`, `B_w = D_yw = 0`."""
     element = _layer(structure)
     n_x, n_u = linear["B_u"].shape
     shape = (element.channels, element.n)
     blocks = {name: linear[name] for name in LINEAR}
-    blocks["C_z"], blocks["D_zu"] = rng.uniform(-1, 1, (element.channels, n_x)), rng.uniform(-1, 1, (element.channels, n_u))
+    blocks["C_z"], blocks["D_zu"] = (
+        rng.uniform(-1, 1, (element.channels, n_x)),
+        rng.uniform(-1, 1, (element.channels, n_u)),
+    )
     blocks["w"], blocks["r"] = rng.uniform(0, 1 / element.n, shape), rng.uniform(0, spread, shape)
     return blocks
 
 
 def grid_start(
-    structure: PILFR, linear: Mapping[str, np.ndarray], inputs: list[np.ndarray], states: list[np.ndarray], rng: np.random.Generator
+    structure: PILFR,
+    linear: Mapping[str, np.ndarray],
+    inputs: list[np.ndarray],
+    states: list[np.ndarray],
+    rng: np.random.Generator,
 ) -> Blocks:
-    """A random direction of z scaled to unit deviation, thresholds on a grid over its range, equal weights, `B_w = D_yw = 0`.
+    """A random direction of z of unit deviation, thresholds on a grid over its range, equal weights, `B_w = D_yw = 0`.
 
-    Where `structure` fixes blocks such that the input reaches the dynamics only through the element (Hammerstein), or the
-    output is read only through it (Wiener), the linear blocks move to the other side of the element.
+    Where `structure` fixes blocks such that the input reaches the dynamics only through the element (Hammerstein), or
+    the output is read only through it (Wiener), the linear blocks move to the other side of the element.
     """
     element = _layer(structure)
     blocks = paper_start(structure, linear, rng)
@@ -91,12 +100,14 @@ def _layer(structure: PILFR) -> PrandtlIshlinskii:
 
 
 def density(r: np.ndarray, w: np.ndarray, grid: np.ndarray, width: float) -> np.ndarray:
-    """Smoothed density of weights over thresholds: Gaussian kernels, mirrored at zero; shapes (N,), (N,), (G,) -> (G,)."""
+    """Density of weights (N,) over thresholds (N,) on a grid (G,): Gaussian kernels, mirrored at zero."""
     kernels = sum(np.exp(-0.5 * ((grid[:, None] - sign * r) / width) ** 2) for sign in (1, -1))
     return np.asarray(kernels @ w) / (width * np.sqrt(2 * np.pi))
 
 
-def regrid(r: np.ndarray, w: np.ndarray, reach: float, *, beyond: float = 1.3, smooth: float = 1 / 12) -> tuple[np.ndarray, np.ndarray]:
+def regrid(
+    r: np.ndarray, w: np.ndarray, reach: float, *, beyond: float = 1.3, smooth: float = 1 / 12
+) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds and weights of one channel placed anew along the smoothed density.
 
     Parameters
@@ -134,7 +145,7 @@ def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def regridded(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3) -> dict[str, Any]:
-    """The values with every channel's thresholds and weights placed anew; z (M, n_w) is the signal of the fitted model."""
+    """The values with every channel's thresholds and weights placed anew; z (M, n_w) is the fitted model's signal."""
     rows = [
         regrid(r, w, float(np.max(np.abs(z_i))), beyond=beyond) if w.sum() > 0 and np.max(np.abs(z_i)) > 0 else (r, w)
         for r, w, z_i in zip(values["r"], values["w"], z.T, strict=True)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .bla import BLA
-from .recording import Recording
+from .recording import Recording, as_recordings
 from .subspace_frequency import FrequencyProblem
 from .subspace_problem import checked_order
 from .subspace_time import TimeProblem
@@ -110,7 +110,7 @@ def subspace_matrices(
     Parameters
     ----------
     recordings, nx, offset, block_rows
-        As for :func:`time_subspace`.
+        As for :func:`time_subspace`; order 0, a static gain, is legal here.
 
     Returns
     -------
@@ -121,8 +121,20 @@ def subspace_matrices(
     InputError
         As :func:`time_subspace`.
     """
+    if nx == 0:
+        return _static_gain(as_recordings(recordings), offset)
     model = TimeProblem(recordings, offset).solve([checked_order(nx)], block_rows)[0]
     return model.A, model.B, model.C, model.D
+
+
+def _static_gain(recordings: tuple[Recording, ...], offset: bool) -> tuple[Array, Array, Array, Array]:
+    """Least-squares gain of the outputs over the inputs, each taken from its mean in the recording with `offset`."""
+    parts = [(r.u[r.skip :], r.y[r.skip :]) for r in recordings]
+    if offset:
+        parts = [(u - np.mean(u, axis=0), y - np.mean(y, axis=0)) for u, y in parts]
+    u, y = (np.concatenate(signals) for signals in zip(*parts, strict=True))
+    n_u, n_y = u.shape[1], y.shape[1]
+    return np.zeros((0, 0)), np.zeros((0, n_u)), np.zeros((n_y, 0)), np.linalg.lstsq(u, y, rcond=None)[0].T
 
 
 def singular_values(data: Data, block_rows: int | None = None, weight: bool = True, offset: bool = False) -> Array:

@@ -1,7 +1,7 @@
 """One BLAS thread for the many small products of a fit.
 
-The matrices here are at most a few thousand rows by a few hundred columns: more threads do not help one fit, and where several
-fits run side by side they fight for the cores.
+The matrices here are at most a few thousand rows by a few hundred columns: more threads do not help one fit, and
+where several fits run side by side they fight for the cores.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def draw(seed: int, fits: Mapping[str, Fit], errors: Mapping[str, np.ndarray], f
     data = benchmark(seed)
     best = fits["PI-LFR N=20"]
     bla = robust_bla([r.with_(initial="estimate") for r in data.steady])
-    figures = {
+    figures: dict[str, Any] = {
         "fig03_operators": plots.operators_demo(),
         "fig07_loops": plots.loops(
             _sweep_loops(data), "displacement of mass 1 [mm]", "spring force [N]", title="sweep, truth"
@@ -56,7 +57,9 @@ def draw(seed: int, fits: Mapping[str, Fit], errors: Mapping[str, np.ndarray], f
     }
     rows = [row for row in errors if row != "LTI"]
     if rows:
-        groups = {name: {r.removeprefix("PI-LFR "): errors[r][:, i] for r in rows} for i, name in enumerate(SETS)}
+        groups = {
+            name: {r.removeprefix("PI-LFR "): errors[r][:, i].tolist() for r in rows} for i, name in enumerate(SETS)
+        }
         published = {name: {r.removeprefix("PI-LFR "): PUBLISHED[r][i] for r in rows} for i, name in enumerate(SETS)}
         figures["fig11_starts"] = plots.compared_spread(
             groups, published=published, floor=FLOOR, source="published 25th percentile", x="operators"
