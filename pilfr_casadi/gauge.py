@@ -63,8 +63,11 @@ def _complement(columns: Array, tolerance: float = 1e-10) -> Array:
     """Orthonormal basis of the orthogonal complement of some columns, which may depend on each other."""
     from scipy.linalg import qr
 
-    q, r, _ = qr(columns, pivoting=True)
+    q, r = np.linalg.qr(columns, mode="complete")
     diagonal = np.abs(np.diag(r))
+    if np.any(diagonal <= tolerance * diagonal.max(initial=0.0)):  # dependent: the slower way tells how many are not
+        q, r, _ = qr(columns, pivoting=True)
+        diagonal = np.abs(np.diag(r))
     return np.asarray(q[:, int(np.sum(diagonal > tolerance * diagonal.max(initial=0.0))) :])
 
 

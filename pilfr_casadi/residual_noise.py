@@ -34,8 +34,7 @@ def gradient_covariance(problem: Problem, theta: Array, weights: Array) -> Array
     array, shape (k, k)
         `weights' J'ΩJ weights / R²`, and `(I - weights' J'J weights / R) σ²/R` for the priors.
     """
-    from scipy.linalg import eigh
-    from scipy.signal import lfilter
+    from scipy.linalg import eigh, solve_banded
 
     total, n_y, k = problem.residuals, problem.model.n_y, weights.shape[1]
     lags = _autocovariances(problem, theta, weights)
@@ -48,8 +47,8 @@ def gradient_covariance(problem: Problem, theta: Array, weights: Array) -> Array
         for i, (polynomial, variance) in enumerate(models):
             own = slope[i::n_y]
             white += lags[i, 0] * own.T @ own
-            # Ω = variance G G' with G = 1/polynomial: filter J backwards in time
-            filtered = lfilter([1.0], polynomial, own[::-1], axis=0)
+            # Ω = variance L^-1 L^-T with the banded triangle L of the polynomial
+            filtered = solve_banded((0, len(polynomial) - 1), np.tile(polynomial[::-1, None], len(own)), own)
             coloured += variance * filtered.T @ filtered
     prior = (np.eye(k) - informed) * lags[:, 0].mean() / total
     white, coloured = white / total**2 + prior, coloured / total**2 + prior
