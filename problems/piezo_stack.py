@@ -78,7 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     best = next(result for name, where, _, result in rows if where.startswith("sine") and name.startswith("20"))
     picture = options.out / "nested_loops.png"
-    plots.output_over_input(best, recordings(folder)["varying"]).figure.savefig(picture, dpi=130)
+    figure: Any = plots.output_over_input(best, recordings(folder)["varying"]).figure
+    figure.savefig(picture, dpi=130)
     print(f"picture: {picture}")
     return 0
 
