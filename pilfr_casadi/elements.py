@@ -50,7 +50,6 @@ class PrandtlIshlinskii:
         Operators a channel, N.
     channels : int
         Number of signals, each with weights `w[i, :] ≥ 0` and thresholds `r[i, :] ≥ 0` of its own.
-
     rounded : bool
         Round the kinks over a band of half-width `eps`, then a parameter, fixed at 0 until changed (see `operators`).
     """
@@ -65,10 +64,12 @@ class PrandtlIshlinskii:
         operator = self.operator() if isinstance(self.operator, type) else self.operator
         if not isinstance(operator, Play | Stop | GeneralizedPlay):
             raise InputError(f"The operator {self.operator!r} is unknown; use Play, Stop or GeneralizedPlay.")
-        if self.n < 1 or self.channels < 1:
-            raise InputError(
-                f"A Prandtl-Ishlinskii element needs n >= 1 and channels >= 1; {self.n} and {self.channels} were given."
-            )
+        for count in (self.n, self.channels):
+            if count < 1 or int(count) != count:
+                raise InputError(
+                    f"A Prandtl-Ishlinskii element needs whole numbers n >= 1 and channels >= 1; "
+                    f"{self.n} and {self.channels} were given."
+                )
         object.__setattr__(self, "operator", operator)
 
     @property

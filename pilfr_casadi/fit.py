@@ -94,7 +94,7 @@ class Fit:
         n = self.model.n_x + self.model.n_s
         initial = recording.initial
         known = self.initial.get(fingerprint(recording))
-        if known is not None and isinstance(initial, str) and initial == "estimate":
+        if known is not None and isinstance(initial, str) and initial != "zero":
             return known
         if not isinstance(initial, str):
             given = np.asarray(initial, dtype=float).ravel()
@@ -107,7 +107,7 @@ class Fit:
         state = np.zeros(n)
         if initial == "periodic":
             period = recording.u[: recording.period]
-            for _ in range(20):
+            for _ in range(200):
                 before = state
                 state = self._engine.simulate(period, values, state)[1]
                 if np.max(np.abs(state - before)) <= 1e-10 * max(float(np.max(np.abs(state))), 1e-300):
@@ -341,7 +341,7 @@ def _result(
         dt=recordings[0].dt,
         solution=solution,
         train_nrmse=tuple(problem.nrmse(theta)),
-        initial={fingerprint(r): state for r, state in zip(recordings, problem.initial_states(theta), strict=True)},
+        initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
         labels=problem.labels,
         errors=standard_errors(problem, theta, structure),
         active=tuple(at_bound),

@@ -161,7 +161,7 @@ def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candida
         z = np.concatenate(
             [
                 engine.simulate(r.u, best.model.parameters.pack(values), s, True)[2]
-                for r, s in zip(search.recordings, plain.initial_states(best.theta), strict=True)
+                for r, s in zip(search.recordings, plain.first_states(best.theta), strict=True)
             ]
         )
         moved = regridded(search.structure, values, z, beyond)

@@ -53,8 +53,8 @@ class Problem:
         Weight of the absolute sum of non-negative parameters by name, for example `{"w": 1e-4}`.
     noise : float
         Standard deviation of the noise relative to the output's, against which priors are weighed.
-    periods : int
-        Periods run before a recording in periodic steady state.
+    periods : int, optional
+        Periods run before a recording in periodic steady state; by default as many as the start model takes to settle.
 
     Raises
     ------
@@ -71,7 +71,7 @@ class Problem:
         constraints: Sequence[Constraint] = (),
         l1: dict[str, float] | None = None,
         noise: float = 1.0,
-        periods: int = 2,
+        periods: int | None = None,
         scale: np.ndarray | None = None,
     ) -> None:
         self.model = model
@@ -108,7 +108,7 @@ class Problem:
         g, slope, self.g_lower, self.g_upper, self.g_labels = compile_constraints(self.constraints, parameters)
         self._g, self._g_slope = g, slope
 
-    def _lay_out(self, at: int, periods: int) -> Iterator[_Part]:
+    def _lay_out(self, at: int, periods: int | None) -> Iterator[_Part]:
         n_state = self.model.n_x + self.model.n_s
         for r in self.recordings:
             zero, nothing = np.zeros(n_state), r.u[:0]
@@ -123,7 +123,7 @@ class Problem:
                         raise InputError(
                             "A recording in periodic steady state needs its period in samples; give `period=`."
                         )
-                    yield _Part(r, None, zero, np.tile(r.u[: r.period], (periods, 1)))
+                    yield _Part(r, None, zero, self._periods_before(r, periods))
             else:
                 given = np.asarray(r.initial, dtype=float).ravel()
                 if given.size not in (self.model.n_x, n_state):
@@ -131,6 +131,18 @@ class Problem:
                         f"An initial state of {given.size} numbers was given; expected {self.model.n_x} or {n_state}."
                     )
                 yield _Part(r, None, np.concatenate([given, zero[given.size :]]), nothing)
+
+    def _periods_before(self, r: Recording, periods: int | None) -> np.ndarray:
+        """Input of the periods run before a periodic recording: as many as the start model takes to settle, 2 to 50."""
+        one, state = r.u[: r.period], np.zeros(self.model.n_x + self.model.n_s)
+        for count in range(1, 51 if periods is None else 1):
+            before, state = state, self.engine.simulate(one, self._base, state)[1]
+            if not np.all(np.isfinite(state)):
+                break
+            periods = max(count, 2)
+            if np.max(np.abs(state - before), initial=0.0) <= 1e-6 * np.max(np.abs(state), initial=0.0):
+                break
+        return np.tile(one, (periods or 2, 1))
 
     def _set_penalties(self, l1: dict[str, float], noise: float) -> None:
         parameters = self.model.parameters
@@ -170,21 +182,24 @@ class Problem:
         return p
 
     def initial_states(self, theta: np.ndarray) -> list[np.ndarray]:
-        """State with memory at each recording's first sample (before any warm-up periods)."""
+        """State with memory from which each recording is run (before any warm-up periods)."""
         n = self.model.n_x + self.model.n_s
         return [p.state if p.first is None else theta[p.first : p.first + n] for p in self._parts]
+
+    def first_states(self, theta: np.ndarray) -> list[np.ndarray]:
+        """State with memory at each recording's first sample, the warm-up periods behind it."""
+        p, states = self.parameters(theta), zip(self._parts, self.initial_states(theta), strict=True)
+        return [
+            self.engine.simulate(part.warm_up, p, state)[1] if len(part.warm_up) else state for part, state in states
+        ]
 
     def _penalty(self, theta: np.ndarray) -> float:
         return float(0.5 * self._prior_weight @ (theta - self._prior_mean) ** 2 + self._l1 @ theta)
 
     def simulate(self, theta: np.ndarray) -> list[np.ndarray]:
         """Simulated outputs, one (M, n_y) array a recording."""
-        p, out = self.parameters(theta), []
-        for part, state in zip(self._parts, self.initial_states(theta), strict=True):
-            if len(part.warm_up):
-                state = self.engine.simulate(part.warm_up, p, state)[1]
-            out.append(self.engine.simulate(part.recording.u, p, state)[0])
-        return out
+        p, states = self.parameters(theta), zip(self._parts, self.first_states(theta), strict=True)
+        return [self.engine.simulate(part.recording.u, p, state)[0] for part, state in states]
 
     def residual(self, theta: np.ndarray) -> np.ndarray:
         """Normalised residuals `(y_hat - y) / σ_y` of all scored samples, shape (R,)."""

@@ -1,0 +1,128 @@
+"""Constraints: the bound on the spectral radius holds exactly, and expressions of a user's own."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from pilfr_casadi.constraints import Constraint, compile_constraints, log_norm_of_power, stable
+from pilfr_casadi.parameters import Parameter, ParameterSet
+from pilfr_casadi.recording import InputError
+
+matrices = st.integers(1, 5).flatmap(lambda n: hnp.arrays(float, (n, n), elements=st.floats(-2, 2, width=32)))
+
+
+def log_radius(matrix):
+    return np.log(max(np.max(np.abs(np.linalg.eigvals(matrix))), 1e-300))
+
+
+@given(matrices, st.integers(0, 20))
+def test_the_bound_is_never_below_the_spectral_radius(matrix, squarings):
+    radius = np.max(np.abs(np.linalg.eigvals(matrix)))
+    assume(radius > 1e-3)  # the eigenvalues of nearly nilpotent matrices are not known to rounding
+    assert float(log_norm_of_power(ca.DM(matrix), squarings)) >= np.log(radius) - 1e-6
+
+
+@given(st.integers(0, 10**6), st.integers(1, 8), st.floats(0.5, 1.5))
+def test_exactly_known_spectra(seed, n, radius):
+    """Orthogonal matrices times a radius, sheared: ρ is known to rounding, and the bound holds to rounding."""
+    rng = np.random.default_rng(seed)
+    q, _ = np.linalg.qr(rng.normal(size=(n, n)))
+    shear = np.eye(n) + np.triu(rng.normal(size=(n, n)), 1)
+    matrix = radius * np.linalg.solve(shear, q @ shear)
+    for squarings in (0, 4, 12, 20):
+        assert float(log_norm_of_power(ca.DM(matrix), squarings)) >= np.log(radius) - 1e-12
+    assert float(log_norm_of_power(ca.DM(matrix), 20)) <= np.log(radius) + 1e-4
+
+
+@given(st.integers(0, 10**6), st.integers(1, 8))
+def test_it_is_tight(seed, n):
+    matrix = np.random.default_rng(seed).normal(size=(n, n))
+    gap = float(log_norm_of_power(ca.DM(matrix))) - log_radius(matrix)
+    assert -1e-9 <= gap < 1e-3
+    rough = [float(log_norm_of_power(ca.DM(matrix), k)) for k in (0, 3, 6, 12, 20)]
+    assert np.all(np.diff(rough) <= 1e-12)  # more squarings, tighter
+
+
+@pytest.mark.parametrize(
+    "matrix", [np.zeros((3, 3)), np.triu(np.ones((3, 3)), 1), 1e150 * np.eye(2), 1e-100 * np.eye(2)]
+)
+def test_extreme_matrices_stay_in_range(matrix):
+    x = ca.SX.sym("A", *matrix.shape)
+    f = ca.Function("f", [x], [log_norm_of_power(x), ca.jacobian(log_norm_of_power(x), ca.vec(x))])
+    value, slope = f(matrix)
+    assert np.isfinite(float(value))
+    assert float(value) >= log_radius(matrix) - 1e-9
+    assert np.all(np.isfinite(np.asarray(slope)))
+
+
+@given(st.integers(0, 10**6), st.integers(1, 5))
+def test_gradient(seed, n):
+    rng = np.random.default_rng(seed)
+    matrix = rng.normal(size=(n, n))
+    matrix /= np.max(np.abs(np.linalg.eigvals(matrix)))
+    vector = ca.MX.sym("p", n * n)
+    expression = log_norm_of_power(ca.reshape(vector, n, n), 6)
+    f = ca.Function("f", [vector], [expression])
+    slope = ca.Function("slope", [vector], [ca.jacobian(expression, vector)])
+    at, h = matrix.ravel(order="F"), 1e-6
+    central = [(float(f(at + h * e)) - float(f(at - h * e))) / (2 * h) for e in np.eye(n * n)]
+    np.testing.assert_allclose(np.asarray(slope(at)).ravel(), central, rtol=1e-4, atol=1e-6)
+
+
+def system():
+    return ParameterSet({"A": Parameter([[0.5, 0.2], [0.0, 0.9]]), "gain": Parameter(2.0)})
+
+
+def test_stable_bounds_any_square_expression():
+    g, slope, lower, upper, labels = compile_constraints(
+        (stable(0.95), stable(1.0, lambda p: p["A"] * p["gain"], name="closed loop")), system()
+    )
+    value = np.asarray(g(system().start)).ravel()
+    np.testing.assert_allclose(np.exp(value), [0.9, 1.8], rtol=1e-4)
+    np.testing.assert_allclose(upper, [np.log(0.95), 0.0])
+    assert np.all(np.isinf(lower))
+    assert labels == ("spectral radius <= 0.95", "closed loop <= 1")
+    assert np.asarray(slope(system().start)).shape == (2, 5)
+
+
+def test_own_expressions_of_named_parameters():
+    mine = Constraint(lambda p: ca.vertcat(p["A"][0, 1] * p["gain"], ca.trace(p["A"])), [-1.0, 0.0], [1.0, 2.0], "mine")
+    tied = Constraint(lambda p: p["gain"] - 2, 0.0, 0.0)
+    g, slope, lower, upper, labels = compile_constraints((mine, tied), system())
+    np.testing.assert_allclose(np.asarray(g(system().start)).ravel(), [0.4, 1.4, 0.0])
+    assert labels == ("mine[0]", "mine[1]", "constraint")
+    assert lower.tolist() == [-1, 0, 0]
+    assert upper.tolist() == [1, 2, 0]
+    expected = [[0, 0, 2.0, 0, 0.2], [1, 0, 0, 1, 0], [0, 0, 0, 0, 1]]
+    np.testing.assert_allclose(np.asarray(slope(system().start)), expected)
+
+
+def test_no_constraints():
+    g, slope, lower, _, labels = compile_constraints((), system())
+    assert (
+        np.asarray(g(system().start)).size == np.asarray(slope(system().start)).size == lower.size == len(labels) == 0
+    )
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: stable(0.0), "bounded by 0.0; give a positive number"),
+        (
+            lambda: compile_constraints((Constraint(lambda p: p["mass"], name="m"),), system()),
+            "'m' reads a parameter 'mass'",
+        ),
+        (lambda: compile_constraints((Constraint(lambda p: p["gain"], 2.0, 1.0),), system()), "infeasible"),
+        (lambda: compile_constraints((Constraint(lambda p: p["gain"], upper=np.nan),), system()), "infeasible"),
+        (
+            lambda: compile_constraints((Constraint(lambda p: p["A"], [0.0, 1.0]),), system()),
+            "do not fit its 4 entries",
+        ),
+    ],
+)
+def test_what_cannot_be_a_constraint(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
