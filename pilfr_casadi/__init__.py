@@ -40,6 +40,7 @@ _EXPORTS = {
     "hammerstein": "lfr",
     "load": "export",
     "multisine": "signals",
+    "normalise": "normal_form",
     "nrmse": "metrics",
     "open_model": "model",
     "orthogonal_multisine": "signals",
@@ -56,11 +57,15 @@ _EXPORTS = {
     "select_order": "order_selection",
     "sine_sweep": "signals",
     "stable": "constraints",
+    "standard_errors": "gauge",
     "stop": "operators",
     "time_subspace": "subspace",
     "to_casadi": "export",
+    "to_plays": "conversion",
+    "to_stops": "conversion",
     "tukey_realizations": "signals",
     "wiener": "lfr",
+    "write_report": "report",
 }
 
 __all__ = sorted(_EXPORTS)

@@ -234,7 +234,7 @@ class Problem:
                 cut = min(max(r.skip - a, 0), b - a)
                 e = ((y - r.y[a:b]) / self.scale)[cut:].ravel()
                 jac /= self.scale[:, None]
-                yield e, jac[cut:].reshape(e.size, -1), columns
+                yield e, jac[cut:].reshape(e.size, jac.shape[2]), columns
 
     def jacobian(self, theta: np.ndarray) -> np.ndarray:
         """Jacobian of `residual`, shape (R, size)."""
@@ -247,11 +247,12 @@ class Problem:
     def normal(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Objective, its gradient and Gauss-Newton Hessian at θ."""
         value, gradient, hessian = 0.0, np.zeros(self.size), np.zeros((self.size, self.size))
-        for e, jac, columns in self.stretches(theta):
-            value += float(e @ e)
-            gradient[columns] += e @ jac
-            square = np.ix_(columns, columns) if len(columns) < self.size else ...
-            hessian[square] += jac.T @ jac
+        with np.errstate(over="ignore", invalid="ignore"):  # a diverging simulation gives an infinite value
+            for e, jac, columns in self.stretches(theta):
+                value += float(e @ e)
+                gradient[columns] += e @ jac
+                square = np.ix_(columns, columns) if len(columns) < self.size else ...
+                hessian[square] += jac.T @ jac
         m = self._residuals
         gradient = gradient / m + self._prior_weight * (theta - self._prior_mean) + self._l1
         return 0.5 * value / m + self._penalty(theta), gradient, hessian / m + np.diag(self._prior_weight)

@@ -46,6 +46,8 @@ def gradient_covariance(problem: Problem, theta: Array, weights: Array) -> Array
         informed += slope.T @ slope / total
         for i, (polynomial, variance) in enumerate(models):
             own = slope[i::n_y]
+            if not len(own):
+                continue
             white += lags[i, 0] * own.T @ own
             # Ω = variance L^-1 L^-T with the banded triangle L of the polynomial
             filtered = solve_banded((0, len(polynomial) - 1), np.tile(polynomial[::-1, None], len(own)), own)

@@ -478,6 +478,24 @@ def test_an_active_constraint_is_projected_out():
     assert matrix[0, 0] < covariance(problem, problem.start)[0, 0]
 
 
+def test_a_constraint_that_only_fixes_the_gauge_changes_no_invariant():
+    structure, values = random_lfr(21, nx=2, n=2, gain=0.5)
+    u = random_input(21, 500)
+    model, recording = recorded(structure, values, u, noise=0.01, initial="zero")
+    free = Problem(model, recording, engine="vm")
+    total = float(values["w"].sum())
+    limits = [
+        Constraint(lambda p: ca.sum2(p["w"]), total, total),
+        Constraint(lambda p: p["A"][0, 1] - p["A"][1, 0], *[float(values["A"][0, 1] - values["A"][1, 0])] * 2),
+    ]
+    tied = Problem(model, recording, engine="vm", constraints=limits)
+    slope = slopes(structure, free, free.start)
+    found = [variance(covariance(p, p.start, structure), slope) for p in (free, tied)]
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-9 * np.max(np.abs(found[0])))
+    matrix = covariance(tied, tied.start, structure)
+    np.testing.assert_allclose(tied.constraint_jacobian(tied.start) @ matrix, 0.0, atol=1e-12)
+
+
 def test_what_the_data_leaves_open_is_infinite():
     structure, values = random_lfr(14, nx=2, n=3)
     values["r"][0] = [0.2, 50.0, 0.7]  # the second play never moves
