@@ -15,9 +15,8 @@ from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 
-from pilfr_casadi.demo import FLOOR, PUBLISHED, SETS, structure
+from pilfr_casadi.demo import FLOOR, SETS, structure
 from pilfr_casadi.fit import fit
-from pilfr_casadi.problem import Problem
 
 from .masing_data import benchmark
 
@@ -32,15 +31,6 @@ def default_run(record: int, n: int, seed: int) -> tuple[list[float], float]:
     return [result.nrmse(records[name]) for name in SETS], result.seconds
 
 
-def paper_run(record: int, n: int, seed: int) -> tuple[list[float], float]:
-    """The same for one start of the paper."""
-    records = benchmark(record).records
-    result = fit(structure(n), records["train"], seed=seed, start="paper", starts=1)
-    candidate = result.candidates[0]
-    errors = [Problem(candidate.model, records[name]).nrmse(candidate.theta)[0] for name in SETS]
-    return [e if np.isfinite(e) else np.inf for e in errors], result.seconds
-
-
 def _row(values: Sequence[float]) -> str:
     return " / ".join(f"{v:.4f}" for v in values)
 
@@ -49,25 +39,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--records", type=int, default=3, help=f"fresh records, from {FIRST_RECORD} on")
-    parser.add_argument("--seeds", type=int, default=20, help="seeds a record (starts a record with --start paper)")
+    parser.add_argument("--seeds", type=int, default=20, help="seeds a record")
     parser.add_argument("--operators", type=int, nargs="+", default=None, metavar="N")
-    parser.add_argument("--start", choices=("grid", "paper"), default="grid")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args(arguments)
-    paper = options.start == "paper"
-    what = "starts" if paper else "seeds"
-    print(f"{options.records} records x {options.seeds} {what}; floor {FLOOR}; {' / '.join(SETS)}")
-    for n in options.operators or ((5, 10, 15, 20) if paper else (20, 10)):
+    print(f"{options.records} records x {options.seeds} seeds; floor {FLOOR}; {' / '.join(SETS)}")
+    for n in options.operators or (20, 10):
         jobs = [(FIRST_RECORD + r, n, s) for r in range(options.records) for s in range(options.seeds)]
         with ProcessPoolExecutor(options.workers) as pool:
-            results = list(pool.map(paper_run if paper else default_run, *zip(*jobs, strict=True)))
+            results = list(pool.map(default_run, *zip(*jobs, strict=True)))
         errors = np.array([e for e, _ in results])
         seconds = np.median([s for _, s in results])
-        if paper:
-            quartile, published = np.percentile(errors, 25, axis=0), PUBLISHED[f"PI-LFR N={n}"]
-            print(f"N = {n:<3} 25th percentile {_row(quartile)}   Table 2 {_row(published)}")
-        else:
-            print(f"N = {n:<3} median {_row(np.median(errors, axis=0))}   target {_row(TARGETS.get(n, ()))}")
+        print(f"N = {n:<3} median {_row(np.median(errors, axis=0))}   target {_row(TARGETS.get(n, ()))}")
         for r in range(options.records):
             part = errors[r * options.seeds : (r + 1) * options.seeds]
             median, worst = np.median(part, axis=0), part.max(axis=0)
