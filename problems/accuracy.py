@@ -1,10 +1,8 @@
 """Accuracy of the default pipeline on fresh records of the Masing rig (`python -m problems.accuracy`).
 
 Each run sees one training record and one seed; the two test records are looked at only to report. Targets: N = 20:
-medians of
-0.0045 / 0.0065 / 0.0080 (train / multisine / sweep) and no multisine above 0.02; N = 10: 0.0070 / 0.0100 / 0.0100.
-With `--start paper` each start of Krikelis et al. (2024), Eq. 22-24, is run to the end and their 25th percentiles are
-printed beside Table 2.
+medians of 0.0045 / 0.0065 / 0.0080 (train / multisine / sweep) and no multisine above 0.02; N = 10: medians of 0.0070 /
+0.0100 / 0.0100.
 """
 
 from __future__ import annotations

@@ -1,0 +1,58 @@
+"""Self-contained HTML pages: the general page, and the one of a fit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..export import write_atomically
+from ..recording import InputError, Recording
+from .page import Code, Page, Picture, Section, Table, Text, write_report
+
+if TYPE_CHECKING:
+    from ..fit import Fit
+
+__all__ = ["Code", "Page", "Picture", "Section", "Table", "Text", "fit_report", "write_report"]
+
+
+def fit_report(
+    fit: Fit,
+    train: Recording | Sequence[Recording],
+    tests: Recording | Sequence[Recording],
+    folder: str | os.PathLike[str],
+) -> Path:
+    """Write `report.html` and `model.json` of a fit into a folder.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fitted model.
+    train : Recording or sequence of Recording
+        What it was fitted to.
+    tests : Recording or sequence of Recording
+        What it is judged on; may be empty.
+    folder : path
+        Made where it does not exist.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    InputError
+        If a recording does not fit the model, or the folder cannot be written.
+    """
+    from .fit_page import fit_page
+
+    page = fit_page(fit, train, tests, model_file="model.json")
+    target = Path(folder)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"The folder {folder} cannot be made ({error.strerror}); give another one.") from error
+    fit.save(target / "model.json")
+    return write_atomically(target / "report.html", page.html())
