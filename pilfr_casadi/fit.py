@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import signal
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,7 +22,7 @@ from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .metrics import nrmse
 from .model import Model
-from .multistart import Candidate, Search, linear_model, search_starts, stability
+from .multistart import KEEP, POLISH, PRIOR, Candidate, Search, linear_model, search_starts, stability
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings, check_for_identification
 from .sensitivities import Engine
@@ -69,6 +70,7 @@ class Fit:
     seconds: float = 0.0
     units: dict[str, str] = field(default_factory=dict)
     engine: str = "auto"
+    note: str = ""
 
     @property
     def status(self) -> Status:
@@ -176,6 +178,8 @@ class Fit:
         if self.candidates:
             reached = sorted(c.error for c in self.candidates)
             lines.append(f"{len(reached)} starts, explored to NRMSE {reached[0]:.4f} ... {reached[-1]:.4f}")
+        if self.note:
+            lines.append(self.note)
         lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
         return "\n".join(lines)
 
@@ -210,7 +214,7 @@ def fit(
     train : Recording or sequence of Recording
         Training data; nothing else is used.
     solver : GaussNewton or Ipopt
-        Solver of the final problem.
+        Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`.
     starts, seed : int
         Number of random starts and the seed of all of them.
     start : {"grid", "paper"}
@@ -236,7 +240,9 @@ def fit(
         If recordings and model do not fit each other, hold too little, or the start is not usable.
     """
     began = time.perf_counter()
-    solver = solver or GaussNewton()
+    solver = solver or POLISH
+    constraints = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+    _check_options(model, solver, starts, seed, workers, l1)
     if not isinstance(model, PILFR):
         given, structure = (model.model, model.structure) if isinstance(model, Fit) else (model, None)
         recordings = check_for_identification(train, int(given.parameters.free.sum()) + 2)
@@ -247,8 +253,6 @@ def fit(
         if not np.isfinite(problem.cost(problem.start)):
             raise InputError("The simulation diverges at the start values; start from a stable model.")
         return _result(given, structure, problem, solver.solve(problem), began, recordings)
-    if starts < 1:
-        raise InputError(f"{starts} starts were asked for; give 1 or more.")
     if start not in ("grid", "paper"):
         raise InputError(f"The start {start!r} is unknown; use 'grid' or 'paper'.")
     recordings = check_for_identification(train, _fewest_samples(model, train))
@@ -273,26 +277,47 @@ def fit(
         raise InputError("A PI-LFR is identified with a PrandtlIshlinskii element; pass a closed Model for any other.")
     blocks = {k: p.value for k, p in fitted.parameters.items()}
     search = Search(model, recordings, blocks, solver, (*limits, *constraints), engine, start, l1 or {}, noise)
-    pool = ProcessPoolExecutor(workers) if executor is None and workers > 1 else None
+    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if executor is None and workers > 1 else None
     try:
         seen: list[float] = []
 
         def report(candidate: Candidate) -> None:
             seen.append(candidate.error)
             if progress:
-                progress("starts" if len(seen) <= starts else "polish", len(seen), starts, min(seen))
+                polishing = len(seen) > starts
+                stage, total = ("polish", min(starts, KEEP)) if polishing else ("starts", starts)
+                progress(stage, len(seen) - starts * polishing, total, min(seen))
 
         candidates, best, stopped = search_starts(search, starts, seed, executor or pool, report)
     finally:
         if pool is not None:
             pool.shutdown(cancel_futures=True)
+    if best is None:
+        return _result(linear, model.linear(), problem, replace(solution, status=Status.INTERRUPTED), began, recordings)
     problem = search.problem(best.model, noise=best.error)
-    result = best.solution
     if stopped:
-        from dataclasses import replace
+        result = replace(best.solution, status=Status.INTERRUPTED)
+    else:
+        result = best.solution if start == "paper" else solver.solve(problem, best.theta)
+    return _result(best.model, model, problem, result, began, recordings, tuple(candidates), fitted, best.note)
 
-        result = replace(result, status=Status.INTERRUPTED)
-    return _result(best.model, model, problem, result, began, recordings, tuple(candidates), fitted)
+
+def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, l1: Any) -> None:
+    """Refuse what cannot be used before any long work."""
+    if not isinstance(model, PILFR | Model | Fit):
+        raise InputError(f"The model is a {type(model).__name__}; give a PILFR, a closed Model or a Fit.")
+    if isinstance(solver, type) or not hasattr(solver, "solve"):
+        raise InputError(f"The solver is {solver!r}; give an object such as GaussNewton() or Ipopt().")
+    for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
+        if not isinstance(value, int | np.integer) or value < least:
+            raise InputError(f"{name} = {value!r} was given; give a whole number, {least} or more.")
+    if l1 is not None and not isinstance(l1, dict):
+        raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
+
+
+def _leave_interrupts() -> None:
+    """In a worker: Ctrl-C is for the process that waits for the results."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _limits(structure: PILFR, stable: bool | float) -> tuple[Constraint, ...]:
@@ -323,8 +348,14 @@ def _result(
     recordings: tuple[Recording, ...],
     candidates: tuple[Candidate, ...] = (),
     linear: Model | None = None,
+    note: str = "",
 ) -> Fit:
     fitted = _fitted(model, problem, solution)
+    if note == PRIOR:
+        asked = structure.priors if structure else {}
+        fitted = fitted.with_parameters(
+            fitted.parameters.change(**{name: {"prior": asked.get(name)} for name in ("w", "r")})
+        )
     theta = solution.theta
     at_bound = [
         f"{label} = {value:g}"
@@ -349,4 +380,5 @@ def _result(
         linear=linear,
         seconds=time.perf_counter() - began,
         units=dict(recordings[0].units),
+        note=note,
     )

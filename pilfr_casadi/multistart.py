@@ -7,13 +7,15 @@
 3. The best few are re-gridded (`start.regrid`) and run again: thresholds that have clustered or fallen asleep are
    spread along the density the fit has found. This is done twice, the second time with thresholds beyond the visited
    range and a weak prior that holds the weights to the smoothed density, which decides what the data leaves open.
-4. The smallest training error wins; a candidate with the prior wins over one without when it is within `margin` of it.
+   A last run without the prior shows what the prior costs.
+4. The smallest training error wins; with the prior wins over without when it is within `margin` of it.
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
 """
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -37,6 +39,9 @@ from .subspace import subspace_matrices
 from .threads import one_blas_thread
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
+POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
+KEEP = 4  # candidates that are polished
+PRIOR = "weights held near a smooth density by a weak prior"
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,30 +156,33 @@ def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, no
 
 @one_blas_thread
 def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candidate:
-    """Re-grid a candidate and run it to the end; returns the better of what came out, never worse than what went in."""
+    """Re-grid a candidate and run it further, with and without a prior that holds the weights to a smooth density.
+
+    The one with the prior (its `note` says so) is returned where its training error is within `margin` of the smallest.
+    """
+    parameters = candidate.model.parameters
+    if not np.all(np.concatenate([parameters.free[parameters.position(name)] for name in ("r", "w")])):
+        return candidate
     engine = make_engine(candidate.model, search.engine)
-    plain = search.problem(candidate.model, engine)
+    n_free = int(parameters.free.sum())
     found = [candidate]
-    for beyond, spread in ((1.0, 0.0), (1.3, 0.05)):
+    for beyond, spread in ((1.0, 0.0), (1.3, 0.02)):
         best = min(found, key=lambda c: c.error)
-        values = best.model.parameters.unpack(search.problem(best.model, engine).parameters(best.theta))
-        z = np.concatenate(
-            [
-                engine.simulate(r.u, best.model.parameters.pack(values), s, True)[2]
-                for r, s in zip(search.recordings, plain.first_states(best.theta), strict=True)
-            ]
-        )
-        moved = regridded(search.structure, values, z, beyond)
-        model = best.model.with_parameters(best.model.parameters.at(best.model.parameters.pack(moved)))
+        problem = search.problem(best.model, engine)
+        values, states = problem.parameters(best.theta), problem.first_states(best.theta)
+        runs = [engine.simulate(r.u, values, s, True) for r, s in zip(search.recordings, states, strict=True)]
+        moved = regridded(search.structure, parameters.unpack(values), np.concatenate([run[2] for run in runs]), beyond)
+        model = candidate.model.with_parameters(parameters.at(parameters.pack(moved)))
         if spread:
             model = _with_prior(model, moved, spread)
         problem = search.problem(model, engine, noise=best.error)
-        start = np.concatenate([problem.start[: int(problem.free.sum())], best.theta[int(problem.free.sum()) :]])
-        solution = (search.solver if spread else EXPLORE).solve(problem, start)
-        found.append(_candidate(candidate.seed, model, problem, solution, "prior" if spread else ""))
-    smallest = min(c.error for c in found)
+        solution = POLISH.solve(problem, np.concatenate([problem.start[:n_free], best.theta[n_free:]]))
+        found.append(_candidate(candidate.seed, model, problem, solution, PRIOR if spread else ""))
     smooth = found[-1]
-    return smooth if smooth.error <= margin * smallest else min(found, key=lambda c: c.error)
+    problem = search.problem(candidate.model, engine)
+    found.append(_candidate(candidate.seed, candidate.model, problem, POLISH.solve(problem, smooth.theta)))
+    best = min(found, key=lambda c: c.error)
+    return smooth if smooth.error <= margin * best.error else best
 
 
 def _with_prior(model: Model, values: dict[str, Any], spread: float) -> Model:
@@ -197,6 +205,14 @@ def run_tasks(
 ) -> tuple[list[Candidate], bool]:
     """Results in the order of the tasks, from an executor or one after the other; whether the run was interrupted."""
     tasks, results = list(tasks), []
+    if executor is not None:
+        try:
+            pickle.dumps(tasks[:1])
+        except Exception as error:
+            raise InputError(
+                f"The model or a constraint cannot be sent to other processes ({error}); "
+                "define functions at the top of a module, or use workers=1."
+            ) from None
     futures = [executor.submit(function, *task) for task in tasks] if executor is not None else None
     try:
         for i, task in enumerate(tasks):
@@ -218,9 +234,9 @@ def search_starts(
     seed: int,
     executor: Executor | None,
     report: Callable[[Candidate], None],
-    keep: int = 3,
-) -> tuple[list[Candidate], Candidate, bool]:
-    """All candidates of the exploration, the winner, and whether the run was interrupted.
+    keep: int = KEEP,
+) -> tuple[list[Candidate], Candidate | None, bool]:
+    """All candidates of the exploration, the winner (None if interrupted before there was one), whether interrupted.
 
     Raises
     ------
@@ -230,6 +246,8 @@ def search_starts(
     sequences = np.random.SeedSequence(seed).spawn(starts)
     found, stopped = run_tasks(explore, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
     usable = sorted((c for c in found if np.isfinite(c.error)), key=lambda c: c.error)
+    if not usable and stopped:
+        return found, None, True
     if not usable:
         raise InputError(
             "No start gave a finite simulation; check units and the initial state, or choose another order."
@@ -237,8 +255,4 @@ def search_starts(
     if search.start == "paper" or stopped:
         return found, usable[0], stopped
     polished, stopped = run_tasks(polish, [(search, c) for c in usable[:keep]], executor, report)
-    return (
-        found,
-        min([*polished, usable[0]], key=lambda c: c.error) if not polished else min(polished, key=lambda c: c.error),
-        stopped,
-    )
+    return found, min(polished or usable[:1], key=lambda c: c.error), stopped
