@@ -219,6 +219,12 @@ def _fit(options: argparse.Namespace) -> int:
     from .report import fit_report
 
     inputs, outputs = _names(options.inputs), _names(options.outputs)
+    seen = [Path(path).resolve() for path in (*options.train, *options.test)]
+    if len(set(seen)) < len(seen):
+        raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
+    for name, value in (("--starts", options.starts), ("--workers", options.workers)):
+        if value < 1:
+            raise InputError(f"{name} {value} was given; give 1 or more.")
     train = [_read(options, path, inputs, outputs) for path in options.train]
     tests = [_read(options, path, inputs, outputs) for path in options.test]
     folder = _folder(options.out)
@@ -258,7 +264,7 @@ def _share_of_range(result: Any, recording: Recording) -> str:
 def _choose_order(train: Sequence[Recording]) -> int:
     from .order_selection import select_order
 
-    choice = select_order(train, range(1, 9))
+    choice = select_order(train, range(1, 9), offset=True)
     print(f"order chosen on the training data: {choice.recommended}")
     return int(choice.recommended)
 
@@ -268,11 +274,15 @@ def _simulate(options: argparse.Namespace) -> int:
 
     from .export import load, write_atomically
 
+    if Path(options.out).resolve() == Path(options.data).resolve():
+        raise InputError(f"--out {options.out} would overwrite the recording; give another file.")
     model = load(options.model)
     inputs = _names(options.inputs) if options.inputs else model.model.inputs
     outputs = _names(options.outputs) if options.outputs else model.model.outputs
     recording = _read(options, options.data, inputs, outputs)
     y = model.simulate(recording)
+    if not np.all(np.isfinite(y)):
+        return _say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
     header = ",".join(["t", *inputs, *outputs])
     rows = np.column_stack([recording.t, recording.u, y])
     text = "\n".join([header, *(",".join(map(repr, row)) for row in rows.tolist())]) + "\n"
@@ -284,7 +294,10 @@ def _simulate(options: argparse.Namespace) -> int:
 def _export(options: argparse.Namespace) -> int:
     from .export import load
 
-    load(options.model).to_casadi().save(options.out)
+    function, out = load(options.model).to_casadi(), Path(options.out)
+    if out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
+        raise InputError(f"--out {options.out} cannot be written; give a file in a folder that exists.")
+    function.save(str(out))
     print(f"casadi function: {options.out}")
     return DONE
 

@@ -17,6 +17,7 @@ from .operators import Play
 from .progress import progress_bar
 from .readers import read_csv
 from .recording import Recording
+from .solution import Status
 
 SETS = ("train", "multisine", "sweep")
 FLOOR = 0.0032
@@ -60,6 +61,9 @@ def run_demo(folder: Path, workers: int) -> int:
         n = 0 if row == "LTI" else int(row.partition("=")[2])
         with progress_bar() as progress:
             result = fit(structure(n), recordings["train"], workers=workers, progress=progress)
+        if result.status is Status.INTERRUPTED:
+            console.print("Interrupted; nothing was written.")
+            return 130
         errors = [result.nrmse(recordings[s]) for s in SETS]
         cells = [f"{e:.4f} ({p:.4f})" for e, p in zip(errors, published, strict=True)]
         table.add_row(row, *cells, f"{result.seconds:.1f} s")

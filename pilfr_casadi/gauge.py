@@ -172,8 +172,8 @@ def _snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, toleranc
     """
     held = np.zeros(problem.size, dtype=bool)
     for bound in (problem.lower, problem.upper):
-        near = np.isfinite(bound)
-        near[near] = np.abs(theta - bound)[near] * np.where(sensitivity > 0, sensitivity, np.inf)[near] <= tolerance
+        near = np.isfinite(bound) & (sensitivity > 0)
+        near[near] = np.abs(theta - bound)[near] * sensitivity[near] <= tolerance
         near |= theta == bound
         theta[near] = bound[near]
         held |= near

@@ -146,6 +146,17 @@ def test_bad_options_are_refused(capsys, tmp_path, train, options, says):
     refused(capsys, *fit_arguments(train, tmp_path, *options), says=says)
 
 
+def test_a_test_on_training_data_is_refused(capsys, tmp_path, train):
+    refused(capsys, *fit_arguments(train, tmp_path, "--test", train), says="twice")
+
+
+def test_a_recording_is_never_overwritten(capsys, tmp_path, train):
+    assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
+    before = train.read_text()
+    refused(capsys, "simulate", tmp_path / "out" / "model.json", train, "--out", train, says="overwrite")
+    assert train.read_text() == before
+
+
 def test_a_folder_that_cannot_be_written(capsys, tmp_path, train):
     (tmp_path / "file").write_text("kept")
     refused(capsys, *fit_arguments(train, tmp_path, "--out", tmp_path / "file" / "below"), says="--out")
@@ -201,10 +212,13 @@ def test_an_interrupted_run_writes_the_best_so_far(tmp_path):
         stdout=subprocess.PIPE,
         text=True,
     )
-    with pytest.raises(subprocess.TimeoutExpired):
-        process.wait(timeout=12)
-    process.send_signal(2)
-    out, _ = process.communicate(timeout=60)
+    try:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(timeout=12)
+        process.send_signal(2)
+        out, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == 130
     assert "interrupted" in out
     assert json.loads(Path(tmp_path / "out" / "model.json").read_text())["parameters"]["A"]

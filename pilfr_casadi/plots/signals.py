@@ -183,7 +183,10 @@ def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.nd
     """(label, frequency, power density, colour) of noise and total distortion, as in a single period."""
     if not periodic:
         return []
-    levels = output_spectra(periodic)
+    try:
+        levels = output_spectra(periodic)
+    except InputError:  # too few periods or experiments to tell a level: the line is left out
+        return []
     period = periodic[0].period or 2
     averaged = (len(periodic[0]) - periodic[0].skip) // period
     density_of = 2 * period * periodic[0].dt
