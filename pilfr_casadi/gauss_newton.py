@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from .callback import handled_interrupt
 from .problem import Problem
 from .solution import Iteration, Progress, Solution, Status
 
@@ -88,6 +89,7 @@ class _Run:
         self.damping, self.growth, self.penalty = options.damping, 2.0, 0.0
         self.multipliers = np.zeros(problem.size + self.n_g)
         self.history: list[Iteration] = []
+        self.interrupted = False
         self.began = time.perf_counter()
 
     def violation(self, theta: np.ndarray) -> np.ndarray:
@@ -103,10 +105,14 @@ class _Run:
         if not np.isfinite(self.cost):
             return self._finish(Status.DIVERGED_START)
         try:
-            status = self._iterate()
+            with handled_interrupt(self._interrupt):  # casadi may swallow a KeyboardInterrupt
+                status = self._iterate()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
         return self._finish(status)
+
+    def _interrupt(self) -> None:
+        self.interrupted = True
 
     def _iterate(self) -> Status:
         problem, options = self.problem, self.options
@@ -114,6 +120,8 @@ class _Run:
         recent: list[float] = []
         fresh = True
         for number in range(options.max_iterations):
+            if self.interrupted:
+                return Status.INTERRUPTED
             if time.perf_counter() - self.began > options.time_limit:
                 return Status.TIME_LIMIT
             if fresh:
