@@ -2,6 +2,7 @@
  *
  * The generated part above defines pilfr_step(), pilfr_computed(), the sizes N_X N_S N_Z N_Y N_U N_P N_TERMS, and
  * where the values of one sample begin in their stack: AT_CONSTANT AT_P AT_U AT_X AT_S AT_Z AT_W AT_COMPUTED, N_VALUES.
+ * Of STRIDE steps the first one's outputs are kept; `length` counts the steps.
  * A row of slopes is a sum of terms. TERM_<t>[ROW_<t>[i]] .. TERM_<t>[ROW_<t>[i+1]] are those of row i of target t, each
  * {source, index, value}: the row `index` of source 0 x, 1 s, 2 z, 3 w, times a value of the stack; DIRECT_<t> likewise
  * {parameter, value}: the value goes to the parameter's column.
@@ -79,16 +80,18 @@ static void rows(double *out, long ld, int n_rows, const int *row, const term_t 
 
 /* state (N_X + N_S) is advanced in place; z and w may be null. */
 int pilfr_simulate(long length, const double *u, const double *p, double *state, double *y, double *z, double *w) {
-    double *work = malloc(sizeof(double) * (SZ_W + N_X + N_S + 2 * N_Z + 1));
+    double *work = malloc(sizeof(double) * (SZ_W + N_X + N_S + 2 * N_Z + N_Y + 1));
     if (!work) return 1;
-    double *next = work + SZ_W, *z_k = next + N_X + N_S, *w_k = z_k + N_Z;
+    double *next = work + SZ_W, *z_k = next + N_X + N_S, *w_k = z_k + N_Z, *y_k = w_k + N_Z;
     casadi_int iw[SZ_IW];
     const double *arg[SZ_ARG];
     double *res[SZ_RES];
     for (long k = 0; k < length; ++k) {
         arg[0] = state; arg[1] = state + N_X; arg[2] = u + k * N_U; arg[3] = p;
-        res[0] = next; res[1] = next + N_X; res[2] = y + k * N_Y;
-        res[3] = z ? z + k * N_Z : z_k; res[4] = w ? w + k * N_Z : w_k;
+        const int kept = k % STRIDE == 0;
+        const long i = k / STRIDE;
+        res[0] = next; res[1] = next + N_X; res[2] = kept ? y + i * N_Y : y_k;
+        res[3] = z && kept ? z + i * N_Z : z_k; res[4] = w && kept ? w + i * N_Z : w_k;
         pilfr_step(arg, res, iw, work, 0);
         memcpy(state, next, sizeof(double) * (N_X + N_S));
     }
@@ -97,17 +100,17 @@ int pilfr_simulate(long length, const double *u, const double *p, double *state,
 }
 
 /* Derivatives with respect to n_c columns: slope ((N_X + N_S) x n_c, row by row) is advanced in place with the state, jac is
- * (length * N_Y) x n_c; column[i] is the column of parameter i, or -1. */
+ * (length / STRIDE * N_Y) x n_c; column[i] is the column of parameter i, or -1. */
 int pilfr_sensitivity(long length, const double *u, const double *p, double *state, double *slope, const long *column,
                       long n_c, double *y, double *jac) {
     enum { N = N_X + N_S, ROWS = N + N_X + 2 * N_Z + N_Y + (KEEPS ? 0 : N_S), LINE = 64 };
     const long ld = (n_c + LANE - 1) / LANE * LANE;
-    const size_t doubles = (size_t)ROWS * ld + N_VALUES + N + SZ_W, terms = N_TERMS + 1, spans = N + N_Z + N_Y + 1;
+    const size_t doubles = (size_t)ROWS * ld + N_VALUES + N + N_Y + SZ_W, terms = N_TERMS + 1, spans = N + N_Z + N_Y + 1;
     char *memory = malloc(LINE + sizeof(double) * doubles + sizeof(active_t) * terms + sizeof(span_t) * spans);
     if (!memory) return 1;
     double *x = (double *)(((uintptr_t)memory + LINE - 1) / LINE * LINE), *s = x + N_X * ld, *x_next = s + N_S * ld;
     double *z = x_next + N_X * ld, *w = z + N_Z * ld, *y_k = w + N_Z * ld, *s_next = KEEPS ? s : y_k + N_Y * ld;
-    double *value = x + ROWS * ld, *next = value + N_VALUES, *work = next + N;
+    double *value = x + ROWS * ld, *next = value + N_VALUES, *work = next + N + N_Y;
     active_t *active = (active_t *)(work + SZ_W);
     span_t *span = (span_t *)(active + terms);
     casadi_int iw[SZ_IW];
@@ -124,7 +127,9 @@ int pilfr_sensitivity(long length, const double *u, const double *p, double *sta
     for (long k = 0; k < length; ++k) {
         memcpy(value + AT_U, u + k * N_U, sizeof(double) * N_U);
         arg[0] = value + AT_X; arg[1] = value + AT_S; arg[2] = value + AT_U; arg[3] = value + AT_P;
-        res[0] = next; res[1] = next + N_X; res[2] = y + k * N_Y; res[3] = value + AT_Z; res[4] = value + AT_W;
+        const int kept = k % STRIDE == 0;
+        const long sample = k / STRIDE;
+        res[0] = next; res[1] = next + N_X; res[2] = kept ? y + sample * N_Y : next + N; res[3] = value + AT_Z; res[4] = value + AT_W;
         pilfr_step(arg, res, iw, work, 0);
         arg[0] = value + AT_X; arg[1] = value + AT_S; arg[2] = value + AT_Z; arg[3] = value + AT_W;
         arg[4] = value + AT_U; arg[5] = value + AT_P;
@@ -134,9 +139,9 @@ int pilfr_sensitivity(long length, const double *u, const double *p, double *sta
         ROWS_OF(z, z, N_Z, 0);
         ROWS_OF(w, w, N_Z, 0);
         ROWS_OF(s, s_next, N_S, KEEPS);
-        ROWS_OF(y, y_k, N_Y, 0);
+        if (kept) ROWS_OF(y, y_k, N_Y, 0);
         ROWS_OF(x, x_next, N_X, 0);
-        for (int i = 0; i < N_Y; ++i) memcpy(jac + (k * N_Y + i) * n_c, y_k + i * ld, sizeof(double) * n_c);
+        for (int i = 0; kept && i < N_Y; ++i) memcpy(jac + (sample * N_Y + i) * n_c, y_k + i * ld, sizeof(double) * n_c);
         double *swap = x; x = x_next; x_next = swap;
         if (!KEEPS) { swap = s; s = s_next; s_next = swap; }
         memcpy(value + AT_X, next, sizeof(double) * N);

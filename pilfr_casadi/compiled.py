@@ -159,6 +159,7 @@ def source_code(linear: Linearization) -> str:
         most = max(most, sum(map(len, terms)))
     # a diagonal s_s lets the memory's slopes be advanced in place
     diagonal = linear.partial.sparsity_out(BLOCKS.index(("s", "s"))).is_diag()
+    lines.append(f"#define STRIDE {linear.substeps}")
     lines += [f"#define N_VALUES {at['end']}", f"#define N_TERMS {most}", f"#define KEEPS {int(diagonal)}"]
     kernel = Path(__file__).with_name("_kernel.c").read_text(encoding="utf-8")
     return "\n".join([generator.dump(), *lines, kernel])
@@ -241,14 +242,15 @@ class Compiled:
         n = self.linear.sizes
         u = np.ascontiguousarray(u, dtype=float).reshape(len(u), n["u"])
         p = np.ascontiguousarray(p, dtype=float).reshape(n["p"])
-        return u, p, np.array(state, dtype=float).reshape(n["x"] + n["s"]), np.empty((len(u), n["y"]))
+        y = np.empty((len(u) // self.linear.substeps, n["y"]))
+        return u, p, np.array(state, dtype=float).reshape(n["x"] + n["s"]), y
 
     def simulate(
         self, u: np.ndarray, p: np.ndarray, state: np.ndarray, signals: bool = False
     ) -> tuple[np.ndarray, ...]:
         """See `Engine.simulate`."""
         u, p, state, y = self._arguments(u, p, state)
-        more = [np.empty((len(u), self.linear.sizes["z"])) for _ in range(2)] if signals else []
+        more = [np.empty((len(y), self.linear.sizes["z"])) for _ in range(2)] if signals else []
         z, w = more or (None, None)
         self._call("pilfr_simulate", ctypes.c_long(len(u)), *map(_pointer, (u, p, state, y, z, w)))
         return (y, state, *more)

@@ -13,10 +13,11 @@ from functools import cached_property
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from .elements import Element
 from .parameters import ParameterSet
-from .recording import InputError
+from .recording import InputError, Recording
 
 StepExpression = Callable[[Any, Any, Any, dict[str, Any]], tuple[Any, Any]]
 PortExpression = Callable[[Any, Any, dict[str, Any]], Any]
@@ -44,6 +45,10 @@ class Model:
         `(z, s, p) -> (w, s_next)`, the element; without one it has no memory and `w = 0`.
     parameters : ParameterSet
         All parameters, the element's included.
+    reads : tuple of {"u", "next", "t", "y"}
+        What the columns of the step's u are; see `drive`.
+    substeps : int
+        Steps within a sample; outputs are those at the first of them.
     """
 
     step: ca.Function
@@ -54,15 +59,39 @@ class Model:
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    reads: tuple[str, ...] = ("u",)
+    substeps: int = 1
+
+    def drive(self, recording: Recording) -> np.ndarray:
+        """What the step reads while a recording is run, shape (M * substeps, n_u): the columns named in `reads`.
+
+        `u` is the input at the start of a sub-step and `next` at its end (both interpolated between samples; `u` alone
+        is held over the sample), `t` the time in s since the recording's first sample, `y` the measured output.
+        """
+        n, m = self.substeps, len(recording)
+        share = np.tile(np.arange(n) / n, m)
+        columns = []
+        for what in self.reads:
+            if what == "t":
+                columns.append((np.repeat(np.arange(m), n) + share)[:, None] * recording.dt)
+            elif what == "u" and "next" not in self.reads:
+                columns.append(np.repeat(recording.u, n, axis=0))
+            else:
+                values = recording.y if what == "y" else recording.u
+                whole = recording.period if recording.period and m % recording.period == 0 else None
+                after = values[m - whole] if whole else values[-1]
+                a, b = np.repeat(values, n, axis=0), np.repeat(np.vstack([values[1:], after]), n, axis=0)
+                columns.append(a + (b - a) * (share + (1 / n if what == "next" else 0.0))[:, None])
+        return np.ascontiguousarray(np.hstack(columns)) if len(columns) != 1 else columns[0]
 
     @property
     def n_x(self) -> int:
-        """States without the element's memory."""
+        """States without the memory of the element in the port; a simulator's own elements count as states."""
         return int(self.step.size1_in(0))
 
     @property
     def n_u(self) -> int:
-        """Inputs."""
+        """Columns that the step reads: the inputs, unless `reads` says otherwise."""
         return int(self.step.size1_in(1))
 
     @property

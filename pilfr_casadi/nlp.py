@@ -75,9 +75,9 @@ def to_nlp(problem: Problem) -> Horizon:
     for part in problem._parts:
         state = ca.MX(ca.DM(part.state)) if part.first is None else theta[part.first : part.first + n_state]
         r = part.recording
-        u = np.concatenate([part.warm_up, r.u])
+        u = np.concatenate([part.warm_up, part.drive])
         _, y = model.closed.mapaccum("run", len(u))(state, u.T, ca.repmat(p, 1, len(u)))
-        y = y[:, len(part.warm_up) :]
+        y = y[:, len(part.warm_up) :: model.substeps]
         initial.append(state)
         simulated.append(y)
         residual.append(ca.vec(((y - r.y.T) / np.tile(problem.scale[:, None], (1, len(r))))[:, r.skip :]))

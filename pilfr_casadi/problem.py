@@ -28,11 +28,12 @@ STRETCH = 2_000_000  # numbers in the piece of the Jacobian that is held at a ti
 
 @dataclass(frozen=True)
 class _Part:
-    """One recording inside the problem: its first variable (or None), its weight rows, and samples run before it."""
+    """One recording inside the problem: its first variable (or None), what drives it, and what is run before it."""
 
     recording: Recording
     first: int | None
     state: np.ndarray
+    drive: np.ndarray
     warm_up: np.ndarray
 
 
@@ -83,10 +84,10 @@ class Problem:
         self.free = parameters.free
         n_free = int(self.free.sum())
         for r in self.recordings:
-            if r.n_u != model.n_u or r.n_y != model.n_y:
+            if r.n_u != len(model.inputs) or r.n_y != model.n_y:
                 raise InputError(
                     f"The recording has {r.n_u} inputs and {r.n_y} outputs, "
-                    f"the model {model.n_u} and {model.n_y}; they must match."
+                    f"the model {len(model.inputs)} and {model.n_y}; they must match."
                 )
         self.scale = _output_scale(self.recordings) if scale is None else np.asarray(scale, dtype=float)
         self._parts = list(self._lay_out(n_free, periods))
@@ -111,30 +112,33 @@ class Problem:
     def _lay_out(self, at: int, periods: int | None) -> Iterator[_Part]:
         n_state = self.model.n_x + self.model.n_s
         for r in self.recordings:
-            zero, nothing = np.zeros(n_state), r.u[:0]
+            zero, drive = np.zeros(n_state), self.model.drive(r)
+            nothing = drive[:0]
             if isinstance(r.initial, str):
                 if r.initial == "zero":
-                    yield _Part(r, None, zero, nothing)
+                    yield _Part(r, None, zero, drive, nothing)
                 elif r.initial == "estimate":
-                    yield _Part(r, at, zero, nothing)
+                    yield _Part(r, at, zero, drive, nothing)
                     at += n_state
                 else:
                     if r.period is None:
                         raise InputError(
                             "A recording in periodic steady state needs its period in samples; give `period=`."
                         )
-                    yield _Part(r, None, zero, self._periods_before(r, periods))
+                    one = drive[: r.period * self.model.substeps]
+                    yield _Part(r, None, zero, drive, self._periods_before(one, periods))
             else:
                 given = np.asarray(r.initial, dtype=float).ravel()
-                if given.size not in (self.model.n_x, n_state):
+                if given.size not in (len(self.model.states), n_state):
                     raise InputError(
-                        f"An initial state of {given.size} numbers was given; expected {self.model.n_x} or {n_state}."
+                        f"An initial state of {given.size} numbers was given; "
+                        f"expected {len(self.model.states)} or {n_state}."
                     )
-                yield _Part(r, None, np.concatenate([given, zero[given.size :]]), nothing)
+                yield _Part(r, None, np.concatenate([given, zero[given.size :]]), drive, nothing)
 
-    def _periods_before(self, r: Recording, periods: int | None) -> np.ndarray:
-        """Input of the periods run before a periodic recording: as many as the start model takes to settle, 2 to 50."""
-        one, state = r.u[: r.period], np.zeros(self.model.n_x + self.model.n_s)
+    def _periods_before(self, one: np.ndarray, periods: int | None) -> np.ndarray:
+        """What drives the periods before a periodic recording: as many as the start model takes to settle, 2 to 50."""
+        state = np.zeros(self.model.n_x + self.model.n_s)
         for count in range(1, 51 if periods is None else 1):
             before, state = state, self.engine.simulate(one, self._base, state)[1]
             if not np.all(np.isfinite(state)):
@@ -199,7 +203,7 @@ class Problem:
     def simulate(self, theta: np.ndarray) -> list[np.ndarray]:
         """Simulated outputs, one (M, n_y) array a recording."""
         p, states = self.parameters(theta), zip(self._parts, self.first_states(theta), strict=True)
-        return [self.engine.simulate(part.recording.u, p, state)[0] for part, state in states]
+        return [self.engine.simulate(part.drive, p, state)[0] for part, state in states]
 
     def residual(self, theta: np.ndarray) -> np.ndarray:
         """Normalised residuals `(y_hat - y) / σ_y` of all scored samples, shape (R,)."""
@@ -225,12 +229,13 @@ class Problem:
                 seed[:, n_free:] = np.eye(n_state)
                 columns = np.concatenate([columns, part.first + np.arange(n_state)])
             length = max(1, STRETCH // max(1, seed.shape[1] * self.model.n_y))
-            for a in range(0, len(part.warm_up), length):
-                _, _, state, seed = self.engine.sensitivity(part.warm_up[a : a + length], p, state, seed, self._columns)
-            r = part.recording
+            r, n = part.recording, self.model.substeps
+            for a in range(0, len(part.warm_up), length * n):
+                rows = part.warm_up[a : a + length * n]
+                _, _, state, seed = self.engine.sensitivity(rows, p, state, seed, self._columns)
             for a in range(0, len(r), length):
                 b = min(a + length, len(r))
-                y, jac, state, seed = self.engine.sensitivity(r.u[a:b], p, state, seed, self._columns)
+                y, jac, state, seed = self.engine.sensitivity(part.drive[a * n : b * n], p, state, seed, self._columns)
                 cut = min(max(r.skip - a, 0), b - a)
                 e = ((y - r.y[a:b]) / self.scale)[cut:].ravel()
                 jac /= self.scale[:, None]

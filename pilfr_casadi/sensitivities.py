@@ -38,11 +38,14 @@ class Linearization:
         `(x, s, z, w, u, p) -> z_x, z_p, w_z, ...`: one sparse matrix for each of `BLOCKS`, (target, source).
     sizes : dict
         Length of x, s, z, w, u, p and y.
+    substeps : int
+        Steps a sample.
     """
 
     step: ca.Function
     partial: ca.Function
     sizes: dict[str, int]
+    substeps: int = 1
 
     def symbols(self) -> dict[str, Any]:
         """Fresh symbols x, s, z, w, u, p."""
@@ -71,11 +74,14 @@ def linearize(model: Model) -> Linearization:
     names = [f"{target}_{source}" for target, source in BLOCKS]
     partial = ca.Function("pilfr_partial", list(symbol.values()), ca.cse(blocks), list(symbol), names)
     sizes = {k: int(v.shape[0]) for k, v in symbol.items()}
-    return Linearization(step, partial, {**sizes, "y": model.n_y})
+    return Linearization(step, partial, {**sizes, "y": model.n_y}, model.substeps)
 
 
 class Engine(Protocol):
-    """What runs a model over a stretch of samples; both ways of running give the same numbers."""
+    """What runs a model over a stretch of samples; both ways of running give the same numbers.
+
+    u has a row a step, `Model.substeps` of them a sample; outputs, derivatives and signals have one row a sample.
+    """
 
     def simulate(
         self, u: np.ndarray, p: np.ndarray, state: np.ndarray, signals: bool = False
@@ -108,12 +114,14 @@ class VirtualMachine:
         """`(u, p, state) -> (y, z, w, next state)`; one column a sample."""
         key = (length, -1, b"")
         if key not in self._functions:
-            n = self.linear.sizes
-            u, p, first = ca.MX.sym("u", n["u"], length), ca.MX.sym("p", n["p"]), ca.MX.sym("state", n["x"] + n["s"])
+            n, stride = self.linear.sizes, self.linear.substeps
+            u, p = ca.MX.sym("u", n["u"], length * stride), ca.MX.sym("p", n["p"])
+            first = ca.MX.sym("state", n["x"] + n["s"])
             x, s, signals = first[: n["x"]], first[n["x"] :], []
-            for k in range(length):
+            for k in range(length * stride):
                 x, s, *now = self.linear.step(x, s, u[:, k], p)
-                signals.append(now)
+                if k % stride == 0:
+                    signals.append(now)
             columns = [ca.horzcat(*each) for each in zip(*signals, strict=True)]
             self._functions[key] = ca.Function("simulate", [u, p, first], [*columns, ca.vertcat(x, s)])
         return self._functions[key]
@@ -122,12 +130,13 @@ class VirtualMachine:
         """`(u, p, state, slope) -> (y, J, next state, next slope)`; slope (n_c, n_x + n_s), J (n_c, n_y) a sample."""
         key = (length, n_c, columns.tobytes())
         if key not in self._functions:
-            n, linear = self.linear.sizes, self._transposed(n_c, columns)
-            u, p, first = ca.MX.sym("u", n["u"], length), ca.MX.sym("p", n["p"]), ca.MX.sym("state", n["x"] + n["s"])
+            n, stride, linear = self.linear.sizes, self.linear.substeps, self._transposed(n_c, columns)
+            u, p = ca.MX.sym("u", n["u"], length * stride), ca.MX.sym("p", n["p"])
+            first = ca.MX.sym("state", n["x"] + n["s"])
             x, s, y, jac = first[: n["x"]], first[n["x"] :], [], []
             slopes = ca.MX.sym("slope", n_c, n["x"] + n["s"])
             slope = {"x": slopes[:, : n["x"]], "s": slopes[:, n["x"] :]}
-            for k in range(length):
+            for k in range(length * stride):
                 x, s, y_k, *found = linear(x, s, u[:, k], p)
                 block, following = dict(zip(BLOCKS, found, strict=True)), dict[str, Any]()
                 for target, sources in TARGETS.items():
@@ -137,8 +146,9 @@ class VirtualMachine:
                             total = ca.mac(slope[source], block[target, source], total)
                     (slope if target in ("z", "w") else following)[target] = total
                 slope = following
-                y.append(y_k)
-                jac.append(slope["y"])
+                if k % stride == 0:
+                    y.append(y_k)
+                    jac.append(slope["y"])
             outputs = [ca.horzcat(*y), ca.horzcat(*jac), ca.vertcat(x, s), ca.horzcat(slope["x"], slope["s"])]
             self._functions[key] = ca.Function("sensitivity", [u, p, first, slopes], outputs)
         return self._functions[key]
@@ -163,14 +173,14 @@ class VirtualMachine:
     ) -> list[np.ndarray]:
         """Fill `out`, one row a sample, block by block, and return what is carried from one block to the next."""
         u, p = np.ascontiguousarray(u, dtype=float), np.ascontiguousarray(p, dtype=float)
-        at, following = 0, [np.empty_like(a) for a in carried]
-        for length in (self.block, 1):
-            if at + length > len(u):
+        at, stride, following = 0, self.linear.substeps, [np.empty_like(a) for a in carried]
+        for length in (max(self.block // stride, 1), 1):
+            if (at + length) * stride > len(u):
                 continue
             buffer, evaluate = build(length).buffer()
             buffer.set_arg(1, p.data)
-            while at + length <= len(u):
-                buffer.set_arg(0, u[at : at + length].data)
+            while (at + length) * stride <= len(u):
+                buffer.set_arg(0, u[at * stride : (at + length) * stride].data)
                 for i, array in enumerate(out):
                     buffer.set_res(i, array[at : at + length].data)
                 for i, (before, after) in enumerate(zip(carried, following, strict=True)):
@@ -185,7 +195,7 @@ class VirtualMachine:
         self, u: np.ndarray, p: np.ndarray, state: np.ndarray, signals: bool = False
     ) -> tuple[np.ndarray, ...]:
         """See `Engine.simulate`."""
-        y, z, w = (np.empty((len(u), self.linear.sizes[k])) for k in ("y", "z", "w"))
+        y, z, w = (np.empty((len(u) // self.linear.substeps, self.linear.sizes[k])) for k in ("y", "z", "w"))
         (state,) = self._run(self._simulator, u, p, [y, z, w], [np.array(state, dtype=float)])
         return (y, state, z, w) if signals else (y, state)
 
@@ -194,7 +204,8 @@ class VirtualMachine:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See `Engine.sensitivity`."""
         n_y, n_c, columns = self.linear.sizes["y"], seed.shape[1], np.asarray(columns, dtype=int)
-        y, jac = np.empty((len(u), n_y)), np.empty((len(u), n_y, n_c))
+        m = len(u) // self.linear.substeps
+        y, jac = np.empty((m, n_y)), np.empty((m, n_y, n_c))
         carried = [np.array(state, dtype=float), np.array(seed, dtype=float, order="C")]
         state, slope = self._run(lambda m: self._sensitivity(m, n_c, columns), u, p, [y, jac], carried)
         return y, jac, state, slope

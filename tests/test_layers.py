@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parent.parent / "pilfr_casadi"
 LAYERS = {
     0: ("recording", "signals", "multisines", "metrics", "parameters", "readers", "csv_table", "timebase", "threads"),
     1: ("operators", "elements"),
-    2: ("model", "simulator"),
+    2: ("model", "simulator", "integration"),
     3: (
         "simulate",
         "sensitivities",

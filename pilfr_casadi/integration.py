@@ -1,0 +1,260 @@
+"""A simulator as a discrete-time `Model`: classical Runge-Kutta of fourth order with a fixed sub-step.
+
+Within a sub-step of length h the inputs are held or follow their chord, and
+
+    k₁ = f(x, u₀), k₂ = f(x + h k₁/2, u_½), k₃ = f(x + h k₂/2, u_½), k₄ = f(x + h k₃, u₁),
+    x⁺ = x + h (k₁ + 2 k₂ + 2 k₃ + k₄) / 6.
+
+Laws are evaluated inside every stage; one with memory (`step(z, s, p)`, such as a play) is evaluated from the memory at
+the sub-step's begin and its memory is moved on once, at the sub-step's end. A law with differential equations of its
+own (`flow`) adds states. The model's state is [x; laws' states; laws' memory].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .model import Model
+from .parameters import ParameterSet
+from .recording import InputError, Recording
+from .simulator import Named, Placed, Simulator, call
+
+REACH = 0.35  # largest |λ| h: phase error (λh)⁴/120 = 1e-4 of a cycle's angle
+MOST = 200  # sub-steps a sample
+
+
+@dataclass(frozen=True, eq=False)
+class _Values:
+    """What is known at one instant inside a sub-step."""
+
+    x: Any  # simulator's states and laws' states
+    s: Any  # laws' memory
+    u: Any
+    slope: Any  # du/dt
+    t: Any
+
+
+class _Equations:
+    """The closed equations of a simulator with its laws, on symbols."""
+
+    def __init__(self, simulator: Simulator, vector: Any) -> None:
+        self.simulator = simulator
+        parameters = ParameterSet(dict(simulator.parameters))
+        self.values = parameters.symbols(vector)
+        self.p = Named("parameter", self.values)
+        self.n_q = [int(getattr(e.law, "order", 0)) for e in simulator.elements]
+        self.n_s = [int(e.law.memory) if hasattr(e.law, "step") else 0 for e in simulator.elements]
+        self.names = simulator.output_names
+
+    def _own(self, element: Placed) -> Named:
+        n = len(element.prefix)
+        return Named("parameter", {k[n:]: v for k, v in self.values.items() if k.startswith(element.prefix)})
+
+    def _parts(self, x: Any, s: Any) -> tuple[list[Any], list[Any], Any]:
+        n_x = len(self.simulator.states)
+        at_q, at_s = np.cumsum([n_x, *self.n_q]), np.cumsum([0, *self.n_s])
+        q = [x[int(a) : int(b)] for a, b in zip(at_q[:-1], at_q[1:], strict=True)]
+        memory = [s[int(a) : int(b)] for a, b in zip(at_s[:-1], at_s[1:], strict=True)]
+        return q, memory, x[:n_x]
+
+    def evaluate(self, v: _Values) -> tuple[Any, Any, Any, dict[int, tuple[Any, Any, Any]]]:
+        """Derivatives of [x; q], outputs, next memory, and each element's (z, dz, w)."""
+        simulator, p, t = self.simulator, self.p, v.t
+        q, s, x_only = self._parts(v.x, v.s)
+        x = Named("state", dict(zip(simulator.states, ca.vertsplit(x_only) if simulator.states else [], strict=True)))
+        u = {name: v.u[i] for i, name in enumerate(simulator.inputs)}
+        signals: dict[int, tuple[Any, Any, Any]] = {}
+        flow: list[Any] = [ca.SX(n, 1) for n in self.n_q]
+        memory: list[Any] = [ca.SX(n, 1) for n in self.n_s]
+
+        def apply(i: int, z: Any, dz: Any) -> Any:
+            e, now = simulator.elements[i], Named("input", u)
+            have = {"z": z, "dz": dz, "q": q[i], "p": self._own(e), "t": t, "x": x, "u": now}
+            if hasattr(e.law, "step"):
+                w, memory[i] = e.law.step(z, s[i], self._own(e))
+            else:
+                w = call(e.law.force, f"law {e.law.id!r}", **have)
+                if self.n_q[i]:
+                    flow[i] = call(e.law.flow, f"law {e.law.id!r}", **have)
+            signals[i] = (z, dz, w)
+            return w
+
+        placed = list(enumerate(simulator.elements))
+        for i, e in placed:
+            if e.port.startswith("actuator:"):
+                name = e.port.removeprefix("actuator:")
+                at = simulator.inputs.index(name)
+                u[name] = u[name] + apply(i, u[name], v.slope[at])
+        inputs = Named("input", u)
+        f = simulator.derivatives(x, inputs, p, t)
+        y = simulator.measured(x, inputs, p, t)
+        motion = (x_only, f) if not simulator.discrete else (x_only, ca.SX.zeros(x_only.shape))
+
+        def rate_of(z: Any) -> Any:
+            return ca.jtimes(z, ca.vertcat(motion[0], v.u), ca.vertcat(motion[1], v.slope))
+
+        open_f = f
+        for i, e in placed:
+            if e.port.startswith(("actuator:", "sensor:")):
+                continue
+            port = simulator.port(e.port)
+            z = simulator.across(port, x, inputs, p, t)
+            dz = call(port.rate, f"rate of port {port.name!r}", x=x, u=inputs, p=p, t=t) if port.rate else rate_of(z)
+            w = apply(i, z, dz)
+            for name, factor in simulator.into(port, x, inputs, p, t).items():
+                if name in simulator.states:
+                    unit = ca.SX.zeros(open_f.shape)
+                    unit[simulator.states.index(name)] = factor
+                    f = f + unit * w
+                else:
+                    y[name] = y[name] + factor * w
+        for i, e in placed:
+            if e.port.startswith("sensor:"):
+                name = e.port.removeprefix("sensor:")
+                y[name] = y[name] + apply(i, y[name], rate_of(y[name]))
+        return ca.vertcat(f, *flow), ca.vertcat(*y.values()), ca.vertcat(ca.SX(0, 1), *memory), signals
+
+
+def discretise(
+    simulator: Simulator, dt: float, hold: str = "zero", substeps: int = 1, parameters: ParameterSet | None = None
+) -> Model:
+    """The simulator with its laws as a closed discrete-time model.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    dt : float
+        Sampling interval, s.
+    hold : {"zero", "linear"}
+        Inputs between samples.
+    substeps : int
+        Runge-Kutta steps a sample; see `choose_substeps`.
+    """
+    own = parameters or ParameterSet(dict(simulator.parameters))
+    vector = ca.SX.sym("p", own.size)
+    equations = _Equations(simulator, vector)
+    n_x, n_u = len(simulator.states) + sum(equations.n_q), len(simulator.inputs)
+    x, s = ca.SX.sym("x", n_x), ca.SX.sym("s", sum(equations.n_s))
+    u0, u1, t = ca.SX.sym("u", n_u), ca.SX.sym("next", n_u), ca.SX.sym("t")
+    h = dt / substeps
+    end, slope = (u1, (u1 - u0) / h) if hold == "linear" else (u0, ca.SX.zeros(n_u))
+    middle = (u0 + end) / 2
+
+    def at(state: Any, memory: Any, u: Any, time: Any) -> tuple[Any, ...]:
+        return equations.evaluate(_Values(state, memory, u, slope, time))
+
+    k1, y, memory, _ = at(x, s, u0, t)
+    n_own = len(simulator.states)
+    if simulator.discrete:  # laws' own states move with z held over the sample
+        q = x[n_own:] + h * k1[n_own:]
+        x_next, memory_next = ca.vertcat(k1[:n_own], q), memory
+    else:
+        k2 = at(x + h / 2 * k1, s, middle, t + h / 2)[0]
+        k3 = at(x + h / 2 * k2, s, middle, t + h / 2)[0]
+        k4 = at(x + h * k3, s, end, t + h)[0]
+        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        memory_next = at(x_next, s, end, t + h)[2] if s.numel() else s
+    state, following = ca.vertcat(x, s), ca.vertcat(x_next, memory_next)
+    everything = ca.vertcat(following, y)
+    reads = ["u"]
+    columns = [u0]
+    if hold == "linear":
+        reads, columns = [*reads, "next"], [*columns, u1]
+    if ca.depends_on(everything, t):
+        reads, columns = [*reads, "t"], [*columns, t]
+    drive, w = ca.vertcat(*columns), ca.SX.sym("w", 0)
+    following, y = ca.cse([following, y])
+    names = ["x", "u", "w", "p"]
+    z_in, none = ca.SX.sym("z", 0), ca.SX.sym("s", 0)
+    return Model(
+        step=ca.Function("step", [state, drive, w, vector], [following, y], names, ["x_next", "y"]),
+        port=ca.Function("port", [state, drive, vector], [ca.SX(0, 1)], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [z_in, none, vector], [w, none], ["z", "s", "p"], ["w", "s_next"]),
+        parameters=own,
+        element=None,
+        states=simulator.states,
+        inputs=simulator.inputs,
+        outputs=simulator.output_names,
+        reads=tuple(reads),
+        substeps=substeps,
+    )
+
+
+def signals(simulator: Simulator) -> ca.Function:
+    """`(x, u, slope, t, p) -> (z, dz)` of every port of `all_ports`, in its order, laws left out.
+
+    x (n_x,), u (n_u,), slope = du/dt (n_u,), t and p as in `discretise`; z and dz have one row a port.
+    """
+    bare = ParameterSet({k: v for k, v in simulator.parameters.items()})
+    vector = ca.SX.sym("p", bare.size)
+    p = Named("parameter", bare.symbols(vector))
+    n_x, n_u = len(simulator.states), len(simulator.inputs)
+    xs, us, slope, t = ca.SX.sym("x", n_x), ca.SX.sym("u", n_u), ca.SX.sym("slope", n_u), ca.SX.sym("t")
+    x = Named("state", {name: xs[i] for i, name in enumerate(simulator.states)})
+    u = Named("input", {name: us[i] for i, name in enumerate(simulator.inputs)})
+    f = simulator.derivatives(x, u, p, t) if not simulator.discrete else ca.SX.zeros(n_x)
+    y = simulator.measured(x, u, p, t)
+    z, dz = [], []
+    for port in simulator.all_ports():
+        here = y[port.name.removeprefix("sensor:")] if port.name.startswith("sensor:") else None
+        local = simulator.across(port, x, u, p, t) if here is None else here
+        z.append(local)
+        if port.rate is not None:
+            dz.append(ca.SX(call(port.rate, f"rate of port {port.name!r}", x=x, u=u, p=p, t=t)))
+        else:
+            dz.append(ca.jtimes(local, ca.vertcat(xs, us), ca.vertcat(f, slope)))
+    return ca.Function(
+        "signals",
+        [xs, us, slope, t, vector],
+        [ca.vertcat(*z), ca.vertcat(*dz)],
+        ["x", "u", "slope", "t", "p"],
+        ["z", "dz"],
+    )
+
+
+def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> float:
+    """Largest |eigenvalue| of ∂f/∂x over states x (K, n_x) and inputs u (K, n_u), rad/s."""
+    n_x = len(simulator.states)
+    if not n_x or simulator.discrete:
+        return 0.0
+    vector = ca.SX.sym("p", len(p))
+    equations = _Equations(simulator, vector)
+    xs, us = ca.SX.sym("x", n_x + sum(equations.n_q)), ca.SX.sym("u", len(simulator.inputs))
+    s = ca.SX.zeros(sum(equations.n_s))
+    f = equations.evaluate(_Values(xs, s, us, ca.SX.zeros(us.shape), ca.SX(0.0)))[0]
+    jacobian = ca.Function("f_x", [xs, us, vector], [ca.densify(ca.jacobian(f, xs))])
+    largest = 0.0
+    for row, inputs in zip(x, u, strict=True):
+        full = np.concatenate([row, np.zeros(xs.numel() - len(row))]) if len(row) < xs.numel() else row[: xs.numel()]
+        a = np.asarray(jacobian(full, inputs, p))
+        if np.all(np.isfinite(a)):
+            largest = max(largest, float(np.max(np.abs(np.linalg.eigvals(a)))))
+    return largest
+
+
+def choose_substeps(simulator: Simulator, recordings: Sequence[Recording], states: np.ndarray | None = None) -> int:
+    """Sub-steps a sample that keep |λ| h below `REACH`, from the Jacobian at rest, or at `states` (K, n_x).
+
+    Raises
+    ------
+    InputError
+        If more than `MOST` would be needed.
+    """
+    p, dt = ParameterSet(dict(simulator.parameters)).start, recordings[0].dt
+    if states is None:
+        states = np.zeros((1, len(simulator.states)))
+    u = np.concatenate([r.u for r in recordings])
+    picked = np.vstack([np.mean(u, axis=0)] * len(states))
+    rate = fastest(simulator, states, picked, p)
+    needed = max(1, int(np.ceil(rate * dt / REACH)))
+    if needed > MOST:
+        raise InputError(
+            f"The simulator has an eigenvalue of {rate:.3g} rad/s, too fast for samples {dt:g} s apart; "
+            "check its units, or replace the fast state by its steady state."
+        )
+    return needed

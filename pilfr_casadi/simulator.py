@@ -1,0 +1,306 @@
+"""The user's simulator: continuous-time equations with ports that missing physics can be put into.
+
+    ẋ = f(x, u, p) + Σ into_j(p) w_j,    y = h(x, u, p) + Σ into_j(p) w_j,    w_j = law_j(z_j, ż_j),  z_j = across_j(x, u, p)
+
+`close_loop(simulator, law, port)` puts a law into a port and gives a simulator again; `discretise` (in
+`integration.py`) makes it a `Model`, the same as any other. At an actuator or a sensor a law stands in series: what it
+adds to the signal is `w = law(u) - u`.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import casadi as ca
+
+from .parameters import Parameter, ParameterSet
+from .recording import InputError
+
+Expression = Callable[..., Any]
+
+
+class Named:
+    """Symbols by name: `x.pos`, `p.k` or `p["k"]`."""
+
+    def __init__(self, kind: str, values: Mapping[str, Any]) -> None:
+        self.__dict__.update(_kind=kind, _values=dict(values))
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self._values[name]
+        except KeyError:
+            if name.startswith("__"):
+                raise AttributeError(name) from None
+            known = ", ".join(self._values) or "none"
+            raise InputError(f"There is no {self._kind} {name!r}; there are {known}.") from None
+
+    __getitem__ = __getattr__
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise InputError(f"The {self._kind} {name!r} cannot be assigned; return the equations in a dict instead.")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+
+def call(function: Expression, what: str, **available: Any) -> Any:
+    """Call a user's function with those of `available` that it names.
+
+    Raises
+    ------
+    InputError
+        If it asks for something else, or fails.
+    """
+    wanted = [
+        name
+        for name, p in inspect.signature(function).parameters.items()
+        if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) and p.default is p.empty
+    ]
+    for name in wanted:
+        if name not in available:
+            raise InputError(f"The {what} asks for {name!r}; it can have {', '.join(available)}.")
+    try:
+        return function(**{name: available[name] for name in wanted})
+    except InputError as error:
+        raise InputError(f"In the {what}: {error}") from None
+    except Exception as error:
+        raise InputError(f"The {what} fails: {type(error).__name__}: {error}.") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Port:
+    """A place where physics may be missing.
+
+    Parameters
+    ----------
+    name : str
+        Name in results.
+    into : callable or mapping
+        How an internal force w enters: `{state: factor}` (added to the state's derivative) or `{output: factor}`; a
+        callable takes any of x, u, p by name.
+    across : callable
+        Local coordinate z, of any of x, u, p.
+    rate : callable, optional
+        dz/dt, of any of x, u, p; left out, `across` is differentiated along the dynamics.
+    unit, across_unit : str
+        Units of w and of z.
+    """
+
+    name: str
+    into: Any
+    across: Expression
+    rate: Expression | None = None
+    unit: str = ""
+    across_unit: str = ""
+    series: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A law in a port, and the prefix of its parameters' names."""
+
+    port: str
+    law: Any
+    prefix: str
+
+
+@dataclass(frozen=True, eq=False)
+class Simulator:
+    """A simulator with ports.
+
+    Parameters
+    ----------
+    dynamics : callable
+        Of any of x, u, p (and t, time in s) by name, to `{state: derivative}`; x.<state>, u.<input>, p.<parameter> are
+        CasADi symbols.
+    outputs : callable
+        Of the same, to `{output: expression}`.
+    states, inputs : tuple of str
+        Names; `states=()` is a static device.
+    parameters : mapping
+        `Parameter` by name.
+    ports : tuple of Port
+        Declared ports; where there are none, each state's equation is one.
+    hold : {"zero", "linear"}, optional
+        What inputs do between samples, where recordings do not say.
+    discrete : bool
+        `dynamics` gives the next sample's states instead of derivatives.
+
+    Raises
+    ------
+    InputError
+        If names are not unique, a derivative is missing, or a port names what is not there.
+    """
+
+    dynamics: Expression
+    outputs: Expression
+    states: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    ports: tuple[Port, ...] = ()
+    hold: str | None = None
+    discrete: bool = False
+    elements: tuple[Placed, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kind in ("states", "inputs"):
+            names = getattr(self, kind)
+            names = (names,) if isinstance(names, str) else tuple(names)
+            if len(set(names)) != len(names):
+                raise InputError(f"The simulator's {kind} {', '.join(names)} are not unique; name each once.")
+            object.__setattr__(self, kind, names)
+        if self.hold not in (None, "zero", "linear"):
+            raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear' or None.")
+        for name, p in self.parameters.items():
+            if not isinstance(p, Parameter):
+                raise InputError(f"The simulator's parameter {name!r} is {p!r}; give Parameter(value, ...).")
+        object.__setattr__(self, "parameters", ParameterSet(dict(self.parameters)))
+        object.__setattr__(self, "ports", tuple(self.ports))
+        x, u, p, t = self._symbols()
+        self.derivatives(x, u, p, t)
+        self.output_names  # noqa: B018 - evaluated to be checked
+        names = [port.name for port in self.ports]
+        if len(set(names)) != len(names):
+            raise InputError(f"The port names {', '.join(names)} are not unique; name each port once.")
+        for port in self.ports:
+            self.into(port, x, u, p, t)
+            self.across(port, x, u, p, t)
+
+    def _symbols(self) -> tuple[Named, Named, Named, Any]:
+        x = Named("state", {n: ca.SX.sym(n) for n in self.states})
+        u = Named("input", {n: ca.SX.sym(n) for n in self.inputs})
+        own = ParameterSet(dict(self.parameters))
+        return x, u, Named("parameter", own.symbols(ca.SX.sym("p", own.size))), ca.SX.sym("t")
+
+    def derivatives(self, x: Named, u: Named, p: Named, t: Any) -> Any:
+        """The dynamics as a vector (n_x, 1), elements left out."""
+        if not self.states:
+            return ca.SX(0, 1)
+        found = call(self.dynamics, "simulator's dynamics", x=x, u=u, p=p, t=t)
+        if not isinstance(found, Mapping):
+            raise InputError(f"The simulator's dynamics returned {type(found).__name__}; return {{state: derivative}}.")
+        return ca.vertcat(*_row(found, self.states, "dynamics", "derivative"))
+
+    def measured(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        """The outputs by name, elements left out."""
+        found = call(self.outputs, "simulator's outputs", x=x, u=u, p=p, t=t)
+        if not isinstance(found, Mapping) or not found:
+            raise InputError("The simulator's outputs must be a dict {output: expression} with at least one entry.")
+        return dict(zip(found, _row(found, tuple(found), "outputs", "expression"), strict=True))
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return tuple(self.measured(*self._symbols()))
+
+    def into(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        """Factors of w by state or output."""
+        what = f"`into` of port {port.name!r}"
+        found = call(port.into, what, x=x, u=u, p=p, t=t) if callable(port.into) else port.into
+        if not isinstance(found, Mapping) or not found:
+            raise InputError(f"The {what} must be a dict {{state or output: factor}}; got {found!r}.")
+        known = (*self.states, *self.output_names)
+        for name in found:
+            if name not in known:
+                raise InputError(f"Port {port.name!r} goes into {name!r}; there are {', '.join(known)}.")
+        return dict(zip(found, _row(found, tuple(found), f"port {port.name!r}", "factor"), strict=True))
+
+    def across(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
+        """Local coordinate z."""
+        what = f"`across` of port {port.name!r}"
+        return _scalar(call(port.across, what, x=x, u=u, p=p, t=t), what)
+
+    def port(self, name: str) -> Port:
+        """A port by name: declared, `actuator:<input>`, `sensor:<output>` or `equation:<state>`."""
+        for port in self.all_ports():
+            if port.name == name:
+                return port
+        known = ", ".join(port.name for port in self.all_ports())
+        raise InputError(f"There is no port {name!r}; there are {known}.")
+
+    def all_ports(self) -> tuple[Port, ...]:
+        """Declared ports (else one for each state's equation), then actuators and sensors."""
+        inner = self.ports or (() if self.discrete else tuple(map(self._equation, self.states)))
+        actuators = (
+            Port(
+                f"actuator:{n}",
+                {},
+                lambda u, n=n: u[n],
+                unit=self.units.get(n, ""),
+                across_unit=self.units.get(n, ""),
+                series=True,
+            )
+            for n in self.inputs
+        )
+        sensors = (
+            Port(
+                f"sensor:{n}",
+                {},
+                lambda: 0,
+                unit=self.units.get(n, ""),
+                across_unit=self.units.get(n, ""),
+                series=True,
+            )
+            for n in self.output_names
+        )
+        return (*inner, *actuators, *sensors)
+
+    def _equation(self, state: str) -> Port:
+        """The port of a state's equation: w is taken from its derivative.
+
+        Where the state is itself the derivative of another (a velocity), the local coordinate is that other one.
+        """
+        x, u, p, t = self._symbols()
+        derivatives = ca.vertsplit(self.derivatives(x, u, p, t))
+        held = next(
+            (n for n, d in zip(self.states, derivatives, strict=True) if d.is_symbolic() and d.name() == state), None
+        )
+        if held is None or held == state:
+            return Port(f"equation:{state}", {state: -1.0}, lambda x: x[state])
+        return Port(f"equation:{state}", {state: -1.0}, lambda x: x[held], lambda x: x[state])
+
+    def with_parameters(self, parameters: Mapping[str, Parameter]) -> Simulator:
+        """The same equations with other parameters of the same names."""
+        return replace(self, parameters=ParameterSet(dict(parameters)))
+
+    def with_element(self, port: str, law: Any) -> Simulator:
+        """A simulator with a law put into a port; see `model.close_loop`."""
+        place = self.port(port)
+        allowed = getattr(law, "places", ("series", "parallel"))
+        kind = "series" if place.series else "parallel"
+        if kind not in allowed:
+            raise InputError(f"The law {law.id!r} cannot stand in {kind} at {port!r}; choose another port or law.")
+        count = sum(e.port == port for e in self.elements)
+        prefix = f"{port}." if not count else f"{port}#{count + 1}."
+        own = {f"{prefix}{name}": p for name, p in law.parameters().items()}
+        return replace(
+            self,
+            parameters=ParameterSet(dict(self.parameters)) | own,
+            elements=(*self.elements, Placed(port, law, prefix)),
+        )
+
+
+def _scalar(value: Any, what: str) -> Any:
+    try:
+        value = ca.SX(value)
+    except Exception:
+        raise InputError(f"The {what} gave {value!r}; give a number or a CasADi expression.") from None
+    if value.shape != (1, 1):
+        raise InputError(f"The {what} has the shape {value.shape}; give one number or expression.")
+    return value
+
+
+def _row(found: Mapping[str, Any], names: tuple[str, ...], where: str, what: str) -> list[Any]:
+    for name in names:
+        if name not in found:
+            raise InputError(f"The simulator's {where} give no {what} for the state {name!r}; add it.")
+    for name in found:
+        if name not in names:
+            raise InputError(
+                f"The simulator's {where} give {name!r}, which is not a state; there are {', '.join(names)}."
+            )
+    return [_scalar(found[name], f"{what} of {name!r} in the {where}") for name in names]
