@@ -13,7 +13,8 @@ own (`flow`) adds states. The model's state is [x; laws' states; laws' memory].
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -47,9 +48,12 @@ class _Equations:
         parameters = ParameterSet(dict(simulator.parameters))
         self.values = parameters.symbols(vector)
         self.p = Named("parameter", self.values)
-        self.n_q = [int(getattr(e.law, "order", 0)) for e in simulator.elements]
-        self.n_s = [int(e.law.memory) if hasattr(e.law, "step") else 0 for e in simulator.elements]
-        self.names = simulator.output_names
+        laws = [e.law for e in simulator.elements]
+        self.n_q = [int(getattr(law, "order", 0)) for law in laws]
+        self.n_s = [int(law.memory) if hasattr(law, "step") else 0 for law in laws]
+        self.vector = vector
+        self.local = signals(simulator)
+        self.rows = {port.name: i for i, port in enumerate(simulator.all_ports())}
 
     def _own(self, element: Placed) -> Named:
         n = len(element.prefix)
@@ -58,8 +62,8 @@ class _Equations:
     def _parts(self, x: Any, s: Any) -> tuple[list[Any], list[Any], Any]:
         n_x = len(self.simulator.states)
         at_q, at_s = np.cumsum([n_x, *self.n_q]), np.cumsum([0, *self.n_s])
-        q = [x[int(a) : int(b)] for a, b in zip(at_q[:-1], at_q[1:], strict=True)]
-        memory = [s[int(a) : int(b)] for a, b in zip(at_s[:-1], at_s[1:], strict=True)]
+        q = [x[int(a) : int(b)] for a, b in pairwise(at_q)]
+        memory = [s[int(a) : int(b)] for a, b in pairwise(at_s)]
         return q, memory, x[:n_x]
 
     def evaluate(self, v: _Values) -> tuple[Any, Any, Any, dict[int, tuple[Any, Any, Any]]]:
@@ -93,19 +97,14 @@ class _Equations:
         inputs = Named("input", u)
         f = simulator.derivatives(x, inputs, p, t)
         y = simulator.measured(x, inputs, p, t)
-        motion = (x_only, f) if not simulator.discrete else (x_only, ca.SX.zeros(x_only.shape))
-
-        def rate_of(z: Any) -> Any:
-            return ca.jtimes(z, ca.vertcat(motion[0], v.u), ca.vertcat(motion[1], v.slope))
-
+        rates = self.local(x_only, ca.vertcat(*u.values()), v.slope, t, self.vector)[1]
         open_f = f
         for i, e in placed:
             if e.port.startswith(("actuator:", "sensor:")):
                 continue
             port = simulator.port(e.port)
             z = simulator.across(port, x, inputs, p, t)
-            dz = call(port.rate, f"rate of port {port.name!r}", x=x, u=inputs, p=p, t=t) if port.rate else rate_of(z)
-            w = apply(i, z, dz)
+            w = apply(i, z, rates[self.rows[e.port]])
             for name, factor in simulator.into(port, x, inputs, p, t).items():
                 if name in simulator.states:
                     unit = ca.SX.zeros(open_f.shape)
@@ -116,7 +115,7 @@ class _Equations:
         for i, e in placed:
             if e.port.startswith("sensor:"):
                 name = e.port.removeprefix("sensor:")
-                y[name] = y[name] + apply(i, y[name], rate_of(y[name]))
+                y[name] = y[name] + apply(i, y[name], rates[self.rows[e.port]])
         return ca.vertcat(f, *flow), ca.vertcat(*y.values()), ca.vertcat(ca.SX(0, 1), *memory), signals
 
 
@@ -135,6 +134,8 @@ def discretise(
     substeps : int
         Runge-Kutta steps a sample; see `choose_substeps`.
     """
+    placed = [replace(e, law=e.law.on_grid(dt / substeps)) if hasattr(e.law, "on_grid") else e for e in simulator.elements]
+    simulator = replace(simulator, elements=tuple(placed))
     own = parameters or ParameterSet(dict(simulator.parameters))
     vector = ca.SX.sym("p", own.size)
     equations = _Equations(simulator, vector)
@@ -186,35 +187,38 @@ def discretise(
 
 
 def signals(simulator: Simulator) -> ca.Function:
-    """`(x, u, slope, t, p) -> (z, dz)` of every port of `all_ports`, in its order, laws left out.
+    """`(x, u, slope, t, p) -> (z, dz, lift, push)` of every port of `all_ports`, in its order, laws left out.
 
-    x (n_x,), u (n_u,), slope = du/dt (n_u,), t and p as in `discretise`; z and dz have one row a port.
+    x (n_x,), u (n_u,), slope = du/dt (n_u,), t and p as in `discretise`; each result has one row a port. A unit force in
+    the port moves z at once at the rate `lift`, and dz at the rate `push`: where `lift` is zero and `push` negative, a
+    positive force opposes the port's motion.
     """
-    bare = ParameterSet({k: v for k, v in simulator.parameters.items()})
-    vector = ca.SX.sym("p", bare.size)
-    p = Named("parameter", bare.symbols(vector))
+    own = ParameterSet(dict(simulator.parameters))
+    vector = ca.SX.sym("p", own.size)
+    p = Named("parameter", own.symbols(vector))
     n_x, n_u = len(simulator.states), len(simulator.inputs)
     xs, us, slope, t = ca.SX.sym("x", n_x), ca.SX.sym("u", n_u), ca.SX.sym("slope", n_u), ca.SX.sym("t")
     x = Named("state", {name: xs[i] for i, name in enumerate(simulator.states)})
     u = Named("input", {name: us[i] for i, name in enumerate(simulator.inputs)})
     f = simulator.derivatives(x, u, p, t) if not simulator.discrete else ca.SX.zeros(n_x)
     y = simulator.measured(x, u, p, t)
-    z, dz = [], []
+    rows: list[list[Any]] = []
     for port in simulator.all_ports():
         here = y[port.name.removeprefix("sensor:")] if port.name.startswith("sensor:") else None
-        local = simulator.across(port, x, u, p, t) if here is None else here
-        z.append(local)
+        z = simulator.across(port, x, u, p, t) if here is None else here
         if port.rate is not None:
-            dz.append(ca.SX(call(port.rate, f"rate of port {port.name!r}", x=x, u=u, p=p, t=t)))
+            dz = ca.SX(call(port.rate, f"rate of port {port.name!r}", x=x, u=u, p=p, t=t))
         else:
-            dz.append(ca.jtimes(local, ca.vertcat(xs, us), ca.vertcat(f, slope)))
-    return ca.Function(
-        "signals",
-        [xs, us, slope, t, vector],
-        [ca.vertcat(*z), ca.vertcat(*dz)],
-        ["x", "u", "slope", "t", "p"],
-        ["z", "dz"],
-    )
+            dz = ca.jtimes(z, ca.vertcat(xs, us), ca.vertcat(f, slope))
+        force = ca.SX.zeros(n_x)
+        if not port.series:
+            for name, factor in simulator.into(port, x, u, p, t).items():
+                if name in simulator.states:
+                    force[simulator.states.index(name)] = factor
+        rows.append([z, dz, ca.jtimes(z, xs, force), ca.jtimes(dz, xs, force)])
+    names = ["x", "u", "slope", "t", "p"]
+    columns = [ca.vertcat(*column) for column in zip(*rows, strict=True)]
+    return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push"])
 
 
 def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> float:

@@ -1,6 +1,6 @@
 """The user's simulator: continuous-time equations with ports that missing physics can be put into.
 
-    ẋ = f(x, u, p) + Σ into_j(p) w_j,    y = h(x, u, p) + Σ into_j(p) w_j,    w_j = law_j(z_j, ż_j),  z_j = across_j(x, u, p)
+    ẋ = f(x, u, p) + Σ into_j(p) w_j,   y = h(x, u, p) + Σ into_j(p) w_j,   w_j = law_j(z_j, ż_j),   z_j = across_j(x, u)
 
 `close_loop(simulator, law, port)` puts a law into a port and gives a simulator again; `discretise` (in
 `integration.py`) makes it a `Model`, the same as any other. At an actuator or a sensor a law stands in series: what it
@@ -160,15 +160,15 @@ class Simulator:
                 raise InputError(f"The simulator's parameter {name!r} is {p!r}; give Parameter(value, ...).")
         object.__setattr__(self, "parameters", ParameterSet(dict(self.parameters)))
         object.__setattr__(self, "ports", tuple(self.ports))
-        x, u, p, t = self._symbols()
-        self.derivatives(x, u, p, t)
+        x, u, named, t = self._symbols()
+        self.derivatives(x, u, named, t)
         self.output_names  # noqa: B018 - evaluated to be checked
         names = [port.name for port in self.ports]
         if len(set(names)) != len(names):
             raise InputError(f"The port names {', '.join(names)} are not unique; name each port once.")
         for port in self.ports:
-            self.into(port, x, u, p, t)
-            self.across(port, x, u, p, t)
+            self.into(port, x, u, named, t)
+            self.across(port, x, u, named, t)
 
     def _symbols(self) -> tuple[Named, Named, Named, Any]:
         x = Named("state", {n: ca.SX.sym(n) for n in self.states})

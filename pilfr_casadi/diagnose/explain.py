@@ -1,0 +1,197 @@
+"""Full fits of the surviving pairs of port and law, the simulator's own parameters re-estimated with each.
+
+Each pair is fitted to the first part of every recording, from several starts: the screen's best shapes on the refitted
+and on the user's parameters, and led there by an observer. It is judged on the rest, and the best are fitted to
+everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..compiled import make_engine
+from ..laws import Law
+from ..recording import InputError, Recording
+from ..simulator import Simulator
+from .screen import Scored
+from .workbench import QUICK, THOROUGH, Fitted, Workbench
+
+HEAD = 0.7  # share of each recording that candidates are fitted to
+LONG = 12000  # samples that candidates are fitted to
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A port and law, fitted.
+
+    Attributes
+    ----------
+    fitted : Fitted
+        On the first part; on everything once `polished`.
+    head, tail : float
+        Mean square errors of the first part (fitted) and of the rest (not seen), in units of the outputs' variance.
+    size : int
+        Parameters of the law.
+    """
+
+    port: str
+    law: Law
+    fitted: Fitted
+    head: float
+    tail: float
+    size: int
+    full: float = np.nan
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """Port and law id."""
+        return self.port, self.law.id
+
+    @property
+    def error(self) -> float:
+        """Root of the geometric mean of both mean squares."""
+        return float((self.head * self.tail) ** 0.25)
+
+
+def heads(recordings: Sequence[Recording], share: float = HEAD) -> tuple[Recording, ...]:
+    """First part of each recording."""
+    total, out = sum(map(len, recordings)), []
+    for r in recordings:
+        most = int(len(r) * min(1.0, LONG / (share * total)))
+        cut = max(int(share * most), min(len(r), r.skip + 20))
+        part = r.slice(0, cut)
+        out.append(part.with_(initial="estimate", period=None) if part.initial == "periodic" else part)
+    return tuple(out)
+
+
+def judged(bench: Workbench, fitted: Fitted) -> tuple[float, float]:
+    """Mean square error on the first part and on the rest of each recording."""
+    head, tail = [], []
+    vector = fitted.vector
+    firsts = heads(bench.recordings)
+    for r, first, state in zip(bench.recordings, firsts, fitted.initial, strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):
+            y = fitted.engine.simulate(fitted.model.drive(r), vector, state)[0]
+            e = ((y - r.y) / bench.scale) ** 2
+        cut = len(first)
+        head.append(e[r.skip : cut])
+        tail.append(e[cut:] if len(r) - cut > 5 else e[r.skip :])
+    means = [float(np.mean(np.concatenate(part))) for part in (head, tail)]
+    return means[0], means[1] if np.isfinite(means[1]) else np.inf
+
+
+def survivors(scored: Sequence[Scored], keep: int = 10) -> list[tuple[str, type[Law], list[Scored]]]:
+    """Pairs worth a full fit: the best of both lists and the best of each port."""
+    chosen: dict[tuple[str, type[Law]], list[Scored]] = {}
+    for source in ("simulation", "observer"):
+        ranked = [s for s in scored if s.source == source]
+        ports: set[str] = set()
+        for i, s in enumerate(ranked):
+            if i < keep or s.port not in ports:
+                chosen.setdefault((s.port, type(s.law)), [])
+            ports.add(s.port)
+    for s in scored:
+        if (s.port, type(s.law)) in chosen:
+            chosen[s.port, type(s.law)].append(s)
+    return [(port, law, entries) for (port, law), entries in chosen.items()]
+
+
+def closed(
+    simulator: Simulator, entry: Scored, start: Mapping[str, Any], sign: int
+) -> tuple[Simulator, dict[str, Any], str]:
+    """The simulator with the law in its port, start values by full name, and the prefix of the law's parameters."""
+    law = entry.law
+    limits: dict[str, tuple[Any, Any]] = dict(law.at(start).bounds(entry.local))
+    if law.dissipative and sign:
+        limits |= {name: ((0.0, np.inf) if sign > 0 else (-np.inf, 0.0)) for name in law.strength if name != "F_0"}
+    inside = {k: np.clip(v, *limits[k]) if k in limits else v for k, v in start.items()}
+    placed = simulator.with_element(entry.port, law.at(inside, limits))
+    prefix = placed.elements[-1].prefix
+    return placed, {f"{prefix}{k}": v for k, v in inside.items()}, prefix
+
+
+def fit_pair(
+    bench: Workbench,
+    entries: Sequence[Scored],
+    without: Fitted,
+    sign: int,
+    gain: np.ndarray | None,
+    runs: int = 3,
+) -> Candidate | None:
+    """Fit one pair to the first part of the recordings; None where every start diverges."""
+    part = bench.on(heads(bench.recordings))
+    first = entries[0]
+    placed, _, _ = closed(without.simulator, first, first.starts[0], sign)
+    model = part.model(placed, gain)
+    engine = make_engine(model, bench.engine)
+    nominal = {k: p.value for k, p in without.simulator.parameters.items()}
+    starts: list[dict[str, Any]] = []
+    for entry in entries:
+        for i, own in enumerate(entry.starts):
+            _, named, _ = closed(without.simulator, entry, own, sign)
+            starts.append({**without.values, **named})
+            if i == 0:
+                starts.append({**nominal, **named})
+    ranked = sorted(starts, key=lambda s: _quick_cost(part, model, engine, s, without))
+    try:
+        fitted = part.fit(placed, ranked[:runs], gain=gain, solver=QUICK, engine=engine)
+        if gain is not None:
+            led = part.fit(placed, [ranked[0]], gain=gain, anneal=(1.0, 0.1), solver=QUICK, engine=engine)
+            fitted = min(fitted, led, key=lambda f: f.cost)
+    except InputError:
+        return None
+    head, tail = judged(bench, fitted)
+    if not np.isfinite(tail):
+        tail = 1e12
+    size = sum(p.size for p in placed.elements[-1].law.parameters().values())
+    return Candidate(first.port, placed.elements[-1].law, fitted, head, tail, size)
+
+
+def _quick_cost(part: Workbench, model: Any, engine: Any, start: Mapping[str, Any], without: Fitted) -> float:
+    parameters = model.parameters
+    vector = np.clip(parameters.pack({k: v for k, v in start.items() if k in parameters}), parameters.lower, parameters.upper)
+    total = 0.0
+    for r, state in zip(part.recordings, without.initial, strict=True):
+        full = np.zeros(model.n_x)
+        full[: min(len(state), model.n_x)] = state[: model.n_x]
+        with np.errstate(over="ignore", invalid="ignore"):
+            y = engine.simulate(model.drive(r), vector, full)[0]
+            total += float(np.sum(((y - r.y) / part.scale)[r.skip :] ** 2))
+    return total if np.isfinite(total) else np.inf
+
+
+def polish(bench: Workbench, candidate: Candidate) -> Candidate:
+    """Fit a candidate to everything."""
+    placed = candidate.fitted.simulator
+    try:
+        fitted = bench.fit(placed, [candidate.fitted.values], solver=THOROUGH)
+    except InputError:
+        return replace(candidate, full=np.inf)
+    return replace(candidate, fitted=fitted, full=fitted.cost)
+
+
+def explain(
+    bench: Workbench,
+    scored: Sequence[Scored],
+    without: Fitted,
+    signs: Mapping[str, int],
+    gain: np.ndarray | None,
+    workers: int,
+    report: Callable[[int, int, float], None],
+) -> list[Candidate]:
+    """Every survivor fitted, smallest error first."""
+    pairs = survivors(scored)
+    found: list[Candidate] = []
+    with ThreadPoolExecutor(workers) as pool:
+        tasks = [pool.submit(fit_pair, bench, entries, without, signs[port], gain) for port, _, entries in pairs]
+        for i, task in enumerate(tasks):
+            candidate = task.result()
+            if candidate is not None:
+                found.append(candidate)
+            report(i + 1, len(tasks), min((c.error for c in found), default=np.inf))
+    return sorted(found, key=lambda c: c.error)

@@ -1,0 +1,213 @@
+"""A score test of every port and law: how much of the residual a small dose of a law would take away.
+
+The outputs' sensitivity to a law at zero strength is projected off the simulator's own parameters and the initial
+states (Rao 1948); shape parameters lie on a grid. It is done twice: along the refitted simulation, and along an observer
+with process noise at every port, on its innovations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..laws import Law
+from ..laws.base import Local
+from ..laws.trace import columns, trace
+from ..simulator import Port
+from .linearise import Probe, Run, locals_of, observer_gain, propagate, run
+from .workbench import Fitted, Workbench
+
+MOST = 8000  # samples looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """A port and law with the share of the residual that a small dose takes away, and start values in falling order."""
+
+    port: str
+    law: Law
+    share: float
+    starts: tuple[dict[str, Any], ...]
+    local: Local
+    source: str = "simulation"
+
+
+def screen(
+    bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, keep: int = 3
+) -> tuple[list[Scored], dict[str, int], np.ndarray | None]:
+    """Every port and law with its score along the simulation and along the observer, best first.
+
+    Also returns each port's sense (+1: a positive force opposes motion, see `linearise.Run`) and the observer's gain.
+
+    Parameters
+    ----------
+    noise : array, shape (n_y,)
+        Standard deviation of the outputs' noise.
+    keep : int
+        Start values kept of each pair.
+    """
+    probe = Probe.of(bench, fitted)
+    n = len(bench.recordings)
+    runs = [run(bench, probe, fitted, i) for i in range(n)]
+    gain = observer_gain(probe, runs, noise)
+    found = _score(bench, probe, runs, laws, None, keep)
+    if gain.any():
+        led = [run(bench, probe, fitted, i, gain) for i in range(n)]
+        found += _score(bench, probe, led, laws, gain, keep)
+    signs = {name: int(s) for name, s in zip(probe.ports, runs[0].sign, strict=True)}
+    return sorted(found, key=lambda s: -s.share), signs, gain if gain.any() else None
+
+
+def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
+    """The stretch of each recording that is looked at: where the error is largest."""
+    share = max(MOST // len(runs), 200)
+    out = []
+    for r, recording in zip(runs, bench.recordings, strict=True):
+        m, skip = len(r.error), recording.skip
+        if m - skip <= share:
+            out.append(slice(skip, m))
+            continue
+        energy = np.cumsum(np.append(0.0, np.sum((r.error / bench.scale) ** 2, axis=1)))
+        starts = np.arange(skip, m - share + 1, max(share // 8, 1))
+        at = int(starts[np.argmax(energy[starts + share] - energy[starts])])
+        out.append(slice(at, at + share))
+    return out
+
+
+def _score(
+    bench: Workbench,
+    probe: Probe,
+    runs: list[Run],
+    laws: Sequence[type[Law]],
+    gain: np.ndarray | None,
+    keep: int,
+) -> list[Scored]:
+    n, n_free = probe.model.substeps, len(probe.free) - len(probe.ports)
+    places = locals_of(bench, runs)
+    windows = _windows(bench, runs)
+    cuts = [slice(w.start * n, w.stop * n) for w in windows]
+    short = [
+        replace(r, a=r.a[c], b=r.b[c], c=r.c[c], d=r.d[c], error=r.error[w])
+        for r, c, w in zip(runs, cuts, windows, strict=True)
+    ]
+    error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
+    tasks = _tasks(bench, probe, runs, laws, places)
+    edges = np.cumsum([0, *(len(r.z) for r in runs)])
+    blocks = []
+    for i, (r, w) in enumerate(zip(short, windows, strict=True)):
+        forces = [(t.index, t.forces[edges[i] : edges[i + 1]][w]) for t in tasks]
+        y = propagate(r, forces, n_free, n, True, gain) / bench.scale[:, None]
+        blocks.append(y.reshape(-1, y.shape[2]))
+    first = n_free + short[0].a.shape[1]
+    base = _orthonormal(_block_diagonal([b[:, :first] for b in blocks], n_free))
+    left = error - base @ (base.T @ error)
+    phi = np.concatenate([b[:, first:] for b in blocks])
+    phi -= base @ (base.T @ phi)
+    total, at, out = max(float(left @ left), 1e-300), 0, []
+    source = "simulation" if gain is None else "observer"
+    for task in tasks:
+        own = at
+        for law, shapes in task.pairs:
+            width, scores = columns(law), []
+            for k, shape in enumerate(shapes):
+                cols = slice(at + k * width, at + (k + 1) * width)
+                drop, strength = _gain(phi[:, cols], left, law, int(runs[0].sign[task.index]))
+                scores.append((drop / total, shape, -strength / task.size[cols.start - own : cols.stop - own]))
+            at += width * len(shapes)
+            scores.sort(key=lambda s: -s[0])
+            starts = tuple(_start(law, shape, c) for _, shape, c in scores[:keep])
+            out.append(Scored(task.port.name, law, scores[0][0], starts, task.local, source))
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """A port's laws and shapes with their forces, each column of unit size (`size` is what it was)."""
+
+    index: int
+    port: Port
+    local: Local
+    pairs: list[tuple[Law, list[dict[str, Any]]]]
+    forces: np.ndarray
+    size: np.ndarray
+
+
+def _tasks(
+    bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], places: list[Local]
+) -> list[_Task]:
+    by_name = {port.name: port for port in bench.simulator.all_ports()}
+    out = []
+    for j, (name, local) in enumerate(zip(probe.ports, places, strict=True)):
+        port = by_name[name]
+        if not np.ptp(local.z) > 0:
+            continue
+        chosen = [law() for law in laws if ("series" if port.series else "parallel") in law.places]
+        pairs = [(law, list(law.shapes(local))) for law in chosen if usable(law, local)]
+        forces = np.hstack([trace(law, local, shapes).reshape(len(local.z), -1) for law, shapes in pairs])
+        forces = np.where(np.isfinite(forces), forces, 0.0)
+        size = np.sqrt(np.mean(forces**2, axis=0))
+        size = np.where(size > 0, size, 1.0)
+        out.append(_Task(j, port, local, pairs, forces / size, size))
+    return sorted(out, key=lambda t: t.port.name.startswith("sensor:"))
+
+
+def usable(law: Law, local: Local) -> bool:
+    """Whether the data can speak to a law at a port."""
+    if "dz" in law.reads() and not np.any(local.dz):
+        return False
+    return not law.applies(local)
+
+
+def _start(law: Law, shape: dict[str, Any], strength: np.ndarray) -> dict[str, Any]:
+    values, at, p = dict(shape), 0, law.at(shape).parameters()
+    for name in law.strength:
+        size = p[name].size
+        values[name] = strength[at : at + size] if p[name].value.ndim else float(strength[at])
+        at += size
+    return values
+
+
+def _block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
+    """Parameters shared by all recordings, an initial state for each."""
+    n_x = blocks[0].shape[1] - n_free
+    out = np.zeros((sum(map(len, blocks)), n_free + n_x * len(blocks)))
+    at = 0
+    for i, b in enumerate(blocks):
+        rows = slice(at, at + len(b))
+        out[rows, :n_free] = b[:, :n_free]
+        out[rows, n_free + i * n_x : n_free + (i + 1) * n_x] = b[:, n_free:]
+        at += len(b)
+    return out
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    size = np.linalg.norm(columns, axis=0)
+    kept = columns[:, size > 0] / size[size > 0]
+    u, s, _ = np.linalg.svd(kept, full_matrices=False)
+    return u[:, s > 1e-9 * s.max(initial=1e-300)]
+
+
+def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sign: int) -> tuple[float, np.ndarray]:
+    """Drop of the sum of squares by the columns of one shape, and their coefficients."""
+    gram, right = phi.T @ phi, phi.T @ left
+    size = np.sqrt(np.diag(gram))
+    if not np.any(size > 0):
+        return 0.0, np.zeros(phi.shape[1])
+    size = np.where(size > 0, size, 1.0)
+    n = len(size)
+    ridge = gram / np.outer(size, size) + 1e-10 * np.eye(n)
+    if law.dissipative and sign and n > 1:
+        from scipy.optimize import nnls
+
+        root = np.linalg.cholesky(ridge).T
+        target = np.linalg.solve(root.T, -sign * right / size)
+        coefficients = -sign * nnls(root, target)[0]
+    else:
+        coefficients = np.linalg.solve(ridge, right / size)
+        if law.dissipative and sign and n == 1 and -sign * coefficients[0] < 0:
+            coefficients = np.zeros(1)
+    share = float(2 * coefficients @ (right / size) - coefficients @ ridge @ coefficients)
+    return share, coefficients / size

@@ -1,0 +1,220 @@
+"""What all steps of a diagnosis share: the simulator, its recordings, how it is integrated, and how it is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..compiled import make_engine
+from ..gauss_newton import GaussNewton
+from ..integration import choose_substeps, discretise
+from ..model import Model
+from ..observer import GAMMA, led
+from ..parameters import ParameterSet
+from ..problem import Problem
+from ..recording import InputError, Recording
+from ..sensitivities import Engine
+from ..simulator import Simulator
+
+QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
+THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A simulator fitted to recordings.
+
+    Attributes
+    ----------
+    values : dict
+        Parameters by name.
+    initial : list of array
+        State with memory at each recording's first sample.
+    residual : list of array, shape (M, n_y)
+        Simulated minus measured outputs of each recording, unscored samples included.
+    cost : float
+        Mean square of the scored residuals, each output in units of its deviation.
+    """
+
+    simulator: Simulator
+    model: Model
+    engine: Engine
+    values: dict[str, np.ndarray]
+    initial: list[np.ndarray]
+    residual: list[np.ndarray]
+    cost: float
+
+    @property
+    def vector(self) -> np.ndarray:
+        """Parameter vector of the model."""
+        return self.model.parameters.pack(self.values)
+
+    def corrected(self) -> Simulator:
+        """The simulator with the fitted values as start values."""
+        own = ParameterSet(dict(self.simulator.parameters))
+        vector = own.pack({k: v for k, v in self.values.items() if k in own})
+        return self.simulator.with_parameters(own.at(vector))
+
+
+@dataclass(frozen=True, eq=False)
+class Workbench:
+    """The data of one diagnosis, and how simulators are run on it."""
+
+    simulator: Simulator
+    recordings: tuple[Recording, ...]
+    hold: str
+    substeps: int
+    scale: np.ndarray
+    engine: str = "auto"
+
+    @classmethod
+    def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
+        """Check that simulator and recordings fit each other, and choose the sub-steps."""
+        ordered = tuple(arranged(simulator, r) for r in recordings)
+        steps = {round(r.dt / ordered[0].dt, 4) for r in ordered}
+        if steps != {1.0}:
+            given = ", ".join(f"{r.dt:g} s" for r in ordered)
+            raise InputError(f"The recordings have different steps ({given}); resample them to one.")
+        scale = np.std(np.concatenate([r.y[r.skip :] for r in ordered]), axis=0)
+        return cls(simulator, ordered, hold, choose_substeps(simulator, ordered), scale, engine)
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval, s."""
+        return self.recordings[0].dt
+
+    def on(self, recordings: Sequence[Recording]) -> Workbench:
+        """The same with other recordings, errors still in units of the training outputs' deviation."""
+        return replace(self, recordings=tuple(arranged(self.simulator, r) for r in recordings))
+
+    def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
+        """The simulator as a model, with output injection where a gain is given."""
+        substeps = self.substeps
+        if simulator.elements:
+            substeps = max(substeps, choose_substeps(simulator, self.recordings))
+        model = discretise(simulator, self.dt, self.hold, substeps)
+        return model if gain is None else led(model, gain)
+
+    def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:
+        """The simulation-error problem of a model."""
+        return Problem(model, recordings or self.recordings, engine=engine or self.engine, scale=self.scale)
+
+    def fit(
+        self,
+        simulator: Simulator,
+        starts: Sequence[Mapping[str, Any]] = ({},),
+        *,
+        gain: np.ndarray | None = None,
+        anneal: Sequence[float] = (),
+        solver: GaussNewton = QUICK,
+        engine: Engine | None = None,
+        initial: np.ndarray | None = None,
+    ) -> Fitted:
+        """Fit from several starts (values by name), each also led through `anneal` where there are injection gains.
+
+        Raises
+        ------
+        InputError
+            If the simulation diverges from every start.
+        """
+        model = self.model(simulator, gain)
+        engine = engine or make_engine(model, self.engine)
+        best: tuple[float, np.ndarray, Problem] | None = None
+        for start in starts:
+            for path in ((), tuple(anneal)) if anneal else ((),):
+                found = self._run(model, engine, start, path, solver, initial)
+                if found is not None and (best is None or found[0] < best[0]):
+                    best = found
+        if best is None:
+            raise InputError(
+                "The simulation diverges at the start values; check the parameters' values and units, and the hold."
+            )
+        _, theta, problem = best
+        values = model.parameters.unpack(problem.parameters(theta))
+        values.pop(GAMMA, None)
+        return self.result(simulator, values, problem.first_states(theta), engine, model)
+
+    def _run(
+        self,
+        model: Model,
+        engine: Engine,
+        start: Mapping[str, Any],
+        path: tuple[float, ...],
+        solver: GaussNewton,
+        initial: np.ndarray | None,
+    ) -> tuple[float, np.ndarray, Problem] | None:
+        parameters = model.parameters
+        known = {k: v for k, v in start.items() if k in parameters}
+        vector = np.clip(parameters.pack(known), parameters.lower, parameters.upper)
+        states: np.ndarray | None = initial
+        problem: Problem | None = None
+        for gamma in (*path, 0.0):
+            at = parameters.at(vector)
+            if GAMMA in parameters:
+                at = at.change(**{GAMMA: {"value": gamma}})
+            problem = self.problem(model.with_parameters(at), engine)
+            n_free = int(problem.free.sum())
+            theta = problem.start.copy()
+            if states is not None and len(states) <= len(theta) - n_free:
+                theta[n_free : n_free + len(states)] = states
+            if not np.isfinite(problem.cost(theta)):
+                if gamma == 0.0 and not path:
+                    return None
+                continue
+            solution = solver.solve(problem, theta)
+            vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
+        if problem is None:
+            return None
+        theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
+        cost = problem.cost(theta)
+        return (cost, theta, problem) if np.isfinite(cost) else None
+
+    def result(
+        self,
+        simulator: Simulator,
+        values: dict[str, np.ndarray],
+        initial: list[np.ndarray],
+        engine: Engine,
+        model: Model,
+    ) -> Fitted:
+        """Residuals at given values and initial states."""
+        vector = model.parameters.pack(values)
+        residual = []
+        for r, state in zip(self.recordings, initial, strict=True):
+            y = engine.simulate(model.drive(r), vector, state)[0]
+            residual.append(y - r.y)
+        scored = np.concatenate([(e / self.scale)[r.skip :] for e, r in zip(residual, self.recordings, strict=True)])
+        return Fitted(simulator, model, engine, values, initial, residual, float(np.mean(scored**2)))
+
+
+def arranged(simulator: Simulator, recording: Recording) -> Recording:
+    """A recording with its columns in the simulator's order.
+
+    Raises
+    ------
+    InputError
+        If a column is missing.
+    """
+    changes: dict[str, Any] = {}
+    for names, own, letter in (
+        (simulator.inputs, recording.inputs, "u"),
+        (simulator.output_names, recording.outputs, "y"),
+    ):
+        kind = {"u": "input", "y": "output"}[letter]
+        for name in names:
+            if name not in own:
+                raise InputError(
+                    f"The recording {recording.label} has no {kind} {name!r}, which the simulator has; "
+                    f"it has {', '.join(own) or 'none'}. Map a column to it by name."
+                )
+        if tuple(own) != tuple(names):
+            order = [own.index(name) for name in names]
+            values = getattr(recording, letter)[:, order]
+            changes |= {letter: values, f"{kind}s": tuple(names)}
+    if changes:
+        kept = {*changes.get("inputs", recording.inputs), *changes.get("outputs", recording.outputs)}
+        changes["units"] = {k: v for k, v in recording.units.items() if k in kept}
+    return recording.with_(**changes) if changes else recording

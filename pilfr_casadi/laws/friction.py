@@ -1,0 +1,123 @@
+"""Laws of the local rate: friction and damping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ..operators import play
+from .base import Law, Local, grid
+
+
+class CoulombFriction(Law):
+    """Dry friction with a smooth reversal (Armstrong-Hélouvry et al. 1994)."""
+
+    id = "coulomb_friction"
+    form = "smooth"
+    equation = "w = F_c tanh(dz/dt / v_0)"
+    source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7)"
+    sentence = "dry friction: a force that opposes motion and hardly depends on speed"
+    units = {"F_c": "w", "v_0": "z/s"}
+    strength = ("F_c",)
+    dissipative = True
+
+    def force(self, dz: Any, p: Any) -> Any:
+        return p.F_c * ca.tanh(dz / p.v_0)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(v_0=local.speed * np.array([0.005, 0.02, 0.06, 0.15]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"v_0": (2e-3 * local.speed, 0.5 * local.speed)}
+
+
+class AsymmetricFriction(CoulombFriction):
+    """Dry friction that differs between the two directions."""
+
+    form = "asymmetric"
+    equation = "w = F_c tanh(dz/dt / v_0) + F_0"
+    units = {"F_c": "w", "F_0": "w", "v_0": "z/s"}
+    strength = ("F_c", "F_0")
+
+    def force(self, dz: Any, p: Any) -> Any:
+        return p.F_c * ca.tanh(dz / p.v_0) + p.F_0
+
+
+class PreslidingFriction(Law):
+    """Dry friction whose contact springs back before it slides: one elasto-plastic element (Jenkins 1962; Dahl 1968)."""
+
+    id = "coulomb_friction"
+    form = "presliding"
+    equation = "w = k_t stop_r[z],  F_c = k_t r"
+    source = "Jenkins (1962); Al-Bender & Swevers (2008), IEEE Control Syst. 28(6)"
+    sentence = "dry friction whose contact springs back a little before it slides"
+    units = {"k_t": "w/z", "r": "z"}
+    strength = ("k_t",)
+    dissipative = True
+    memory = 1
+
+    def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
+        """One stop."""
+        following = play(z, s, p["r"])
+        return p["k_t"] * (z - following), following
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(r=local.half * np.array([0.003, 0.01, 0.03, 0.1, 0.25]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"r": (5e-4 * local.half, 0.6 * local.half)}
+
+
+class StribeckFriction(Law):
+    """Dry friction that falls as motion sets in (Stribeck 1902; Armstrong-Hélouvry et al. 1994)."""
+
+    id = "stribeck_friction"
+    equation = "w = (F_c + F_e exp(-(dz/dt / v_s)^2)) tanh(dz/dt / v_0)"
+    source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7)"
+    sentence = "dry friction that is larger at rest than in motion"
+    units = {"F_c": "w", "F_e": "w", "v_s": "z/s", "v_0": "z/s"}
+    strength = ("F_c", "F_e")
+    dissipative = True
+
+    def force(self, dz: Any, p: Any) -> Any:
+        return (p.F_c + p.F_e * ca.exp(-((dz / p.v_s) ** 2))) * ca.tanh(dz / p.v_0)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        for v_s in (0.04, 0.1, 0.2, 0.4):
+            for v_0 in (0.1, 0.3):
+                yield {"v_s": v_s * local.speed, "v_0": v_0 * v_s * local.speed}
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (2e-3 * local.speed, 0.3 * local.speed)}
+
+
+class QuadraticDrag(Law):
+    """Drag of turbulent flow (White 2011)."""
+
+    id = "quadratic_drag"
+    equation = "w = c_2 dz/dt |dz/dt|"
+    source = "White (2011), Fluid Mechanics, sec. 7.6"
+    sentence = "a drag that grows with the square of speed"
+    units = {"c_2": "w*s^2/z^2"}
+    strength = ("c_2",)
+    dissipative = True
+
+    def force(self, dz: Any, p: Any) -> Any:
+        return p.c_2 * dz * ca.fabs(dz)
+
+
+class CubicDamping(Law):
+    """Damping that grows with the cube of speed (Nayfeh & Mook 1979)."""
+
+    id = "cubic_damping"
+    equation = "w = c_3 (dz/dt)^3"
+    source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 3.3"
+    sentence = "a damping force that grows with the cube of speed"
+    units = {"c_3": "w*s^3/z^3"}
+    strength = ("c_3",)
+
+    def force(self, dz: Any, p: Any) -> Any:
+        return p.c_3 * dz**3

@@ -1,0 +1,110 @@
+"""Limits of an actuator's or a sensor's range: saturation and dead zone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .base import Law, Local, grid
+
+
+class Saturation(Law):
+    """A hard limit, the same on both sides."""
+
+    id = "saturation"
+    form = "symmetric"
+    equation = "w = clip(u, -L, L) - u"
+    source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
+    sentence = "saturation: beyond a limit the signal does not follow any more"
+    units = {"L": "z"}
+    places = ("series",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return ca.fmax(ca.fmin(z, p.L), -p.L) - z
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(L=local.reach * np.array([0.3, 0.45, 0.6, 0.75, 0.9]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"L": (0.1 * local.reach, 0.995 * local.reach)}
+
+
+class AsymmetricSaturation(Saturation):
+    """A hard limit on either side."""
+
+    form = "asymmetric"
+    equation = "w = clip(u, low, high) - u"
+    units = {"low": "z", "high": "z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return ca.fmax(ca.fmin(z, p.high), p.low) - z
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        at = np.array([0.5, 0.75, 0.97])
+        middle = (local.low + local.high) / 2
+        yield from grid(low=middle - local.half * at, high=middle + local.half * at)
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        middle = (local.low + local.high) / 2
+        return {"low": (local.low * 1.0 - 0.1 * local.half, middle), "high": (middle, local.high + 0.1 * local.half)}
+
+
+class SoftSaturation(Saturation):
+    """A limit that is approached gradually."""
+
+    form = "soft"
+    equation = "w = L tanh(u / L) - u"
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.L * ca.tanh(z / p.L) - z
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(L=local.reach * np.array([0.3, 0.6, 1.0, 2.0]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"L": (0.1 * local.reach, 10 * local.reach)}
+
+
+class DeadZone(Law):
+    """Small signals have no effect."""
+
+    id = "dead_zone"
+    form = "symmetric"
+    equation = "w = -clip(u, -g, g)"
+    source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
+    sentence = "a dead zone: small signals have no effect"
+    units = {"g": "z"}
+    places = ("series",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return -ca.fmax(ca.fmin(z, p.g), -p.g)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(g=local.reach * np.array([0.02, 0.06, 0.12, 0.25, 0.4]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"g": (1e-3 * local.reach, 0.8 * local.reach)}
+
+    def applies(self, local: Local) -> str:
+        return "" if local.low < 0 < local.high else "one side is never visited"
+
+
+class AsymmetricDeadZone(DeadZone):
+    """A dead zone that reaches further on one side."""
+
+    form = "asymmetric"
+    equation = "w = -clip(u, -g_1, g_2)"
+    units = {"g_1": "z", "g_2": "z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return -ca.fmax(ca.fmin(z, p.g_2), -p.g_1)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        at = local.reach * np.array([0.02, 0.15, 0.35])
+        yield from grid(g_1=at, g_2=at)
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"g_1": (0.0, 0.8 * local.reach), "g_2": (0.0, 0.8 * local.reach)}

@@ -1,0 +1,220 @@
+"""Memoryless laws of the local coordinate: stiffnesses, contacts, gaps, curves, and forces periodic in position."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .base import Law, Local, grid
+
+
+class CubicStiffness(Law):
+    """Hardening (k_3 > 0) or softening spring (Duffing 1918)."""
+
+    id = "cubic_stiffness"
+    equation = "w = k_3 z^3"
+    source = "Kovacic & Brennan (2011), The Duffing Equation, ch. 1"
+    sentence = "a stiffness that grows (or falls) with the square of the deflection, the same in both directions"
+    units = {"k_3": "w/z^3"}
+    strength = ("k_3",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k_3 * z**3
+
+
+class QuadraticStiffness(Law):
+    """A spring that is stiffer in one direction (Nayfeh & Mook 1979)."""
+
+    id = "quadratic_stiffness"
+    equation = "w = k_2 z^2"
+    source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 4.2"
+    sentence = "a stiffness that changes in proportion to the deflection, so that it is stiffer in one direction"
+    units = {"k_2": "w/z^2"}
+    strength = ("k_2",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k_2 * z**2
+
+
+class PiecewiseStiffness(Law):
+    """A contact: another spring takes part beyond a point (Shaw & Holmes 1983)."""
+
+    id = "piecewise_stiffness"
+    form = "above"
+    equation = "w = k_c max(z - g, 0)"
+    source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
+    sentence = "a contact: beyond a point of the travel another stiffness sets in"
+    units = {"k_c": "w/z", "g": "z"}
+    strength = ("k_c",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k_c * ca.fmax(z - p.g, 0)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(g=local.low + 2 * local.half * np.array([0.15, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"g": (local.low + 0.04 * local.half, local.high - 0.04 * local.half)}
+
+
+class PiecewiseStiffnessBelow(PiecewiseStiffness):
+    """The same on the other side."""
+
+    form = "below"
+    equation = "w = -k_c max(g - z, 0)"
+
+    def force(self, z: Any, p: Any) -> Any:
+        return -p.k_c * ca.fmax(p.g - z, 0)
+
+
+class HertzContact(PiecewiseStiffness):
+    """A contact between curved bodies (Hertz 1881)."""
+
+    form = "hertz"
+    equation = "w = k_c max(z - g, 0)^1.5"
+    source = "Johnson (1985), Contact Mechanics, ch. 4"
+    units = {"k_c": "w/z^1.5", "g": "z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        depth = ca.fmax(z - p.g, 0)
+        return p.k_c * depth * ca.sqrt(depth + 1e-300)
+
+
+class Clearance(Law):
+    """A gap spring: force only beyond the clearance on either side (Shaw & Holmes 1983)."""
+
+    id = "clearance"
+    form = "symmetric"
+    equation = "w = k_g (z - clip(z, -g, g))"
+    source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
+    sentence = "a clearance: the spring carries load only beyond a gap on either side"
+    units = {"k_g": "w/z", "g": "z"}
+    strength = ("k_g",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k_g * (ca.fmax(z - p.g, 0) - ca.fmax(-z - p.g, 0))
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(g=local.reach * np.array([0.03, 0.08, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"g": (1e-3 * local.reach, 0.97 * local.reach)}
+
+    def applies(self, local: Local) -> str:
+        return "" if local.low < -0.05 * local.reach and local.high > 0.05 * local.reach else "one side is never visited"
+
+
+class OffCentreClearance(Clearance):
+    """A gap that does not lie around zero."""
+
+    form = "off-centre"
+    equation = "w = k_g (z - clip(z, m - g, m + g))"
+    units = {"k_g": "w/z", "g": "z", "m": "z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k_g * (ca.fmax(z - p.m - p.g, 0) - ca.fmax(p.m - z - p.g, 0))
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        middle = (local.low + local.high) / 2
+        yield from grid(g=local.half * np.array([0.1, 0.3, 0.6]), m=middle + local.half * np.array([-0.3, 0.0, 0.3]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"g": (1e-3 * local.half, local.half), "m": (local.low, local.high)}
+
+
+class PeriodicForce(Law):
+    """A force that repeats with position: cogging, ripple of a screw or gear (Hanselman 2006)."""
+
+    id = "periodic_force"
+    equation = "w = a sin(2 pi z / L) + b cos(2 pi z / L)"
+    source = "Hanselman (2006), Brushless Permanent Magnet Motor Design, sec. 8.3"
+    sentence = "a force that repeats with position, as from cogging or the pitch of a screw or gear"
+    units = {"a": "w", "b": "w", "L": "z"}
+    strength = ("a", "b")
+
+    def force(self, z: Any, p: Any) -> Any:
+        angle = 2 * np.pi * z / p.L
+        return p.a * ca.sin(angle) + p.b * ca.cos(angle)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(L=2 * local.half / np.arange(1.5, 24.1, 0.5))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"L": (2 * local.half / 60, 2 * local.half / 1.5)}
+
+
+class Polynomial(Law):
+    """A memoryless curve: quadratic and cubic terms."""
+
+    id = "static_curve"
+    form = "polynomial"
+    equation = "w = a_2 z^2 + a_3 z^3"
+    source = "Billings & Fakhouri (1982), Automatica 18(1)"
+    sentence = "a memoryless curve: the signal is bent by its own square and cube"
+    units = {"a_2": "w/z^2", "a_3": "w/z^3"}
+    strength = ("a_2", "a_3")
+    places = ("series",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a_2 * z**2 + p.a_3 * z**3
+
+
+class Quadratic(Polynomial):
+    """A memoryless curve: the square alone."""
+
+    form = "quadratic"
+    equation = "w = a_2 z^2"
+    units = {"a_2": "w/z^2"}
+    strength = ("a_2",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a_2 * z**2
+
+
+class Cubic(Polynomial):
+    """A memoryless curve: the cube alone."""
+
+    form = "cubic"
+    equation = "w = a_3 z^3"
+    units = {"a_3": "w/z^3"}
+    strength = ("a_3",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a_3 * z**3
+
+
+class Magnitude(Polynomial):
+    """A gain that differs between the two signs."""
+
+    form = "magnitude"
+    equation = "w = a |z|"
+    units = {"a": "w/z"}
+    strength = ("a",)
+    sentence = "a memoryless curve: the gain differs between the two signs"
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a * ca.fabs(z)
+
+
+class Power(Polynomial):
+    """A signed power, such as the square root of a flow under its own head (Torricelli)."""
+
+    form = "power"
+    equation = "w = a sign(z) |z|^n"
+    source = "White (2011), Fluid Mechanics, sec. 3.5"
+    sentence = "a memoryless curve: a power of the local signal, as in flow through an orifice"
+    units = {"a": "w/z^n", "n": ""}
+    strength = ("a",)
+    places = ("parallel", "series")
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a * ca.sign(z) * (ca.fabs(z) + 1e-12) ** p.n
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(n=[0.4, 0.5, 0.65, 1.5, 2.5])
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"n": (0.3, 5.0)}
