@@ -35,6 +35,7 @@ from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachin
 # without contraction the generated step gives the very numbers of the virtual machine: what slips, slips in both
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 FLAGS = (("-O2", "-march=native", *COMMON), ("-O2", *COMMON))  # the second where the first is not understood
+LONG = 120_000  # characters of source that are optimised less
 PATIENCE = 600.0  # seconds for one compilation
 _failures: dict[str, str] = {}  # what did not compile is not tried again by this process
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
@@ -183,6 +184,8 @@ def _compile(cc: str, source: str, key: str) -> Path:
         c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
         c_file.write_text(source, encoding="utf-8")
         for flags in FLAGS:
+            if len(source) > LONG:  # what takes seconds to compile gains little from it
+                flags = tuple("-O1" if flag == "-O2" else flag for flag in flags)
             command = [cc, *flags, str(c_file), "-o", str(partial), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
             if not done.returncode and partial.exists():

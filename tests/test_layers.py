@@ -9,12 +9,26 @@ PACKAGE = Path(__file__).parent.parent / "pilfr_casadi"
 
 # A file imports from its own layer and from those with a lower number. A new file takes its place here.
 LAYERS = {
-    0: ("recording", "signals", "multisines", "metrics", "parameters", "readers", "csv_table", "timebase", "threads"),
-    1: ("operators", "elements"),
+    0: (
+        "checks",
+        "recording",
+        "signals",
+        "multisines",
+        "metrics",
+        "parameters",
+        "readers",
+        "csv_table",
+        "array_files",
+        "timebase",
+        "threads",
+        "progress",
+    ),
+    1: ("operators", "elements", "laws"),
     2: ("model", "simulator", "integration"),
     3: (
         "simulate",
         "sensitivities",
+        "observer",
         "compiled",
         "bla",
         "local_polynomial",
@@ -39,9 +53,9 @@ LAYERS = {
         "baselines",
     ),
     5: ("gauss_newton", "ipopt", "callback", "damping", "scaling", "solution"),
-    6: ("fit", "multistart", "export", "plots"),
+    6: ("fit", "fitted", "linear_model", "penalty", "multistart", "export", "plots"),
     7: ("diagnose",),
-    8: ("cli", "report", "demo", "progress"),
+    8: ("cli", "commands", "option_values", "interrupts", "report", "demo"),
 }
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")

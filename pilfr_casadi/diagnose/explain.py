@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..compiled import make_engine
+from ..gauss_newton import GaussNewton
 from ..laws import Law
 from ..recording import InputError, Recording
 from ..simulator import Simulator
@@ -22,6 +23,8 @@ from .screen import Scored
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 HEAD = 0.7  # share of each recording that candidates are fitted to
+BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
+REFINED = 8  # pairs fitted from several starts
 LONG = 12000  # samples that candidates are fitted to
 
 
@@ -115,15 +118,22 @@ def closed(
     return placed, {f"{prefix}{k}": v for k, v in inside.items()}, prefix
 
 
-def fit_pair(
-    bench: Workbench,
-    entries: Sequence[Scored],
-    without: Fitted,
-    sign: int,
-    gain: np.ndarray | None,
-    runs: int = 3,
-) -> Candidate | None:
-    """Fit one pair to the first part of the recordings; None where every start diverges."""
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """A pair with its compiled model and its starts, best first."""
+
+    placed: Simulator
+    model: Any
+    engine: Any
+    starts: list[dict[str, Any]]
+    port: str
+    candidate: Candidate | None = None
+
+
+def prepare(
+    bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: int, gain: np.ndarray | None
+) -> _Pair:
+    """Compile a pair and fit it briefly from its best start."""
     part = bench.on(heads(bench.recordings))
     first = entries[0]
     placed, _, _ = closed(without.simulator, first, first.starts[0], sign)
@@ -138,18 +148,39 @@ def fit_pair(
             if i == 0:
                 starts.append({**nominal, **named})
     ranked = sorted(starts, key=lambda s: _quick_cost(part, model, engine, s, without))
+    pair = _Pair(placed, model, engine, ranked, first.port)
+    return replace(pair, candidate=_attempt(bench, part, pair, ranked[:1], None, BRIEF))
+
+
+def refine(bench: Workbench, pair: _Pair, gain: np.ndarray | None, runs: int = 3) -> Candidate | None:
+    """Fit a pair from several starts, led by the observer as well."""
+    part = bench.on(heads(bench.recordings))
+    starts = pair.starts[:runs]
+    if pair.candidate is not None:
+        starts = [pair.candidate.fitted.values, *starts[1:]]
+    found = [pair.candidate, _attempt(bench, part, pair, starts, gain, QUICK)]
+    if gain is not None:
+        found.append(_attempt(bench, part, pair, pair.starts[:1], gain, QUICK, (1.0, 0.1)))
+    return min((c for c in found if c is not None), key=lambda c: c.head, default=None)
+
+
+def _attempt(
+    bench: Workbench,
+    part: Workbench,
+    pair: _Pair,
+    starts: Sequence[Mapping[str, Any]],
+    gain: np.ndarray | None,
+    solver: GaussNewton,
+    anneal: tuple[float, ...] = (),
+) -> Candidate | None:
     try:
-        fitted = part.fit(placed, ranked[:runs], gain=gain, solver=QUICK, engine=engine)
-        if gain is not None:
-            led = part.fit(placed, [ranked[0]], gain=gain, anneal=(1.0, 0.1), solver=QUICK, engine=engine)
-            fitted = min(fitted, led, key=lambda f: f.cost)
+        fitted = part.fit(pair.placed, starts, anneal=anneal, solver=solver, model=pair.model, engine=pair.engine)
     except InputError:
         return None
     head, tail = judged(bench, fitted)
-    if not np.isfinite(tail):
-        tail = 1e12
-    size = sum(p.size for p in placed.elements[-1].law.parameters().values())
-    return Candidate(first.port, placed.elements[-1].law, fitted, head, tail, size)
+    law = pair.placed.elements[-1].law
+    size = sum(p.size for p in law.parameters().values())
+    return Candidate(pair.port, law, fitted, head, tail if np.isfinite(tail) else 1e12, size)
 
 
 def _quick_cost(part: Workbench, model: Any, engine: Any, start: Mapping[str, Any], without: Fitted) -> float:
@@ -186,12 +217,23 @@ def explain(
 ) -> list[Candidate]:
     """Every survivor fitted, smallest error first."""
     pairs = survivors(scored)
-    found: list[Candidate] = []
+    done = 0
+
+    def step(error: float) -> None:
+        nonlocal done
+        done += 1
+        report(done, len(pairs) + min(len(pairs), REFINED), error)
+
     with ThreadPoolExecutor(workers) as pool:
-        tasks = [pool.submit(fit_pair, bench, entries, without, signs[port], gain) for port, _, entries in pairs]
-        for i, task in enumerate(tasks):
-            candidate = task.result()
-            if candidate is not None:
-                found.append(candidate)
-            report(i + 1, len(tasks), min((c.error for c in found), default=np.inf))
-    return sorted(found, key=lambda c: c.error)
+        tasks = [pool.submit(prepare, bench, entries, without, signs[port], gain) for port, _, entries in pairs]
+        prepared = []
+        for task in tasks:
+            prepared.append(task.result())
+            step(min((p.candidate.error for p in prepared if p.candidate), default=np.inf))
+        prepared.sort(key=lambda p: p.candidate.error if p.candidate else np.inf)
+        again = [pool.submit(refine, bench, pair, gain) for pair in prepared[:REFINED]]
+        found = [p.candidate for p in prepared[REFINED:]]
+        for refined in again:
+            found.append(refined.result())
+            step(min((c.error for c in found if c), default=np.inf))
+    return sorted((c for c in found if c is not None), key=lambda c: c.error)

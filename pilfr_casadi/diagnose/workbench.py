@@ -110,6 +110,7 @@ class Workbench:
         gain: np.ndarray | None = None,
         anneal: Sequence[float] = (),
         solver: GaussNewton = QUICK,
+        model: Model | None = None,
         engine: Engine | None = None,
         initial: np.ndarray | None = None,
     ) -> Fitted:
@@ -120,7 +121,7 @@ class Workbench:
         InputError
             If the simulation diverges from every start.
         """
-        model = self.model(simulator, gain)
+        model = model or self.model(simulator, gain)
         engine = engine or make_engine(model, self.engine)
         best: tuple[float, np.ndarray, Problem] | None = None
         for start in starts:

@@ -25,8 +25,8 @@ class StopHysteresis(Law):
     units = {"w": "w/z", "r": "z"}
     strength = ("w",)
     dissipative = True
-    n = 8
-    memory = 8
+    n = 6
+    memory = 6
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         """Stops side by side."""

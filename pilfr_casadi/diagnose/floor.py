@@ -1,0 +1,71 @@
+"""The noise floor: from repeated periods, from repeated recordings, or estimated from a residual.
+
+The estimate takes third differences of the residual (normalised by √20): slow model error drops out, white noise stays.
+Coloured noise is underestimated by it; where a fit's residual cannot be told from noise (no local signal explains any
+of it on data held out) the residual itself is the floor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..recording import Recording
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """Standard deviation of each output's noise (n_y,), and where it comes from."""
+
+    deviation: np.ndarray
+    source: str
+
+    def nrmse(self, scale: np.ndarray) -> float:
+        """Averaged over outputs, in units of their deviation."""
+        return float(np.mean(self.deviation / scale))
+
+
+def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
+    """From periods, else from recordings with the same input; None where there are neither."""
+    found = [d for d in map(_from_periods, recordings) if d is not None]
+    if found:
+        return Floor(np.sqrt(np.mean(np.square(found), axis=0)), "periods")
+    groups: dict[bytes, list[Recording]] = {}
+    for r in recordings:
+        groups.setdefault(r.u.tobytes(), []).append(r)
+    repeats = [np.std([r.y[r.skip :] for r in g], axis=0, ddof=1) for g in groups.values() if len(g) > 1]
+    if repeats:
+        return Floor(np.sqrt(np.mean(np.concatenate(repeats) ** 2, axis=0)), "repeats")
+    return None
+
+
+def _from_periods(r: Recording) -> np.ndarray | None:
+    n = r.period
+    if not n or r.initial != "periodic":
+        return None
+    y = r.y[r.skip :]
+    count = len(y) // n
+    if count < 2:
+        return None
+    folded = y[: count * n].reshape(count, n, -1)
+    return np.asarray(np.sqrt(np.mean(np.var(folded, axis=0, ddof=1), axis=0)))
+
+
+def white_part(residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """White noise inside residuals, (n_y,): third differences, the smallest over recordings."""
+    return np.asarray(np.min([np.sqrt(np.mean(np.diff(e, 3, axis=0) ** 2, axis=0) / 20) for e in residuals], axis=0))
+
+
+def effective_size(residuals: Sequence[np.ndarray], most: int = 400) -> float:
+    """Samples that count: all of them over the residuals' correlation time `1 + 2 Σ ρ²`."""
+    total = 0.0
+    for e in residuals:
+        for column in (e - e.mean(axis=0)).T:
+            n = len(column)
+            spectrum = np.abs(np.fft.rfft(column, 2 * n)) ** 2
+            rho = np.fft.irfft(spectrum)[: min(most, n // 4)]
+            rho = rho / rho[0] if rho[0] > 0 else np.zeros(1)
+            total += n / (1 + 2 * float(np.sum(rho[1:] ** 2)))
+    return total

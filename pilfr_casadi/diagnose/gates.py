@@ -1,0 +1,166 @@
+"""The dull causes, looked at first: sign, unit, time unit, alignment, clock, clipping, offset, hold.
+
+Each is a change of the recordings (or a constant added at a sensor); it counts when the simulator, refitted, follows the
+changed recordings far better than the given ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..recording import InputError, Recording
+from .workbench import QUICK, Fitted, Workbench
+
+FACTORS = (1e3, 1e-3, 1e6, 1e-6, 180 / np.pi, np.pi / 180, 1e2, 1e-2, 9.80665, 1 / 9.80665)
+Change = Callable[[Recording], Recording]
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One finding about a channel; `fault` where it is a fault of the recording rather than a note."""
+
+    channel: str
+    finding: str
+    value: Any
+    sentence: str
+    corrected: bool
+    fault: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in diagnosis.json."""
+        keys = ("channel", "finding", "value", "sentence", "corrected")
+        return {k: getattr(self, k) for k in keys}
+
+
+def scaled(kind: str, index: int, factor: float) -> Change:
+    """Multiply one channel."""
+
+    def change(r: Recording) -> Recording:
+        values = np.array(getattr(r, kind))
+        values[:, index] *= factor
+        return r.with_(**{kind: values})
+
+    return change
+
+
+def shifted(kind: str, index: int, seconds: float, rate: float = 0.0) -> Change:
+    """Read one channel at `t + seconds + rate t`, interpolated; ends held."""
+
+    def change(r: Recording) -> Recording:
+        values = np.array(getattr(r, kind))
+        values[:, index] = np.interp(r.t * (1 + rate) + seconds, r.t, values[:, index])
+        return r.with_(**{kind: values})
+
+    return change
+
+
+def changed(bench: Workbench, change: Change) -> Workbench:
+    """The bench with changed recordings, errors in units of their own deviation."""
+    recordings = tuple(change(r) for r in bench.recordings)
+    scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
+    return replace(bench, recordings=recordings, scale=scale)
+
+
+def refit(bench: Workbench, previous: Fitted | None = None) -> Fitted | None:
+    """The simulator fitted from the user's values, and from a previous fit; None where it diverges."""
+    starts: list[dict[str, Any]] = [{}]
+    if previous is not None:
+        starts.append(previous.values)
+    try:
+        return bench.fit(bench.simulator, starts, solver=QUICK)
+    except InputError:
+        return None
+
+
+def choose_hold(simulator: Any, recordings: tuple[Recording, ...], said: str | None, engine: str) -> tuple[str, list[Gate]]:
+    """What inputs do between samples: as said, else what fits better."""
+    for hold in (said, simulator.hold, *(r.hold for r in recordings)):
+        if hold is not None:
+            return hold, []
+    errors = {}
+    for hold in ("zero", "linear"):
+        found = refit(Workbench.of(simulator, recordings, hold, engine))
+        errors[hold] = np.inf if found is None else found.cost
+    best = "linear" if errors["linear"] < errors["zero"] else "zero"
+    ratio = np.sqrt(max(errors.values()) / max(min(errors.values()), 1e-300))
+    if ratio < 1.02:
+        return "zero", []
+    words = {"zero": "held over each sample", "linear": "interpolated between samples"}
+    gate = Gate(
+        ", ".join(simulator.inputs),
+        "hold",
+        best,
+        f"The recordings do not say what inputs do between samples; {words[best]} fits better "
+        f"(error {ratio:.3g} times smaller) and is used.",
+        True,
+    )
+    return best, [gate]
+
+
+def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Sign and unit slips of each channel, and of the time."""
+    best, found = plain, None
+    n_y = len(bench.scale)
+    trials: list[tuple[str, str, float, Change]] = []
+    several = len(bench.simulator.inputs) + n_y > 2
+    for i, name in enumerate(bench.simulator.output_names):
+        trials.append((name, "sign", -1.0, scaled("y", i, -1.0)))
+        trials += [(name, "unit", f, scaled("y", i, f)) for f in FACTORS]
+    for i, name in enumerate(bench.simulator.inputs):
+        if several:
+            trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
+            trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS]
+    for factor in (1e-3, 1e3, 60.0, 1 / 60):
+        trials.append(("time", "time-unit", factor, lambda r, f=factor: r.with_(dt=r.dt * f)))
+    for name, finding, value, change in trials:
+        other = changed(bench, change)
+        try:
+            if finding == "time-unit":
+                other = Workbench.of(bench.simulator, other.recordings, bench.hold, bench.engine)
+        except InputError:
+            continue
+        result = refit(other)
+        if result is not None and result.cost < best.cost:
+            best, found = result, (name, finding, value, other)
+    if found is None or best.cost > 0.12 * plain.cost or best.cost > 0.3:
+        return bench, plain, []
+    name, finding, value, other = found
+    words = {
+        "sign": f"{name} has the wrong sign",
+        "unit": f"{name} is off by a factor of {1 / value:.4g}, as from a wrong unit",
+        "time-unit": f"the time is off by a factor of {1 / value:.4g}, as from a wrong unit",
+    }[finding]
+    sentence = (
+        f"In the recordings {words}: with it corrected the refitted simulator's error falls from "
+        f"{np.sqrt(plain.cost):.3g} to {np.sqrt(best.cost):.3g} of the outputs' deviation."
+    )
+    return other, best, [Gate(name, finding, value, sentence, True, fault=True)]
+
+
+def clipped(bench: Workbench) -> list[tuple[int, float, float, int]]:
+    """Outputs whose extremes are repeated exactly over several samples: (output, low, high, samples at the limits)."""
+    out = []
+    for i in range(len(bench.scale)):
+        y = np.concatenate([r.y[:, i] for r in bench.recordings])
+        limits, count = [-np.inf, np.inf], 0
+        for j, extreme in enumerate((y.min(), y.max())):
+            at = y == extreme
+            runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]]))))[::2]
+            neighbours = np.mean(np.abs(np.diff(y)) == 0)
+            if at.sum() >= 6 and runs.max(initial=0) >= 3 and at.mean() > 3 * _quantised(y) and neighbours < 0.5:
+                limits[j], count = float(extreme), count + int(at.sum())
+        if count:
+            out.append((i, limits[0], limits[1], count))
+    return out
+
+
+def _quantised(y: np.ndarray) -> float:
+    """Share of samples at a typical level of a quantised signal near its extremes; 0 for a continuous one."""
+    values, counts = np.unique(y, return_counts=True)
+    if len(values) > 0.5 * len(y):
+        return 0.0
+    return float(np.median(np.concatenate([counts[1:6], counts[-6:-1]])) / len(y))

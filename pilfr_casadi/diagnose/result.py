@@ -1,0 +1,144 @@
+"""What a diagnosis found: immutable, printable, and as the contract's diagnosis.json."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..recording import Recording
+from ..simulator import Simulator
+from .gates import Gate
+
+VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """A piece of physics that was left out."""
+
+    port: str
+    law: str
+    confidence: float
+    sentence: str
+    equation: str
+    parameters: dict[str, dict[str, Any]]
+    indistinguishable: tuple[tuple[str, str], ...] = ()
+    form: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in diagnosis.json."""
+        out: dict[str, Any] = {
+            "port": self.port,
+            "law": self.law,
+            "confidence": self.confidence,
+            "sentence": self.sentence,
+            "equation": self.equation,
+            "parameters": self.parameters,
+            "indistinguishable": [{"port": p, "law": law} for p, law in self.indistinguishable],
+        }
+        if self.form:
+            out["form"] = self.form
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """Where the simulator is wrong, what it lacks, how sure that is, and the proof.
+
+    Attributes
+    ----------
+    verdict : str
+        One of `VERDICTS`.
+    corrected : Simulator
+        The simulator with the effects closed in, at the fitted values (without effects: refitted).
+    errors : dict
+        `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs.
+    floor : dict
+        `nrmse` and `source`.
+    """
+
+    verdict: str
+    sentence: str
+    effects: tuple[Effect, ...]
+    candidates: tuple[dict[str, Any], ...]
+    gates: tuple[Gate, ...]
+    mismatch: dict[str, Any]
+    parameters: dict[str, dict[str, Any]]
+    errors: dict[str, dict[str, float] | None]
+    floor: dict[str, Any]
+    corrected: Simulator
+    refitted: Simulator
+    hold: str
+    train: tuple[Recording, ...] = ()
+    test: tuple[Recording, ...] = ()
+    next_experiment: dict[str, Any] | None = None
+    seconds: float = 0.0
+    times: Mapping[str, float] = field(default_factory=dict)
+    evidence: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of diagnosis.json; numbers that are not finite are None."""
+        raw = {
+            "schema": 1,
+            "verdict": self.verdict,
+            "sentence": self.sentence,
+            "effects": [e.to_dict() for e in self.effects],
+            "candidates": list(self.candidates),
+            "gates": [g.to_dict() for g in self.gates],
+            "mismatch": self.mismatch,
+            "parameters": self.parameters,
+            "fit": {**self.errors, "noise_floor": self.floor},
+            "next_experiment": self.next_experiment,
+        }
+        clean: dict[str, Any] = plain(raw)
+        return clean
+
+    def report(self, folder: str | os.PathLike[str]) -> None:
+        """Write report.html, diagnosis.json and figures into a folder."""
+        from ..report import diagnosis_report
+
+        diagnosis_report(self, folder)
+
+    def __str__(self) -> str:
+        lines = [self.sentence]
+        for e in self.effects:
+            lines.append(f"{e.port}: {e.law}{f' ({e.form})' if e.form else ''}, confidence {e.confidence:.2f}")
+            lines.append(f"  {e.sentence}: {e.equation}")
+            for name, p in e.parameters.items():
+                std = "" if p["std"] is None else f" ± {p['std']:.2g}"
+                lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
+            if e.indistinguishable:
+                others = ", ".join(f"{port}: {law}" for port, law in e.indistinguishable)
+                lines.append(f"  cannot be told apart from {others}")
+        for kind in ("train", "test"):
+            errors = self.errors[kind]
+            if errors:
+                shown = " -> ".join("diverges" if not np.isfinite(v) else f"{v:.4f}" for v in errors.values())
+                lines.append(f"NRMSE {kind} (nominal -> refitted without -> with): {shown}")
+        lines.append(f"noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})")
+        lines += [f"note: {g.sentence}" for g in self.gates]
+        lines.append(f"{self.seconds:.1f} s")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def plain(value: Any) -> Any:
+    """Plain JSON types; None for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value
