@@ -13,6 +13,12 @@ __version__ = "0.1.0"
 
 # public name -> submodule that defines it
 _EXPORTS = {
+    "diagnose": "diagnose",
+    "Simulator": "simulator",
+    "Port": "simulator",
+    "Local": "laws",
+    "Law": "laws",
+    "Diagnosis": "diagnose",
     "BLA": "bla",
     "Constraint": "constraints",
     "Fit": "fit",

@@ -67,7 +67,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     folder = measured("piezo_dbo")
     if folder is None:
-        print("The piezo recordings are not here; put them into shared/data/piezo_dbo beside the repository.")
+        print(
+            "The piezo recordings are not here; put them into a folder DATA/piezo_dbo and run with PILFR_DATA=DATA, "
+            "or put them into shared/data/piezo_dbo beside the repository."
+        )
         return 1
     print(f"{'model':<20} {'trained on -> judged on':<28} rms error [% of range]")
     rows = run(folder)

@@ -35,7 +35,7 @@ ONE_THREAD = {key: "1" for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "M
 def prepare(folder: Path) -> None:
     """Write the case: training record, a start of the default pipeline, and a point on the way from it."""
     from pilfr_casadi.gauss_newton import GaussNewton
-    from pilfr_casadi.multistart import linear_model
+    from pilfr_casadi.linear_model import linear_model
     from pilfr_casadi.problem import Problem
     from pilfr_casadi.start import grid_start, unit_states
 

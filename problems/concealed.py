@@ -1,0 +1,113 @@
+"""Concealed cases on which `diagnose` has to find the physics that was left out of a simulator.
+
+`case(seed)` draws a rig, what it hides, and its recordings; `score` judges a diagnosis. Truths are simulated apart from
+the package and, mostly, by formulas that are not the catalogue's. Seeds 0 to 999 are for development; results are
+reported on seeds from 1000 on.
+
+    python -m problems.concealed --cases 200 --first-seed 1000 --workers 2
+    python -m problems.concealed --export DIR --cases 5 --first-seed 0      (files for the command line)
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from pilfr_casadi.recording import Recording
+
+from .concealed_case import KINDS, Case, case
+from .concealed_score import Score, line, score, summary
+
+__all__ = ["KINDS", "Case", "Score", "case", "export", "run_one", "score", "summary"]
+
+
+def run_one(seed: int) -> Score:
+    """Diagnose one case and judge the answer; a crash is an answer that is wrong."""
+    hidden = case(seed)
+    began = time.perf_counter()
+    try:
+        import pilfr_casadi
+
+        diagnosis = pilfr_casadi.diagnose(hidden.simulator, hidden.train, test=hidden.test, workers=1)
+        answer, crash = diagnosis.to_dict(), ""
+    except Exception as error:
+        text = " ".join(str(error).split())
+        answer, crash = {}, f"{type(error).__name__}: {text[:160]}"
+    return score(hidden, answer, time.perf_counter() - began, crash)
+
+
+def _write(path: Path, r: Recording) -> None:
+    table = np.column_stack([np.arange(len(r)) * r.dt, r.u, r.y])
+    head = ",".join(["t", *r.inputs, *r.outputs])
+    np.savetxt(path, table, delimiter=",", header=head, comments="", fmt="%.12g")
+
+
+def export(hidden: Case, folder: Path) -> None:
+    """Write a case in the contract's formats: simulator.py, train*.csv, test.csv; the answer apart, in truth.json."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "simulator.py").write_text(hidden.source, encoding="utf-8")
+    for r in (*hidden.train, hidden.test):
+        _write(folder / f"{r.name}.csv", r)
+    answer = {
+        "verdict": hidden.verdict,
+        "truth": list(hidden.truth),
+        "accepted": [sorted(map(list, pairs)) for pairs in hidden.accepted],
+        "channels": sorted(hidden.channels),
+        "floor": hidden.floor,
+        "hold": hidden.test.hold,
+        "initial": hidden.train[0].initial,
+        "period": hidden.train[0].period,
+        "tags": sorted(hidden.tags),
+        "details": hidden.details["effects"],
+    }
+    (folder / "truth.json").write_text(json.dumps(answer, indent=1), encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark, or write its files."""
+    parser = argparse.ArgumentParser(prog="python -m problems.concealed", description="Concealed cases.")
+    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--first-seed", type=int, default=1000)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--only", default="", help="cases with this tag: a rig, a law, a kind, a noise")
+    parser.add_argument("--export", type=Path, help="write the cases here instead of running them")
+    parser.add_argument("--list", action="store_true", help="print the cases instead of running them")
+    a = parser.parse_args(arguments)
+    seeds = list(range(a.first_seed, a.first_seed + a.cases))
+    if a.only or a.export or a.list:
+        kept = []
+        for seed in seeds:
+            hidden = case(seed)
+            if a.only and a.only not in hidden.tags:
+                continue
+            kept.append(seed)
+            if a.export:
+                export(hidden, a.export / hidden.name)
+            if a.list:
+                print(
+                    f"{hidden.name:46} {hidden.verdict:16} {hidden.details['effects']} {sorted(hidden.tags)}",
+                    flush=True,
+                )
+        seeds = kept
+    if a.export or a.list:
+        return
+    scores = []
+    with ProcessPoolExecutor(a.workers, mp_context=get_context("spawn")) as pool:
+        for k, s in enumerate(pool.map(run_one, seeds), 1):
+            scores.append(s)
+            print(f"[{k:3d}/{len(seeds)}] {line(s)}", flush=True)
+    if not scores:
+        sys.exit("No case has that tag; see --list.")
+    print("\n" + summary(scores))
+
+
+if __name__ == "__main__":
+    main()
