@@ -17,6 +17,7 @@ from ..recording import InputError, Recording, as_recordings
 from ..simulator import Simulator
 from ..threads import one_blas_thread
 from .explain import Candidate, explain, judged, polish
+from .flexible import explainable
 from .floor import Floor, effective_size, measured_floor, white_part
 from .gates import Gate, choose_hold, wrong_scale
 from .result import Diagnosis, Effect
@@ -131,9 +132,12 @@ def diagnose(
         base = choice.winner.fitted if np.isfinite(choice.winner.full) else polish(bench, choice.winner).fitted
         if base.cost < 1.05 * floor2 or choice.remains < 0.02:
             break
+    open_before, open_after = explainable(bench, without), explainable(bench, base)
+    lap("flexible")
     accepted = [s for s in steps if s.accepted]
     verdict, sentence = _verdict(accepted, without, noise, bench, gates)
     named = [_effect(bench, s, base) for s in accepted] if verdict == "missing-physics" else []
+    found = base
     if verdict != "missing-physics":
         base = without
     errors = {
@@ -159,7 +163,15 @@ def diagnose(
         test=tests,
         seconds=time.perf_counter() - began,
         times=times,
-        evidence={"passes": tuple(steps)},
+        evidence={
+            "passes": tuple(steps),
+            "open_before": open_before,
+            "open_after": open_after,
+            "without": without,
+            "base": found,
+            "noise": noise / bench.scale,
+            "measured": measured is not None,
+        },
     )
 
 

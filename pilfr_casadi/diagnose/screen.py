@@ -85,6 +85,30 @@ def _score(
     gain: np.ndarray | None,
     keep: int,
 ) -> list[Scored]:
+    tasks, phi, left = columns_of(bench, probe, runs, laws, gain)
+    total, at, out = max(float(left @ left), 1e-300), 0, []
+    source = "simulation" if gain is None else "observer"
+    for task in tasks:
+        own = at
+        for law, shapes in task.pairs:
+            width, scores = columns(law), []
+            for k, shape in enumerate(shapes):
+                cols = slice(at + k * width, at + (k + 1) * width)
+                drop, strength = _gain(phi[:, cols], left, law, int(runs[0].sign[task.index]))
+                scores.append((drop / total, shape, -strength / task.size[cols.start - own : cols.stop - own]))
+            at += width * len(shapes)
+            scores.sort(key=lambda s: -s[0])
+            starts = tuple(_start(law, shape, c) for _, shape, c in scores[:keep])
+            out.append(Scored(task.port.name, law, scores[0][0], starts, task.local, source))
+    return out
+
+
+def columns_of(
+    bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], gain: np.ndarray | None
+) -> tuple[list[_Task], np.ndarray, np.ndarray]:
+    """Each port's laws, the outputs' changes by all their shapes, and the error, both without what the simulator's own
+    parameters and the initial states can follow.
+    """
     n, n_free = probe.model.substeps, len(probe.free) - len(probe.ports)
     places = locals_of(bench, runs)
     windows = _windows(bench, runs)
@@ -106,21 +130,7 @@ def _score(
     left = error - base @ (base.T @ error)
     phi = np.concatenate([b[:, first:] for b in blocks])
     phi -= base @ (base.T @ phi)
-    total, at, out = max(float(left @ left), 1e-300), 0, []
-    source = "simulation" if gain is None else "observer"
-    for task in tasks:
-        own = at
-        for law, shapes in task.pairs:
-            width, scores = columns(law), []
-            for k, shape in enumerate(shapes):
-                cols = slice(at + k * width, at + (k + 1) * width)
-                drop, strength = _gain(phi[:, cols], left, law, int(runs[0].sign[task.index]))
-                scores.append((drop / total, shape, -strength / task.size[cols.start - own : cols.stop - own]))
-            at += width * len(shapes)
-            scores.sort(key=lambda s: -s[0])
-            starts = tuple(_start(law, shape, c) for _, shape, c in scores[:keep])
-            out.append(Scored(task.port.name, law, scores[0][0], starts, task.local, source))
-    return out
+    return tasks, phi, left
 
 
 @dataclass(frozen=True, eq=False)

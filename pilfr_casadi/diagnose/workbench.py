@@ -165,7 +165,13 @@ class Workbench:
                 if gamma == 0.0 and not path:
                     return None
                 continue
-            solution = solver.solve(problem, theta)
+            try:
+                with np.errstate(all="ignore"):
+                    solution = solver.solve(problem, theta)
+            except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
+                if gamma == 0.0 and states is None:
+                    return None
+                continue
             vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
         if problem is None:
             return None

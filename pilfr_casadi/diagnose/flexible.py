@@ -1,0 +1,91 @@
+"""How much of a residual any force at a port could explain: a flexible surface `w(z, ż)` with memory, cross-validated.
+
+The surface has Chebyshev terms of z and ż up to the fourth degree, stops (or plays) and relaxations besides. Its
+response is linear in its coefficients, which are fitted to every second block of the record by ridge regression and
+judged on the others: what is noise is not explained there. This tells noise from missing structure without knowing the
+floor, and a right name from one that only comes near.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ..laws.base import Law, Local
+from ..laws.memory import Creep, PlayHysteresis, Relaxation, StopHysteresis
+from ..parameters import Parameter
+from .linearise import Probe, run
+from .screen import columns_of
+from .workbench import Fitted, Workbench
+
+DEGREE = 4
+TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
+BLOCKS = 10  # a recording, odd and even ones in turn
+
+
+def _chebyshev(x: Any) -> list[Any]:
+    out = [1.0, x]
+    for _ in range(DEGREE - 1):
+        out.append(2 * x * out[-1] - out[-2])
+    return out
+
+
+class Surface(Law):
+    """A smooth force of the local coordinate and its rate."""
+
+    id = "surface"
+    equation = "w = sum_ij c_ij T_i(z) T_j(dz/dt)"
+    units = {"c": "w", "z_m": "z", "z_s": "z", "v_s": "z/s"}
+    strength = ("c",)
+    places = ("parallel", "series")
+
+    def force(self, z: Any, dz: Any, p: Any) -> Any:
+        a, b = _chebyshev((z - p.z_m) / p.z_s), _chebyshev(dz / p.v_s)
+        return sum(p.c[k] * a[i] * b[j] for k, (i, j) in enumerate(TERMS))
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Coefficients and scales."""
+        scales = {k: Parameter(float(self.values.get(k, 1.0))) for k in ("z_m", "z_s", "v_s")}
+        return {"c": Parameter(np.zeros(len(TERMS))), **scales}
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield {
+            "z_m": (local.low + local.high) / 2,
+            "z_s": 1.1 * local.half,
+            "v_s": 1.5 * local.speed if np.any(local.dz) else 1.0,
+        }
+
+
+FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
+
+
+def explainable(bench: Workbench, fitted: Fitted) -> dict[str, float]:
+    """Share of the residual's power that a flexible force explains on blocks it was not fitted to, by port."""
+    probe = Probe.of(bench, fitted)
+    runs = [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
+    tasks, phi, left = columns_of(bench, probe, runs, FLEXIBLE, None)
+    odd = (np.arange(len(left)) * BLOCKS * len(runs) // len(left)) % 2 == 1
+    out, at = {}, 0
+    for task in tasks:
+        width = task.forces.shape[1]
+        out[task.port.name] = _held_out(phi[:, at : at + width], left, odd)
+        at += width
+    return out
+
+
+def _held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray) -> float:
+    size = np.linalg.norm(phi, axis=0)
+    if not np.any(size > 0):
+        return 0.0
+    phi = phi[:, size > 0] / size[size > 0]
+    best = 0.0
+    for ridge in (1e-6, 1e-3):
+        wrong = 0.0
+        for fold in (odd, ~odd):
+            a, b = phi[fold], left[fold]
+            c = np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ b)
+            wrong += float(np.sum((left[~fold] - phi[~fold] @ c) ** 2))
+        best = max(best, 1 - wrong / max(float(left @ left), 1e-300))
+    return best
