@@ -25,7 +25,7 @@ from .parameters import ParameterSet
 from .recording import InputError, Recording
 from .simulator import Named, Placed, Simulator, call
 
-REACH = 0.35  # largest |λ| h: phase error (λh)⁴/120 = 1e-4 of a cycle's angle
+REACH = 0.25  # largest |λ| h: phase error (λh)⁴/120 = 3e-5 of a cycle's angle
 MOST = 200  # sub-steps a sample
 
 
@@ -221,44 +221,56 @@ def signals(simulator: Simulator) -> ca.Function:
     return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push"])
 
 
-def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> float:
-    """Largest |eigenvalue| of ∂f/∂x over states x (K, n_x) and inputs u (K, n_u), rad/s."""
+def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Largest |eigenvalue| of ∂f/∂x at each state x (K, n_x) and input u (K, n_u), rad/s, shape (K,); nan if infinite."""
     n_x = len(simulator.states)
     if not n_x or simulator.discrete:
-        return 0.0
+        return np.zeros(len(x))
     vector = ca.SX.sym("p", len(p))
     equations = _Equations(simulator, vector)
     xs, us = ca.SX.sym("x", n_x + sum(equations.n_q)), ca.SX.sym("u", len(simulator.inputs))
     s = ca.SX.zeros(sum(equations.n_s))
     f = equations.evaluate(_Values(xs, s, us, ca.SX.zeros(us.shape), ca.SX(0.0)))[0]
     jacobian = ca.Function("f_x", [xs, us, vector], [ca.densify(ca.jacobian(f, xs))])
-    largest = 0.0
-    for row, inputs in zip(x, u, strict=True):
+    out = np.full(len(x), np.nan)
+    for k, (row, inputs) in enumerate(zip(x, u, strict=True)):
         full = np.concatenate([row, np.zeros(xs.numel() - len(row))]) if len(row) < xs.numel() else row[: xs.numel()]
         a = np.asarray(jacobian(full, inputs, p))
         if np.all(np.isfinite(a)):
-            largest = max(largest, float(np.max(np.abs(np.linalg.eigvals(a)))))
-    return largest
+            out[k] = float(np.max(np.abs(np.linalg.eigvals(a))))
+    return out
 
 
-def choose_substeps(simulator: Simulator, recordings: Sequence[Recording], states: np.ndarray | None = None) -> int:
-    """Sub-steps a sample that keep |λ| h below `REACH`, from the Jacobian at rest, or at `states` (K, n_x).
+def choose_substeps(simulator: Simulator, recordings: Sequence[Recording]) -> int:
+    """Sub-steps a sample that keep |λ| h below `REACH`, from the Jacobian at rest and, where that is very fast, along a
+    run (a square root is infinitely steep at zero).
 
     Raises
     ------
     InputError
         If more than `MOST` would be needed.
     """
-    p, dt = ParameterSet(dict(simulator.parameters)).start, recordings[0].dt
-    if states is None:
-        states = np.zeros((1, len(simulator.states)))
-    u = np.concatenate([r.u for r in recordings])
-    picked = np.vstack([np.mean(u, axis=0)] * len(states))
-    rate = fastest(simulator, states, picked, p)
-    needed = max(1, int(np.ceil(rate * dt / REACH)))
+    p, first = ParameterSet(dict(simulator.parameters)).start, recordings[0]
+    rest = np.zeros((1, len(simulator.states)))
+    rate = float(np.nan_to_num(fastest(simulator, rest, np.mean(first.u, axis=0)[None], p)[0], nan=1e12))
+    if rate * first.dt > 8 * REACH:
+        rate = _along_a_run(simulator, first, p, rate)
+    needed = max(1, int(np.ceil(rate * first.dt / REACH)))
     if needed > MOST:
         raise InputError(
-            f"The simulator has an eigenvalue of {rate:.3g} rad/s, too fast for samples {dt:g} s apart; "
+            f"The simulator has an eigenvalue of {rate:.3g} rad/s, too fast for samples {first.dt:g} s apart; "
             "check its units, or replace the fast state by its steady state."
         )
     return needed
+
+
+def _along_a_run(simulator: Simulator, recording: Recording, p: np.ndarray, rate: float) -> float:
+    """A high quantile of the rates along a run from rest, if that runs."""
+    model = discretise(simulator, recording.dt, "zero", substeps=20)
+    short = recording.slice(0, min(len(recording), 400))
+    run = model.closed.mapaccum("run", len(short) * model.substeps)
+    with np.errstate(all="ignore"):
+        states = np.asarray(run(np.zeros(model.n_x), model.drive(short).T, p)[0]).T[:: model.substeps]
+    found = fastest(simulator, states[40::20], short.u[40::20], p)
+    found = found[np.isfinite(found)]
+    return min(rate, float(np.quantile(found, 0.9))) if len(found) > 5 else rate

@@ -17,12 +17,11 @@ from ..laws.base import Law, Local
 from ..laws.memory import Creep, PlayHysteresis, Relaxation, StopHysteresis
 from ..parameters import Parameter
 from .linearise import Probe, run
-from .screen import columns_of
+from .screen import columns_of, folds, held_out
 from .workbench import Fitted, Workbench
 
 DEGREE = 4
 TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
-BLOCKS = 10  # a recording, odd and even ones in turn
 
 
 def _chebyshev(x: Any) -> list[Any]:
@@ -66,26 +65,10 @@ def explainable(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     probe = Probe.of(bench, fitted)
     runs = [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
     tasks, phi, left = columns_of(bench, probe, runs, FLEXIBLE, None)
-    odd = (np.arange(len(left)) * BLOCKS * len(runs) // len(left)) % 2 == 1
+    odd = folds(len(left), len(runs))
     out, at = {}, 0
     for task in tasks:
         width = task.forces.shape[1]
-        out[task.port.name] = _held_out(phi[:, at : at + width], left, odd)
+        out[task.port.name] = held_out(phi[:, at : at + width], left, odd, (1e-6, 1e-3))
         at += width
     return out
-
-
-def _held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray) -> float:
-    size = np.linalg.norm(phi, axis=0)
-    if not np.any(size > 0):
-        return 0.0
-    phi = phi[:, size > 0] / size[size > 0]
-    best = 0.0
-    for ridge in (1e-6, 1e-3):
-        wrong = 0.0
-        for fold in (odd, ~odd):
-            a, b = phi[fold], left[fold]
-            c = np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ b)
-            wrong += float(np.sum((left[~fold] - phi[~fold] @ c) ** 2))
-        best = max(best, 1 - wrong / max(float(left @ left), 1e-300))
-    return best

@@ -12,11 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from ..compiled import make_engine
+from ..laws.limits import AsymmetricSaturation
 from ..recording import InputError, Recording
 from .workbench import QUICK, Fitted, Workbench
 
-FACTORS = (1e3, 1e-3, 1e6, 1e-6, 180 / np.pi, np.pi / 180, 1e2, 1e-2, 9.80665, 1 / 9.80665)
 Change = Callable[[Recording], Recording]
+FACTORS = (1e3, 1e-3, 1e6, 1e-6, 180 / np.pi, np.pi / 180, 1e2, 1e-2, 9.80665, 1 / 9.80665)
+NEAR = 6.0  # a factor is tried where it brings the simulated and the measured size this near
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,7 @@ class Gate:
     sentence: str
     corrected: bool
     fault: bool = False
+    change: Change | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As in diagnosis.json."""
@@ -83,7 +87,10 @@ def choose_hold(simulator: Any, recordings: tuple[Recording, ...], said: str | N
             return hold, []
     errors = {}
     for hold in ("zero", "linear"):
-        found = refit(Workbench.of(simulator, recordings, hold, engine))
+        try:
+            found = refit(Workbench.of(simulator, recordings, hold, engine))
+        except InputError:  # said again, or put right, where the bench is opened for good
+            return "zero", []
         errors[hold] = np.inf if found is None else found.cost
     best = "linear" if errors["linear"] < errors["zero"] else "zero"
     ratio = np.sqrt(max(errors.values()) / max(min(errors.values()), 1e-300))
@@ -101,19 +108,72 @@ def choose_hold(simulator: Any, recordings: tuple[Recording, ...], said: str | N
     return best, [gate]
 
 
+def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:
+    """The bench; where the simulator is too fast for the recordings' step, with the time in another unit.
+
+    Raises
+    ------
+    InputError
+        If no unit of time makes simulator and recordings fit each other.
+    """
+    try:
+        return Workbench.of(simulator, recordings, hold, engine), []
+    except InputError as error:
+        for factor in (1e-3, 1 / 60, 1e-6, 1 / 3600):
+            slower = tuple(r.with_(dt=r.dt * factor) for r in recordings)
+            try:
+                bench = Workbench.of(simulator, slower, hold, engine)
+            except InputError:
+                continue
+            found = refit(bench)
+            if found is not None and found.cost < 0.25:
+                words = (
+                    f"The time of the recordings is off by a factor of {1 / factor:.4g}, as from a wrong unit: as given, "
+                    f"the simulator cannot follow at all; corrected, its error is {found.cost**0.5:.3g} of the "
+                    "outputs' deviation."
+                )
+                change: Change = lambda r, f=factor: r.with_(dt=r.dt * f)  # noqa: E731
+                return bench, [Gate("time", "time-unit", factor, words, True, True, change)]
+        raise error
+
+
+def unclip(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Outputs that the recorder clipped: the simulator's are clipped alike, and what else they say is kept."""
+    gates = []
+    for i, low, high, count in clipped(bench):
+        name = bench.simulator.output_names[i]
+        law = AsymmetricSaturation().at({"low": max(low, -1e300), "high": min(high, 1e300)})
+        placed = bench.simulator.with_element(f"sensor:{name}", law)
+        prefix = placed.elements[-1].prefix
+        held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
+        other = replace(bench, simulator=placed.with_parameters(held))
+        found = refit(other, plain)
+        if found is None or found.cost > 0.97 * plain.cost:
+            continue
+        at = " and ".join(f"{v:.6g}" for v in (low, high) if np.isfinite(v))
+        sentence = (
+            f"{name} is clipped at {at} ({count} samples at the limit); with the simulator's output clipped alike the "
+            f"refitted error falls from {plain.cost**0.5:.3g} to {found.cost**0.5:.3g} of the outputs' deviation."
+        )
+        gates.append(Gate(name, "clipping", [v for v in (low, high) if np.isfinite(v)], sentence, True, fault=True))
+        bench, plain = other, found
+    return bench, plain, gates
+
+
 def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
     """Sign and unit slips of each channel, and of the time."""
     best, found = plain, None
     n_y = len(bench.scale)
     trials: list[tuple[str, str, float, Change]] = []
     several = len(bench.simulator.inputs) + n_y > 2
+    sizes = _sizes(bench)
     for i, name in enumerate(bench.simulator.output_names):
         trials.append((name, "sign", -1.0, scaled("y", i, -1.0)))
-        trials += [(name, "unit", f, scaled("y", i, f)) for f in FACTORS]
+        trials += [(name, "unit", f, scaled("y", i, f)) for f in FACTORS if _near(f * sizes[i])]
     for i, name in enumerate(bench.simulator.inputs):
         if several:
             trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
-            trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS]
+            trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if np.any([_near(v / f) for v in sizes])]
     for factor in (1e-3, 1e3, 60.0, 1 / 60):
         trials.append(("time", "time-unit", factor, lambda r, f=factor: r.with_(dt=r.dt * f)))
     for name, finding, value, change in trials:
@@ -138,7 +198,22 @@ def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, lis
         f"In the recordings {words}: with it corrected the refitted simulator's error falls from "
         f"{np.sqrt(plain.cost):.3g} to {np.sqrt(best.cost):.3g} of the outputs' deviation."
     )
-    return other, best, [Gate(name, finding, value, sentence, True, fault=True)]
+    changes = {t[:3]: t[3] for t in trials}
+    return other, best, [Gate(name, finding, value, sentence, True, True, changes[name, finding, value])]
+
+
+def _sizes(bench: Workbench) -> np.ndarray:
+    """Size of each measured output over that of the output simulated at the user's values; nan where it diverges."""
+    model = bench.model(bench.simulator)
+    engine = make_engine(model, bench.engine)
+    start, n = model.parameters.start, model.n_x
+    with np.errstate(all="ignore"):
+        y = [engine.simulate(model.drive(r), start, np.zeros(n))[0] for r in bench.recordings]
+        return np.asarray(bench.scale / np.std(np.concatenate(y), axis=0))
+
+
+def _near(ratio: float) -> bool:
+    return not np.isfinite(ratio) or ratio == 0 or 1 / NEAR < ratio < NEAR
 
 
 def clipped(bench: Workbench) -> list[tuple[int, float, float, int]]:

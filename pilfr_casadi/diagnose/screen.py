@@ -21,11 +21,14 @@ from .linearise import Probe, Run, locals_of, observer_gain, propagate, run
 from .workbench import Fitted, Workbench
 
 MOST = 8000  # samples looked at
+BLOCKS = 10  # a recording, odd and even ones in turn
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A port and law with the share of the residual that a small dose takes away, and start values in falling order."""
+    """A port and law with the share of the residual that a small dose takes away, judged on blocks it was not fitted to,
+    and start values in falling order.
+    """
 
     port: str
     law: Law
@@ -88,6 +91,7 @@ def _score(
     tasks, phi, left = columns_of(bench, probe, runs, laws, gain)
     total, at, out = max(float(left @ left), 1e-300), 0, []
     source = "simulation" if gain is None else "observer"
+    odd = folds(len(left), len(runs))
     for task in tasks:
         own = at
         for law, shapes in task.pairs:
@@ -95,12 +99,36 @@ def _score(
             for k, shape in enumerate(shapes):
                 cols = slice(at + k * width, at + (k + 1) * width)
                 drop, strength = _gain(phi[:, cols], left, law, int(runs[0].sign[task.index]))
-                scores.append((drop / total, shape, -strength / task.size[cols.start - own : cols.stop - own]))
+                found = -strength / task.size[cols.start - own : cols.stop - own]
+                scores.append((drop / total, shape, found, cols))
             at += width * len(shapes)
             scores.sort(key=lambda s: -s[0])
-            starts = tuple(_start(law, shape, c) for _, shape, c in scores[:keep])
-            out.append(Scored(task.port.name, law, scores[0][0], starts, task.local, source))
+            starts = tuple(_start(law, shape, c) for _, shape, c, _ in scores[:keep])
+            share = held_out(phi[:, scores[0][3]], left, odd)
+            out.append(Scored(task.port.name, law, share, starts, task.local, source))
     return out
+
+
+def folds(length: int, recordings: int) -> np.ndarray:
+    """Every second block of the stacked record, as a mask."""
+    return (np.arange(length) * BLOCKS * recordings // max(length, 1)) % 2 == 1
+
+
+def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float] = (1e-6,)) -> float:
+    """Share of `left` that the columns explain on blocks they were not fitted to."""
+    size = np.linalg.norm(phi, axis=0)
+    if not np.any(size > 0):
+        return 0.0
+    phi = phi[:, size > 0] / size[size > 0]
+    best = 0.0
+    for ridge in ridges:
+        wrong = 0.0
+        for fold in (odd, ~odd):
+            a, b = phi[fold], left[fold]
+            c = np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ b)
+            wrong += float(np.sum((left[~fold] - phi[~fold] @ c) ** 2))
+        best = max(best, 1 - wrong / max(float(left @ left), 1e-300))
+    return best
 
 
 def columns_of(
@@ -126,7 +154,7 @@ def columns_of(
         y = propagate(r, forces, n_free, n, True, gain) / bench.scale[:, None]
         blocks.append(y.reshape(-1, y.shape[2]))
     first = n_free + short[0].a.shape[1]
-    base = _orthonormal(_block_diagonal([b[:, :first] for b in blocks], n_free))
+    base = orthonormal(block_diagonal([b[:, :first] for b in blocks], n_free))
     left = error - base @ (base.T @ error)
     phi = np.concatenate([b[:, first:] for b in blocks])
     phi -= base @ (base.T @ phi)
@@ -180,7 +208,7 @@ def _start(law: Law, shape: dict[str, Any], strength: np.ndarray) -> dict[str, A
     return values
 
 
-def _block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
+def block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
     """Parameters shared by all recordings, an initial state for each."""
     n_x = blocks[0].shape[1] - n_free
     out = np.zeros((sum(map(len, blocks)), n_free + n_x * len(blocks)))
@@ -193,7 +221,7 @@ def _block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
     return out
 
 
-def _orthonormal(columns: np.ndarray) -> np.ndarray:
+def orthonormal(columns: np.ndarray) -> np.ndarray:
     size = np.linalg.norm(columns, axis=0)
     kept = columns[:, size > 0] / size[size > 0]
     u, s, _ = np.linalg.svd(kept, full_matrices=False)

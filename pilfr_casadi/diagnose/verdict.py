@@ -10,11 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .explain import Candidate
+from .gates import Gate
 
+if TYPE_CHECKING:
+    from .search import Search
+
+AT_FLOOR = 1.15  # times a measured floor that counts as being at it
+COLOURED = 15.0  # times the white part of a residual that coloured noise may have
+HINT = 0.1  # share of a residual that a flexible force has to explain to count
+PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name that only comes near
+MOST_OPEN = 0.4  # share of the excess that no named law may leave
 LIKE = 0.03  # rivals whose error is within this share cannot be told apart
 # (a flexible law, what it imitates) -> factor by which its error must be smaller; "*" is any other law at that port
 FLEXIBLE: dict[str, float] = {
@@ -25,7 +35,17 @@ FLEXIBLE: dict[str, float] = {
     "periodic_force": 1.1,
 }
 IMITATES = {("hysteresis", "coulomb_friction"): 1.4}
-FORMS = {"mode": 1.15, "off-centre": 1.05, "asymmetric": 1.05, "power": 1.1, "polynomial": 1.05, "attached mass": 1.1}
+FORMS = {
+    "mode": 1.15,
+    "off-centre": 1.05,
+    "asymmetric": 1.05,
+    "soft asymmetric": 1.05,
+    "power": 1.1,
+    "root": 1.1,
+    "polynomial": 1.05,
+    "attached mass": 1.1,
+    "generalized_play": 1.1,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +123,49 @@ def choose(
     return Choice(winner, tuple(alike), float(gain), float(np.clip(remains, 0, 1)), float(margin))
 
 
-def confidence(choice: Choice) -> float:
+def left_open(search: Search) -> tuple[float, float]:
+    """Share of the excess over the floor that is left, and the share of the residual that a flexible force explains."""
+    floor = search.floor2
+    share = (search.base.cost - floor) / max(search.without.cost - floor, 1e-300)
+    return float(np.clip(share, 0, 1)), max(search.open_after.values(), default=0.0)
+
+
+def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
+    """Verdict and its sentence."""
+    faults = [g for g in gates if g.fault]
+    accepted = [p.choice for p in search.passes if p.accepted and p.choice is not None]
+    remains, still = left_open(search)
+    where = max(search.open_before, key=lambda k: search.open_before[k], default="")
+    error, floor = search.without.cost**0.5, search.floor2**0.5
+    if not accepted:
+        open_now = max(search.open_before.values(), default=0.0)
+        bare = error < (AT_FLOOR if search.floor.source != "estimated" else COLOURED) * floor
+        if faults and (bare or open_now < HINT):
+            return "recording-fault", faults[0].sentence
+        if bare and open_now < HINT:
+            return "complete", (
+                f"Nothing is missing: refitted, the simulator follows the recordings to {error:.3g} of the outputs' "
+                f"deviation, and no force at any port explains any of the rest."
+            )
+        at = f"; a force at {where} could explain {open_now:.0%} of the rest" if open_now > HINT else ""
+        return "unexplained", (
+            f"Something is missing and no law of the catalogue explains it: refitted, the simulator is off by "
+            f"{error:.3g} of the outputs' deviation, the noise is about {floor:.3g}{at}."
+        )
+    if (remains > PARTLY and still > STILL) or remains > MOST_OPEN:
+        port = accepted[0].winner.port
+        return "unexplained", (
+            f"Something is missing, most likely at {port}, and no law of the catalogue explains it: the nearest, "
+            f"{accepted[0].winner.law.id.replace('_', ' ')}, leaves {remains:.0%} of the excess, and a flexible force "
+            f"explains {still:.0%} of what it leaves."
+        )
+    words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
+    return "missing-physics", f"The simulator leaves out {words}."
+
+
+def confidence(choice: Choice, search: Search) -> float:
     """How sure the name is: from the margin over true rivals, lowered by what stays unexplained."""
-    rivals = 1 + len(choice.alike)
+    remains, still = left_open(search)
     lead = 1 - np.exp(-8 * np.log(max(min(choice.margin, 10.0), 1.0)))
-    return float(np.clip(lead * (1 - choice.remains) / rivals, 0.0, 0.99))
+    doubt = (1 - min(4 * remains, 1.0)) * (1 - 0.3 * still)
+    return float(np.clip(lead * doubt / (1 + len(choice.alike)), 0.0, 0.99))

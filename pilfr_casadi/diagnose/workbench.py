@@ -20,6 +20,7 @@ from ..sensitivities import Engine
 from ..simulator import Simulator
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
+FINER = 4  # times as many sub-steps for a law at most
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
 
 
@@ -92,11 +93,18 @@ class Workbench:
 
     def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
         """The simulator as a model, with output injection where a gain is given."""
-        substeps = self.substeps
-        if simulator.elements:
-            substeps = max(substeps, choose_substeps(simulator, self.recordings))
-        model = discretise(simulator, self.dt, self.hold, substeps)
+        model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
         return model if gain is None else led(model, gain)
+
+    def _substeps(self, simulator: Simulator) -> int:
+        """More where a law is fast, up to a limit: a stiff start of a law is not worth a fine grid."""
+        if not simulator.elements:
+            return self.substeps
+        try:
+            wanted = choose_substeps(simulator, self.recordings)
+        except InputError:
+            wanted = 0
+        return int(np.clip(wanted, self.substeps, FINER * self.substeps))
 
     def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:
         """The simulation-error problem of a model."""

@@ -11,7 +11,7 @@ from .friction import (
     QuadraticDrag,
     StribeckFriction,
 )
-from .limits import AsymmetricDeadZone, AsymmetricSaturation, DeadZone, Saturation, SoftSaturation
+from .limits import AsymmetricDeadZone, AsymmetricSaturation, DeadZone, Saturation, SkewSaturation, SoftSaturation
 from .memory import (
     Attached,
     Backlash,
@@ -19,6 +19,7 @@ from .memory import (
     Creep,
     Delay,
     Drift,
+    GeneralizedHysteresis,
     Lag,
     Mode,
     PlayHysteresis,
@@ -38,17 +39,22 @@ from .stiffness import (
     PiecewiseStiffnessBelow,
     Polynomial,
     Power,
+    PowerStiffness,
     Quadratic,
     QuadraticStiffness,
+    Root,
+    SoftClearance,
 )
 
 CATALOGUE: tuple[type[Law], ...] = (
     CubicStiffness,
+    PowerStiffness,
     QuadraticStiffness,
     PiecewiseStiffness,
     PiecewiseStiffnessBelow,
     HertzContact,
     Clearance,
+    SoftClearance,
     OffCentreClearance,
     CoulombFriction,
     AsymmetricFriction,
@@ -58,11 +64,13 @@ CATALOGUE: tuple[type[Law], ...] = (
     CubicDamping,
     StopHysteresis,
     PlayHysteresis,
+    GeneralizedHysteresis,
     BoucWen,
     Backlash,
     Saturation,
     AsymmetricSaturation,
     SoftSaturation,
+    SkewSaturation,
     DeadZone,
     AsymmetricDeadZone,
     Quadratic,
@@ -70,6 +78,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     Polynomial,
     Magnitude,
     Power,
+    Root,
     Delay,
     Relaxation,
     Creep,

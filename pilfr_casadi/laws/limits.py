@@ -68,6 +68,25 @@ class SoftSaturation(Saturation):
         return {"L": (0.1 * local.reach, 10 * local.reach)}
 
 
+class SkewSaturation(AsymmetricSaturation):
+    """A limit on either side that is approached gradually."""
+
+    form = "soft asymmetric"
+    equation = "w = L tanh(u / L) - u,  L = L_1 below zero and L_2 above"
+    units = {"L_1": "z", "L_2": "z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        up, down = ca.fmax(z, 0), ca.fmin(z, 0)
+        return p.L_2 * ca.tanh(up / p.L_2) + p.L_1 * ca.tanh(down / p.L_1) - z
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        at = local.reach * np.array([0.4, 0.9, 2.0])
+        yield from grid(L_1=at, L_2=at)
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {name: (0.1 * local.reach, 20 * local.reach) for name in ("L_1", "L_2")}
+
+
 class DeadZone(Law):
     """Small signals have no effect."""
 

@@ -70,6 +70,39 @@ class PlayHysteresis(StopHysteresis):
         yield {"r": local.half * np.linspace(0.0, 0.9, self.n)}
 
 
+class GeneralizedHysteresis(PlayHysteresis):
+    """Asymmetric hysteresis: plays of a bent signal (generalized Prandtl-Ishlinskii; Al Janaideh, Rakheja & Su 2011)."""
+
+    form = "generalized_play"
+    equation = "w = sum_i w_i play_{r_i}[u + a_2 u^2 + a_3 u^3] + b_2 u^2"
+    source = "Al Janaideh, Rakheja & Su (2011), IEEE/ASME Trans. Mechatronics 16(4); Krikelis et al. (2024), Eq. 14"
+    units = {"w": "w/z", "b_2": "w/z^2", "r": "z", "a_2": "1/z", "a_3": "1/z^2"}
+    strength = ("w", "b_2")
+
+    def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
+        """Plays of the bent signal."""
+        bent = z + p["a_2"] * z**2 + p["a_3"] * z**3
+        w, following = super().step(bent, s, p)
+        return w + p["b_2"] * z**2, following
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Weights and thresholds, the bend, and a memoryless part."""
+        out = super().parameters()
+        scalars = {}
+        for name in ("b_2", "a_2", "a_3"):
+            low, high = self.limits.get(name, (-np.inf, np.inf))
+            scalars[name] = Parameter(float(self.values.get(name, 0.0)), unit=self.units[name], bounds=(low, high))
+        return {"w": out["w"], "b_2": scalars["b_2"], "r": out["r"], "a_2": scalars["a_2"], "a_3": scalars["a_3"]}
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        for bend in (-0.2, 0.0, 0.2):
+            yield {"r": local.half * np.linspace(0.0, 0.9, self.n), "a_2": bend / local.reach, "a_3": 0.0}
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        bend = {"a_2": (-0.4 / local.reach, 0.4 / local.reach), "a_3": (-0.2 / local.reach**2, 0.5 / local.reach**2)}
+        return {**super().bounds(local), **bend}
+
+
 class BoucWen(Law):
     """Hysteresis by the Bouc-Wen equation (Bouc 1967; Wen 1976)."""
 
@@ -244,7 +277,7 @@ class Resonance(Law):
         return ca.vertcat(p.W * q[1], p.W * (z - q[0]) - 2 * p.D * p.W * q[1])
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(W=np.geomspace(0.02, 1.2, 10) / local.dt, D=[0.05, 0.4])
+        yield from grid(W=np.geomspace(0.015, 1.2, 20) / local.dt, D=[0.02, 0.2])
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"W": (8 / local.duration, 1.6 / local.dt), "D": (1e-3, 2.0)}

@@ -25,6 +25,24 @@ class CubicStiffness(Law):
         return p.k_3 * z**3
 
 
+class PowerStiffness(CubicStiffness):
+    """A hardening spring of another power, such as a taut string or a rubber block."""
+
+    form = "power"
+    equation = "w = k_n sign(z) |z|^n"
+    units = {"k_n": "w/z^n", "n": ""}
+    strength = ("k_n",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k_n * ca.sign(z) * (ca.fabs(z) + 1e-12) ** p.n
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(n=[2.0, 2.5, 4.0])
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"n": (1.7, 6.0)}
+
+
 class QuadraticStiffness(Law):
     """A spring that is stiffer in one direction (Nayfeh & Mook 1979)."""
 
@@ -105,6 +123,19 @@ class Clearance(Law):
 
     def applies(self, local: Local) -> str:
         return "" if local.low < -0.05 * local.reach and local.high > 0.05 * local.reach else "one side is never visited"
+
+
+class SoftClearance(Clearance):
+    """A gap between curved bodies: Hertz's contact on either side."""
+
+    form = "hertz"
+    equation = "w = k_g sign(z) max(|z| - g, 0)^1.5"
+    source = "Johnson (1985), Contact Mechanics, ch. 4"
+    units = {"k_g": "w/z^1.5", "g": "z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        above, below = ca.fmax(z - p.g, 0), ca.fmax(-z - p.g, 0)
+        return p.k_g * (above * ca.sqrt(above + 1e-300) - below * ca.sqrt(below + 1e-300))
 
 
 class OffCentreClearance(Clearance):
@@ -208,7 +239,6 @@ class Power(Polynomial):
     sentence = "a memoryless curve: a power of the local signal, as in flow through an orifice"
     units = {"a": "w/z^n", "n": ""}
     strength = ("a",)
-    places = ("parallel", "series")
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a * ca.sign(z) * (ca.fabs(z) + 1e-12) ** p.n
@@ -218,3 +248,16 @@ class Power(Polynomial):
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"n": (0.3, 5.0)}
+
+
+class Root(Power):
+    """A power below one inside the dynamics, such as flow through an orifice under its own head."""
+
+    form = "root"
+    places = ("parallel",)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(n=[0.4, 0.5, 0.65])
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"n": (0.3, 0.9)}

@@ -1,0 +1,61 @@
+"""From the user's simulator and recordings to a refitted simulator on recordings without dull faults."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..recording import Recording
+from ..simulator import Simulator
+from .floor import Floor, measured_floor, white_part
+from .gates import Gate, choose_hold, opened, unclip, wrong_scale
+from .proof import errors_of
+from .timing import timing
+from .workbench import THOROUGH, Fitted, Workbench
+
+SUSPECT = 0.06  # mean square error beyond which wrong signs and units are looked for
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What the search starts from.
+
+    Attributes
+    ----------
+    nominal : float
+        NRMSE at the user's values.
+    without : Fitted
+        The simulator refitted.
+    floor : Floor
+        Measured, or estimated from the refit.
+    """
+
+    bench: Workbench
+    without: Fitted
+    nominal: float
+    gates: tuple[Gate, ...]
+    floor: Floor
+
+
+def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | None, engine: str) -> Prepared:
+    """Open the bench, look at the dull causes, refit, and measure the floor."""
+    bench, gates = opened(simulator, tuple(recordings), hold or "zero", engine)
+    hold, more = choose_hold(simulator, bench.recordings, hold, engine)
+    gates = [*gates, *more]
+    bench = Workbench.of(simulator, bench.recordings, hold, engine)
+    nominal = errors_of(bench, simulator)
+    without = bench.fit(simulator, solver=THOROUGH)
+    if without.cost > SUSPECT:
+        bench, without, more = wrong_scale(bench, without)
+        gates += more
+    bench, without, more = unclip(bench, without)
+    gates += more
+    floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+    bench, without, more = timing(bench, without, float(np.mean((floor.deviation / bench.scale) ** 2)))
+    gates += more
+    if gates:
+        without = bench.fit(bench.simulator, [without.values], solver=THOROUGH)
+    floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+    return Prepared(bench, without, nominal, tuple(gates), floor)

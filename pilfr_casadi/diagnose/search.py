@@ -1,0 +1,208 @@
+"""From a refitted simulator to the effects it lacks: one pass for each, then a look back at the first.
+
+A second effect is looked for where the first leaves more than a few per cent of the excess and a flexible force could
+explain it. It is accepted at another port when it removes most of what is left. Then the first law is put up again
+against its rivals, with the second in place, and dropped where the second does as well alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ..laws import Law
+from ..recording import InputError
+from ..simulator import Simulator
+from .explain import Candidate, explain, heads, judged, polish
+from .flexible import explainable
+from .floor import Floor, effective_size, white_part
+from .screen import Scored, screen
+from .verdict import Choice, choose
+from .workbench import QUICK, THOROUGH, Fitted, Workbench
+
+ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
+MORE = 0.06  # share of the excess that has to be left for a second effect to be looked for
+MOSTLY = 0.5  # share of the rest that a second effect may leave
+HINT = 0.1  # share of a residual that a flexible force has to explain
+NOTHING = 0.01  # below this share nothing is explained
+
+Say = Callable[[str, int, int, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """One search for an effect."""
+
+    choice: Choice | None
+    candidates: tuple[Candidate, ...]
+    scored: tuple[Scored, ...]
+    before: tuple[float, float]
+    accepted: bool
+
+
+@dataclass(eq=False)
+class Search:
+    """The state of a search; `run` fills it.
+
+    Attributes
+    ----------
+    base : Fitted
+        The simulator with the effects accepted so far.
+    open_before, open_after : dict
+        Share of the residual that a flexible force explains, by port, without and with the effects.
+    """
+
+    bench: Workbench
+    without: Fitted
+    floor: Floor
+    laws: Sequence[type[Law]]
+    workers: int
+    say: Say
+    base: Fitted = field(init=False)
+    passes: list[Pass] = field(default_factory=list)
+    open_before: dict[str, float] = field(default_factory=dict)
+    open_after: dict[str, float] = field(default_factory=dict)
+    times: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def floor2(self) -> float:
+        """Mean square of the noise in units of the outputs' variance."""
+        return float(np.mean((self.floor.deviation / self.bench.scale) ** 2))
+
+    def _timed(self, stage: str, began: float) -> None:
+        self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - began
+
+    def _open(self, fitted: Fitted) -> dict[str, float]:
+        began = time.perf_counter()
+        found = explainable(self.bench, fitted)
+        self._timed("flexible", began)
+        return found
+
+    def run(self, effects: int) -> Search:
+        """Look for effects, one after the other."""
+        self.base = self.without
+        self.open_before = self.open_after = self._open(self.without)
+        for number in range(effects):
+            if number and not self._more():
+                break
+            found = self._pass(number)
+            self.passes.append(found)
+            if not found.accepted:
+                break
+            assert found.choice is not None
+            self.base = self._polished(found.choice.winner).fitted
+            if number:
+                self._look_back()
+            self.open_after = self._open(self.base)
+        return self
+
+    def _more(self) -> bool:
+        excess = (self.base.cost - self.floor2) / max(self.without.cost - self.floor2, 1e-300)
+        return excess > MORE and max(self.open_after.values(), default=0.0) > HINT
+
+    def _pass(self, number: int) -> Pass:
+        began = time.perf_counter()
+        self.say("screen", 0, 1, self.base.cost**0.5)
+        scored, signs, gain = screen(self.bench, self.base, self.laws, self.floor.deviation)
+        self._timed("screen", began)
+        taken = {e.port for e in self.base.simulator.elements}
+        scored = [s for s in scored if s.port not in taken]
+        most = max((s.share for s in scored), default=0.0)
+        nothing = max(most, max(self.open_after.values(), default=0.0)) < NOTHING and self.base.cost < 0.0025
+        before = (self.base.cost, self.base.cost)
+        if nothing or not scored:
+            return Pass(None, (), tuple(scored), before, False)
+        began = time.perf_counter()
+        candidates = explain(
+            self.bench,
+            scored,
+            self.base,
+            signs,
+            gain,
+            self.workers,
+            lambda i, n, e: self.say("fits" if not number else "fits, second effect", i, n, e),
+        )
+        self._timed("fits", began)
+        began = time.perf_counter()
+        before = self._judged(self.base)
+        self._lower_floor([c.fitted for c in candidates[:5]])
+        kept = [
+            polish(self.bench, c) if i < 4 and c.error < 1.5 * candidates[0].error else c
+            for i, c in enumerate(candidates)
+        ]
+        choice = self._choose(kept, before)
+        accepted = choice is not None and choice.gain > ROOM and (not number or choice.remains < MOSTLY)
+        self._timed("choice", began)
+        return Pass(choice, tuple(kept), tuple(scored), before, accepted)
+
+    def _choose(self, candidates: Sequence[Candidate], before: tuple[float, float]) -> Choice | None:
+        best = min(candidates, key=lambda c: c.error, default=None)
+        n = effective_size(best.fitted.residual if best else self.base.residual)
+        return choose(candidates, before, self.floor2, max(n, 30.0))
+
+    def _judged(self, fitted: Fitted) -> tuple[float, float]:
+        """Errors of a simulator fitted to the first part only, on both parts."""
+        part = self.bench.on(heads(self.bench.recordings))
+        return judged(self.bench, part.fit(fitted.simulator, [fitted.values, {}], solver=THOROUGH))
+
+    def _lower_floor(self, fits: Sequence[Fitted]) -> None:
+        if self.floor.source == "estimated":
+            found = [self.floor.deviation, *(white_part(f.residual) for f in fits)]
+            self.floor = Floor(np.min(found, axis=0), "estimated")
+
+    def _polished(self, candidate: Candidate) -> Candidate:
+        return candidate if np.isfinite(candidate.full) else polish(self.bench, candidate)
+
+    def _look_back(self) -> None:
+        """With the second effect in place: its rivals in the first's place, and the second alone."""
+        began = time.perf_counter()
+        first, second = self.passes[-2], self.passes[-1]
+        assert first.choice is not None
+        assert second.choice is not None
+        kept = self.base.simulator.elements[-1]
+        bare = self.bench.simulator
+        current = replace(second.choice.winner, fitted=self.base)
+        alone = self._attempt(bare.with_element(kept.port, kept.law), self.base.values)
+        if alone is not None and alone.error < 1.1 * current.error:
+            self.base = self._polished(replace(alone, port=kept.port, law=kept.law)).fitted
+            choice = replace(second.choice, winner=replace(alone, port=kept.port, law=kept.law))
+            self.passes[-2:] = [replace(second, choice=choice)]
+            self._timed("look back", began)
+            return
+        rivals: list[Candidate] = []
+        winner = first.choice.winner
+        for c in first.candidates:
+            if c.port != winner.port or type(c.law) is type(winner.law) or len(rivals) >= 6:
+                continue
+            own = c.fitted.simulator.elements[-1]
+            placed = bare.with_element(own.port, own.law).with_element(kept.port, kept.law)
+            values = {**self.base.values, **{k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}}
+            found = self._attempt(placed, values)
+            if found is not None:
+                rivals.append(replace(found, port=own.port, law=own.law, size=c.size))
+        own_now = self._attempt(self.base.simulator, self.base.values)
+        if own_now is not None and rivals:
+            stay = replace(own_now, port=winner.port, law=winner.law, size=winner.size)
+            choice = self._choose([stay, *rivals], first.before)
+            if choice is not None:
+                if choice.winner is not stay:
+                    self.base = self._polished(choice.winner).fitted
+                alike = tuple(c for c in choice.alike if c.port == winner.port)
+                better = replace(first.choice, winner=choice.winner, alike=alike, margin=choice.margin)
+                self.passes[-2] = replace(first, choice=better)
+        self._timed("look back", began)
+
+    def _attempt(self, simulator: Simulator, values: Mapping[str, Any]) -> Candidate | None:
+        part = self.bench.on(heads(self.bench.recordings))
+        try:
+            fitted = part.fit(simulator, [values], solver=QUICK)
+        except InputError:
+            return None
+        head, tail = judged(self.bench, fitted)
+        element = simulator.elements[-1]
+        size = sum(p.size for p in element.law.parameters().values())
+        return Candidate(element.port, element.law, fitted, head, tail if np.isfinite(tail) else 1e12, size)

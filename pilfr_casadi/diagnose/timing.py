@@ -1,0 +1,132 @@
+"""Gates of time: a channel that was recorded too early or too late, or by a clock that runs differently.
+
+The residual of the refitted simulator, with one channel read at another time, is projected off what the simulator's own
+parameters and initial states can follow; the shift (or clock rate) with the smallest remainder is confirmed by a refit.
+A late output may be physics (a delay); a shift of many whole samples is the mark of a recorder, and an output that comes
+before its cause is nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..recording import Recording
+from .gates import Change, Gate, changed, refit, shifted
+from .linearise import Probe, propagate, run
+from .screen import block_diagonal, orthonormal
+from .workbench import Fitted, Workbench
+
+FARTHEST = 64  # samples
+RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 14)[::-1], np.geomspace(1e-4, 0.05, 14)])
+WHOLE = 0.12  # samples within which a shift counts as whole
+LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
+DROP = 0.3  # share of the mean square that has to be left at most
+
+
+def nominal_directions(bench: Workbench, fitted: Fitted) -> np.ndarray:
+    """Orthonormal basis of what parameters and initial states can change in the stacked outputs."""
+    probe = Probe.of(bench, fitted)
+    n_free = len(probe.free) - len(probe.ports)
+    blocks = []
+    for i, r in enumerate(bench.recordings):
+        one = run(bench, probe, fitted, i)
+        y = propagate(one, [], n_free, probe.model.substeps, True) / bench.scale[:, None]
+        blocks.append(y[r.skip :].reshape(-1, y.shape[2]))
+    return orthonormal(block_diagonal(blocks, n_free))
+
+
+def _remainder(bench: Workbench, fitted: Fitted, basis: np.ndarray, change: Change, input_changed: bool) -> float:
+    parts = []
+    for r, e, state in zip(bench.recordings, fitted.residual, fitted.initial, strict=True):
+        other = change(r)
+        y = fitted.engine.simulate(fitted.model.drive(other), fitted.vector, state)[0] if input_changed else e + r.y
+        parts.append(((y - other.y) / bench.scale)[r.skip :].ravel())
+    error = np.concatenate(parts)
+    left = error - basis @ (basis.T @ error)
+    value = float(left @ left) / len(error)
+    return value if np.isfinite(value) else np.inf
+
+
+def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Look for a shifted channel or clock; returns the corrected bench where it is a fault of the recording."""
+    if plain.cost < 4 * noise2:
+        return bench, plain, []
+    basis, dt = nominal_directions(bench, plain), bench.dt
+    channels = [("y", i, name) for i, name in enumerate(bench.simulator.output_names)]
+    if len(bench.simulator.inputs) > 1:
+        channels += [("u", i, name) for i, name in enumerate(bench.simulator.inputs)]
+    straight = _remainder(bench, plain, basis, lambda r: r, False)
+    trials: list[tuple[float, str, str, float, Callable[[float], Change], bool, str]] = []
+    for kind, i, name in channels:
+        for what, values in (("alignment", dt * np.arange(-FARTHEST, FARTHEST + 1)), ("clock", RATES)):
+            for value in values:
+                make = _maker(kind, i, what)
+                left = _remainder(bench, plain, basis, make(value), kind == "u")
+                trials.append((left, name, what, float(value), make, kind == "u", kind))
+    best: tuple[float, str, str, float, Workbench, Fitted, Change] | None = None
+    for left, name, what, value, make, is_input, kind in sorted(trials, key=lambda t: t[0])[:3]:
+        if left > 0.7 * straight:
+            continue
+        now, current, at = bench, plain, value
+        for _ in range(3):
+            other = changed(bench, make(at))
+            found = refit(other, current)
+            if found is None:
+                break
+            now, current = other, found
+            step = _refined(bench, now, current, make, at, dt if what == "alignment" else 0.2 * abs(at), is_input)
+            if abs(step - at) < 1e-3 * (dt if what == "alignment" else abs(at)):
+                break
+            at = step
+        relative = current.cost * float(np.mean((now.scale / bench.scale) ** 2))
+        if current is not plain and (best is None or relative < best[0]):
+            best = (relative, name, what, at if kind == "y" else -at, now, current, make(at))
+    if best is None or best[0] > DROP * plain.cost:
+        return bench, plain, []
+    relative, name, what, value, other, found, change = best
+    gate = _gate(name, what, value, dt, plain.cost, relative, change)
+    return (other, found, [gate]) if gate else (bench, plain, [])
+
+
+def _maker(kind: str, i: int, what: str) -> Callable[[float], Change]:
+    if what == "alignment":
+        return lambda value: shifted(kind, i, value)
+    return lambda value: shifted(kind, i, 0.0, value)
+
+
+def _refined(
+    bench: Workbench, now: Workbench, fitted: Fitted, make: Callable[[float], Change], at: float, width: float, u: bool
+) -> float:
+    """Shift of the original recordings that fits best around `at`."""
+    from scipy.optimize import minimize_scalar
+
+    basis = nominal_directions(now, fitted)
+    original = bench.on(bench.recordings)
+
+    def left(value: float) -> float:
+        parts = []
+        for r, state in zip(original.recordings, fitted.initial, strict=True):
+            other: Recording = make(value)(r)
+            y = fitted.engine.simulate(fitted.model.drive(other), fitted.vector, state)[0]
+            parts.append(((y - other.y) / now.scale)[r.skip :].ravel())
+        error = np.concatenate(parts)
+        rest = error - basis @ (basis.T @ error)
+        return float(rest @ rest)
+
+    return float(minimize_scalar(left, bounds=(at - width, at + width), method="bounded").x)
+
+
+def _gate(name: str, what: str, value: float, dt: float, before: float, after: float, change: Change) -> Gate | None:
+    fall = f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
+    if what == "clock":
+        sentence = f"The clock of {name} runs {value * 100:+.3g} % off the others'; with it corrected {fall}."
+        return Gate(name, "clock", value, sentence, True, True, change)
+    samples = value / dt
+    whole = abs(samples - round(samples)) < WHOLE and abs(samples) > LONG
+    if samples > -0.3 and not whole:
+        return None  # late, and not by whole samples: a delay is physics
+    word = "late" if samples > 0 else "early"
+    sentence = f"{name} is recorded {abs(samples):.3g} samples ({abs(value):.3g} s) too {word}; with it corrected {fall}."
+    return Gate(name, "alignment", value, sentence, True, True, change)
