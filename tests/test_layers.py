@@ -53,9 +53,9 @@ LAYERS = {
         "baselines",
     ),
     5: ("gauss_newton", "ipopt", "callback", "damping", "scaling", "solution"),
-    6: ("fit", "fitted", "linear_model", "penalty", "multistart", "export", "plots"),
-    7: ("diagnose",),
-    8: ("cli", "commands", "option_values", "interrupts", "report", "demo"),
+    6: ("fit", "fitted", "linear_model", "penalty", "multistart", "export", "plots", "accepted", "load_simulator"),
+    7: ("diagnose", "report"),  # a diagnosis writes its own report
+    8: ("cli", "commands", "diagnose_command", "option_values", "interrupts", "demo"),
 }
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")

@@ -130,9 +130,7 @@ class _Pair:
     candidate: Candidate | None = None
 
 
-def prepare(
-    bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: int, gain: np.ndarray | None
-) -> _Pair:
+def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: int, gain: np.ndarray | None) -> _Pair:
     """Compile a pair and fit it briefly from its best start."""
     part = bench.on(heads(bench.recordings))
     first = entries[0]
@@ -185,7 +183,9 @@ def _attempt(
 
 def _quick_cost(part: Workbench, model: Any, engine: Any, start: Mapping[str, Any], without: Fitted) -> float:
     parameters = model.parameters
-    vector = np.clip(parameters.pack({k: v for k, v in start.items() if k in parameters}), parameters.lower, parameters.upper)
+    vector = np.clip(
+        parameters.pack({k: v for k, v in start.items() if k in parameters}), parameters.lower, parameters.upper
+    )
     total = 0.0
     for r, state in zip(part.recordings, without.initial, strict=True):
         full = np.zeros(model.n_x)

@@ -8,8 +8,8 @@ floor, and a right name from one that only comes near.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -36,11 +36,12 @@ class Surface(Law):
 
     id = "surface"
     equation = "w = sum_ij c_ij T_i(z) T_j(dz/dt)"
-    units = {"c": "w", "z_m": "z", "z_s": "z", "v_s": "z/s"}
-    strength = ("c",)
-    places = ("parallel", "series")
+    units: ClassVar[Mapping[str, str]] = {"c": "w", "z_m": "z", "z_s": "z", "v_s": "z/s"}
+    strength: ClassVar[tuple[str, ...]] = ("c",)
+    places: ClassVar[tuple[str, ...]] = ("parallel", "series")
 
     def force(self, z: Any, dz: Any, p: Any) -> Any:
+        """Chebyshev terms."""
         a, b = _chebyshev((z - p.z_m) / p.z_s), _chebyshev(dz / p.v_s)
         return sum(p.c[k] * a[i] * b[j] for k, (i, j) in enumerate(TERMS))
 
@@ -50,6 +51,7 @@ class Surface(Law):
         return {"c": Parameter(np.zeros(len(TERMS))), **scales}
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        """One scale, that of the data."""
         yield {
             "z_m": (local.low + local.high) / 2,
             "z_s": 1.1 * local.half,

@@ -1,7 +1,7 @@
 """The dull causes, looked at first: sign, unit, time unit, alignment, clock, clipping, offset, hold.
 
-Each is a change of the recordings (or a constant added at a sensor); it counts when the simulator, refitted, follows the
-changed recordings far better than the given ones.
+Each is a change of the recordings; it counts when the simulator, refitted, follows the changed recordings far better
+than the given ones.
 """
 
 from __future__ import annotations
@@ -62,6 +62,11 @@ def shifted(kind: str, index: int, seconds: float, rate: float = 0.0) -> Change:
     return change
 
 
+def slower_by(factor: float) -> Change:
+    """Multiply the time."""
+    return lambda r: r.with_(dt=r.dt * factor)
+
+
 def changed(bench: Workbench, change: Change) -> Workbench:
     """The bench with changed recordings, errors in units of their own deviation."""
     recordings = tuple(change(r) for r in bench.recordings)
@@ -80,7 +85,9 @@ def refit(bench: Workbench, previous: Fitted | None = None) -> Fitted | None:
         return None
 
 
-def choose_hold(simulator: Any, recordings: tuple[Recording, ...], said: str | None, engine: str) -> tuple[str, list[Gate]]:
+def choose_hold(
+    simulator: Any, recordings: tuple[Recording, ...], said: str | None, engine: str
+) -> tuple[str, list[Gate]]:
     """What inputs do between samples: as said, else what fits better."""
     for hold in (said, simulator.hold, *(r.hold for r in recordings)):
         if hold is not None:
@@ -128,12 +135,11 @@ def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine:
             found = refit(bench)
             if found is not None and found.cost < 0.25:
                 words = (
-                    f"The time of the recordings is off by a factor of {1 / factor:.4g}, as from a wrong unit: as given, "
-                    f"the simulator cannot follow at all; corrected, its error is {found.cost**0.5:.3g} of the "
+                    f"The time of the recordings is off by a factor of {1 / factor:.4g}, as from a wrong unit: as "
+                    f"given, the simulator cannot follow at all; corrected, its error is {found.cost**0.5:.3g} of the "
                     "outputs' deviation."
                 )
-                change: Change = lambda r, f=factor: r.with_(dt=r.dt * f)  # noqa: E731
-                return bench, [Gate("time", "time-unit", factor, words, True, True, change)]
+                return bench, [Gate("time", "time-unit", factor, words, True, True, slower_by(factor))]
         raise error
 
 
@@ -175,7 +181,7 @@ def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, lis
             trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
             trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if np.any([_near(v / f) for v in sizes])]
     for factor in (1e-3, 1e3, 60.0, 1 / 60):
-        trials.append(("time", "time-unit", factor, lambda r, f=factor: r.with_(dt=r.dt * f)))
+        trials.append(("time", "time-unit", factor, slower_by(factor)))
     for name, finding, value, change in trials:
         other = changed(bench, change)
         try:

@@ -1,4 +1,4 @@
-"""The simulator linearised along its own run: how a small force at any port, a parameter or the start moves the outputs.
+"""The simulator linearised along its own run: how a small force at a port, a parameter or the start moves the outputs.
 
 With a force held over each step,
 
@@ -10,8 +10,10 @@ and along an observer with gain K, whose innovations are then looked at instead 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -30,12 +32,13 @@ class Constant(Law):
 
     id = "probe"
     equation = "w = w"
-    units = {"w": "w"}
-    strength = ("w",)
-    places = ("parallel", "series")
+    units: ClassVar[Mapping[str, str]] = {"w": "w"}
+    strength: ClassVar[tuple[str, ...]] = ("w",)
+    places: ClassVar[tuple[str, ...]] = ("parallel", "series")
 
-    def force(self, p: object) -> object:
-        return p.w  # type: ignore[attr-defined]
+    def force(self, p: Any) -> Any:
+        """The parameter itself."""
+        return p.w
 
 
 def probed(simulator: Simulator) -> Simulator:
@@ -126,7 +129,13 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     u = r.u
     slope = np.gradient(u, r.dt, axis=0) if bench.hold == "linear" and len(u) > 2 else np.zeros_like(u)
     own = p[: len(p) - len(probe.ports)]
-    inputs = (states[::n, : probe.n_x].T, u.T, slope.T, (np.arange(len(u)) * r.dt)[None], np.tile(own[:, None], (1, len(u))))
+    inputs = (
+        states[::n, : probe.n_x].T,
+        u.T,
+        slope.T,
+        (np.arange(len(u)) * r.dt)[None],
+        np.tile(own[:, None], (1, len(u))),
+    )
     z, dz, lift, push = (np.asarray(v).T for v in probe.local(*inputs))
     sign = np.where(np.abs(lift).max(axis=0) > 0, 0.0, -np.sign(np.median(push, axis=0)))
     return Run(*blocks, error=y.T[::n] - r.y, z=z, dz=dz, states=states, sign=sign)
@@ -142,7 +151,9 @@ def _states(
     if gain is not None:
         following = following + ca.DM(gain) @ (ys - y)
     step = ca.Function("step", [xs, ca.vertcat(us, ys), ps], [following])
-    found = np.asarray(step.mapaccum("run", len(rows) - 1)(x, rows[:-1].T, p)).T if len(rows) > 1 else np.zeros((0, len(x)))
+    found = (
+        np.asarray(step.mapaccum("run", len(rows) - 1)(x, rows[:-1].T, p)).T if len(rows) > 1 else np.zeros((0, len(x)))
+    )
     return np.vstack([x[None], found])
 
 
@@ -164,7 +175,12 @@ def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarra
 
 
 def propagate(
-    r: Run, forces: list[tuple[int, np.ndarray]], n_free: int, substeps: int, start: bool, gain: np.ndarray | None = None
+    r: Run,
+    forces: list[tuple[int, np.ndarray]],
+    n_free: int,
+    substeps: int,
+    start: bool,
+    gain: np.ndarray | None = None,
 ) -> np.ndarray:
     """Output changes of free parameters, the initial state (where `start`), and forces at ports.
 
@@ -214,6 +230,6 @@ def propagate(
 
 def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     """Local signals of every port over all recordings."""
-    lengths = tuple(len(r) for r in bench.recordings)
+    lengths = tuple(len(r.z) for r in runs)
     z, dz = np.concatenate([r.z for r in runs]), np.concatenate([r.dz for r in runs])
     return [Local(z[:, j], dz[:, j], bench.dt, lengths) for j in range(z.shape[1])]

@@ -83,7 +83,7 @@ def test_errors(
 
 
 def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
-    """Standard error of each free parameter, from the residual and its correlation time; nan where held or at a bound."""
+    """Standard errors of free parameters, from the residual and its correlation time; nan where held or at a bound."""
     from .floor import effective_size
 
     free = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))

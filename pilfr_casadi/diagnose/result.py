@@ -28,6 +28,7 @@ class Effect:
     parameters: dict[str, dict[str, Any]]
     indistinguishable: tuple[tuple[str, str], ...] = ()
     form: str = ""
+    placebo: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """As in diagnosis.json."""
@@ -42,6 +43,8 @@ class Effect:
         }
         if self.form:
             out["form"] = self.form
+        if self.placebo:
+            out["placebo"] = dict(self.placebo)
         return out
 
 
@@ -121,6 +124,8 @@ class Diagnosis:
                 lines.append(f"NRMSE {kind} (nominal -> refitted without -> with): {shown}")
         lines.append(f"noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})")
         lines += [f"note: {g.sentence}" for g in self.gates]
+        if self.next_experiment:
+            lines.append(f"next experiment: {self.next_experiment['sentence']}")
         lines.append(f"{self.seconds:.1f} s")
         return "\n".join(lines)
 

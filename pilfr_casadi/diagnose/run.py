@@ -13,7 +13,9 @@ from ..laws import CATALOGUE, Law, readable_unit
 from ..recording import InputError, Recording, as_recordings, check_for_identification
 from ..simulator import Simulator
 from ..threads import one_blas_thread
+from .experiment import next_experiment, placebo
 from .explain import Candidate
+from .mismatch import mismatch
 from .prepare import prepare
 from .proof import deviations, nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
@@ -90,15 +92,23 @@ def diagnose(
         if tests
         else None,
     }
+    effects_found = tuple(_effect(search, p, after, std) for p in accepted) if explained else ()
+    experiment = _next(search, accepted) if explained else None
     now = time.perf_counter()
     times = {"gates and refit": prepared_at - began, **search.times, "proof": now - searched_at}
     return Diagnosis(
         verdict=verdict,
         sentence=sentence,
-        effects=tuple(_effect(search, p, after, std) for p in accepted) if explained else (),
+        effects=effects_found,
         candidates=tuple(_row(c, p) for p in search.passes for c in p.candidates),
         gates=ready.gates,
-        mismatch={"sentence": ""},
+        mismatch=mismatch(
+            bench.recordings,
+            without.residual,
+            [e + r.y for e, r in zip(without.residual, bench.recordings, strict=True)],
+            search.floor.deviation,
+            bench.scale,
+        ),
         parameters=parameter_table(simulator, without, after, std),
         errors=errors,
         floor={"nrmse": search.floor.nrmse(bench.scale), "source": search.floor.source},
@@ -107,6 +117,7 @@ def diagnose(
         hold=bench.hold,
         train=bench.recordings,
         test=tests,
+        next_experiment=experiment,
         seconds=now - began,
         times=times,
         evidence={"search": search, "without": without, "after": after},
@@ -117,9 +128,8 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
     choice = found.choice
     assert choice is not None
     winner, bench = choice.winner, search.bench
-    element = next(
-        e for e in fitted.simulator.elements if e.port == winner.port and type(e.law) is type(winner.law)
-    )
+    own, unrelated = placebo(bench, search.without, winner.port, winner.law)
+    element = next(e for e in fitted.simulator.elements if e.port == winner.port and type(e.law) is type(winner.law))
     port = bench.simulator.port(winner.port)
     values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
     shown: dict[str, dict[str, Any]] = {}
@@ -139,11 +149,27 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
         parameters=shown,
         indistinguishable=tuple(c.name for c in choice.alike),
         form=winner.law.form,
+        placebo={"own": own, "unrelated": unrelated},
     )
 
 
+def _next(search: Search, accepted: Sequence[Pass]) -> dict[str, Any] | None:
+    """The experiment that would separate the first tie, where there is one."""
+    for found in accepted:
+        choice = found.choice
+        if choice is not None and choice.alike:
+            one, other = choice.winner, choice.alike[0]
+            best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation)
+            names = [[c.port, c.law.id] for c in (one, other)]
+            if best is not None:
+                return {"between": names, **best}
+            sentence = "No sine or triangle within the recorded amplitude separates them beyond the noise."
+            return {"between": names, "sentence": sentence}
+    return None
+
+
 def _row(c: Candidate, step: Pass) -> dict[str, Any]:
-    n = 1000.0
+    n = step.samples
     return {
         "port": c.port,
         "law": c.law.id,

@@ -1,8 +1,8 @@
 """A score test of every port and law: how much of the residual a small dose of a law would take away.
 
 The outputs' sensitivity to a law at zero strength is projected off the simulator's own parameters and the initial
-states (Rao 1948); shape parameters lie on a grid. It is done twice: along the refitted simulation, and along an observer
-with process noise at every port, on its innovations.
+states (Rao 1948); shape parameters lie on a grid. It is done twice: along the refitted simulation, and along an
+observer with process noise at every port, on its innovations.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ BLOCKS = 10  # a recording, odd and even ones in turn
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A port and law with the share of the residual that a small dose takes away, judged on blocks it was not fitted to,
-    and start values in falling order.
+    """A port and law with the share of the residual that a small dose takes away, and start values, best first.
+
+    The share is judged on blocks it was not fitted to.
     """
 
     port: str
@@ -66,7 +67,7 @@ def screen(
 
 def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
     """The stretch of each recording that is looked at: where the error is largest."""
-    share = max(MOST // len(runs), 200)
+    share = max(MOST // len(runs) // len(bench.scale), 200)
     out = []
     for r, recording in zip(runs, bench.recordings, strict=True):
         m, skip = len(r.error), recording.skip
@@ -134,23 +135,23 @@ def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequenc
 def columns_of(
     bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], gain: np.ndarray | None
 ) -> tuple[list[_Task], np.ndarray, np.ndarray]:
-    """Each port's laws, the outputs' changes by all their shapes, and the error, both without what the simulator's own
-    parameters and the initial states can follow.
+    """Each port's laws, the outputs' changes by all their shapes, and the error.
+
+    Changes and error are without what the simulator's own parameters and the initial states can follow.
     """
     n, n_free = probe.model.substeps, len(probe.free) - len(probe.ports)
-    places = locals_of(bench, runs)
     windows = _windows(bench, runs)
     cuts = [slice(w.start * n, w.stop * n) for w in windows]
     short = [
-        replace(r, a=r.a[c], b=r.b[c], c=r.c[c], d=r.d[c], error=r.error[w])
+        replace(r, a=r.a[c], b=r.b[c], c=r.c[c], d=r.d[c], error=r.error[w], z=r.z[w], dz=r.dz[w])
         for r, c, w in zip(runs, cuts, windows, strict=True)
     ]
     error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
-    tasks = _tasks(bench, probe, runs, laws, places)
-    edges = np.cumsum([0, *(len(r.z) for r in runs)])
+    tasks = _tasks(bench, probe, laws, locals_of(bench, runs), locals_of(bench, short))
+    edges = np.cumsum([0, *(len(r.z) for r in short)])
     blocks = []
-    for i, (r, w) in enumerate(zip(short, windows, strict=True)):
-        forces = [(t.index, t.forces[edges[i] : edges[i + 1]][w]) for t in tasks]
+    for i, r in enumerate(short):
+        forces = [(t.index, t.forces[edges[i] : edges[i + 1]]) for t in tasks]
         y = propagate(r, forces, n_free, n, True, gain) / bench.scale[:, None]
         blocks.append(y.reshape(-1, y.shape[2]))
     first = n_free + short[0].a.shape[1]
@@ -174,18 +175,19 @@ class _Task:
 
 
 def _tasks(
-    bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], places: list[Local]
+    bench: Workbench, probe: Probe, laws: Sequence[type[Law]], places: list[Local], parts: list[Local]
 ) -> list[_Task]:
+    """Forces along `parts` of the signals of `places`."""
     by_name = {port.name: port for port in bench.simulator.all_ports()}
     out = []
-    for j, (name, local) in enumerate(zip(probe.ports, places, strict=True)):
+    for j, (name, local, part) in enumerate(zip(probe.ports, places, parts, strict=True)):
         port = by_name[name]
         if not np.ptp(local.z) > 0:
             continue
         chosen = [law() for law in laws if ("series" if port.series else "parallel") in law.places]
         pairs = [(law, list(law.shapes(local))) for law in chosen if usable(law, local)]
-        forces = np.hstack([trace(law, local, shapes).reshape(len(local.z), -1) for law, shapes in pairs])
-        forces = np.where(np.isfinite(forces), forces, 0.0)
+        forces = np.hstack([trace(law, part, shapes).reshape(len(part.z), -1) for law, shapes in pairs])
+        forces = np.where(np.abs(forces) < 1e100, forces, 0.0)
         size = np.sqrt(np.mean(forces**2, axis=0))
         size = np.where(size > 0, size, 1.0)
         out.append(_Task(j, port, local, pairs, forces / size, size))
@@ -222,6 +224,7 @@ def block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of the columns' span."""
     size = np.linalg.norm(columns, axis=0)
     kept = columns[:, size > 0] / size[size > 0]
     u, s, _ = np.linalg.svd(kept, full_matrices=False)

@@ -42,6 +42,7 @@ class Pass:
     scored: tuple[Scored, ...]
     before: tuple[float, float]
     accepted: bool
+    samples: float = 30.0
 
 
 @dataclass(eq=False)
@@ -134,10 +135,12 @@ class Search:
             polish(self.bench, c) if i < 4 and c.error < 1.5 * candidates[0].error else c
             for i, c in enumerate(candidates)
         ]
-        choice = self._choose(kept, before)
+        best = min(kept, key=lambda c: c.error, default=None)
+        samples = max(effective_size(best.fitted.residual if best else self.base.residual), 30.0)
+        choice = choose(kept, before, self.floor2, samples)
         accepted = choice is not None and choice.gain > ROOM and (not number or choice.remains < MOSTLY)
         self._timed("choice", began)
-        return Pass(choice, tuple(kept), tuple(scored), before, accepted)
+        return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
     def _choose(self, candidates: Sequence[Candidate], before: tuple[float, float]) -> Choice | None:
         best = min(candidates, key=lambda c: c.error, default=None)
@@ -187,12 +190,12 @@ class Search:
         own_now = self._attempt(self.base.simulator, self.base.values)
         if own_now is not None and rivals:
             stay = replace(own_now, port=winner.port, law=winner.law, size=winner.size)
-            choice = self._choose([stay, *rivals], first.before)
-            if choice is not None:
-                if choice.winner is not stay:
-                    self.base = self._polished(choice.winner).fitted
-                alike = tuple(c for c in choice.alike if c.port == winner.port)
-                better = replace(first.choice, winner=choice.winner, alike=alike, margin=choice.margin)
+            again = self._choose([stay, *rivals], first.before)
+            if again is not None:
+                if again.winner is not stay:
+                    self.base = self._polished(again.winner).fitted
+                alike = tuple(c for c in again.alike if c.port == winner.port)
+                better = replace(first.choice, winner=again.winner, alike=alike, margin=again.margin)
                 self.passes[-2] = replace(first, choice=better)
         self._timed("look back", began)
 

@@ -1,9 +1,9 @@
 """Gates of time: a channel that was recorded too early or too late, or by a clock that runs differently.
 
 The residual of the refitted simulator, with one channel read at another time, is projected off what the simulator's own
-parameters and initial states can follow; the shift (or clock rate) with the smallest remainder is confirmed by a refit.
-A late output may be physics (a delay); a shift of many whole samples is the mark of a recorder, and an output that comes
-before its cause is nothing else.
+parameters and initial states can follow; the shift (or clock rate) with the smallest remainder is confirmed by a
+refit. A late output may be physics (a delay); a shift of many whole samples is the mark of a recorder, and an output
+that comes before its cause is nothing else.
 """
 
 from __future__ import annotations
@@ -128,5 +128,7 @@ def _gate(name: str, what: str, value: float, dt: float, before: float, after: f
     if samples > -0.3 and not whole:
         return None  # late, and not by whole samples: a delay is physics
     word = "late" if samples > 0 else "early"
-    sentence = f"{name} is recorded {abs(samples):.3g} samples ({abs(value):.3g} s) too {word}; with it corrected {fall}."
+    sentence = (
+        f"{name} is recorded {abs(samples):.3g} samples ({abs(value):.3g} s) too {word}; with it corrected {fall}."
+    )
     return Gate(name, "alignment", value, sentence, True, True, change)

@@ -1,9 +1,9 @@
 """Choosing among fitted candidates, and how sure the choice is.
 
-The criterion of a candidate is `½ n ln(mse) + ½ k ln n` with mse the geometric mean of the errors on the fitted part and
-on the rest, k its parameters and n an effective number of samples, which shrinks with the residual's correlation time:
-where model error dominates, neighbouring samples say the same thing. Laws that can imitate others have to beat them by a
-clear factor first.
+The criterion of a candidate is `½ n ln(mse) + ½ k ln n` with mse the geometric mean of the errors on the fitted part
+and on the rest, k its parameters and n an effective number of samples, which shrinks with the residual's correlation
+time: where model error dominates, neighbouring samples say the same thing. Laws that can imitate others have to beat
+them by a clear factor first.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FLEXIBLE: dict[str, float] = {
     "static_curve": 1.1,
     "extra_mode": 1.15,
     "stribeck_friction": 1.05,
-    "periodic_force": 1.1,
+    "periodic_force": 1.25,
 }
 IMITATES = {("hysteresis", "coulomb_friction"): 1.4}
 FORMS = {
@@ -41,6 +41,7 @@ FORMS = {
     "asymmetric": 1.05,
     "soft asymmetric": 1.05,
     "power": 1.1,
+    "quintic": 1.05,
     "root": 1.1,
     "polynomial": 1.05,
     "attached mass": 1.1,
@@ -79,9 +80,7 @@ def weighted(candidate: Candidate, n: float) -> float:
     return float(np.log(candidate.error) + 0.5 * candidate.size * np.log(n) / n)
 
 
-def choose(
-    candidates: Sequence[Candidate], without: tuple[float, float], floor: float, n: float
-) -> Choice | None:
+def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor: float, n: float) -> Choice | None:
     """The winner among candidates; `without` are the errors of the simulator alone, `floor` the noise, all squared."""
     usable = [c for c in candidates if np.isfinite(c.error)]
     if not usable:

@@ -42,6 +42,7 @@ from .stiffness import (
     PowerStiffness,
     Quadratic,
     QuadraticStiffness,
+    QuinticStiffness,
     Root,
     SoftClearance,
 )
@@ -49,6 +50,7 @@ from .stiffness import (
 CATALOGUE: tuple[type[Law], ...] = (
     CubicStiffness,
     PowerStiffness,
+    QuinticStiffness,
     QuadraticStiffness,
     PiecewiseStiffness,
     PiecewiseStiffnessBelow,

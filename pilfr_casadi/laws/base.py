@@ -1,8 +1,8 @@
-"""What a law is: one small class a physical hypothesis, with its equation, source, sentence, parameters and start values.
+"""What a law is: a small class a physical hypothesis, with its equation, source, sentence, parameters and start values.
 
-A law is a force `w = Σ_i c_i φ_i(z, ż, q, t; shape)`, linear in its *strengths* c, nonlinear in its *shape* (threshold,
-gap, knee, delay). `q̇ = flow(...)` are states of its own; a law with `step(z, s, p)` has a discrete memory instead. A law
-without strengths is the deviation of a signal from itself: `w = law(u) - u`.
+A law is a force `w = Σ_i c_i φ_i(z, ż, q, t; shape)`, linear in its *strengths* c, nonlinear in its *shape*
+(threshold, gap, knee, delay). `q̇ = flow(...)` are states of its own; a law with `step(z, s, p)` has a discrete memory
+instead. A law without strengths is the deviation of a signal from itself: `w = law(u) - u`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import inspect
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -37,12 +38,12 @@ class Local:
     dt: float
     lengths: tuple[int, ...]
 
-    @property
+    @cached_property
     def low(self) -> float:
         """Smallest z, without the outermost 0.1 %."""
         return float(np.quantile(self.z, 0.001))
 
-    @property
+    @cached_property
     def high(self) -> float:
         """Largest z, without the outermost 0.1 %."""
         return float(np.quantile(self.z, 0.999))
@@ -57,7 +58,7 @@ class Local:
         """Half the range of z."""
         return max((self.high - self.low) / 2, 1e-300)
 
-    @property
+    @cached_property
     def speed(self) -> float:
         """Largest |ż|, without the outermost 1 %."""
         return max(float(np.quantile(np.abs(self.dz), 0.99)), 1e-300)
@@ -130,6 +131,10 @@ class Law:
             named |= set(inspect.signature(cls.flow).parameters)  # type: ignore[attr-defined]
         return named & {"z", "dz", "t", "x", "u"}
 
+    def on_grid(self, h: float) -> Law:
+        """The law for steps of length h, s; most do not care."""
+        return self
+
     def at(self, values: Mapping[str, Any], limits: Mapping[str, tuple[Any, Any]] | None = None) -> Law:
         """The law starting at `values` inside `limits`."""
         return replace(self, values={**self.values, **values}, limits={**self.limits, **(limits or {})})
@@ -146,6 +151,8 @@ class Law:
 
 def readable_unit(unit: str, w: str, z: str) -> str:
     """A unit in w, z and s with the port's own units put in: ("w/z^3", "N", "m") -> "N/m^3"."""
+    if unit == "w/z" and w == z:
+        return ""
     parts = []
     for token in unit.replace("*", " * ").replace("/", " / ").split():
         base, _, power = token.partition("^")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -20,8 +20,8 @@ class CoulombFriction(Law):
     equation = "w = F_c tanh(dz/dt / v_0)"
     source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7)"
     sentence = "dry friction: a force that opposes motion and hardly depends on speed"
-    units = {"F_c": "w", "v_0": "z/s"}
-    strength = ("F_c",)
+    units: ClassVar[Mapping[str, str]] = {"F_c": "w", "v_0": "z/s"}
+    strength: ClassVar[tuple[str, ...]] = ("F_c",)
     dissipative = True
 
     def force(self, dz: Any, p: Any) -> Any:
@@ -39,23 +39,23 @@ class AsymmetricFriction(CoulombFriction):
 
     form = "asymmetric"
     equation = "w = F_c tanh(dz/dt / v_0) + F_0"
-    units = {"F_c": "w", "F_0": "w", "v_0": "z/s"}
-    strength = ("F_c", "F_0")
+    units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_0": "w", "v_0": "z/s"}
+    strength: ClassVar[tuple[str, ...]] = ("F_c", "F_0")
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.F_c * ca.tanh(dz / p.v_0) + p.F_0
 
 
 class PreslidingFriction(Law):
-    """Dry friction whose contact springs back before it slides: one elasto-plastic element (Jenkins 1962; Dahl 1968)."""
+    """Dry friction whose contact springs back before it slides: an elasto-plastic element (Jenkins 1962; Dahl 1968)."""
 
     id = "coulomb_friction"
     form = "presliding"
     equation = "w = k_t stop_r[z],  F_c = k_t r"
     source = "Jenkins (1962); Al-Bender & Swevers (2008), IEEE Control Syst. 28(6)"
     sentence = "dry friction whose contact springs back a little before it slides"
-    units = {"k_t": "w/z", "r": "z"}
-    strength = ("k_t",)
+    units: ClassVar[Mapping[str, str]] = {"k_t": "w/z", "r": "z"}
+    strength: ClassVar[tuple[str, ...]] = ("k_t",)
     dissipative = True
     memory = 1
 
@@ -78,8 +78,8 @@ class StribeckFriction(Law):
     equation = "w = (F_c + F_e exp(-(dz/dt / v_s)^2)) tanh(dz/dt / v_0)"
     source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7)"
     sentence = "dry friction that is larger at rest than in motion"
-    units = {"F_c": "w", "F_e": "w", "v_s": "z/s", "v_0": "z/s"}
-    strength = ("F_c", "F_e")
+    units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_e": "w", "v_s": "z/s", "v_0": "z/s"}
+    strength: ClassVar[tuple[str, ...]] = ("F_c", "F_e")
     dissipative = True
 
     def force(self, dz: Any, p: Any) -> Any:
@@ -101,8 +101,8 @@ class QuadraticDrag(Law):
     equation = "w = c_2 dz/dt |dz/dt|"
     source = "White (2011), Fluid Mechanics, sec. 7.6"
     sentence = "a drag that grows with the square of speed"
-    units = {"c_2": "w*s^2/z^2"}
-    strength = ("c_2",)
+    units: ClassVar[Mapping[str, str]] = {"c_2": "w*s^2/z^2"}
+    strength: ClassVar[tuple[str, ...]] = ("c_2",)
     dissipative = True
 
     def force(self, dz: Any, p: Any) -> Any:
@@ -116,8 +116,8 @@ class CubicDamping(Law):
     equation = "w = c_3 (dz/dt)^3"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 3.3"
     sentence = "a damping force that grows with the cube of speed"
-    units = {"c_3": "w*s^3/z^3"}
-    strength = ("c_3",)
+    units: ClassVar[Mapping[str, str]] = {"c_3": "w*s^3/z^3"}
+    strength: ClassVar[tuple[str, ...]] = ("c_3",)
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.c_3 * dz**3

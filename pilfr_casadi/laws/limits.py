@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -19,8 +19,8 @@ class Saturation(Law):
     equation = "w = clip(u, -L, L) - u"
     source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
     sentence = "saturation: beyond a limit the signal does not follow any more"
-    units = {"L": "z"}
-    places = ("series",)
+    units: ClassVar[Mapping[str, str]] = {"L": "z"}
+    places: ClassVar[tuple[str, ...]] = ("series",)
 
     def force(self, z: Any, p: Any) -> Any:
         return ca.fmax(ca.fmin(z, p.L), -p.L) - z
@@ -37,7 +37,7 @@ class AsymmetricSaturation(Saturation):
 
     form = "asymmetric"
     equation = "w = clip(u, low, high) - u"
-    units = {"low": "z", "high": "z"}
+    units: ClassVar[Mapping[str, str]] = {"low": "z", "high": "z"}
 
     def force(self, z: Any, p: Any) -> Any:
         return ca.fmax(ca.fmin(z, p.high), p.low) - z
@@ -73,7 +73,7 @@ class SkewSaturation(AsymmetricSaturation):
 
     form = "soft asymmetric"
     equation = "w = L tanh(u / L) - u,  L = L_1 below zero and L_2 above"
-    units = {"L_1": "z", "L_2": "z"}
+    units: ClassVar[Mapping[str, str]] = {"L_1": "z", "L_2": "z"}
 
     def force(self, z: Any, p: Any) -> Any:
         up, down = ca.fmax(z, 0), ca.fmin(z, 0)
@@ -95,8 +95,8 @@ class DeadZone(Law):
     equation = "w = -clip(u, -g, g)"
     source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
     sentence = "a dead zone: small signals have no effect"
-    units = {"g": "z"}
-    places = ("series",)
+    units: ClassVar[Mapping[str, str]] = {"g": "z"}
+    places: ClassVar[tuple[str, ...]] = ("series",)
 
     def force(self, z: Any, p: Any) -> Any:
         return -ca.fmax(ca.fmin(z, p.g), -p.g)
@@ -116,7 +116,7 @@ class AsymmetricDeadZone(DeadZone):
 
     form = "asymmetric"
     equation = "w = -clip(u, -g_1, g_2)"
-    units = {"g_1": "z", "g_2": "z"}
+    units: ClassVar[Mapping[str, str]] = {"g_1": "z", "g_2": "z"}
 
     def force(self, z: Any, p: Any) -> Any:
         return -ca.fmax(ca.fmin(z, p.g_2), -p.g_1)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -22,8 +22,8 @@ class StopHysteresis(Law):
     equation = "w = sum_i w_i stop_{r_i}[z]"
     source = "Krikelis et al. (2024), Eq. 2 and 16"
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
-    units = {"w": "w/z", "r": "z"}
-    strength = ("w",)
+    units: ClassVar[Mapping[str, str]] = {"w": "w/z", "r": "z"}
+    strength: ClassVar[tuple[str, ...]] = ("w",)
     dissipative = True
     n = 6
     memory = 6
@@ -58,7 +58,7 @@ class PlayHysteresis(StopHysteresis):
     equation = "w = sum_i w_i play_{r_i}[u]"
     source = "Krikelis et al. (2024), Eq. 1 and 16"
     sentence = "rate-independent hysteresis: the output depends on where the signal last turned round"
-    places = ("series",)
+    places: ClassVar[tuple[str, ...]] = ("series",)
     dissipative = False
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
@@ -71,13 +71,13 @@ class PlayHysteresis(StopHysteresis):
 
 
 class GeneralizedHysteresis(PlayHysteresis):
-    """Asymmetric hysteresis: plays of a bent signal (generalized Prandtl-Ishlinskii; Al Janaideh, Rakheja & Su 2011)."""
+    """Asymmetric hysteresis: plays of a bent signal (Al Janaideh, Rakheja & Su 2011)."""
 
     form = "generalized_play"
     equation = "w = sum_i w_i play_{r_i}[u + a_2 u^2 + a_3 u^3] + b_2 u^2"
     source = "Al Janaideh, Rakheja & Su (2011), IEEE/ASME Trans. Mechatronics 16(4); Krikelis et al. (2024), Eq. 14"
-    units = {"w": "w/z", "b_2": "w/z^2", "r": "z", "a_2": "1/z", "a_3": "1/z^2"}
-    strength = ("w", "b_2")
+    units: ClassVar[Mapping[str, str]] = {"w": "w/z", "b_2": "w/z^2", "r": "z", "a_2": "1/z", "a_3": "1/z^2"}
+    strength: ClassVar[tuple[str, ...]] = ("w", "b_2")
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         """Plays of the bent signal."""
@@ -111,8 +111,8 @@ class BoucWen(Law):
     equation = "w = k_h q,  dq/dt = dz/dt (1 - (1 - s + s sign(q dz/dt)) |q/q_0|^n)"
     source = "Wen (1976), J. Eng. Mech. 102(2); Ismail, Ikhouane & Rodellar (2009)"
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
-    units = {"k_h": "w/z", "q_0": "z", "s": "", "n": ""}
-    strength = ("k_h",)
+    units: ClassVar[Mapping[str, str]] = {"k_h": "w/z", "q_0": "z", "s": "", "n": ""}
+    strength: ClassVar[tuple[str, ...]] = ("k_h",)
     dissipative = True
     order = 1
 
@@ -138,8 +138,8 @@ class Backlash(Law):
     equation = "w = play_r[u] - u"
     source = "Nordin & Gutman (2002), Automatica 38(10)"
     sentence = "backlash: on every reversal the signal is lost until the play is taken up"
-    units = {"r": "z"}
-    places = ("series",)
+    units: ClassVar[Mapping[str, str]] = {"r": "z"}
+    places: ClassVar[tuple[str, ...]] = ("series",)
     memory = 1
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
@@ -162,8 +162,8 @@ class Delay(Law):
     equation = "w = u(t - T) - u(t)"
     source = "Ljung (1999), System Identification, sec. 4.2"
     sentence = "a pure delay: the signal arrives later than the simulator has it"
-    units = {"T": "s"}
-    places = ("series",)
+    units: ClassVar[Mapping[str, str]] = {"T": "s"}
+    places: ClassVar[tuple[str, ...]] = ("series",)
     h: float = 0.0  # length of a step, s
 
     def on_grid(self, h: float) -> Delay:
@@ -197,8 +197,8 @@ class Relaxation(Law):
     equation = "w = k_v (z - q),  dq/dt = (z - q) / T"
     source = "Findley, Lai & Onaran (1976), Creep and Relaxation, ch. 5"
     sentence = "creep: under a constant load the deflection goes on slowly"
-    units = {"k_v": "w/z", "T": "s"}
-    strength = ("k_v",)
+    units: ClassVar[Mapping[str, str]] = {"k_v": "w/z", "T": "s"}
+    strength: ClassVar[tuple[str, ...]] = ("k_v",)
     dissipative = True
     order = 1
 
@@ -222,9 +222,9 @@ class Creep(Relaxation):
     equation = "w = c q,  dq/dt = (u - q) / T"
     source = "Kuhnen & Janocha (2002), Control and Intelligent Systems 30(1)"
     sentence = "creep: after a step the signal goes on slowly in the same direction"
-    units = {"c": "", "T": "s"}
-    strength = ("c",)
-    places = ("series",)
+    units: ClassVar[Mapping[str, str]] = {"c": "", "T": "s"}
+    strength: ClassVar[tuple[str, ...]] = ("c",)
+    places: ClassVar[tuple[str, ...]] = ("series",)
     dissipative = False
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
@@ -239,8 +239,8 @@ class Lag(Law):
     equation = "w = q - u,  dq/dt = (u - q) / T"
     source = "Franklin, Powell & Emami-Naeini (2015), sec. 3.3"
     sentence = "an unmodelled lag: the signal follows with a time constant"
-    units = {"T": "s"}
-    places = ("series",)
+    units: ClassVar[Mapping[str, str]] = {"T": "s"}
+    places: ClassVar[tuple[str, ...]] = ("series",)
     order = 1
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
@@ -265,8 +265,8 @@ class Resonance(Law):
     equation = "w = q_1 - u,  d2q_1/dt2 = W^2 (u - q_1) - 2 D W dq_1/dt"
     source = "Franklin, Powell & Emami-Naeini (2015), sec. 3.3"
     sentence = "an unmodelled resonance in the path of the signal"
-    units = {"W": "rad/s", "D": ""}
-    places = ("series",)
+    units: ClassVar[Mapping[str, str]] = {"W": "rad/s", "D": ""}
+    places: ClassVar[tuple[str, ...]] = ("series",)
     order = 2
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
@@ -277,7 +277,7 @@ class Resonance(Law):
         return ca.vertcat(p.W * q[1], p.W * (z - q[0]) - 2 * p.D * p.W * q[1])
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(W=np.geomspace(0.015, 1.2, 20) / local.dt, D=[0.02, 0.2])
+        yield from grid(W=np.geomspace(0.015, 1.2, 16) / local.dt, D=[0.05])
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"W": (8 / local.duration, 1.6 / local.dt), "D": (1e-3, 2.0)}
@@ -289,9 +289,10 @@ class Mode(Resonance):
     form = "mode"
     equation = "w = c_1 q_1 + c_2 q_2,  dq_1/dt = W q_2,  dq_2/dt = W (u - q_1) - 2 D W q_2"
     source = "Preumont (2011), Vibration Control of Active Structures, sec. 2.6"
-    sentence = "an unmodelled mode beside the path of the signal"
-    units = {"c_1": "", "c_2": "", "W": "rad/s", "D": ""}
-    strength = ("c_1", "c_2")
+    sentence = "an unmodelled mode that the signal excites"
+    units: ClassVar[Mapping[str, str]] = {"c_1": "w/z", "c_2": "w/z", "W": "rad/s", "D": ""}
+    strength: ClassVar[tuple[str, ...]] = ("c_1", "c_2")
+    places: ClassVar[tuple[str, ...]] = ("parallel", "series")
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c_1 * q[0] + p.c_2 * q[1]
@@ -304,9 +305,9 @@ class Attached(Resonance):
     equation = "w = k_a (z - q_1),  d2q_1/dt2 = W^2 (z - q_1) - 2 D W dq_1/dt"
     source = "Den Hartog (1956), Mechanical Vibrations, sec. 3.2"
     sentence = "an unmodelled mode: a part on a spring of its own that is carried along"
-    units = {"k_a": "w/z", "W": "rad/s", "D": ""}
-    strength = ("k_a",)
-    places = ("parallel",)
+    units: ClassVar[Mapping[str, str]] = {"k_a": "w/z", "W": "rad/s", "D": ""}
+    strength: ClassVar[tuple[str, ...]] = ("k_a",)
+    places: ClassVar[tuple[str, ...]] = ("parallel",)
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return p.k_a * (z - q[0])
@@ -319,9 +320,9 @@ class Drift(Law):
     equation = "w = a t + b t^2"
     source = "Ljung (1999), System Identification, sec. 14.1"
     sentence = "a slow trend in time that no input explains"
-    units = {"a": "w/s", "b": "w/s^2"}
-    strength = ("a", "b")
-    places = ("parallel", "series")
+    units: ClassVar[Mapping[str, str]] = {"a": "w/s", "b": "w/s^2"}
+    strength: ClassVar[tuple[str, ...]] = ("a", "b")
+    places: ClassVar[tuple[str, ...]] = ("parallel", "series")
 
     def force(self, t: Any, p: Any) -> Any:
         return p.a * t + p.b * t**2

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -18,8 +18,8 @@ class CubicStiffness(Law):
     equation = "w = k_3 z^3"
     source = "Kovacic & Brennan (2011), The Duffing Equation, ch. 1"
     sentence = "a stiffness that grows (or falls) with the square of the deflection, the same in both directions"
-    units = {"k_3": "w/z^3"}
-    strength = ("k_3",)
+    units: ClassVar[Mapping[str, str]] = {"k_3": "w/z^3"}
+    strength: ClassVar[tuple[str, ...]] = ("k_3",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_3 * z**3
@@ -30,8 +30,8 @@ class PowerStiffness(CubicStiffness):
 
     form = "power"
     equation = "w = k_n sign(z) |z|^n"
-    units = {"k_n": "w/z^n", "n": ""}
-    strength = ("k_n",)
+    units: ClassVar[Mapping[str, str]] = {"k_n": "w/z^n", "n": ""}
+    strength: ClassVar[tuple[str, ...]] = ("k_n",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_n * ca.sign(z) * (ca.fabs(z) + 1e-12) ** p.n
@@ -43,6 +43,18 @@ class PowerStiffness(CubicStiffness):
         return {"n": (1.7, 6.0)}
 
 
+class QuinticStiffness(CubicStiffness):
+    """A hardening spring that follows its cube only at first."""
+
+    form = "quintic"
+    equation = "w = k_3 z^3 + k_5 z^5"
+    units: ClassVar[Mapping[str, str]] = {"k_3": "w/z^3", "k_5": "w/z^5"}
+    strength: ClassVar[tuple[str, ...]] = ("k_3", "k_5")
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k_3 * z**3 + p.k_5 * z**5
+
+
 class QuadraticStiffness(Law):
     """A spring that is stiffer in one direction (Nayfeh & Mook 1979)."""
 
@@ -50,8 +62,8 @@ class QuadraticStiffness(Law):
     equation = "w = k_2 z^2"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 4.2"
     sentence = "a stiffness that changes in proportion to the deflection, so that it is stiffer in one direction"
-    units = {"k_2": "w/z^2"}
-    strength = ("k_2",)
+    units: ClassVar[Mapping[str, str]] = {"k_2": "w/z^2"}
+    strength: ClassVar[tuple[str, ...]] = ("k_2",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_2 * z**2
@@ -65,8 +77,8 @@ class PiecewiseStiffness(Law):
     equation = "w = k_c max(z - g, 0)"
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
     sentence = "a contact: beyond a point of the travel another stiffness sets in"
-    units = {"k_c": "w/z", "g": "z"}
-    strength = ("k_c",)
+    units: ClassVar[Mapping[str, str]] = {"k_c": "w/z", "g": "z"}
+    strength: ClassVar[tuple[str, ...]] = ("k_c",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_c * ca.fmax(z - p.g, 0)
@@ -94,7 +106,7 @@ class HertzContact(PiecewiseStiffness):
     form = "hertz"
     equation = "w = k_c max(z - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
-    units = {"k_c": "w/z^1.5", "g": "z"}
+    units: ClassVar[Mapping[str, str]] = {"k_c": "w/z^1.5", "g": "z"}
 
     def force(self, z: Any, p: Any) -> Any:
         depth = ca.fmax(z - p.g, 0)
@@ -109,8 +121,8 @@ class Clearance(Law):
     equation = "w = k_g (z - clip(z, -g, g))"
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
     sentence = "a clearance: the spring carries load only beyond a gap on either side"
-    units = {"k_g": "w/z", "g": "z"}
-    strength = ("k_g",)
+    units: ClassVar[Mapping[str, str]] = {"k_g": "w/z", "g": "z"}
+    strength: ClassVar[tuple[str, ...]] = ("k_g",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_g * (ca.fmax(z - p.g, 0) - ca.fmax(-z - p.g, 0))
@@ -122,7 +134,9 @@ class Clearance(Law):
         return {"g": (1e-3 * local.reach, 0.97 * local.reach)}
 
     def applies(self, local: Local) -> str:
-        return "" if local.low < -0.05 * local.reach and local.high > 0.05 * local.reach else "one side is never visited"
+        return (
+            "" if local.low < -0.05 * local.reach and local.high > 0.05 * local.reach else "one side is never visited"
+        )
 
 
 class SoftClearance(Clearance):
@@ -131,7 +145,7 @@ class SoftClearance(Clearance):
     form = "hertz"
     equation = "w = k_g sign(z) max(|z| - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
-    units = {"k_g": "w/z^1.5", "g": "z"}
+    units: ClassVar[Mapping[str, str]] = {"k_g": "w/z^1.5", "g": "z"}
 
     def force(self, z: Any, p: Any) -> Any:
         above, below = ca.fmax(z - p.g, 0), ca.fmax(-z - p.g, 0)
@@ -143,7 +157,7 @@ class OffCentreClearance(Clearance):
 
     form = "off-centre"
     equation = "w = k_g (z - clip(z, m - g, m + g))"
-    units = {"k_g": "w/z", "g": "z", "m": "z"}
+    units: ClassVar[Mapping[str, str]] = {"k_g": "w/z", "g": "z", "m": "z"}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_g * (ca.fmax(z - p.m - p.g, 0) - ca.fmax(p.m - z - p.g, 0))
@@ -163,15 +177,15 @@ class PeriodicForce(Law):
     equation = "w = a sin(2 pi z / L) + b cos(2 pi z / L)"
     source = "Hanselman (2006), Brushless Permanent Magnet Motor Design, sec. 8.3"
     sentence = "a force that repeats with position, as from cogging or the pitch of a screw or gear"
-    units = {"a": "w", "b": "w", "L": "z"}
-    strength = ("a", "b")
+    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "L": "z"}
+    strength: ClassVar[tuple[str, ...]] = ("a", "b")
 
     def force(self, z: Any, p: Any) -> Any:
         angle = 2 * np.pi * z / p.L
         return p.a * ca.sin(angle) + p.b * ca.cos(angle)
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(L=2 * local.half / np.arange(1.5, 24.1, 0.5))
+        yield from grid(L=2 * local.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 24.1, 1.0)]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"L": (2 * local.half / 60, 2 * local.half / 1.5)}
@@ -185,9 +199,9 @@ class Polynomial(Law):
     equation = "w = a_2 z^2 + a_3 z^3"
     source = "Billings & Fakhouri (1982), Automatica 18(1)"
     sentence = "a memoryless curve: the signal is bent by its own square and cube"
-    units = {"a_2": "w/z^2", "a_3": "w/z^3"}
-    strength = ("a_2", "a_3")
-    places = ("series",)
+    units: ClassVar[Mapping[str, str]] = {"a_2": "w/z^2", "a_3": "w/z^3"}
+    strength: ClassVar[tuple[str, ...]] = ("a_2", "a_3")
+    places: ClassVar[tuple[str, ...]] = ("series",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a_2 * z**2 + p.a_3 * z**3
@@ -198,8 +212,8 @@ class Quadratic(Polynomial):
 
     form = "quadratic"
     equation = "w = a_2 z^2"
-    units = {"a_2": "w/z^2"}
-    strength = ("a_2",)
+    units: ClassVar[Mapping[str, str]] = {"a_2": "w/z^2"}
+    strength: ClassVar[tuple[str, ...]] = ("a_2",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a_2 * z**2
@@ -210,8 +224,8 @@ class Cubic(Polynomial):
 
     form = "cubic"
     equation = "w = a_3 z^3"
-    units = {"a_3": "w/z^3"}
-    strength = ("a_3",)
+    units: ClassVar[Mapping[str, str]] = {"a_3": "w/z^3"}
+    strength: ClassVar[tuple[str, ...]] = ("a_3",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a_3 * z**3
@@ -222,8 +236,8 @@ class Magnitude(Polynomial):
 
     form = "magnitude"
     equation = "w = a |z|"
-    units = {"a": "w/z"}
-    strength = ("a",)
+    units: ClassVar[Mapping[str, str]] = {"a": "w/z"}
+    strength: ClassVar[tuple[str, ...]] = ("a",)
     sentence = "a memoryless curve: the gain differs between the two signs"
 
     def force(self, z: Any, p: Any) -> Any:
@@ -237,8 +251,8 @@ class Power(Polynomial):
     equation = "w = a sign(z) |z|^n"
     source = "White (2011), Fluid Mechanics, sec. 3.5"
     sentence = "a memoryless curve: a power of the local signal, as in flow through an orifice"
-    units = {"a": "w/z^n", "n": ""}
-    strength = ("a",)
+    units: ClassVar[Mapping[str, str]] = {"a": "w/z^n", "n": ""}
+    strength: ClassVar[tuple[str, ...]] = ("a",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a * ca.sign(z) * (ca.fabs(z) + 1e-12) ** p.n
@@ -254,7 +268,7 @@ class Root(Power):
     """A power below one inside the dynamics, such as flow through an orifice under its own head."""
 
     form = "root"
-    places = ("parallel",)
+    places: ClassVar[tuple[str, ...]] = ("parallel",)
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield from grid(n=[0.4, 0.5, 0.65])

@@ -37,7 +37,7 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
     """
     if not shapes:
         return np.zeros((len(local.z), 0, columns(law)))
-    law = law.on_grid(local.dt) if hasattr(law, "on_grid") else law
+    law = law.on_grid(local.dt)
     z, dz, t = ca.SX.sym("z"), ca.SX.sym("dz"), ca.SX.sym("t")
     following, dz_next = ca.SX.sym("z_next"), ca.SX.sym("dz_next")
     n_q, n_s = law.order, int(getattr(law, "memory", 0)) if hasattr(law, "step") else 0

@@ -1,0 +1,109 @@
+"""What to measure next where two explanations tie, and the placebo that a named law has to beat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..laws import Law
+from .linearise import Probe, run
+from .screen import columns_of, folds, held_out
+from .workbench import Fitted, Workbench
+
+SHARES = (0.1, 0.3, 1.0)  # of the largest amplitude
+SINES = 12  # frequencies tried
+SECONDS = 3000  # samples of a tried experiment
+
+
+def next_experiment(
+    bench: Workbench, one: Fitted, other: Fitted, noise: np.ndarray, limits: Mapping[str, float] | None = None
+) -> dict[str, Any] | None:
+    """The input that separates two fitted explanations best.
+
+    Parameters
+    ----------
+    noise : array, shape (n_y,)
+        Deviation of the outputs' noise.
+    limits : mapping, optional
+        Largest amplitude of each input; by default what was recorded.
+
+    Returns
+    -------
+    dict or None
+        `input`, `waveform`, `amplitude`, `frequency` (Hz), `separation` (rms difference over the noise), `recorded`
+        (that of the recordings) and `sentence`; None where nothing within the limits separates them.
+    """
+    u = np.concatenate([r.u for r in bench.recordings])
+    m, dt = min(max(map(len, bench.recordings)), SECONDS), bench.dt
+    t, rest = np.arange(m) * dt, np.median(u, axis=0)
+    best: dict[str, Any] | None = None
+
+    def separation(drive: np.ndarray) -> float:
+        recording = bench.recordings[0].with_(
+            u=drive, y=np.zeros((len(drive), len(noise))), initial="zero", period=None, skip=0
+        )
+        with np.errstate(all="ignore"):
+            y = [
+                f.engine.simulate(f.model.drive(recording), f.vector, np.zeros(f.model.n_x))[0] for f in (one, other)
+            ]
+            value = float(np.sqrt(np.mean(((y[0] - y[1]) / np.maximum(noise, 1e-300)) ** 2)))
+        return value if np.isfinite(value) else 0.0
+
+    recorded = max(separation(r.u[:m]) for r in bench.recordings)
+    for i, name in enumerate(bench.simulator.inputs):
+        most = (limits or {}).get(name, float(np.max(np.abs(u[:, i] - rest[i]))))
+        trials = [("sine", f) for f in np.geomspace(4 / (m * dt), 0.2 / dt, SINES)]
+        trials += [("triangle", f) for f in np.geomspace(2 / (m * dt), 0.02 / dt, 5)]
+        for waveform, f in trials:
+            wave = np.sin(2 * np.pi * f * t)
+            if waveform == "triangle":
+                wave = 2 / np.pi * np.arcsin(wave)
+            for share in SHARES:
+                drive = np.tile(rest, (m, 1))
+                drive[:, i] += share * most * wave
+                value = separation(drive)
+                if best is None or value > 1.05 * best["separation"]:
+                    best = {
+                        "input": name,
+                        "waveform": waveform,
+                        "amplitude": share * most,
+                        "frequency": float(f),
+                        "separation": value,
+                    }
+    if best is None or best["separation"] < 1.0:
+        return None
+    unit = bench.recordings[0].units.get(best["input"], "")
+    best["recorded"] = recorded
+    best["sentence"] = (
+        f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {best['amplitude']:.3g}"
+        f"{' ' + unit if unit else ''} at {best['input']} separates them best: their outputs then differ by "
+        f"{best['separation']:.3g} times the noise ({recorded:.3g} times in the recordings)."
+    )
+    return best
+
+
+def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[float, float]:
+    """Share of the residual that a small dose of a law explains, held out: driven by its own signal, and by another.
+
+    The other is the port's own signal half a recording later: alike in every statistic, but unrelated to the residual.
+    """
+    probe = Probe.of(bench, fitted)
+    runs = [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
+    shares = []
+    for moved in (False, True):
+        shifted = [
+            replace(r, z=np.roll(r.z, len(r.z) // 2, axis=0), dz=np.roll(r.dz, len(r.dz) // 2, axis=0)) if moved else r
+            for r in runs
+        ]
+        tasks, phi, left = columns_of(bench, probe, shifted, [type(law)], None)
+        odd, at, best = folds(len(left), len(runs)), 0, 0.0
+        for task in tasks:
+            width = task.forces.shape[1]
+            if task.port.name == port:
+                best = held_out(phi[:, at : at + width], left, odd, (1e-6, 1e-3))
+            at += width
+        shares.append(best)
+    return shares[0], shares[1]

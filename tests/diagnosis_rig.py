@@ -1,0 +1,71 @@
+"""A 2-DOF rig with one law hidden in a port, for the tests of the diagnosis."""
+
+import numpy as np
+
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.integration import choose_substeps, discretise
+from pilfr_casadi.parameters import Parameter
+from pilfr_casadi.recording import Recording
+from pilfr_casadi.simulator import Port, Simulator
+
+DT, SAMPLES = 2e-3, 2500
+
+
+def _dynamics(x, u, p):
+    spring, damper = p.k2 * (x.p1 - x.p2), p.d2 * (x.v1 - x.v2)
+    return {
+        "p1": x.v1,
+        "v1": (u.force - p.k1 * x.p1 - p.d1 * x.v1 - spring - damper) / p.m1,
+        "p2": x.v2,
+        "v2": (spring + damper) / p.m2,
+    }
+
+
+def rig(factors=(1.0, 1.0, 1.0, 1.0)):
+    """The rig with k1, d1, k2, d2 off by factors."""
+    k1, d1, k2, d2 = factors
+    return Simulator(
+        _dynamics,
+        lambda x: {"x2": x.p2},
+        states=("p1", "v1", "p2", "v2"),
+        inputs=("force",),
+        parameters={
+            "m1": Parameter(2.0, unit="kg", fixed=True),
+            "m2": Parameter(1.0, unit="kg", fixed=True),
+            "k1": Parameter(1100.0 * k1, unit="N/m", bounds=(100, 9000)),
+            "d1": Parameter(8.0 * d1, unit="N s/m", bounds=(0, 100)),
+            "k2": Parameter(3000.0 * k2, unit="N/m", bounds=(100, 30000)),
+            "d2": Parameter(4.0 * d2, unit="N s/m", bounds=(0, 100)),
+        },
+        ports=(
+            Port("ground-m1", lambda p: {"v1": -1 / p.m1}, lambda x: x.p1, lambda x: x.v1, "N", "m"),
+            Port(
+                "m1-m2",
+                lambda p: {"v1": -1 / p.m1, "v2": 1 / p.m2},
+                lambda x: x.p1 - x.p2,
+                lambda x: x.v1 - x.v2,
+                "N",
+                "m",
+            ),
+        ),
+    )
+
+
+OFF = (1.1, 0.8, 0.9, 1.2)
+
+
+def recordings(law=None, port="ground-m1", seed=0, count=2, noise=1e-3, hold="zero"):
+    """Recordings of the rig with a law in a port, from rest."""
+    rng = np.random.default_rng(seed)
+    true = rig() if law is None else rig().with_element(port, law)
+    t = np.arange(SAMPLES) * DT
+    out = []
+    for _ in range(count):
+        f, phase = np.linspace(0.3, 12, 60), rng.uniform(0, 2 * np.pi, 60)
+        v = np.sum(np.cos(2 * np.pi * f[:, None] * t + phase[:, None]), axis=0)
+        u = (40 * v / np.std(v) * (0.3 + 0.7 * np.sin(np.pi * t / t[-1])))[:, None]
+        blank = Recording(u, u, DT, inputs=("force",), outputs=("x2",), initial="zero", hold=hold)
+        model = discretise(true, DT, hold, max(4, choose_substeps(true, [blank])))
+        y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_x))[0]
+        out.append(blank.with_(y=y + noise * np.std(y) * rng.standard_normal(y.shape)))
+    return out

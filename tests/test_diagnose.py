@@ -1,0 +1,109 @@
+"""The diagnosis end to end on a rig whose truth is known, and its honest other answers."""
+
+import json
+
+import numpy as np
+import pytest
+from diagnosis_rig import OFF, recordings, rig
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.laws import CATALOGUE
+from pilfr_casadi.laws.friction import CoulombFriction
+from pilfr_casadi.laws.memory import Backlash
+from pilfr_casadi.laws.stiffness import CubicStiffness
+
+IDS = {
+    "cubic_stiffness",
+    "quadratic_stiffness",
+    "piecewise_stiffness",
+    "clearance",
+    "coulomb_friction",
+    "stribeck_friction",
+    "quadratic_drag",
+    "cubic_damping",
+    "hysteresis",
+    "backlash",
+    "saturation",
+    "dead_zone",
+    "static_curve",
+    "delay",
+    "creep",
+    "drift",
+    "periodic_force",
+    "extra_mode",
+}
+
+
+def test_the_catalogue_holds_every_law_of_the_contract():
+    assert {law.id for law in CATALOGUE} == IDS
+    for law in CATALOGUE:
+        assert law.equation
+        assert law.source
+        assert law.sentence
+        assert set(law.strength) <= set(law.units)
+
+
+@pytest.mark.parametrize(
+    ("port", "law"),
+    [
+        ("ground-m1", CubicStiffness().at({"k_3": 4e5})),
+        ("m1-m2", CoulombFriction().at({"F_c": 4.0, "v_0": 1e-3})),
+        ("sensor:x2", Backlash().at({"r": 0.002})),
+    ],
+    ids=lambda v: v if isinstance(v, str) else v.id,
+)
+def test_a_hidden_law_is_named_at_its_port(port, law):
+    train, test = recordings(law, port), recordings(law, port, seed=7, count=1)
+    found = pilfr.diagnose(rig(OFF), train, test=test)
+    assert found.verdict == "missing-physics"
+    assert [(e.port, e.law) for e in found.effects] == [(port, law.id)]
+    assert found.effects[0].confidence > 0.8
+    errors = found.errors["test"]
+    assert errors["after"] < 1.3e-3 < errors["before"]
+    for name, truth in (("k1", 1100), ("k2", 3000)):
+        assert found.parameters[name]["refit_with"] == pytest.approx(truth, rel=0.03)
+    answer = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert answer["verdict"] == "missing-physics"
+    assert {"port", "law", "nrmse_train", "nrmse_validation", "delta_bic"} <= set(answer["candidates"][0])
+
+
+def test_nothing_missing_is_said():
+    found = pilfr.diagnose(rig(OFF), recordings())
+    assert found.verdict == "complete"
+    assert not found.effects
+    assert found.errors["test"] is None
+
+
+def test_a_wrong_sign_is_a_fault_of_the_recording():
+    train = [r.with_(y=-r.y) for r in recordings()]
+    found = pilfr.diagnose(rig(OFF), train)
+    assert found.verdict == "recording-fault"
+    assert [(g.channel, g.finding) for g in found.gates] == [("x2", "sign")]
+
+
+def test_an_output_before_its_cause_is_a_fault_of_the_recording():
+    train = [r.with_(y=np.vstack([r.y[7:], np.repeat(r.y[-1:], 7, axis=0)])) for r in recordings()]
+    found = pilfr.diagnose(rig(OFF), train)
+    assert found.verdict == "recording-fault"
+    assert found.gates[-1].finding == "alignment"
+    assert found.gates[-1].value == pytest.approx(-7 * 2e-3, abs=2e-4)
+
+
+def test_a_clipped_output_is_a_fault_of_the_recording():
+    records = recordings()
+    limit = 0.6 * max(np.abs(r.y).max() for r in records)
+    found = pilfr.diagnose(rig(OFF), [r.with_(y=np.clip(r.y, -limit, limit)) for r in records])
+    assert found.verdict == "recording-fault"
+    assert [g.finding for g in found.gates] == ["clipping"]
+
+
+def test_test_data_that_was_trained_on_is_refused():
+    train = recordings()
+    with pytest.raises(pilfr.InputError, match="equals a training recording"):
+        pilfr.diagnose(rig(), train, test=train[0])
+
+
+def test_a_missing_column_is_said():
+    train = [r.with_(outputs=("x3",)) for r in recordings()]
+    with pytest.raises(pilfr.InputError, match="no output 'x2'"):
+        pilfr.diagnose(rig(), train)
