@@ -183,7 +183,8 @@ def _compile(cc: str, source: str, key: str) -> Path:
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
         c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
         c_file.write_text(source, encoding="utf-8")
-        for flags in FLAGS:
+        options: tuple[tuple[str, ...], ...] = FLAGS
+        for flags in options:
             if len(source) > LONG:  # what takes seconds to compile gains little from it
                 flags = tuple("-O1" if flag == "-O2" else flag for flag in flags)
             command = [cc, *flags, str(c_file), "-o", str(partial), "-lm"]

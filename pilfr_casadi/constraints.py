@@ -5,8 +5,10 @@ so
 
     (1/m) log ‖A^m‖_F <= log ρ_max,   m = 2^squarings,
 
-is one smooth inequality that guarantees the bound exactly, at any point where it holds. Repeated squaring with the norm
-taken out after each step keeps the numbers in range.
+is one smooth inequality that guarantees the bound, at any point where it holds. Repeated squaring with the norm taken
+out after each step keeps the numbers in range. Where eigenvalues coincide (a double integrator) the powers grow as
+m^(n-1) and the left-hand side exceeds `log ρ(A)` by up to `(n - 1) log(m) / m`, 1.3e-5 (n - 1) here, with slopes of the
+size of m. `stable` therefore has a slack, and a violation as small as that slack is no failure of a solver.
 """
 
 from __future__ import annotations
@@ -21,6 +23,10 @@ import numpy as np
 from .parameters import ParameterSet
 from .recording import InputError
 
+TOLERATED = 1e-6  # violation, in units of a constraint, that is no failure
+UNIT = 100.0  # unit of log ρ: a violation of 1e-4 is tolerated
+SLACK = 1e-4  # share by which `stable` lets the radius exceed its limit
+
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
@@ -34,12 +40,16 @@ class Constraint:
         Bounds of the expression; equal for an equation.
     name : str
         How the constraint is called in results.
+    unit : float, optional
+        A change of the expression that counts: violations are judged next to it. By default the largest change that one
+        of its variables brings about when it changes by its own size, so that units do not matter.
     """
 
     expression: Callable[[Mapping[str, Any]], Any]
     lower: Any = -np.inf
     upper: Any = np.inf
     name: str = "constraint"
+    unit: float | None = None
 
 
 def log_norm_of_power(matrix: Any, squarings: int = 20) -> Any:
@@ -72,33 +82,42 @@ class LogRadius:
 
 
 def stable(
-    radius: float = 1.0, matrix: Callable[[Mapping[str, Any]], Any] = linear_part, name: str = "spectral radius"
+    radius: float = 1.0,
+    matrix: Callable[[Mapping[str, Any]], Any] = linear_part,
+    name: str = "spectral radius",
+    slack: float = SLACK,
 ) -> Constraint:
     """Spectral radius of `A` (or of another square expression of the parameters) at most `radius`.
+
+    What holds is `radius (1 + slack)`. Without slack no solver could meet a limit of 1 at a double integrator.
 
     Raises
     ------
     InputError
-        If the radius is not positive.
+        If the radius is not positive, or the slack negative.
     """
-    if not radius > 0:
-        raise InputError(f"The spectral radius was bounded by {radius}; give a positive number.")
-    return Constraint(LogRadius(matrix), upper=float(np.log(radius)), name=f"{name} <= {radius:g}")
+    if not (radius > 0 and slack >= 0):
+        raise InputError(
+            f"The spectral radius was bounded by {radius} with slack {slack}; give a positive number, and 0 or more."
+        )
+    return Constraint(
+        LogRadius(matrix), upper=float(np.log(radius) + np.log1p(slack)), name=f"{name} <= {radius:g}", unit=UNIT
+    )
 
 
 def compile_constraints(
     constraints: tuple[Constraint, ...], parameters: ParameterSet
-) -> tuple[ca.Function, ca.Function, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """One Function `p -> g`, its Jacobian, the bounds and a label an entry.
+) -> tuple[ca.Function, ca.Function, np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:
+    """One Function `p -> g`, its Jacobian, the bounds, a label and a unit an entry (nan: not given).
 
     Raises
     ------
     InputError
-        If an expression fails, names an unknown parameter, or its bounds are infeasible.
+        If an expression fails, names an unknown parameter, its bounds are infeasible, or its unit is not positive.
     """
     vector = ca.MX.sym("p", parameters.size)
     named = parameters.symbols(vector)
-    parts, lower, upper, labels = [], [np.zeros(0)], [np.zeros(0)], []
+    parts, lower, upper, labels, units = [], [np.zeros(0)], [np.zeros(0)], [], [np.zeros(0)]
     for c in constraints:
         try:
             g = ca.vec(c.expression(named))
@@ -115,6 +134,9 @@ def compile_constraints(
             ) from None
         if not np.all(low <= high):
             raise InputError(f"The constraint {c.name!r} is infeasible: its lower bound exceeds its upper bound.")
+        if c.unit is not None and not 0 < c.unit < np.inf:
+            raise InputError(f"The unit of the constraint {c.name!r} is {c.unit!r}; give a positive number, or none.")
+        units.append(np.full(size, np.nan if c.unit is None else float(c.unit)))
         parts.append(g)
         lower.append(low)
         upper.append(high)
@@ -122,4 +144,4 @@ def compile_constraints(
     g = ca.densify(ca.vertcat(*parts)) if parts else ca.MX(0, 1)
     value = ca.Function("g", [vector], [g], ["p"], ["g"])
     slope = ca.Function("g_slope", [vector], [ca.densify(ca.jacobian(g, vector))], ["p"], ["jac"])
-    return value, slope, np.concatenate(lower), np.concatenate(upper), tuple(labels)
+    return value, slope, np.concatenate(lower), np.concatenate(upper), tuple(labels), np.concatenate(units)

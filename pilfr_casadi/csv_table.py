@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .recording import InputError
+from .checks import LARGEST, InputError, usable
 
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
 
@@ -47,13 +47,18 @@ class CsvTable:
         Raises
         ------
         InputError
-            For a cell that is empty, not a number or not finite, and for a row of the wrong length.
+            For a cell that is empty, not a number, not finite or too large, and for a row of the wrong length.
         """
         where = [self.names.index(name) for name in names]
         numbers = self._fast(where)
-        if numbers is None or not np.isfinite(numbers).all():
+        if numbers is None or not usable(numbers).all():
             numbers = self._cell_by_cell(where)
         return numbers
+
+    def texts(self, name: str) -> list[str]:
+        """Return the cells of a column as they are written."""
+        where = self.names.index(name)
+        return [_cells(text, self.delimiter, str(self.path))[where] for text in self.lines if text.strip()]
 
     def line_of_row(self, row: int) -> int:
         """Return the line number in the file of the data row `row`, counted from 0."""
@@ -93,9 +98,10 @@ class CsvTable:
             if cell.count(",") == 1 and cell.replace(",", "").strip(" +-").isdigit():
                 hint = "write decimals with a point"
             raise InputError(f"{place} reads {cell.strip()[:40]!r}, which is not a number; {hint}.")
-        if not np.isfinite(value):
+        if not usable(np.array(value)):
             raise InputError(
-                f"{place} is {cell.strip()}; only finite numbers can be used: repair or cut out that piece."
+                f"{place} is {cell.strip()}; only finite numbers up to {LARGEST:g} can be used: repair or cut out that "
+                "piece, or give it in another unit."
             )
         return value
 

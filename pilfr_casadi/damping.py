@@ -14,6 +14,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .magnitude import Neighbours
+
+ROUNDING = 1e-20  # squares of columns that are rounding
+
+
+def without_rounding(squares: np.ndarray, theta: np.ndarray, neighbours: Neighbours) -> np.ndarray:
+    """Squared column norms (n,) in which those that are zero or rounding are replaced.
+
+    A column is rounding where it is so next to the others of its matrix, and a change of its variable by the variable's
+    size changes the outputs by nothing: a state that nothing excites. It gets the norm with which that change would
+    change the outputs by their own size; what rounding says about the variable is then damped away.
+    """
+    size = neighbours.sizes(theta)
+    idle = (squares <= ROUNDING * neighbours.largest(squares)) & (squares * size**2 <= ROUNDING)
+    return np.asarray(np.where(idle, 1.0 / np.where(size > 0, size, 1.0) ** 2, squares))
+
 
 @dataclass(frozen=True, eq=False)
 class Point:
@@ -52,8 +68,8 @@ class Damping:
                 self._follow(self._ratio(self.before, point, multipliers))
             self.value = min(max(self.value, 1e-12), 1e12)
         self.largest = np.maximum(self.largest, np.diag(point.hessian))
-        # a column that has been zero so far does not move, whatever its damping
-        self.damped = point.hessian + self.value * np.diag(np.where(self.largest > 0, self.largest, 1.0))
+        # the variables are scaled: next to 1, what is less has been zero or rounding so far
+        self.damped = point.hessian + self.value * np.diag(np.where(self.largest > ROUNDING, self.largest, 1.0))
         self.before = point
         return self.damped
 

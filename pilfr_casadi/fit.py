@@ -1,192 +1,107 @@
-"""`fit`: the verb that takes a model and recordings and returns one immutable result."""
+"""`fit`: the verb that takes a model and recordings and returns one immutable result.
+
+Three ways lead to it: from an earlier fit or a closed model of one's own (`_from_values`), to a linear model
+(`_linear`), and from nothing to a PI-LFR (`_from_starts`; `multistart` says how). Where an L1 penalty is asked for, a
+last solve follows (`penalty`).
+"""
 
 from __future__ import annotations
 
-import hashlib
-import os
+import multiprocessing
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from .compiled import make_engine
 from .constraints import Constraint
 from .elements import PrandtlIshlinskii
-from .gauge import standard_errors
+from .fitted import Fit, Progress, fingerprint, outcome, with_solution
 from .gauss_newton import GaussNewton
+from .interrupts import deferred_interrupt
+from .ipopt import Ipopt
 from .lfr import PILFR
-from .metrics import nrmse
+from .linear_model import iterations, linear_model
 from .model import Model
-from .multistart import KEEP, POLISH, PRIOR, Candidate, Search, linear_model, search_starts, stability
+from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability
+from .penalty import check_penalty, element_alone, merged, restored, sentence, unit_weights, without_idle
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings, check_for_identification
-from .sensitivities import Engine
 from .solution import Solution, Status
 from .threads import one_blas_thread
 
-Progress = Callable[[str, int, int, float], None]
+__all__ = ["Fit", "Progress", "fingerprint", "fit"]
+DEAD_WORKER = (
+    "A worker process ended before it returned a result (it may have run out of memory); use fewer workers, or "
+    "workers=1."
+)
+NO_GUARD = (
+    "The worker processes could not begin: where processes are spawned, each runs the script again from its top, so "
+    'put the call of fit below `if __name__ == "__main__":`, or use workers=1.'
+)
+
+
+Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
+ROUNDS, AGREE = 5, 0.05  # of noise estimates: how many at most, and the relative change that ends them
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """A fitted model and how it came about.
+class _Job:
+    """What the ways to a fit share."""
 
-    Attributes
-    ----------
-    model : Model
-        Closed model with the fitted values as its parameters' values.
-    structure : PILFR or None
-        What was asked for, where it was a PI-LFR.
-    solution : Solution
-        Status, cost, iterations, history, multipliers.
-    train_nrmse : tuple of float
-        NRMSE (Eq. 27) of each training recording.
-    initial : dict
-        Fingerprint of each training recording -> state with memory at its first sample.
-    labels : tuple of str
-        Names of the variables in `solution.theta`.
-    errors : dict
-        Standard errors by parameter name, in the gauge of `gauge.standard_errors`; nan where fixed or at a bound.
-    candidates : tuple of Candidate
-        Every start that was tried.
-    """
+    recordings: tuple[Recording, ...]
+    solver: Any
+    limits: tuple[Constraint, ...]
+    l1: dict[str, float]
+    noise: float | None
+    engine: str
+    progress: Progress | None
+    began: float = field(default_factory=time.perf_counter)
 
-    model: Model
-    structure: PILFR | None
-    dt: float
-    solution: Solution
-    train_nrmse: tuple[float, ...]
-    initial: dict[str, np.ndarray]
-    labels: tuple[str, ...] = ()
-    errors: dict[str, np.ndarray] = field(default_factory=dict)
-    active: tuple[str, ...] = ()
-    candidates: tuple[Candidate, ...] = ()
-    linear: Model | None = None
-    seconds: float = 0.0
-    units: dict[str, str] = field(default_factory=dict)
-    engine: str = "auto"
-    note: str = ""
+    def problem(self, model: Model, noise: float = 1.0, **options: Any) -> Problem:
+        """The simulation-error problem of a model."""
+        given = {"constraints": self.limits, "noise": self.noise or noise, "engine": self.engine, **options}
+        return Problem(model, self.recordings, **given)
 
-    @property
-    def status(self) -> Status:
-        """How the winning solve ended."""
-        return self.solution.status
+    def settled(self, problem: Problem, solution: Solution, stage: str, **options: Any) -> tuple[Problem, Solution]:
+        """Problem and solution with the noise at the error that is reached, where priors are weighed against it."""
+        priors = any(p.prior is not None and not np.all(p.fixed) for p in problem.model.parameters.values())
+        for _ in range(ROUNDS if priors and self.noise is None else 0):
+            error = _error(problem, solution)
+            if abs(error / problem.noise - 1) < AGREE or error == 0 or solution.status is Status.INTERRUPTED:
+                break
+            problem = self.problem(problem.model, error, **{**options, "engine": problem.engine})
+            solution = self.solve(problem, stage, solution.theta)
+        return problem, solution
 
-    @property
-    def parameters(self) -> dict[str, np.ndarray]:
-        """Fitted values by name."""
-        return {name: p.value for name, p in self.model.parameters.items()}
+    def solve(self, problem: Problem, stage: str, start: np.ndarray | None = None) -> Solution:
+        """The solver's solution; those of the package report their iterations."""
+        if not isinstance(self.solver, GaussNewton | Ipopt):
+            solution: Solution = self.solver.solve(problem, start)
+            return solution
+        return self.solver.solve(problem, start, iterations(self.progress, stage, self.solver.max_iterations))
 
-    @cached_property
-    def _engine(self) -> Engine:
-        return make_engine(self.model, self.engine)
-
-    def initial_state(self, recording: Recording, samples: int | None = None) -> np.ndarray:
-        """State with memory at a recording's first sample, as its `initial` says.
-
-        Where it is to be estimated, a recording of the training gets the state of the fit. For any other the model is
-        held and the state fitted to the first `samples` samples (default: ten a state, at least 50); nothing later is
-        looked at.
-        """
-        n = self.model.n_x + self.model.n_s
-        initial = recording.initial
-        known = self.initial.get(fingerprint(recording))
-        if known is not None and isinstance(initial, str) and initial != "zero":
-            return known
-        if not isinstance(initial, str):
-            given = np.asarray(initial, dtype=float).ravel()
-            if given.size not in (self.model.n_x, n):
-                raise InputError(
-                    f"An initial state of {given.size} numbers was given; expected {self.model.n_x} or {n}."
-                )
-            return np.concatenate([given, np.zeros(n - given.size)])
-        values = self.model.parameters.start
-        state = np.zeros(n)
-        if initial == "periodic":
-            period = recording.u[: recording.period]
-            for _ in range(200):
-                before = state
-                state = self._engine.simulate(period, values, state)[1]
-                if np.max(np.abs(state - before)) <= 1e-10 * max(float(np.max(np.abs(state))), 1e-300):
-                    break
-        elif initial == "estimate" and n:
-            samples = min(len(recording), samples or max(10 * n, 50))
-            held = self.model.with_parameters(
-                self.model.parameters.change(**{k: {"fixed": True, "prior": None} for k in self.model.parameters})
-            )
-            head = recording.slice(0, max(samples, 2)).with_(skip=0)
-            problem = Problem(held, head, engine=self._engine, scale=np.maximum(np.std(recording.y, axis=0), 1e-300))
-            state = GaussNewton(max_iterations=50).solve(problem).theta
-        return state
-
-    def simulate(self, recording: Recording) -> np.ndarray:
-        """Simulated outputs for a recording's inputs, shape (M, n_y)."""
-        return self.signals(recording)["y"]
-
-    def signals(self, recording: Recording) -> dict[str, np.ndarray]:
-        """Simulated `y` (M, n_y) with the element's `z` and `w` (M, n_w)."""
-        self._check(recording)
-        state = self.initial_state(recording)
-        y, _, z, w = self._engine.simulate(recording.u, self.model.parameters.start, state, True)
-        return {"y": y, "z": z, "w": w}
-
-    def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
-        """NRMSE (Eq. 27) over outputs, averaged over recordings, in free-run simulation."""
-        return float(np.mean([nrmse(r.y, self.simulate(r), skip=r.skip) for r in as_recordings(recordings)]))
-
-    def _check(self, recording: Recording) -> None:
-        if (recording.n_u, recording.n_y) != (self.model.n_u, self.model.n_y):
-            raise InputError(
-                f"The recording has {recording.n_u} inputs and {recording.n_y} outputs, "
-                f"the model {self.model.n_u} and {self.model.n_y}; they must match."
-            )
-        if abs(recording.dt / self.dt - 1) > 1e-4:
-            raise InputError(
-                f"The recording's step is {recording.dt:g} s, the model's {self.dt:g} s; resample the recording."
-            )
-
-    def plot(self, recordings: Recording | Sequence[Recording], **options: Any) -> Any:
-        """Figures of the fit over recordings; see `plots.plot_fit`."""
-        from .plots import plot_fit
-
-        return plot_fit(self, recordings, **options)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model as JSON, atomically; see `export.save`."""
-        from .export import save
-
-        save(self, path)
-
-    def to_casadi(self, name: str = "model") -> Any:
-        """`casadi.Function (x, u) -> (x_next, y)`, operator memory inside x; see `export.to_casadi`."""
-        from .export import to_casadi
-
-        return to_casadi(self, name)
-
-    def __str__(self) -> str:
-        errors = ", ".join(f"{e:.4f}" for e in self.train_nrmse)
-        lines = [
-            self.status.value,
-            f"NRMSE on the training recording{'s' if len(self.train_nrmse) > 1 else ''}: {errors}",
-            f"{self.solution.iterations} iterations in the last solve, {self.seconds:.1f} s in all",
-        ]
-        if self.candidates:
-            reached = sorted(c.error for c in self.candidates)
-            lines.append(f"{len(reached)} starts, explored to NRMSE {reached[0]:.4f} ... {reached[-1]:.4f}")
-        if self.note:
-            lines.append(self.note)
-        lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
-        return "\n".join(lines)
-
-    __repr__ = __str__
+    def result(self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, **more: Any) -> Fit:
+        """What a solution of a problem amounts to; Ctrl-C waits until it is known, and is told by the status."""
+        found: list[Fit] = []
+        given = {"engine": self.engine, **more}
+        try:
+            with deferred_interrupt():
+                found.append(outcome(model, structure, problem, solution, self.began, self.recordings, **given))
+            if self.progress:
+                self.progress("standard errors", 1, 1, np.nan)
+        except KeyboardInterrupt:
+            if not found:
+                raise
+            return replace(found[0], solution=replace(solution, status=Status.INTERRUPTED))
+        return found[0]
 
 
-@one_blas_thread
 def fit(
     model: PILFR | Model | Fit,
     train: Recording | Sequence[Recording],
@@ -202,7 +117,7 @@ def fit(
     engine: str = "auto",
     executor: Executor | None = None,
     workers: int = 1,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Fit:
     """Identify a model from recordings by minimising the simulation error (Krikelis et al. 2024, Eq. 20).
 
@@ -218,17 +133,28 @@ def fit(
     starts, seed : int
         Number of random starts and the seed of all of them.
     start : {"grid", "paper"}
-        Thresholds on a grid with screening and re-gridding, or the paper's start alone (Eq. 22-24).
+        Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
+        solved and re-gridded.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, 1 by default; False for none.
-    constraints, l1, noise
+    constraints
         See `Problem`.
+    noise : float, optional
+        Standard deviation of the noise relative to the output's, which priors are weighed against. By default the noise
+        is estimated wherever there are priors: the problem is solved, the noise set to the error that was reached, and
+        the problem solved again, until the two agree.
+    l1 : dict
+        Weight of an L1 penalty by name, `{"w": 1e-4}`: unneeded operators get exactly zero. For a PI-LFR the problem
+        is first solved without; then the weights of each channel are scaled to a sum of one and the penalty acts on the
+        element alone, all linear blocks held, so that no change of scale evades it (see `penalty`). For a closed model
+        of your own see `Problem`.
     engine : {"auto", "c", "vm"}
         Generated C, or CasADi's virtual machine.
     executor, workers
         Where starts run: any `concurrent.futures.Executor`, or a pool of `workers` processes; the numbers are the same.
-    progress : callable
-        Called with (stage, done, total, smallest training error so far).
+        Where processes are spawned, the call belongs below `if __name__ == "__main__":`.
+    progress : bool or callable
+        True for a bar on the terminal; a callable gets (stage, done, total, smallest training error so far).
 
     Returns
     -------
@@ -237,72 +163,199 @@ def fit(
     Raises
     ------
     InputError
-        If recordings and model do not fit each other, hold too little, or the start is not usable.
+        If recordings and model do not fit each other, hold too little, the start is not usable, or an option is unfit.
     """
-    began = time.perf_counter()
     solver = solver or POLISH
-    constraints = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
-    _check_options(model, solver, starts, seed, workers, l1)
-    if not isinstance(model, PILFR):
-        given, structure = (model.model, model.structure) if isinstance(model, Fit) else (model, None)
-        recordings = check_for_identification(train, int(given.parameters.free.sum()) + 2)
-        limits = _limits(structure, stable) if structure else ()
-        problem = Problem(
-            given, recordings, constraints=(*limits, *constraints), l1=l1, noise=noise or 1.0, engine=engine
-        )
-        if not np.isfinite(problem.cost(problem.start)):
-            raise InputError("The simulation diverges at the start values; start from a stable model.")
-        return _result(given, structure, problem, solver.solve(problem), began, recordings)
+    _check_options(model, solver, starts, seed, workers, progress)
     if start not in ("grid", "paper"):
         raise InputError(f"The start {start!r} is unknown; use 'grid' or 'paper'.")
-    recordings = check_for_identification(train, _fewest_samples(model, train))
-    limits = _limits(model, stable)
-    linear, problem, solution = linear_model(recordings, model, engine=engine, constraints=limits[:1])
-    fitted = _fitted(linear, problem, solution)
-    if solution.status is Status.INTERRUPTED:
-        return _result(linear, model.linear(), problem, solution, began, recordings)
-    if model.element is None:
-        with_bounds = model.model(
-            linear.n_u,
-            linear.n_y,
-            {k: p.value for k, p in fitted.parameters.items()},
-            inputs=linear.inputs,
-            outputs=linear.outputs,
-        )
-        problem = Problem(
-            with_bounds, recordings, constraints=(*limits, *constraints), noise=noise or 1.0, engine=engine
-        )
-        return _result(with_bounds, model, problem, solver.solve(problem), began, recordings)
-    if not isinstance(model.element, PrandtlIshlinskii):
-        raise InputError("A PI-LFR is identified with a PrandtlIshlinskii element; pass a closed Model for any other.")
-    blocks = {k: p.value for k, p in fitted.parameters.items()}
-    search = Search(model, recordings, blocks, solver, (*limits, *constraints), engine, start, l1 or {}, noise)
-    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if executor is None and workers > 1 else None
-    try:
-        seen: list[float] = []
+    own = executor is None and workers > 1
+    if own and getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(1)  # a spawned worker that runs the script again; the first process says what to do
+    if l1 is not None and not isinstance(l1, dict):
+        raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
+    further = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+    if progress is True:
+        from .progress import progress_bar
 
-        def report(candidate: Candidate) -> None:
-            seen.append(candidate.error)
-            if progress:
-                polishing = len(seen) > starts
-                stage, total = ("polish", min(starts, KEEP)) if polishing else ("starts", starts)
-                progress(stage, len(seen) - starts * polishing, total, min(seen))
-
-        candidates, best, stopped = search_starts(search, starts, seed, executor or pool, report)
-    finally:
-        if pool is not None:
-            pool.shutdown(cancel_futures=True)
-    if best is None:
-        return _result(linear, model.linear(), problem, replace(solution, status=Status.INTERRUPTED), began, recordings)
-    problem = search.problem(best.model, noise=best.error)
-    if stopped:
-        result = replace(best.solution, status=Status.INTERRUPTED)
+        shown: Any = progress_bar()
     else:
-        result = best.solution if start == "paper" else solver.solve(problem, best.theta)
-    return _result(best.model, model, problem, result, began, recordings, tuple(candidates), fitted, best.note)
+        shown = nullcontext(progress or None)
+    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and isinstance(model, PILFR) else None
+    with shown as report:
+        job = _Job((), solver, further, dict(l1 or {}), noise, engine, report)
+        try:
+            return _fit(model, train, job, stable, starts, seed, start, executor or pool)
+        except BrokenProcessPool:
+            spawned = pool is not None and multiprocessing.get_start_method() != "fork"
+            raise InputError(NO_GUARD if spawned else DEAD_WORKER) from None
+        finally:
+            if pool is not None:
+                pool.shutdown(cancel_futures=True)
 
 
-def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, l1: Any) -> None:
+@one_blas_thread
+def _fit(
+    model: PILFR | Model | Fit,
+    train: Recording | Sequence[Recording],
+    job: _Job,
+    stable: bool | float,
+    starts: int,
+    seed: int,
+    start: str,
+    executor: Executor | None,
+) -> Fit:
+    structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
+    limits = stability(structure, 1.0 if stable is True else float(stable)) if structure and stable else ()
+    job = replace(job, limits=(*limits, *job.limits))
+    if not isinstance(model, PILFR):
+        given = model.model if isinstance(model, Fit) else model
+        job = replace(job, recordings=check_for_identification(train, int(given.parameters.free.sum()) + 2))
+        return _from_values(given, structure, job, model if isinstance(model, Fit) else None)
+    if not isinstance(model.element, PrandtlIshlinskii | None):
+        raise InputError("A PI-LFR is identified with a PrandtlIshlinskii element; pass a closed Model for any other.")
+    first = as_recordings(train)[0]
+    shape = model.model(first.n_u, first.n_y).parameters
+    if job.l1:
+        check_penalty(job.l1, shape, model.element is None)
+    fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
+    job = replace(job, recordings=check_for_identification(train, fewest))
+    linear, problem, solution = linear_model(
+        job.recordings, model, engine=job.engine, constraints=limits[:1], progress=job.progress
+    )
+    if solution.status is Status.INTERRUPTED:
+        return job.result(linear, model.linear(), problem, solution)
+    fitted = with_solution(linear, problem, solution)
+    if model.element is None:
+        alike = not (model.fixed or model.bounds or model.priors or job.limits[1:]) and job.solver is POLISH
+        if alike:  # nothing that the linear model has not seen
+            return job.result(linear, model, problem, solution)
+        return _linear(model, fitted, job)
+    return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
+
+
+def _from_values(model: Model, structure: PILFR | None, job: _Job, earlier: Fit | None) -> Fit:
+    """A closed model or an earlier fit, from its values, and from the initial states that the fit has or estimates."""
+    if job.l1:
+        check_penalty(job.l1, model.parameters, structure is not None and structure.element is None)
+    options: dict[str, Any] = {"l1": {} if structure else job.l1}
+    problem = job.problem(model, **options)
+    if not np.isfinite(problem.cost(problem.start)):
+        raise InputError("The simulation diverges at the start values; start from a stable model.")
+    start = problem.start
+    if earlier is not None:
+        estimated = [r for r in job.recordings if isinstance(r.initial, str) and r.initial == "estimate"]
+        begin = np.concatenate([start[: int(problem.free.sum())], *(earlier.initial_state(r) for r in estimated)])
+        start = begin if problem.cost(begin) < problem.cost(start) else start
+    latest = model, problem, job.solve(problem, "solve", start), ""
+    try:
+        problem, solution = job.settled(problem, latest[2], "solve", **options)
+        latest = model, problem, solution, ""
+        if job.l1 and structure:
+            latest = _penalised(model, problem, solution, job, problem.noise)
+    except KeyboardInterrupt:
+        latest = _interrupted(*latest)
+    model, problem, solution, note = latest
+    return job.result(model, structure, problem, solution, note=note)
+
+
+def _interrupted(model: Model, problem: Problem, solution: Solution, note: str) -> Stage:
+    """The same, its solution marked as interrupted."""
+    return model, problem, replace(solution, status=Status.INTERRUPTED), note
+
+
+def _error(problem: Problem, solution: Solution) -> float:
+    """Root mean square of the normalised residuals."""
+    e = problem.residual(solution.theta)
+    return float(np.sqrt(np.mean(e**2)))
+
+
+def _linear(structure: PILFR, fitted: Model, job: _Job) -> Fit:
+    """A linear model with the structure's bounds and fixed blocks, from the one without."""
+    values = {k: p.value for k, p in fitted.parameters.items()}
+    first = job.recordings[0]
+    model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
+    problem = job.problem(model)
+    latest = problem, job.solve(problem, "solve")
+    try:
+        latest = job.settled(*latest, "solve")
+    except KeyboardInterrupt:
+        latest = problem, replace(latest[1], status=Status.INTERRUPTED)
+    return job.result(model, structure, *latest)
+
+
+def _from_starts(
+    structure: PILFR,
+    linear: Model,
+    problem: Problem,
+    solution: Solution,
+    job: _Job,
+    starts: int,
+    seed: int,
+    start: str,
+    executor: Executor | None,
+) -> Fit:
+    """A PI-LFR from many starts; `problem` and `solution` are those of the linear model."""
+    blocks = {k: p.value for k, p in linear.parameters.items()}
+    options: dict[str, Any] = {"engine": job.engine, "start": start, "noise": job.noise}
+    search = Search(
+        structure, job.recordings, blocks, job.solver, job.limits, level=_error(problem, solution), **options
+    )
+    seen: list[float] = []
+
+    def report(candidate: Candidate) -> None:
+        seen.append(candidate.error)
+        if job.progress:
+            polishing = len(seen) > starts
+            stage, total = ("polish", min(starts, KEEP)) if polishing else ("starts", starts)
+            job.progress(stage, len(seen) - starts * polishing, total, min(seen))
+
+    candidates, best, stopped = search_starts(search, starts, seed, executor, report)
+    if best is None:
+        ended = replace(solution, status=Status.INTERRUPTED)
+        return job.result(linear, structure.linear(), problem, ended)
+    compared: dict[str, Any] = {"linear": linear, "linear_nrmse": tuple(problem.nrmse(solution.theta))}
+    model, note, l1 = best.model, best.note, job.l1 and not stopped
+    if l1:  # the penalty and a prior towards a smooth density contradict each other
+        asked = {name: {"prior": structure.priors.get(name)} for name in ("w", "r")}
+        model, note = model.with_parameters(model.parameters.change(**asked)), ""
+    problem = job.problem(model, best.error)
+    latest = model, problem, best.solution, note
+    try:
+        if stopped:
+            latest = _interrupted(*latest)
+        elif start != "paper":
+            latest = model, problem, job.solve(problem, "solve", best.theta), note
+        if structure.priors and not stopped:
+            problem, result = job.settled(problem, latest[2], "solve")
+            latest = model, problem, result, note
+        if l1:
+            latest = _penalised(model, problem, latest[2], job, problem.noise)
+    except KeyboardInterrupt:
+        latest = _interrupted(*latest)
+    model, problem, result, note = latest
+    return job.result(model, structure, problem, result, candidates=tuple(candidates), note=note, **compared)
+
+
+def _penalised(model: Model, problem: Problem, solution: Solution, job: _Job, noise: float) -> Stage:
+    """The model, problem and solution with the L1 penalty, from the solution without, and a note; see `penalty`."""
+    if solution.status is Status.INTERRUPTED:
+        return model, problem, solution, "interrupted before the L1 penalty was applied"
+    found = unit_weights(with_solution(model, problem, solution))
+    states = solution.theta[int(problem.free.sum()) :]
+    options: dict[str, Any] = {"engine": problem.engine, "l1": job.l1}
+    whole, held = (job.problem(m, noise, **options) for m in (found, element_alone(found, job.l1)))
+    begin = merged(held, np.concatenate([held.start[: int(held.free.sum())], states]))
+    states = begin[int(held.free.sum()) :]
+    last = without_idle(held.model.with_parameters(held.model.parameters.at(held.parameters(begin))))
+    if np.any(last.parameters.free):
+        held = job.problem(last, noise, **options)
+    begin = np.concatenate([held.start[: int(held.free.sum())], states])
+    result = restored(job.solve(held, "L1 penalty", begin), held, whole)
+    return found, whole, result, sentence(with_solution(found, whole, result), job.l1)
+
+
+def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:
     """Refuse what cannot be used before any long work."""
     if not isinstance(model, PILFR | Model | Fit):
         raise InputError(f"The model is a {type(model).__name__}; give a PILFR, a closed Model or a Fit.")
@@ -311,74 +364,10 @@ def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
         if not isinstance(value, int | np.integer) or value < least:
             raise InputError(f"{name} = {value!r} was given; give a whole number, {least} or more.")
-    if l1 is not None and not isinstance(l1, dict):
-        raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
+    if progress is not None and not isinstance(progress, bool) and not callable(progress):
+        raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
 
 
 def _leave_interrupts() -> None:
     """In a worker: Ctrl-C is for the process that waits for the results."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _limits(structure: PILFR, stable: bool | float) -> tuple[Constraint, ...]:
-    return stability(structure, 1.0 if stable is True else float(stable)) if stable else ()
-
-
-def fingerprint(recording: Recording) -> str:
-    """Short digest of a recording's numbers."""
-    return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes()).hexdigest()[:16]
-
-
-def _fewest_samples(model: PILFR, train: Recording | Sequence[Recording]) -> int:
-    first = as_recordings(train)[0]
-    shape = model.model(first.n_u, first.n_y)
-    return max(int(shape.parameters.free.sum()), 10 * model.nx) + 2
-
-
-def _fitted(model: Model, problem: Problem, solution: Solution) -> Model:
-    return model.with_parameters(model.parameters.at(problem.parameters(solution.theta)))
-
-
-def _result(
-    model: Model,
-    structure: PILFR | None,
-    problem: Problem,
-    solution: Solution,
-    began: float,
-    recordings: tuple[Recording, ...],
-    candidates: tuple[Candidate, ...] = (),
-    linear: Model | None = None,
-    note: str = "",
-) -> Fit:
-    fitted = _fitted(model, problem, solution)
-    if note == PRIOR:
-        asked = structure.priors if structure else {}
-        fitted = fitted.with_parameters(
-            fitted.parameters.change(**{name: {"prior": asked.get(name)} for name in ("w", "r")})
-        )
-    theta = solution.theta
-    at_bound = [
-        f"{label} = {value:g}"
-        for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
-        if value in (low, high)
-    ]
-    g = problem.constraint(theta) if problem.constraints else np.zeros(0)
-    at_bound += [
-        name for name, value, high in zip(problem.g_labels, g, problem.g_upper, strict=True) if value >= high - 1e-7
-    ]
-    return Fit(
-        model=fitted,
-        structure=structure,
-        dt=recordings[0].dt,
-        solution=solution,
-        train_nrmse=tuple(problem.nrmse(theta)),
-        initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
-        labels=problem.labels,
-        errors=standard_errors(problem, theta, structure),
-        active=tuple(at_bound),
-        candidates=candidates,
-        linear=linear,
-        seconds=time.perf_counter() - began,
-        units=dict(recordings[0].units),
-        note=note,
-    )

@@ -140,7 +140,7 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     sensitivity = np.sqrt(np.diag(hessian))
     held = _snap_to_bounds(problem, theta, sensitivity)
     tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, held)
-    slopes = problem.constraint_jacobian(theta)[_active_constraints(problem, theta)]
+    slopes = problem.constraint_jacobian(theta)[problem.active_constraints(theta)]
     # a gauge direction that an active constraint forbids is no freedom
     tangents = tangents @ _null_space(slopes @ tangents)
     used = np.flatnonzero(~held & (sensitivity > 0))
@@ -178,10 +178,3 @@ def _snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, toleranc
         theta[near] = bound[near]
         held |= near
     return held
-
-
-def _active_constraints(problem: Problem, theta: Array, tolerance: float = 1e-7) -> Array:
-    if not len(problem.g_lower):
-        return np.zeros(0, dtype=bool)
-    g = problem.constraint(theta)
-    return (g >= problem.g_upper - tolerance) | (g <= problem.g_lower + tolerance)

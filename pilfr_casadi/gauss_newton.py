@@ -4,10 +4,11 @@ Each step solves the quadratic program
 
     minimise  1/2 d'(H + λ D)d + g'd   subject to  lower <= θ + d <= upper,  lower_g <= g(θ) + ∇g d <= upper_g,
 
-with `H` the Gauss-Newton Hessian and `D` the largest diagonal of `H` seen so far (Marquardt 1963; Moré 1978): at the
-usual start (`B_w = 0`) whole columns of the Jacobian vanish and a state space is over-parametrised, so damping is
-needed and has to know the scales. Trial points are judged by simulation alone; λ follows the gain ratio (Nielsen
-1999). General constraints enter an exact penalty `μ Σ violation`, with a second-order correction when a step along
+with `H` the Gauss-Newton Hessian and `D` the largest diagonal of `H` seen so far (Marquardt 1963; Moré 1978), rounding
+left out (`damping.without_rounding`): at the usual start (`B_w = 0`) whole columns of the Jacobian vanish and a state
+space is over-parametrised, so damping is needed and has to know the scales. Trial points are judged by simulation
+alone; λ follows the gain ratio (Nielsen 1999). General constraints, in units of their own
+(`Problem.constraint_units`), enter an exact penalty `μ Σ violation`, with a second-order correction when a step along
 their tangent violates them.
 """
 
@@ -15,22 +16,39 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from .callback import handled_interrupt
+from .constraints import TOLERATED
+from .damping import without_rounding
+from .magnitude import Neighbours
 from .problem import Problem
+from .recording import InputError
 from .solution import Iteration, Progress, Solution, Status
+
+FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
+NOTHING = 1e-24  # a cost that is rounding: outputs are off by 1e-12 of their size
 
 
 class _QuadraticProgram:
-    """Dense QP through `ca.conic`, built once; solves for a step inside limits."""
+    """Dense QP; solves for a step inside limits.
+
+    Where the unconstrained step lies inside all of them it is the solution, for the price of a Cholesky factorisation.
+    Else `ca.conic`, built when it is first needed, finds out which limits hold it.
+    """
 
     def __init__(self, n: int, n_g: int, plugin: str) -> None:
+        self._size, self._plugin = (n, n_g), plugin
+
+    @cached_property
+    def _solve(self) -> ca.Function:
+        (n, n_g), plugin = self._size, self._plugin
         structure = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(n_g, n)}
         quiet = {"daqp": {}, "qrqp": {"print_iter": False, "print_header": False, "print_info": False}}.get(plugin, {})
-        self._solve = ca.conic("qp", plugin, structure, {**quiet, "error_on_fail": False})
+        return ca.conic("qp", plugin, structure, {**quiet, "error_on_fail": False})
 
     def __call__(
         self,
@@ -42,10 +60,26 @@ class _QuadraticProgram:
         lba: np.ndarray,
         uba: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, bool]:
+        d = _unconstrained(h, g)
+        if d is not None and np.all((lbx <= d) & (d <= ubx)):
+            slack = a @ d
+            if np.all((lba <= slack) & (slack <= uba)):
+                return d, np.zeros(len(d) + len(slack)), True
         out = self._solve(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
         d = np.asarray(out["x"]).ravel()
         multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])
         return d, multipliers, bool(self._solve.stats()["success"]) and bool(np.all(np.isfinite(d)))
+
+
+def _unconstrained(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
+    """`-h⁻¹ g` for a positive definite h, else None."""
+    from scipy.linalg import cho_factor, cho_solve
+
+    try:
+        d = -cho_solve(cho_factor(h, lower=True, check_finite=False), g, check_finite=False)
+    except np.linalg.LinAlgError:
+        return None
+    return d if np.all(np.isfinite(d)) else None
 
 
 @dataclass(frozen=True)
@@ -64,6 +98,11 @@ class GaussNewton:
         Seconds.
     qp : str
         CasADi conic plugin.
+
+    Raises
+    ------
+    InputError
+        If there is no such plugin.
     """
 
     max_iterations: int = 200
@@ -73,18 +112,32 @@ class GaussNewton:
     time_limit: float = np.inf
     qp: str = "daqp"
 
+    def __post_init__(self) -> None:
+        if not ca.has_conic(str(self.qp)):
+            raise InputError(f"The QP solver {self.qp!r} is not there; use 'daqp', or another conic plugin of CasADi.")
+
     def solve(self, problem: Problem, start: np.ndarray | None = None, progress: Progress | None = None) -> Solution:
         """Minimise from `start` (n,), by default the problem's own."""
         return _Run(self, problem, problem.start if start is None else start, progress).run()
 
 
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A quadratic program's step (n,), its multipliers (n + n_g,), and whether it was found."""
+
+    d: np.ndarray
+    multipliers: np.ndarray
+    good: bool
+
+
 class _Run:
-    """One solve: the point, its derivatives and the damping."""
+    """One solve: the point, its derivatives and the damping; constraints, limits and multipliers of them are scaled."""
 
     def __init__(self, options: GaussNewton, problem: Problem, start: np.ndarray, progress: Progress | None) -> None:
         self.options, self.problem, self.progress = options, problem, progress
         self.theta = np.clip(np.asarray(start, dtype=float), problem.lower, problem.upper)
         self.n_g = len(problem.g_lower)
+        self.unit, self.known = np.ones(self.n_g), np.zeros(self.n_g, dtype=bool)
         self.qp = _QuadraticProgram(problem.size, self.n_g, options.qp)
         self.damping, self.growth, self.penalty = options.damping, 2.0, 0.0
         self.multipliers = np.zeros(problem.size + self.n_g)
@@ -92,12 +145,16 @@ class _Run:
         self.interrupted = False
         self.began = time.perf_counter()
 
+    def constraint(self, theta: np.ndarray) -> np.ndarray:
+        """Values of the general constraints, shape (n_g,)."""
+        return self.problem.constraint(theta) / self.unit if self.n_g else np.zeros(0)
+
     def violation(self, theta: np.ndarray) -> np.ndarray:
         """Violation of each general constraint, shape (n_g,)."""
         if not self.n_g:
             return np.zeros(0)
-        g = self.problem.constraint(theta)
-        return np.maximum(np.maximum(self.problem.g_lower - g, g - self.problem.g_upper), 0.0)
+        g, low, high = self.constraint(theta), self.problem.g_lower / self.unit, self.problem.g_upper / self.unit
+        return np.maximum(np.maximum(low - g, g - high), 0.0)
 
     def run(self) -> Solution:
         status = Status.MAX_ITERATIONS
@@ -116,8 +173,8 @@ class _Run:
 
     def _iterate(self) -> Status:
         problem, options = self.problem, self.options
-        scale = np.zeros(problem.size)
-        recent: list[float] = []
+        scale, neighbours = np.zeros(problem.size), Neighbours(problem.labels)
+        recent: list[tuple[float, float]] = []  # cost and violation
         fresh = True
         for number in range(options.max_iterations):
             if self.interrupted:
@@ -126,28 +183,23 @@ class _Run:
                 return Status.TIME_LIMIT
             if fresh:
                 self.cost, gradient, hessian = problem.normal(self.theta)
-                slope = problem.constraint_jacobian(self.theta)
                 scale = np.maximum(scale, np.diag(hessian))
-                violation = self.violation(self.theta)
-                recent.append(self.cost + self.penalty * float(violation.sum()))
+                floor = without_rounding(scale, self.theta, neighbours)
+                self._measure(floor)
+                slope = problem.constraint_jacobian(self.theta) / self.unit[:, None]
+                violation = float(self.violation(self.theta).sum())
+                recent.append((self.cost, violation))
                 if self.progress:
                     self.progress(self.history[-1] if self.history else Iteration(0, self.cost, 0.0))
-                calm = len(recent) > options.patience and recent[-1 - options.patience] - recent[
-                    -1
-                ] < options.tolerance * abs(recent[-1])
-                if calm and violation.sum() <= 1e-9:
-                    return Status.CONVERGED
-            # a column that has been zero so far does not move, whatever its damping: the method is invariant to units
-            floor = np.where(scale > 0, scale, 1.0)
-            damped = hessian + self.damping * np.diag(floor)
-            step, good = self._step(damped, gradient, slope)
-            predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)
-            trial, improvement = (
-                self._judge(step, damped, gradient, slope, violation) if good else (self.theta, -np.inf)
-            )
-            expected = predicted + self.penalty * float(violation.sum())
-            fresh = bool(good and improvement > 1e-4 * expected and improvement > 0)
-            length = float(np.max(np.abs(step) * np.sqrt(floor))) if good else 0.0
+                if self._calm(recent):
+                    return Status.CONVERGED if violation <= FEASIBLE else Status.INFEASIBLE
+            step = self._step(hessian + self.damping * np.diag(floor), gradient, slope)
+            self._raise_penalty(step)
+            predicted = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d)
+            trial, improvement = self._judge(step, hessian + self.damping * np.diag(floor), gradient, slope)
+            expected = predicted + self.penalty * violation
+            fresh = bool(step.good and improvement > 1e-4 * expected and improvement > 0)
+            length = float(np.max(np.abs(step.d) * np.sqrt(floor))) if step.good else 0.0
             if fresh:
                 ratio = min(improvement / max(expected, 1e-300), 2.0)  # a cube of it follows
                 self.theta = trial
@@ -159,73 +211,107 @@ class _Run:
                     )
                 )
             else:
-                if good and expected < 1e-3 * options.tolerance * abs(self.cost) and violation.sum() <= 1e-9:
-                    return Status.CONVERGED
+                if step.good and expected < 1e-3 * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
+                    return self._stalled(hessian, floor, gradient, slope)
                 self.damping *= self.growth
                 self.growth *= 2.0
                 if self.damping > 1e12:
-                    return Status.INFEASIBLE if violation.sum() > 1e-6 else Status.SMALL_STEP
+                    return Status.INFEASIBLE if violation > TOLERATED else Status.SMALL_STEP
         return Status.MAX_ITERATIONS
+
+    def _measure(self, floor: np.ndarray) -> None:
+        """Units of the constraints, once and for all: where they first have a slope."""
+        if not np.all(self.known):
+            unit = self.problem.constraint_units(self.theta, floor)
+            first = ~self.known & (unit > 0)
+            self.unit[first], self.known[first] = unit[first], True
+
+    def _calm(self, recent: list[tuple[float, float]]) -> bool:
+        """Whether the last few steps changed next to nothing, all feasible or all as infeasible as the last."""
+        options = self.options
+        if self.cost <= NOTHING and recent[-1][1] <= FEASIBLE:
+            return True
+        if len(recent) <= options.patience:
+            return False
+        (cost, violation), (now, left) = recent[-1 - options.patience], recent[-1]
+        if left > TOLERATED:
+            merits = cost + self.penalty * violation, now + self.penalty * left
+            return violation - left < options.tolerance * left and merits[0] - merits[1] < options.tolerance * merits[1]
+        return max(violation, left) <= FEASIBLE and cost - now < options.tolerance * abs(now)
+
+    def _stalled(self, hessian: np.ndarray, floor: np.ndarray, gradient: np.ndarray, slope: np.ndarray) -> Status:
+        """What it means that a step promises nothing: a minimum, unless only its damping makes it so small."""
+        step = self._step(hessian + min(self.damping, self.options.damping) * np.diag(floor), gradient, slope)
+        promised = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d)
+        small = step.good and promised < self.options.tolerance * abs(self.cost)
+        return Status.CONVERGED if small else Status.SMALL_STEP
 
     def _step(
         self, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, correction: np.ndarray | None = None
-    ) -> tuple[np.ndarray, bool]:
+    ) -> _Step:
         problem = self.problem
-        g = (problem.constraint(self.theta) if self.n_g else np.zeros(0)) if correction is None else correction
-        low, high = problem.g_lower - g, problem.g_upper - g
-        # unit diagonal: daqp's tolerances are absolute
+        g = self.constraint(self.theta) if correction is None else correction
+        # unit diagonal and rows: daqp's tolerances are absolute
         unit = 1.0 / np.sqrt(np.diag(damped))
         lbx, ubx = (problem.lower - self.theta) / unit, (problem.upper - self.theta) / unit
         size = max(float(np.max(np.abs(gradient * unit))), 1e-300)
         h, steepest, a = damped * unit * unit[:, None], gradient * unit / size, slope * unit
+        row = np.max(np.abs(a), axis=1, initial=0.0)
+        row = np.where(row > 0, row, 1.0)
+        low, high, a = (
+            (problem.g_lower / self.unit - g) / row,
+            (problem.g_upper / self.unit - g) / row,
+            a / row[:, None],
+        )
         for share in (1.0, 0.5, 0.1, 0.01, 0.0) if self.n_g else (1.0,):  # of the violation that the step has to remove
             lba = np.minimum(low, share * np.maximum(low, 0.0))
             uba = np.maximum(high, share * np.minimum(high, 0.0))
             d, multipliers, good = self.qp(h, steepest, lbx / size, ubx / size, a, lba / size, uba / size)
             if good:
                 break
-        if good:
-            n = problem.size
-            self.multipliers = np.concatenate([multipliers[:n] * size / unit, multipliers[n:] * size])
+        multipliers = size * multipliers / np.concatenate([unit, row])
+        return _Step(d * size * unit, multipliers, good)
+
+    def _raise_penalty(self, step: _Step) -> None:
+        if step.good:
+            self.multipliers = step.multipliers
             if self.n_g:
                 # Powell's rule: a penalty that only grows keeps what far-off multipliers asked for, and crawls
-                needed = 1.5 * float(np.max(np.abs(self.multipliers[n:])))
+                needed = 1.5 * float(np.max(np.abs(step.multipliers[self.problem.size :])))
                 self.penalty = max(needed, 0.5 * (self.penalty + needed))
-        return d * size * unit, good
 
     def _judge(
-        self, step: np.ndarray, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, violation: np.ndarray
+        self, step: _Step, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray
     ) -> tuple[np.ndarray, float]:
         """Trial point and the improvement of the penalised cost it brings."""
-        problem = self.problem
-        merit = self.cost + self.penalty * float(violation.sum())
-        trial = self._inside(self.theta + step)
+        if not step.good:
+            return self.theta, -np.inf
+        problem, here = self.problem, float(self.violation(self.theta).sum())
+        trial = self._inside(step)
         there = float(self.violation(trial).sum())
-        if self.n_g and there > max(float(violation.sum()), 1e-12):
-            linearised = problem.constraint(trial) - slope @ step
-            corrected, good = self._step(damped, gradient, slope, linearised)
-            if good:
-                candidate = self._inside(self.theta + corrected)
+        if self.n_g and there > max(here, 1e-12):
+            corrected = self._step(damped, gradient, slope, self.constraint(trial) - slope @ step.d)
+            if corrected.good:
+                candidate = self._inside(corrected)
                 if float(self.violation(candidate).sum()) < there:
                     trial, there = candidate, float(self.violation(candidate).sum())
-        return trial, merit - problem.cost(trial) - self.penalty * there
+        return trial, self.cost - problem.cost(trial) + self.penalty * (here - there)
 
-    def _inside(self, theta: np.ndarray) -> np.ndarray:
-        """Exactly on the bounds that the last quadratic program holds active, and inside the others."""
-        problem, force = self.problem, self.multipliers[: self.problem.size]
+    def _inside(self, step: _Step) -> np.ndarray:
+        """The end of a step: exactly on the bounds that its quadratic program holds active, and inside the others."""
+        problem, force, theta = self.problem, step.multipliers[: self.problem.size], self.theta + step.d
         theta = np.where((force < 0) & np.isfinite(problem.lower), problem.lower, theta)
         theta = np.where((force > 0) & np.isfinite(problem.upper), problem.upper, theta)
         return np.asarray(np.clip(theta, problem.lower, problem.upper))
 
     def _finish(self, status: Status) -> Solution:
-        violation = float(self.violation(self.theta).max(initial=0.0))
         return Solution(
             theta=self.theta,
             cost=self.problem.cost(self.theta),
             status=status,
             iterations=len(self.history),
             seconds=time.perf_counter() - self.began,
-            violation=violation,
-            multipliers=self.multipliers,
+            violation=float((self.violation(self.theta) * self.unit).max(initial=0.0)),
+            multipliers=self.multipliers / np.concatenate([np.ones(self.problem.size), self.unit]),
             history=tuple(self.history),
         )

@@ -134,7 +134,9 @@ def discretise(
     substeps : int
         Runge-Kutta steps a sample; see `choose_substeps`.
     """
-    placed = [replace(e, law=e.law.on_grid(dt / substeps)) if hasattr(e.law, "on_grid") else e for e in simulator.elements]
+    placed = [
+        replace(e, law=e.law.on_grid(dt / substeps)) if hasattr(e.law, "on_grid") else e for e in simulator.elements
+    ]
     simulator = replace(simulator, elements=tuple(placed))
     own = parameters or ParameterSet(dict(simulator.parameters))
     vector = ca.SX.sym("p", own.size)
@@ -189,9 +191,9 @@ def discretise(
 def signals(simulator: Simulator) -> ca.Function:
     """`(x, u, slope, t, p) -> (z, dz, lift, push)` of every port of `all_ports`, in its order, laws left out.
 
-    x (n_x,), u (n_u,), slope = du/dt (n_u,), t and p as in `discretise`; each result has one row a port. A unit force in
-    the port moves z at once at the rate `lift`, and dz at the rate `push`: where `lift` is zero and `push` negative, a
-    positive force opposes the port's motion.
+    x (n_x,), u (n_u,), slope = du/dt (n_u,), t and p as in `discretise`; each result has one row a port. A unit force
+    in the port moves z at once at the rate `lift`, and dz at the rate `push`: where `lift` is zero and `push` negative,
+    a positive force opposes the port's motion.
     """
     own = ParameterSet(dict(simulator.parameters))
     vector = ca.SX.sym("p", own.size)
@@ -222,7 +224,7 @@ def signals(simulator: Simulator) -> ca.Function:
 
 
 def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Largest |eigenvalue| of ∂f/∂x at each state x (K, n_x) and input u (K, n_u), rad/s, shape (K,); nan if infinite."""
+    """Largest |eigenvalue| of ∂f/∂x, rad/s, at states x (K, n_x) and inputs u (K, n_u), shape (K,); nan if infinite."""
     n_x = len(simulator.states)
     if not n_x or simulator.discrete:
         return np.zeros(len(x))
@@ -242,8 +244,9 @@ def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -
 
 
 def choose_substeps(simulator: Simulator, recordings: Sequence[Recording]) -> int:
-    """Sub-steps a sample that keep |λ| h below `REACH`, from the Jacobian at rest and, where that is very fast, along a
-    run (a square root is infinitely steep at zero).
+    """Sub-steps a sample that keep |λ| h below `REACH`, from the Jacobian at rest.
+
+    Where that is very fast, a run is looked at instead (a square root is infinitely steep at zero).
 
     Raises
     ------

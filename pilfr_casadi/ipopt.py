@@ -91,10 +91,25 @@ class Ipopt:
     def __post_init__(self) -> None:
         if self.hessian not in ("gauss-newton", "limited-memory"):
             raise InputError(f"The Hessian {self.hessian!r} is unknown; use 'gauss-newton' or 'limited-memory'.")
+        _check_settings(self.options)
 
     def solve(self, problem: Problem, start: np.ndarray | None = None, progress: Progress | None = None) -> Solution:
         """Minimise from `start` (n,), by default the problem's own."""
         return _Run(self, problem, problem.start if start is None else start, progress).run()
+
+
+def _check_settings(options: Any) -> None:
+    """Let IPOPT itself judge its options, on a problem of one variable."""
+    if not isinstance(options, Mapping):
+        raise InputError(f'IPOPT\'s options were given as {options!r}; give them by name, like {{"print_level": 5}}.')
+    x = ca.MX.sym("x")
+    for name, value in options.items():
+        try:
+            ca.nlpsol("check", "ipopt", {"x": x, "f": x**2}, {"ipopt": {name: value, "sb": "yes"}, "print_time": False})
+        except (RuntimeError, TypeError, NotImplementedError):
+            raise InputError(
+                f"IPOPT does not take the option {name!r} with the value {value!r}; see its own list of options."
+            ) from None
 
 
 class _Run:

@@ -59,7 +59,8 @@ class PILFR:
     Raises
     ------
     InputError
-        If nx is negative, or a fixed, bounded or prior parameter is unknown.
+        If nx is no whole number of 0 or more, the element is none, a fixed, bounded or prior parameter is unknown, or
+        a bound or prior is no pair of numbers.
     """
 
     nx: int
@@ -70,13 +71,24 @@ class PILFR:
     offset: bool = True
 
     def __post_init__(self) -> None:
-        if int(self.nx) != self.nx or self.nx < 0:
+        if isinstance(self.nx, bool) or not isinstance(self.nx, int | float | np.number) or not 0 <= self.nx < np.inf:
+            raise InputError(f"The number of states is {self.nx!r}; give a whole number, 0 or more.")
+        if int(self.nx) != self.nx:
             raise InputError(f"The number of states is {self.nx}; give a whole number, 0 or more.")
         object.__setattr__(self, "nx", int(self.nx))
+        _check_element(self.element)
+        for what in ("fixed", "bounds", "priors"):
+            given = getattr(self, what)
+            if not isinstance(given, Mapping):
+                raise InputError(f"{what} = {given!r} was given; give values by parameter name, a mapping.")
         known = (*BLOCKS, *(self.element.parameters() if self.element else ()))
         for name in (*self.fixed, *self.bounds, *self.priors):
             if name not in known:
                 raise InputError(f"There is no parameter {name!r} to fix or bound; there are {', '.join(known)}.")
+        for name, pair in self.bounds.items():
+            _check_pair(f"bounds of {name!r}", pair, "(lower, upper), with -numpy.inf or numpy.inf for none")
+        for name, pair in self.priors.items():
+            _check_pair(f"prior of {name!r}", pair, "(mean, std)")
 
     @property
     def n_w(self) -> int:
@@ -94,6 +106,12 @@ class PILFR:
     ) -> Model:
         """The closed model for n_u inputs and n_y outputs, blocks starting at `values` (zero where not given)."""
         values, fixed = dict(values or {}), dict(self.fixed) if self.offset else {"y_0": 0.0, **self.fixed}
+        for name, count, what in (("D_zu", n_u, "input"), ("D_yw", n_y, "output")):
+            if _is_identity(fixed.get(name), self.n_w) and count != self.n_w:
+                raise InputError(
+                    f"{name} is fixed to the identity (as in a Hammerstein or Wiener model) with {self.n_w} channel(s) "
+                    f"of the element, but there are {count} {what}(s); give channels={count} to the element."
+                )
         shapes = block_shapes(self.nx, n_u, n_y, self.n_w)
         blocks = ParameterSet({name: Parameter(np.zeros(shape)) for name, shape in shapes.items()})
         model = open_model(_step, _port, blocks, n_x=self.nx, n_u=n_u, n_w=self.n_w, inputs=inputs, outputs=outputs)
@@ -116,6 +134,29 @@ class PILFR:
         return PILFR(self.nx, offset=self.offset)
 
 
+def _check_element(element: Any) -> None:
+    wanted = "give an element, such as PrandtlIshlinskii(Play, 20), or None for a linear model"
+    if element is None:
+        return
+    if isinstance(element, type):
+        raise InputError(f"The element is {element.__name__}, a class; {wanted}.")
+    if not all(hasattr(element, name) for name in ("channels", "memory", "parameters", "step")):
+        raise InputError(f"The element is {element!r}; {wanted}.")
+
+
+def _check_pair(what: str, given: Any, wanted: str) -> None:
+    try:
+        first, second = (np.asarray(part, dtype=float) for part in given)
+    except (TypeError, ValueError):
+        first = second = np.asarray(np.nan)
+    if np.any(np.isnan(first)) or np.any(np.isnan(second)):
+        raise InputError(f"{given!r} was given as {what}; give a pair of numbers {wanted}.")
+
+
+def _is_identity(value: Any, n: int) -> bool:
+    return n > 0 and np.shape(value) == (n, n) and bool(np.all(np.asarray(value) == np.eye(n)))
+
+
 def _shaped(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     try:
         return np.broadcast_to(np.asarray(value, dtype=float), shape)
@@ -136,12 +177,20 @@ def _port(x: Any, u: Any, p: dict[str, Any]) -> Any:
 
 
 def hammerstein(nx: int, element: Element, offset: bool = True) -> PILFR:
-    """PI-Hammerstein: the input passes the element first; `z = u`, and u reaches the dynamics only through w."""
+    """PI-Hammerstein: the input passes the element first; `z = u`, and u reaches the dynamics only through w.
+
+    The element has one channel for each input.
+    """
+    _check_element(element)
     eye = np.eye(element.channels)
     return PILFR(nx, element, {"C_z": 0.0, "D_zu": eye, "B_u": 0.0, "D_yu": 0.0}, offset=offset)
 
 
 def wiener(nx: int, element: Element, offset: bool = True) -> PILFR:
-    """PI-Wiener: the linear dynamics come first, the output is read through the element; `y = w`."""
+    """PI-Wiener: the linear dynamics come first, the output is read through the element; `y = w`.
+
+    The element has one channel for each output.
+    """
+    _check_element(element)
     eye = np.eye(element.channels)
     return PILFR(nx, element, {"B_w": 0.0, "C_y": 0.0, "D_yu": 0.0, "D_yw": eye}, offset=offset)

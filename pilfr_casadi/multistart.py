@@ -10,15 +10,17 @@
    A last run without the prior shows what the prior costs.
 4. The smallest training error wins; with the prior wins over without when it is within `margin` of it.
 
+With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start.
+
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
 """
 
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -35,11 +37,11 @@ from .recording import InputError, Recording
 from .sensitivities import Engine
 from .solution import Solution, Status
 from .start import Blocks, grid_start, paper_start, regridded, unit_states
-from .subspace import subspace_matrices
 from .threads import one_blas_thread
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
+PLACES = ("output", "input")  # of the element in the first starts; in all others it is anywhere
 KEEP = 4  # candidates that are polished
 PRIOR = "weights held near a smooth density by a weak prior"
 
@@ -57,16 +59,21 @@ class Search:
     start: str = "grid"
     l1: dict[str, float] = field(default_factory=dict)
     noise: float | None = None
+    level: float = 1.0
 
-    def problem(self, model: Model, engine: Engine | None = None, noise: float = 1.0) -> Problem:
-        """The simulation-error problem of a model of this structure."""
+    def problem(self, model: Model, engine: Engine | None = None, noise: float | None = None) -> Problem:
+        """The simulation-error problem of a model of this structure.
+
+        Priors are weighed against the noise that was asked for, else what has been reached, `noise`; else what a linear
+        model reaches, `level`.
+        """
         return Problem(
             model,
             self.recordings,
             engine=engine or self.engine,
             constraints=self.constraints,
             l1=self.l1,
-            noise=self.noise or noise,
+            noise=self.noise or noise or self.level,
         )
 
     def model(self, values: dict[str, Any]) -> Model:
@@ -102,50 +109,33 @@ def _with_element(p: Any) -> Any:
     return p["A"] + p["B_w"] @ ca.diag(ca.sum2(p["w"])) @ p["C_z"]
 
 
-def linear_model(
-    recordings: Sequence[Recording],
-    structure: PILFR,
-    *,
-    engine: str = "auto",
-    constraints: tuple[Constraint, ...] = (),
-    solver: GaussNewton | None = None,
-) -> tuple[Model, Problem, Solution]:
-    """A linear state-space model: subspace identification refined by output error.
-
-    Raises
-    ------
-    InputError
-        If the recordings are too short for the order.
-    """
-    linear = structure.linear()
-    first = recordings[0]
-    offset = np.mean(np.concatenate([r.y for r in recordings]), axis=0) if structure.offset else np.zeros(first.n_y)
-    a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset)
-    model = linear.model(
-        first.n_u,
-        first.n_y,
-        {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset},
-        inputs=first.inputs,
-        outputs=first.outputs,
-    )
-    problem = Problem(model, recordings, engine=engine, constraints=constraints)
-    solution = (solver or GaussNewton(tolerance=1e-4)).solve(problem)
-    return model, problem, solution
-
-
 @one_blas_thread
 def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Candidate:
-    """One start, run until it has shown what it is worth (to the end with the paper's start)."""
+    """One start, run until it has shown what it is worth; with the paper's start to the end, polish included.
+
+    The paper's start draws thresholds far smaller than z, which end in clusters and beyond the visited range: a solver
+    alone does not bring them back.
+    """
     rng = np.random.default_rng(sequence)
     inputs = [r.u for r in search.recordings]
     scaled, states = unit_states(search.linear, inputs)
     if search.start == "paper":
         values, solver = paper_start(search.structure, scaled, rng), search.solver
     else:
-        values, solver = grid_start(search.structure, scaled, inputs, states, rng), EXPLORE
+        place = PLACES[seed] if seed < len(PLACES) else "random"
+        values, solver = grid_start(search.structure, scaled, inputs, states, rng, place), EXPLORE
     model = search.model(values)
     problem = search.problem(model)
-    return _candidate(seed, model, problem, solver.solve(problem))
+    candidate = _candidate(seed, model, problem, solver.solve(problem))
+    done = candidate.solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error)
+    if search.start != "paper" or done:
+        return candidate
+    polished = polish(search, candidate)
+    if search.solver == POLISH or polished is candidate:
+        return polished
+    # the user's solver has the last word
+    problem = search.problem(polished.model, problem.engine, noise=polished.error)
+    return _candidate(seed, polished.model, problem, search.solver.solve(problem, polished.theta), polished.note)
 
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:
@@ -178,11 +168,21 @@ def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candida
         problem = search.problem(model, engine, noise=best.error)
         solution = POLISH.solve(problem, np.concatenate([problem.start[:n_free], best.theta[n_free:]]))
         found.append(_candidate(candidate.seed, model, problem, solution, PRIOR if spread else ""))
+        if solution.status is Status.INTERRUPTED:
+            return _best_so_far(found)
     smooth = found[-1]
-    problem = search.problem(candidate.model, engine)
+    problem = search.problem(candidate.model, engine, noise=smooth.error)
     found.append(_candidate(candidate.seed, candidate.model, problem, POLISH.solve(problem, smooth.theta)))
+    if found[-1].solution.status is Status.INTERRUPTED:
+        return _best_so_far(found)
     best = min(found, key=lambda c: c.error)
     return smooth if smooth.error <= margin * best.error else best
+
+
+def _best_so_far(found: list[Candidate]) -> Candidate:
+    """The candidate of the smallest error, as one that was interrupted."""
+    best = min(found, key=lambda c: c.error)
+    return replace(best, solution=replace(best.solution, status=Status.INTERRUPTED))
 
 
 def _with_prior(model: Model, values: dict[str, Any], spread: float) -> Model:

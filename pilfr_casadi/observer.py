@@ -2,8 +2,8 @@
 
     x⁺ = f(x, u, p) + γ K (y_measured - y)
 
-γ (`observer`) is a parameter, fixed until changed: 1 gives the predictor, 0 the simulation. Fits that start far from the
-truth are annealed through it.
+γ (`observer`) is a parameter, fixed until changed: 1 gives the predictor, 0 the simulation. Fits that start far from
+the truth are annealed through it.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from .bla import BLA
 from .recording import InputError, check_for_identification
 from .subspace import Data
 from .subspace_frequency import FrequencyProblem
-from .subspace_problem import ROUNDING, SubspaceProblem, checked_order
+from .subspace_problem import ROUNDING, Progress, SubspaceProblem, checked_order
 from .subspace_time import TimeProblem
 
 Array = np.ndarray
@@ -60,7 +60,11 @@ class OrderSelection:
 
 
 def select_order(
-    data: Data, orders: Iterable[int] = range(1, 11), margin: float = 0.05, offset: bool = False
+    data: Data,
+    orders: Iterable[int] = range(1, 11),
+    margin: float = 0.05,
+    offset: bool = False,
+    progress: Progress | None = None,
 ) -> OrderSelection:
     """Try several orders on one part of the data and judge them on the other.
 
@@ -75,6 +79,8 @@ def select_order(
         The recommended order is the smallest whose validation error is at most ``1 + margin`` times the best.
     offset : bool
         For recordings: as for :func:`pilfr_casadi.subspace.time_subspace`.
+    progress : callable, optional
+        Called with ("orders", done, total, smallest training error so far).
 
     Returns
     -------
@@ -101,7 +107,7 @@ def select_order(
         n_train = max(1, min(len(records) - 1, round(0.7 * len(records))))
         train, held = TimeProblem(records[:n_train], offset), TimeProblem(records[n_train:], offset)
     tried = [n for n in tried if train.least_rows(n) <= train.most_rows] or tried[:1]
-    models = train.solve(tried, None)
+    models = train.solve(tried, None, progress)
     train_error, error = (np.array([part.error(m) for m in models]) for part in (train, held))
     good_enough = max((1 + margin) * np.min(error), ROUNDING)
     recommended = next(n for n, e in zip(tried, error, strict=True) if e <= good_enough)

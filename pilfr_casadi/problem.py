@@ -18,6 +18,7 @@ import numpy as np
 
 from .compiled import make_engine
 from .constraints import Constraint, compile_constraints
+from .magnitude import Neighbours
 from .model import Model
 from .nlp import Horizon, to_nlp
 from .recording import InputError, Recording, as_recordings
@@ -105,9 +106,10 @@ class Problem:
         if self.size == 0:
             raise InputError("Every parameter is fixed and no initial state is estimated; free at least one parameter.")
         self._columns = np.where(self.free, np.cumsum(self.free) - 1, -1)
+        self.noise = noise
         self._set_penalties(l1 or {}, noise)
-        g, slope, self.g_lower, self.g_upper, self.g_labels = compile_constraints(self.constraints, parameters)
-        self._g, self._g_slope = g, slope
+        compiled = compile_constraints(self.constraints, parameters)
+        self._g, self._g_slope, self.g_lower, self.g_upper, self.g_labels, self._g_units = compiled
 
     def _lay_out(self, at: int, periods: int | None) -> Iterator[_Part]:
         n_state = self.model.n_x + self.model.n_s
@@ -273,6 +275,26 @@ class Problem:
             jac[:, : int(self.free.sum())] = np.asarray(self._g_slope(self.parameters(theta)))[:, self.free]
         return jac
 
+    def constraint_units(self, theta: np.ndarray, squares: np.ndarray | None = None) -> np.ndarray:
+        """A change of each general constraint that counts, shape (n_g,): as given, else what its variables bring about.
+
+        The largest change that one variable brings about which moves by its size (`magnitude`) or, where that is zero,
+        by what changes the outputs by their own size, `squares` (size,) being the diagonal of the Gauss-Newton Hessian.
+        Zero where the constraint has no slope.
+        """
+        size = Neighbours(self.labels).sizes(theta)
+        still = np.ones(self.size) if squares is None else 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
+        change = np.abs(self.constraint_jacobian(theta)) * np.where(size > 0, size, still)
+        return np.where(np.isnan(self._g_units), np.max(change, axis=1, initial=0.0), self._g_units)
+
+    def active_constraints(self, theta: np.ndarray, tolerance: float = 1e-7) -> np.ndarray:
+        """Which general constraints are at a limit, or beyond, up to a share of their unit: (n_g,), bool."""
+        if not len(self.g_lower):
+            return np.zeros(0, dtype=bool)
+        g, unit = self.constraint(theta), self.constraint_units(theta)
+        slack = tolerance * np.where(unit > 0, unit, 1.0)
+        return (g >= self.g_upper - slack) | (g <= self.g_lower + slack)
+
     def to_nlp(self) -> Horizon:
         """The problem written out over the horizon as CasADi expressions, to add costs and constraints of one's own.
 
@@ -285,13 +307,14 @@ class Problem:
         return to_nlp(self)
 
     def nrmse(self, theta: np.ndarray) -> list[float]:
-        """NRMSE of each recording (Eq. 27, averaged over outputs)."""
+        """NRMSE of each recording (Eq. 27, averaged over outputs); a resting output counts next to all recordings'."""
         out = []
         for part, y in zip(self._parts, self.simulate(theta), strict=True):
-            e = (y - part.recording.y)[part.recording.skip :]
-            out.append(
-                float(np.mean(np.sqrt(np.mean(e**2, axis=0)) / np.std(part.recording.y[part.recording.skip :], axis=0)))
-            )
+            measured = part.recording.y[part.recording.skip :]
+            error, spread = y[part.recording.skip :] - measured, np.std(measured, axis=0)
+            rests = spread <= 1e-14 * np.max(np.abs(measured), axis=0)
+            size = np.where(rests, self.scale, spread)
+            out.append(float(np.mean(np.sqrt(np.mean(error**2, axis=0)) / size)))
         return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -26,6 +27,7 @@ def progress_bar() -> Iterator[Callable[[str, int, int, float], None]]:
         def report(stage: str, done: int, total: int, best: float) -> None:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=total, best="")
-            bar.update(tasks[stage], completed=done, total=total, best=f"best NRMSE {best:.4f}")
+            known = f"best NRMSE {best:.4f}" if math.isfinite(best) else ""
+            bar.update(tasks[stage], completed=done, total=total, best=known)
 
         yield report

@@ -5,7 +5,6 @@ input and output by name; other columns are ignored. Whatever is wrong with it i
 file, the column and the line.
 """
 
-import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,8 @@ from typing import Any, overload
 
 import numpy as np
 
-from .csv_table import existing_file, read_table
+from .array_files import mat_arrays, npz_arrays, samples
+from .csv_table import CsvTable, existing_file, read_table
 from .recording import InputError, Recording, listed
 from .timebase import TIME_NAMES, refuse_other_unit, step_of, time_column
 
@@ -33,8 +33,8 @@ class _Request:
     options: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if not self.inputs or not self.outputs:
-            raise InputError("a recording needs at least one input and one output; name their columns.")
+        if not self.inputs:
+            raise InputError("a recording needs at least one input; name its column.")
         known = {*self.inputs, *self.outputs, *TIME_NAMES}
         for name in self.columns:
             if name not in known:
@@ -43,7 +43,7 @@ class _Request:
                     f"outputs {listed(self.outputs)}, or t; correct the name."
                 )
         if self.dt is not None and not (np.isfinite(self.dt) and self.dt > 0):
-            raise InputError(f"the step dt is {self.dt!r}; give seconds from one sample to the next, above zero.")
+            raise InputError(f"dt={self.dt!r} was given; give the seconds from one sample to the next, above zero.")
 
     def column(self, name: str) -> str:
         return self.columns.get(name, name)
@@ -56,9 +56,14 @@ class _Request:
         mapped = [self.columns[name] for name in TIME_NAMES if name in self.columns]
         time = time_column(names, mapped[0] if mapped else None, source)
         wanted = [self.column(name) for name in (*self.inputs, *self.outputs)]
+        both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
+        if both:
+            raise InputError(f"{source}: column {both[0]!r} is taken both for an input and for an output; correct one.")
         for role, column in zip((*self.inputs, *self.outputs), wanted, strict=True):
             if column not in names:
-                hint = f"map it, as in {role}=COLUMN" if len(names) > 1 else "separate columns by commas"
+                hint = (
+                    f"map it, as in columns={{'{role}': 'COLUMN'}}" if len(names) > 1 else "separate columns by commas"
+                )
                 raise InputError(f"{source} has no column {column!r}; it has {listed(names)}: {hint}.")
         for name in [*wanted, time] if time else wanted:
             if list(names).count(name) > 1:
@@ -67,7 +72,7 @@ class _Request:
             refuse_other_unit(names, source)
             raise InputError(
                 f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in "
-                "seconds, or state the step dt."
+                "seconds, or state the step with dt=STEP."
             )
         return time, wanted
 
@@ -99,7 +104,8 @@ def read_csv(
     path : str or Path, or several
         One file, or a list of files with the same columns.
     inputs, outputs : str or sequence of str
-        Names of the inputs and outputs, which are also their columns where `columns` does not say otherwise.
+        Names of the inputs and outputs, which are also their columns where `columns` does not say otherwise. No outputs
+        (`()`) give a recording to simulate, not to fit.
     columns : mapping, optional
         Column by name, e.g. ``{"force": "u_vir_V"}``; the key ``"t"`` chooses the time column.
     dt : float, optional
@@ -138,7 +144,7 @@ def read_mat(
     channels ``name1, name2, ...``.
     """
     request = _request(inputs, outputs, **options)
-    return _each(path, request, lambda p, r: _from_arrays(p, _mat_arrays(p), r))
+    return _each(path, request, lambda p, r: _from_arrays(p, mat_arrays(p), r))
 
 
 @overload
@@ -154,7 +160,7 @@ def read_npz(
     channels ``name1, name2, ...``.
     """
     request = _request(inputs, outputs, **options)
-    return _each(path, request, lambda p, r: _from_arrays(p, _npz_arrays(p), r))
+    return _each(path, request, lambda p, r: _from_arrays(p, npz_arrays(p), r))
 
 
 @overload
@@ -169,12 +175,54 @@ def read(
     Parameters, returned values and errors are those of :func:`read_csv`; files of different kinds may be mixed.
     """
     if isinstance(path, (str, Path)):
-        suffix = Path(path).suffix.lower()
-        if suffix not in _READERS:
-            existing_file(path)
-            raise InputError(f"{path} has the suffix {suffix!r}; files named {', '.join(_READERS)} can be read.")
-        return _READERS[suffix](path, inputs, outputs, **options)
+        return _READERS[_suffix(Path(path))](path, inputs, outputs, **options)
     return tuple(read(p, inputs, outputs, **options) for p in path)
+
+
+def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the names of a file's columns or variables; `wanted` helps to find what separates those of a CSV file.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    """
+    content = _open(Path(path), wanted)
+    return content.names if isinstance(content, CsvTable) else tuple(content)
+
+
+def written_times(path: PathLike, columns: Mapping[str, str] | None = None) -> list[str] | None:
+    """Return the times of a file as they are written there (an array's to the last digit); None without a time column.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    """
+    columns = columns or {}
+    chosen = next((columns[name] for name in TIME_NAMES if name in columns), None)
+    content = _open(Path(path), [chosen or "t"])
+    if isinstance(content, CsvTable):
+        time = time_column(content.names, chosen, str(path))
+        return content.texts(time) if time else None
+    time = time_column(list(content), chosen, str(path))
+    if time is None:
+        return None
+    return [repr(t) for t in samples(content[time], time, Path(path))[:, 0].tolist()]
+
+
+def _open(path: Path, wanted: Sequence[str]) -> CsvTable | dict[str, np.ndarray]:
+    if (suffix := _suffix(path)) in (".mat", ".npz"):
+        return mat_arrays(path) if suffix == ".mat" else npz_arrays(path)
+    return read_table(path, lambda names: sum(name in names for name in wanted))
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in _READERS:
+        existing_file(path)
+        raise InputError(f"{path} has the suffix {suffix!r}; files named {', '.join(_READERS)} can be read.")
+    return suffix
 
 
 _READERS: dict[str, Callable[..., Recording]] = {
@@ -217,18 +265,18 @@ def _from_csv(path: Path, request: _Request) -> Recording:
 
 def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray], request: _Request) -> Recording:
     time, wanted = request.locate(list(arrays), str(path))
-    parts = [_samples(arrays[name], name, path) for name in wanted]
+    parts = [samples(arrays[name], name, path) for name in wanted]
     lengths = {name: len(part) for name, part in zip(wanted, parts, strict=True)}
     t = None
     if time is not None:
-        t = _samples(arrays[time], time, path)[:, 0]
+        t = samples(arrays[time], time, path)[:, 0]
         lengths[time] = len(t)
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} {n}" for name, n in lengths.items())
         raise InputError(f"{path} has vectors of different lengths ({counts} samples); give all the same.")
     dt = request.step(t, time, str(path), lambda k: f"sample {k}")
     n_u = len(request.inputs)
-    u, y = np.hstack(parts[:n_u]), np.hstack(parts[n_u:])
+    u, y = np.hstack(parts[:n_u]), np.hstack([np.empty((len(parts[0]), 0)), *parts[n_u:]])
     inputs = _channel_names(request.inputs, parts[:n_u])
     outputs = _channel_names(request.outputs, parts[n_u:])
     return _recording(path, request, u, y, dt, inputs, outputs)
@@ -253,46 +301,3 @@ def _recording(
         return Recording(u, y, dt, inputs, outputs, **options)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def _samples(values: np.ndarray, name: str, path: Path) -> np.ndarray:
-    """Return the array as (M, channels) of finite numbers; a row vector is taken as a column."""
-    if values.dtype.kind not in "biuf" or values.ndim > 2 or values.size == 0:
-        raise InputError(
-            f"{path}: variable {name!r} holds {values.dtype} of shape {values.shape}; give a vector of real numbers."
-        )
-    column = values.reshape(-1, 1) if values.ndim < 2 or 1 in values.shape else values
-    column = column.astype(float)
-    bad = np.argwhere(~np.isfinite(column))
-    if bad.size:
-        k, i = bad[0]
-        raise InputError(
-            f"{path}: variable {name!r}, sample {k} is {column[k, i]}; only finite numbers can be used: repair or "
-            "cut out that piece."
-        )
-    return column
-
-
-def _mat_arrays(path: Path) -> dict[str, np.ndarray]:
-    from scipy.io import loadmat
-
-    existing_file(path)
-    try:
-        content = loadmat(path)
-    except NotImplementedError:
-        raise InputError(f"{path} is a MATLAB file of version 7.3; save it with the option -v7.") from None
-    except Exception as error:  # the parser raises many kinds on damaged files
-        raise InputError(
-            f"{path} cannot be read as a MATLAB file ({error}); save it again with the option -v7."
-        ) from None
-    return {name: value for name, value in content.items() if not name.startswith("__")}
-
-
-def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
-    existing_file(path)
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
-            return {name: content[name] for name in content.files}
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path} cannot be read as a NumPy archive ({reason}); write it with numpy.savez.") from None

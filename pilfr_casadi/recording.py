@@ -5,23 +5,19 @@ simulation of it has to know besides: the state it starts from, what the input d
 periodic, and how many leading samples are not scored. It never changes once made; everything behind the door trusts it.
 """
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
 
-HOLDS = ("zero", "linear", None)
-INITIALS = ("zero", "estimate", "periodic")
+from .checks import InputError, check_options, initial_state, listed, signal
+
+__all__ = ["InputError", "Recording", "as_recordings", "check_for_identification", "listed"]
 SAME_STEP = (
     1e-4  # recordings fitted together may differ by this share in `dt` (a time column is written with few digits)
 )
-
-
-class InputError(ValueError):
-    """Something given by the user cannot be used; the message is one plain sentence for that user."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,7 +29,8 @@ class Recording:
     u : array, (M, n_u) or (M,)
         Inputs at the samples. Copied; stored as a read-only (M, n_u) array.
     y : array, (M, n_y) or (M,)
-        Outputs at the same samples. Copied; stored as a read-only (M, n_y) array.
+        Outputs at the same samples. Copied; stored as a read-only (M, n_y) array. (M, 0) where none was measured:
+        such a recording serves as the input of a simulation and is refused by every fit.
     dt : float
         Time from one sample to the next, in seconds.
     inputs, outputs : tuple of str
@@ -70,8 +67,8 @@ class Recording:
     name: str = ""
 
     def __post_init__(self) -> None:
-        u, inputs = _columns(self.u, self.inputs, "u", "input", self.label)
-        y, outputs = _columns(self.y, self.outputs, "y", "output", self.label)
+        u, inputs = signal(self.u, self.inputs, "u", "input", self.label)
+        y, outputs = signal(self.y, self.outputs, "y", "output", self.label, none=True)
         if len(u) != len(y):
             raise InputError(
                 f"{self.label} has {len(u)} samples of u but {len(y)} of y; give arrays of shape (samples, channels) "
@@ -90,10 +87,10 @@ class Recording:
             raise InputError(
                 f"{self.label} gives a unit for {strange[0]!r}; its columns are {listed(inputs + outputs)}."
             )
-        _check_options(self, len(u))
+        check_options(self, len(u))
         initial = self.initial
         if not isinstance(initial, str):
-            initial = _initial_state(initial, self.label)
+            initial = initial_state(initial, self.label)
         units = MappingProxyType(dict(self.units))
         clean = dict(u=u, y=y, dt=float(self.dt), inputs=inputs, outputs=outputs, units=units, initial=initial)
         for key, value in clean.items():
@@ -132,7 +129,7 @@ class Recording:
 
         head = f"Recording {self.name!r}" if self.name else "Recording"
         text = f"{head}: {len(self)} samples, dt {self.dt:.6g} s ({len(self) * self.dt:.4g} s), "
-        text += f"inputs {channels(self.inputs)}, outputs {channels(self.outputs)}"
+        text += f"inputs {channels(self.inputs)}, outputs {channels(self.outputs) or 'none'}"
         extras = {"period": self.period, "hold": self.hold, "skip": self.skip or None}
         initial = self.initial if isinstance(self.initial, str) else "given"
         shown = [f"initial {initial}", *(f"{key} {value}" for key, value in extras.items() if value is not None)]
@@ -207,10 +204,13 @@ def check_for_identification(data: Recording | Iterable[Recording], n_min: int =
     Raises
     ------
     InputError
-        When names or steps differ, samples are too few, every input is constant, or an output is constant.
+        When outputs are missing, names or steps differ, samples are too few, every input or an output is constant.
     """
     recordings = as_recordings(data)
     first = recordings[0]
+    for r in recordings:
+        if not r.n_y:
+            raise InputError(f"{r.label} has no outputs, so nothing can be fitted to it; name the measured columns.")
     for other in recordings[1:]:
         for key in ("inputs", "outputs"):
             a, b = getattr(first, key), getattr(other, key)
@@ -246,81 +246,3 @@ def check_for_identification(data: Recording | Iterable[Recording], n_min: int =
 
 def _varies(x: np.ndarray) -> bool:
     return bool(np.ptp(x) > 1e-12 * np.max(np.abs(x)))
-
-
-def listed(names: Sequence[str], most: int = 20) -> str:
-    """Join names for a message; of many, the first ones."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def _columns(
-    values: Any, names: Sequence[str], letter: str, role: str, label: str
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the signal as a read-only (M, n) copy, and its names."""
-    try:
-        given = np.asarray(values)
-        real = given.dtype.kind in "biuf" or given.dtype == object
-        array = np.array(given, dtype=float) if real else None
-    except (TypeError, ValueError):
-        array = None
-    if array is None:
-        raise InputError(f"{letter} of {label} is not an array of real numbers; give one of shape (samples, channels).")
-    if array.ndim == 1:
-        array = array[:, None]
-    if array.ndim != 2 or array.shape[1] == 0:
-        raise InputError(
-            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels)."
-        )
-    n = array.shape[1]
-    names = (names,) if isinstance(names, str) else tuple(names)
-    if not names:
-        names = (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
-    if len(names) != n:
-        raise InputError(f"{label} has {n} {role} column(s) but {len(names)} name(s) {listed(names)}; give one each.")
-    if len(set(names)) != n or not all(isinstance(name, str) and name for name in names):
-        raise InputError(f"the {role} names {names} of {label} must be distinct and not empty.")
-    if not np.isfinite(array).all():
-        k, i = np.argwhere(~np.isfinite(array))[0]
-        raise InputError(
-            f"sample {k} of {role} {names[i]!r} in {label} is {array[k, i]}; only finite numbers can be used, so "
-            "repair or cut out that piece."
-        )
-    array.setflags(write=False)
-    return array, names
-
-
-def _initial_state(values: Any, label: str) -> np.ndarray:
-    try:
-        state = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        state = np.empty(0)
-    if state.ndim != 1 or state.size == 0 or not np.isfinite(state).all():
-        raise InputError(
-            f"the initial state of {label} must be a vector of finite numbers, or one of {listed(INITIALS)}."
-        )
-    state.setflags(write=False)
-    return state
-
-
-def _check_options(r: Recording, m: int) -> None:
-    if not isinstance(r.dt, (int, float, np.number)) or not math.isfinite(r.dt) or r.dt <= 0:
-        raise InputError(
-            f"{r.label} has a step dt of {r.dt!r}; give the seconds from one sample to the next, above zero."
-        )
-    if r.hold not in HOLDS:
-        raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear' or None.")
-    if isinstance(r.initial, str) and r.initial not in INITIALS:
-        raise InputError(f"initial of {r.label} is {r.initial!r}; give one of {listed(INITIALS)}, or the state itself.")
-    if not _is_count(r.skip) or not 0 <= r.skip < m:
-        raise InputError(f"skip of {r.label} is {r.skip!r}; give a number of samples from 0 to {m - 1}.")
-    if r.period is not None and (not _is_count(r.period) or not 2 <= r.period <= m - r.skip):
-        raise InputError(
-            f"period of {r.label} is {r.period!r} samples; it must be a whole number from 2 to {m - r.skip}, so that "
-            "one period lies after the skipped samples."
-        )
-    if isinstance(r.initial, str) and r.initial == "periodic" and r.period is None:
-        raise InputError(f"initial of {r.label} is 'periodic' but its period is not given; set period, in samples.")
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)

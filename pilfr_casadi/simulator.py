@@ -1,6 +1,7 @@
 """The user's simulator: continuous-time equations with ports that missing physics can be put into.
 
-    ẋ = f(x, u, p) + Σ into_j(p) w_j,   y = h(x, u, p) + Σ into_j(p) w_j,   w_j = law_j(z_j, ż_j),   z_j = across_j(x, u)
+    ẋ = f(x, u, p) + Σ into_j(p) w_j,   y = h(x, u, p) + Σ into_j(p) w_j,
+    w_j = law_j(z_j, ż_j),   z_j = across_j(x, u)
 
 `close_loop(simulator, law, port)` puts a law into a port and gives a simulator again; `discretise` (in
 `integration.py`) makes it a `Model`, the same as any other. At an actuator or a sensor a law stands in series: what it
@@ -161,8 +162,11 @@ class Simulator:
         object.__setattr__(self, "parameters", ParameterSet(dict(self.parameters)))
         object.__setattr__(self, "ports", tuple(self.ports))
         x, u, named, t = self._symbols()
-        self.derivatives(x, u, named, t)
-        self.output_names  # noqa: B018 - evaluated to be checked
+        found = (
+            dict(zip(self.states, ca.vertsplit(self.derivatives(x, u, named, t)), strict=True)) if self.states else {}
+        )
+        known = [*x._values.values(), *u._values.values(), *named._values.values(), t]
+        _check_expressions({**found, **self.measured(x, u, named, t)}, known)
         names = [port.name for port in self.ports]
         if len(set(names)) != len(names):
             raise InputError(f"The port names {', '.join(names)} are not unique; name each port once.")
@@ -281,6 +285,22 @@ class Simulator:
             self,
             parameters=ParameterSet(dict(self.parameters)) | own,
             elements=(*self.elements, Placed(port, law, prefix)),
+        )
+
+
+def _check_expressions(found: Mapping[str, Any], known: list[Any]) -> None:
+    """Refuse symbols of the user's own, and the NaN that `math.sin(symbol)` gives without a word."""
+    names, expressions = list(found), list(found.values())
+    f = ca.Function("equations", known, expressions, {"allow_free": True})
+    if f.has_free():
+        raise InputError(f"The simulator's equations hold a symbol {f.get_free()[0]!r}; use x, u, p and t alone.")
+    k = range(f.n_instructions())
+    if any(f.instruction_id(i) == ca.OP_CONST and f.instruction_constant(i) != f.instruction_constant(i) for i in k):
+        for name in names:
+            _check_expressions({name: found[name]}, known) if len(names) > 1 else None
+        raise InputError(
+            f"The equation of {names[0]!r} holds a number that is none (NaN); use CasADi's functions on symbols, "
+            "as in ca.sin(x.pos) rather than math.sin(x.pos), and check constants."
         )
 
 

@@ -65,16 +65,31 @@ def grid_start(
     inputs: list[np.ndarray],
     states: list[np.ndarray],
     rng: np.random.Generator,
+    place: str = "random",
 ) -> Blocks:
-    """A random direction of z of unit deviation, thresholds on a grid over its range, equal weights, `B_w = D_yw = 0`.
+    """A direction of z of unit deviation, thresholds on a grid over its range, equal weights.
+
+    Places of the element, of which the last two stand for the commonest structures (backlash or friction in what drives
+    a linear system, or in what it drives):
+
+    - "random": a random direction in states and inputs, each in units of its deviation; `B_w = D_yw = 0`;
+    - "output": z is the linear model's output, half of which is read through the element;
+    - "input": z is the input, half of which reaches the linear model through the element.
 
     Where `structure` fixes blocks such that the input reaches the dynamics only through the element (Hammerstein), or
-    the output is read only through it (Wiener), the linear blocks move to the other side of the element.
+    the output is read only through it (Wiener), the linear blocks move to the other side of the element. Where it fixes
+    others, "output" and "input" give the direction of z alone.
     """
     element = _layer(structure)
     blocks = paper_start(structure, linear, rng)
     u, x = np.concatenate(inputs), np.concatenate(states)
-    fixed = structure.fixed
+    fixed, spread = structure.fixed, np.std(u, axis=0)
+    blocks["D_zu"] = blocks["D_zu"] / np.where(spread > 0, spread, 1.0)
+    at_output, at_input = (np.arange(element.channels) % n for n in (len(linear["C_y"]), u.shape[1]))
+    if place == "output":
+        blocks["C_z"], blocks["D_zu"] = linear["C_y"][at_output], linear["D_yu"][at_output]
+    elif place == "input":
+        blocks["C_z"], blocks["D_zu"] = np.zeros_like(blocks["C_z"]), np.eye(u.shape[1])[at_input]
     if "B_u" in fixed and "D_zu" in fixed:
         blocks["B_w"], blocks["D_yw"] = linear["B_u"], linear["D_yu"]
     if "C_y" in fixed and "D_yw" in fixed:
@@ -89,7 +104,22 @@ def grid_start(
     reach = np.max(np.abs(z), axis=0)
     blocks["r"] = 0.9 * reach[:, None] * np.arange(element.n) / element.n
     blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
+    if place != "random" and not set(blocks) & set(fixed):
+        blocks |= _halved(linear, size, at_output if place == "output" else at_input, place == "output")
     return blocks
+
+
+def _halved(linear: Mapping[str, np.ndarray], size: np.ndarray, at: np.ndarray, output: bool) -> Blocks:
+    """Linear blocks of which one half passes the element: channel i carries output or input `at[i]`, over `size`."""
+    b, c, d = linear["B_u"], linear["C_y"], linear["D_yu"]
+    through = np.zeros((len(at), len(c) if output else b.shape[1]))
+    through[np.arange(len(at)), at] = size
+    carried = np.count_nonzero(through, axis=0)
+    through *= 0.5 / np.maximum(carried, 1)
+    left = np.where(carried > 0, 0.5, 1.0)
+    if output:
+        return {"D_yw": through.T, "C_y": c * left[:, None], "D_yu": d * left[:, None]}
+    return {"B_w": b @ through.T, "D_yw": d @ through.T, "B_u": b * left, "D_yu": d * left}
 
 
 def _layer(structure: PILFR) -> PrandtlIshlinskii:

@@ -21,7 +21,7 @@ import numpy as np
 from .bla import BLA
 from .recording import Recording, as_recordings
 from .subspace_frequency import FrequencyProblem
-from .subspace_problem import checked_order
+from .subspace_problem import Progress, checked_order
 from .subspace_time import TimeProblem
 
 if TYPE_CHECKING:
@@ -103,7 +103,11 @@ def time_subspace(
 
 
 def subspace_matrices(
-    recordings: Recording | Iterable[Recording], nx: int, offset: bool = False, block_rows: int | None = None
+    recordings: Recording | Iterable[Recording],
+    nx: int,
+    offset: bool = False,
+    block_rows: int | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Array, Array, Array, Array]:
     """Matrices of :func:`time_subspace`, without the import of the control package.
 
@@ -111,6 +115,8 @@ def subspace_matrices(
     ----------
     recordings, nx, offset, block_rows
         As for :func:`time_subspace`; order 0, a static gain, is legal here.
+    progress : callable, optional
+        Called with ("subspace", done, total, smallest error so far).
 
     Returns
     -------
@@ -123,7 +129,7 @@ def subspace_matrices(
     """
     if nx == 0:
         return _static_gain(as_recordings(recordings), offset)
-    model = TimeProblem(recordings, offset).solve([checked_order(nx)], block_rows)[0]
+    model = TimeProblem(recordings, offset).solve([checked_order(nx)], block_rows, progress)[0]
     return model.A, model.B, model.C, model.D
 
 

@@ -11,6 +11,7 @@ Sources: McKelvey, Akçay & Ljung (1996) and Verhaegen (1994), in full in `subsp
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     import control
 
 Array = np.ndarray
+Progress = Callable[[str, int, int, float], None]
 
 ROUNDING = 1e-8  # relative errors below are rounding
 LADDER = tuple(round(4 * 1.5**k) for k in range(12))  # numbers of block rows to try: 4, 6, 9, 14, 20, 30, ...
@@ -103,19 +105,30 @@ class SubspaceProblem:
         steps = [r for r in LADDER if first < r <= self.most_rows][:TRIALS]
         return [first, *steps[:1], *(r for r in steps[1:] if r <= self.affordable_rows)]
 
-    def solve(self, orders: list[int], block_rows: int | None) -> list[Matrices]:
-        """Return the best model of each order."""
+    def solve(self, orders: list[int], block_rows: int | None, progress: Progress | None = None) -> list[Matrices]:
+        """Return the best model of each order; `progress` is called with (stage, done, total, smallest error)."""
         spaces: dict[int, RangeSpace] = {}
-        models = []
+        models: list[Matrices] = []
+        errors: list[float] = []
         for nx in orders:
-            trials = []
-            for r in self.ladder(nx, block_rows):
+            trials: list[tuple[Matrices, float]] = []
+            steps = self.ladder(nx, block_rows)
+            for k, r in enumerate(steps):
+                if progress:
+                    done, total = (k, len(steps)) if len(orders) == 1 else (len(models), len(orders))
+                    stage = "subspace" if len(orders) == 1 else "orders"
+                    progress(stage, done, total, min((*errors, *(e for _, e in trials)), default=np.nan))
                 if r not in spaces:
                     spaces[r] = self.range_space(r)
                 rows, shifted, C = (x[:, :nx] for x in spaces[r][:3])
                 A = np.linalg.lstsq(rows, shifted, rcond=None)[0]
                 trials.append(self.complete(reflected(A), C))
-            models.append(min(trials, key=lambda trial: trial[1])[0])
+            best = min(trials, key=lambda trial: trial[1])
+            models.append(best[0])
+            errors.append(best[1])
+        if progress and orders:
+            total = len(orders) if len(orders) > 1 else len(steps)
+            progress("orders" if len(orders) > 1 else "subspace", total, total, min(errors))
         return models
 
     def complete(self, A: Array, C: Array) -> tuple[Matrices, float]:

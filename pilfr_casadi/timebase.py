@@ -50,7 +50,10 @@ def time_column(names: Sequence[str], chosen: str | None, source: str) -> str | 
     if not found:
         return None
     if len(found) > 1:
-        raise InputError(f"{source} has several time columns ({', '.join(found)}); say which one, as in t={found[0]}.")
+        raise InputError(
+            f"{source} has several time columns ({', '.join(found)}); say which one, as in "
+            f"columns={{'t': '{found[0]}'}}."
+        )
     if found[0] not in names:
         raise InputError(f"{source} has no column {found[0]!r} for the time; its columns are {listed(names)}.")
     refuse_other_unit(found, source)
@@ -64,7 +67,7 @@ def refuse_other_unit(names: Sequence[str], source: str) -> None:
         if unit:
             raise InputError(
                 f"{source}: column {name!r} is time in {unit} by its name, but time must be in seconds; convert it and "
-                "name it t_s, or leave it out and state the step dt in seconds."
+                "name it t_s, or leave it out and state the step in seconds with dt=STEP."
             )
 
 
@@ -116,14 +119,14 @@ def step_of(
         raise InputError(
             f"{column} is not uniform: {place(k)} comes {gaps[k - 1]:.6g} s after the sample before it where "
             f"{usual:.6g} s is usual, and samples lie up to {deviation.max() / step:.2g} steps off a uniform grid; "
-            "resample, or state a larger time_tolerance."
+            "resample, or allow more with time_tolerance=STEPS."
         )
     step = float(f"{step:.12g}")
     if dt is None:
         return step
     if abs(step - dt) > AGREEMENT * dt:
         raise InputError(
-            f"{column} has a step of {step:.6g} s, but a step dt of {dt:.6g} s was stated, a ratio of {step / dt:.4g}; "
+            f"{column} has a step of {step:.6g} s, but dt={dt:.6g} was stated, a ratio of {step / dt:.4g}; "
             "time must be in seconds, so check its unit."
         )
     return float(dt)

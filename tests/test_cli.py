@@ -4,12 +4,13 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pilfr_casadi.cli import main
+from pilfr_casadi.cli import in_options, main
 
 
 def write_csv(path, seed=0, m=600, **columns):
@@ -85,8 +86,14 @@ def test_fit_simulate_and_export_run_end_to_end(capsys, tmp_path, train):
 def test_a_saved_model_can_be_fitted_further(capsys, tmp_path, train):
     assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
     model = tmp_path / "out" / "model.json"
-    status, out, _ = run(capsys, *fit_arguments(train, tmp_path, "--from", model))
+    names = ("--inputs", "u", "--outputs", "y", "--initial", "zero")
+    further = ("fit", train, *names, "--from", model, "--out", tmp_path / "further")
+    status, out, _ = run(capsys, *further)
     assert status == 0 and "Converged" in out
+    for option, value in (("--nx", 2), ("--operators", 20), ("--fix", "D_yu=0"), ("--bound", "w=0:1"), ("--seed", 0)):
+        refused(capsys, *further, option, value, says=(option, "--from"))
+    swapped = [{"u": "y", "y": "u"}.get(a, a) for a in (*further, "--overwrite")]
+    refused(capsys, *swapped, says=("--inputs y", "the model's inputs are u"))
 
 
 BAD_FILES = {
@@ -140,6 +147,16 @@ def test_too_few_samples_for_the_order(capsys, tmp_path):
         (("--nx", "-1"), "states"),
         (("--operators", "-2"), "--operators"),
         (("--starts", "0"), "starts"),
+        (("--seed", "-1"), "--seed"),
+        (("--channels", "0"), "--channels"),
+        (("--fix", "D_yu=0", "--fix", "D_yu=1"), "twice"),
+        (("--time-limit", "0"), "--time-limit"),
+        (("--period", "1"), "--period 1"),
+        (("--skip", "600"), "--skip 600"),
+        (("--dt", "0"), "--dt 0"),
+        (("--dt", "0.02"), "--dt 0.02"),
+        (("--column", "u=force"), "--column u=COLUMN"),
+        (("--column", "u=y"), "both for an input and for an output"),
     ],
 )
 def test_bad_options_are_refused(capsys, tmp_path, train, options, says):
@@ -186,7 +203,162 @@ def test_an_unstable_start_is_refused(capsys, tmp_path, train):
     document["parameters"]["A"]["value"] = [[1e6]]
     wild = tmp_path / "wild.json"
     wild.write_text(json.dumps(document))
-    refused(capsys, *fit_arguments(train, tmp_path, "--from", wild), says="diverges")
+    names = ("--inputs", "u", "--outputs", "y", "--initial", "zero")
+    refused(capsys, "fit", train, *names, "--from", wild, "--out", tmp_path / "wild", says="diverges")
+
+
+def test_messages_name_options_of_the_command_line(capsys, tmp_path, train, monkeypatch):
+    path = tmp_path / "odd.csv"
+    path.write_text(train.read_text().replace("t,u,y", "clock,u,y", 1))
+    refused(capsys, *fit_arguments(path, tmp_path), says="--dt STEP")
+    write_csv(path, time=np.arange(600) * 0.01)
+    refused(capsys, *fit_arguments(path, tmp_path), says="--column t=t")
+    t = np.arange(600) * 0.01
+    t[300] += 3e-4
+    write_csv(path, t=t)
+    refused(capsys, *fit_arguments(path, tmp_path), says="--time-tolerance STEPS")
+    assert run(capsys, *fit_arguments(path, tmp_path, "--time-tolerance", 0.1))[0] == 0
+    periodic = [a if a != "zero" else "periodic" for a in fit_arguments(train, tmp_path, "--overwrite")]
+    refused(capsys, *periodic, says="--period SAMPLES")
+    monkeypatch.setattr("pilfr_casadi.compiled.compiler", lambda: None)
+    refused(capsys, *fit_arguments(train, tmp_path, "--overwrite", "--engine", "c"), says="--engine vm")
+
+
+@pytest.mark.parametrize(
+    ("python", "options"),
+    [
+        ("or use engine='vm'.", "or use --engine vm."),
+        ("run in a script, or use workers=1.", "run in a script, or use --workers 1."),
+        ("give `period=`.", "give --period PERIOD."),
+        ("as in columns={'force': 'u_vir_V'}.", "as in --column force=u_vir_V."),
+        ("allow more with time_tolerance=STEPS.", "allow more with --time-tolerance STEPS."),
+        ("the file /data/run_dt=0.1.csv is empty", "the file /data/run_dt=0.1.csv is empty"),
+        ("but dt=0.01 was stated, a ratio", "but --dt 0.01 was stated, a ratio"),
+        ("give the model as `model=`", "use it in Python with load(FILE, model=MODEL)"),
+    ],
+)
+def test_keywords_become_options(python, options):
+    assert in_options(python) == options
+
+
+def test_options_are_not_abbreviated(capsys, tmp_path, train):
+    status, _, err = run(capsys, *fit_arguments(train, tmp_path)[:-2], "--start", "3")
+    assert status == 2 and "unrecognized arguments: --start" in err
+
+
+def test_a_model_is_overwritten_only_when_asked(capsys, tmp_path, train):
+    assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
+    model = tmp_path / "out" / "model.json"
+    before = model.read_text()
+    refused(capsys, *fit_arguments(train, tmp_path, "--seed", 1), says=("model.json exists", "--overwrite"))
+    assert model.read_text() == before
+    assert run(capsys, *fit_arguments(train, tmp_path, "--seed", 1, "--overwrite"))[0] == 0
+    assert model.read_text() != before
+
+
+def test_fit_says_what_it_works_with(capsys, tmp_path, train, monkeypatch):
+    status, out, _ = run(capsys, *fit_arguments(train, tmp_path))
+    assert status == 0
+    assert f"training data: {train}, 600 samples, step 0.01 s, inputs u, outputs y\n" in out
+    assert "order: 1, as given" in out
+    arguments = list(fit_arguments(train, tmp_path, "--overwrite", "--operators", 0))
+    del arguments[arguments.index("--nx") : arguments.index("--nx") + 2]
+    monkeypatch.setattr("pilfr_casadi.compiled.compiler", lambda: None)
+    monkeypatch.setattr("pilfr_casadi.commands.compiler", lambda: None)
+    status, out, err = run(capsys, *arguments)
+    assert status == 0 and err == ""
+    assert ", chosen on the training data\n" in out
+    assert "engine: CasADi's virtual machine, which is slower: no C compiler was found\n" in out
+
+
+def test_a_compiler_that_fails_is_named(capsys, tmp_path, train, monkeypatch):
+    monkeypatch.setattr("pilfr_casadi.compiled.compiler", lambda: "/bin/false")
+    status, out, err = run(capsys, *fit_arguments(train, tmp_path, "--operators", 2))
+    assert status == 0 and err == ""
+    assert out.count("virtual machine") == 1 and "/bin/false could not build the model" in out
+
+
+def test_a_time_limit_keeps_the_best_so_far(capsys, tmp_path):
+    path = write_csv(tmp_path / "train.csv", m=20000)
+    names = ("--inputs", "u", "--outputs", "y", "--nx", 4, "--operators", 20, "--starts", 2000)
+    began = time.monotonic()
+    status, out, _ = run(capsys, "fit", path, *names, "--time-limit", 6, "--out", tmp_path / "out")
+    assert time.monotonic() - began < 40
+    assert status == 0 and "the time limit was reached" in out
+    assert json.loads((tmp_path / "out" / "model.json").read_text())["parameters"]["A"]
+    status, _, err = run(capsys, "fit", path, *names, "--time-limit", 1e-3, "--out", tmp_path / "none")
+    assert status == 1 and "--time-limit 0.001" in err and not (tmp_path / "none" / "model.json").exists()
+
+
+@pytest.fixture
+def model(capsys, tmp_path, train):
+    assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
+    return tmp_path / "out" / "model.json"
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".mat"])
+def test_inputs_alone_are_enough_to_simulate(capsys, tmp_path, train, model, suffix):
+    from scipy.io import savemat
+
+    out, both = tmp_path / "sim.csv", tmp_path / "both.csv"
+    t, u = np.loadtxt(train, delimiter=",", skiprows=1).T[:2]
+    path = tmp_path / f"drive{suffix}"
+    if suffix == ".csv":
+        cells = [line.split(",") for line in train.read_text().splitlines()]
+        path.write_text("\n".join(f"{a},{b}" for a, b, _ in cells) + "\n")
+    else:
+        {".npz": lambda: np.savez(path, t=t, u=u), ".mat": lambda: savemat(path, {"t": t, "u": u})}[suffix]()
+    status, said, _ = run(capsys, "simulate", model, path, "--out", out)
+    assert status == 0 and "NRMSE" not in said and "initial state: zero" in said
+    assert run(capsys, "simulate", model, train, "--initial", "zero", "--out", both)[0] == 0
+    assert out.read_text() == both.read_text()
+    periodic = ("--initial", "periodic", "--period", 300)
+    status, said, _ = run(capsys, "simulate", model, path, *periodic, "--out", out)
+    assert status == 0 and "initial state: that of the periodic steady state" in said
+    refused(capsys, "simulate", model, path, "--initial", "estimate", "--out", out, says="needs measured outputs")
+    refused(capsys, "simulate", model, path, "--outputs", "y", "--out", out, says="no column 'y'")
+    refused(capsys, "fit", path, "--inputs", "u", "--outputs", "y", "--out", tmp_path / "no", says="no column 'y'")
+
+
+def test_names_that_are_not_the_models_are_refused(capsys, tmp_path, train, model):
+    out = tmp_path / "sim.csv"
+    simulate = ("simulate", model, train, "--out", out)
+    refused(capsys, *simulate, "--inputs", "y", "--outputs", "u", says=("--inputs y", "--column u=COLUMN"))
+    refused(capsys, *simulate, "--outputs", "x2", says=("--outputs x2", "the model's outputs are y"))
+    assert not out.exists()
+    other = tmp_path / "other.csv"
+    other.write_text(train.read_text().replace("t,u,y", "t,force,disp", 1))
+    columns = ("--column", "u=force", "--column", "y=disp")
+    status, said, _ = run(capsys, "simulate", model, other, *columns, "--out", out)
+    assert status == 0 and "NRMSE" in said
+    assert out.read_text().startswith("t,u,y\n")
+    refused(capsys, "simulate", model, train, "--out", tmp_path / "sim.npz", says="written as CSV")
+    refused(capsys, "simulate", model, train, "--out", model, says="overwrite the model")
+
+
+def test_times_are_written_as_read(capsys, tmp_path, train, model):
+    times = [f"{100 + k * 0.01:.4f}" for k in range(600)]
+    path, out = write_csv(tmp_path / "drive.csv", t=times), tmp_path / "sim.csv"
+    assert run(capsys, "simulate", model, path, "--out", out)[0] == 0
+    assert [line.split(",")[0] for line in out.read_text().splitlines()[1:]] == times
+    text = train.read_text().replace("t,u,y", "clock,u,y", 1)
+    path.write_text(text)
+    assert run(capsys, "simulate", model, path, "--dt", 0.01, "--out", out)[0] == 0
+    written = [line.split(",")[0] for line in out.read_text().splitlines()[1:]]
+    assert written[35] == "0.35" and max(map(len, written)) == 4
+
+
+def test_samples_too_large_to_square_get_one_sentence(capsys, tmp_path):
+    path = write_csv(tmp_path / "train.csv", y=np.r_[np.ones(99), 1e308, np.zeros(500)])
+    refused(capsys, *fit_arguments(path, tmp_path), says=("'y', line 101", "1e+308", "1e+100"))
+
+
+def test_the_piezo_problem_names_its_remedy(capsys, tmp_path, monkeypatch):
+    from problems.piezo_stack import main as piezo
+
+    monkeypatch.setenv("PILFR_DATA", str(tmp_path))
+    assert piezo(["--out", str(tmp_path)]) == 1
+    assert "PILFR_DATA" in capsys.readouterr().out
 
 
 def test_an_interrupted_run_writes_the_best_so_far(tmp_path):

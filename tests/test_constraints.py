@@ -7,7 +7,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pilfr_casadi.constraints import Constraint, compile_constraints, log_norm_of_power, stable
+from pilfr_casadi.constraints import SLACK, Constraint, compile_constraints, log_norm_of_power, stable
 from pilfr_casadi.parameters import Parameter, ParameterSet
 from pilfr_casadi.recording import InputError
 
@@ -77,12 +77,12 @@ def system():
 
 
 def test_stable_bounds_any_square_expression():
-    g, slope, lower, upper, labels = compile_constraints(
-        (stable(0.95), stable(1.0, lambda p: p["A"] * p["gain"], name="closed loop")), system()
+    g, slope, lower, upper, labels, _ = compile_constraints(
+        (stable(0.95, slack=0.0), stable(1.0, lambda p: p["A"] * p["gain"], name="closed loop")), system()
     )
     value = np.asarray(g(system().start)).ravel()
     np.testing.assert_allclose(np.exp(value), [0.9, 1.8], rtol=1e-4)
-    np.testing.assert_allclose(upper, [np.log(0.95), 0.0])
+    np.testing.assert_allclose(upper, [np.log(0.95), np.log(1 + SLACK)])
     assert np.all(np.isinf(lower))
     assert labels == ("spectral radius <= 0.95", "closed loop <= 1")
     assert np.asarray(slope(system().start)).shape == (2, 5)
@@ -91,7 +91,7 @@ def test_stable_bounds_any_square_expression():
 def test_own_expressions_of_named_parameters():
     mine = Constraint(lambda p: ca.vertcat(p["A"][0, 1] * p["gain"], ca.trace(p["A"])), [-1.0, 0.0], [1.0, 2.0], "mine")
     tied = Constraint(lambda p: p["gain"] - 2, 0.0, 0.0)
-    g, slope, lower, upper, labels = compile_constraints((mine, tied), system())
+    g, slope, lower, upper, labels, _ = compile_constraints((mine, tied), system())
     np.testing.assert_allclose(np.asarray(g(system().start)).ravel(), [0.4, 1.4, 0.0])
     assert labels == ("mine[0]", "mine[1]", "constraint")
     assert lower.tolist() == [-1, 0, 0]
@@ -101,7 +101,7 @@ def test_own_expressions_of_named_parameters():
 
 
 def test_no_constraints():
-    g, slope, lower, _, labels = compile_constraints((), system())
+    g, slope, lower, _, labels, _ = compile_constraints((), system())
     assert (
         np.asarray(g(system().start)).size == np.asarray(slope(system().start)).size == lower.size == len(labels) == 0
     )
@@ -110,7 +110,9 @@ def test_no_constraints():
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: stable(0.0), "bounded by 0.0; give a positive number"),
+        (lambda: stable(slack=-1e-6), "bounded by 1.0 with slack"),
+        (lambda: compile_constraints((Constraint(lambda p: p["gain"], unit=0.0),), system()), "unit of the constraint"),
+        (lambda: stable(0.0), "bounded by 0.0 with slack"),
         (
             lambda: compile_constraints((Constraint(lambda p: p["mass"], name="m"),), system()),
             "'m' reads a parameter 'mass'",

@@ -20,6 +20,8 @@ LAYERS = {
         "csv_table",
         "array_files",
         "timebase",
+        "interrupts",
+        "magnitude",
         "threads",
         "progress",
     ),
@@ -55,10 +57,10 @@ LAYERS = {
     5: ("gauss_newton", "ipopt", "callback", "damping", "scaling", "solution"),
     6: ("fit", "fitted", "linear_model", "penalty", "multistart", "export", "plots", "accepted", "load_simulator"),
     7: ("diagnose", "report"),  # a diagnosis writes its own report
-    8: ("cli", "commands", "diagnose_command", "option_values", "interrupts", "demo"),
+    8: ("cli", "commands", "diagnose_command", "option_values", "demo"),
 }
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}
-FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
+FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py" and p.parent.name != "demo_data")
 
 
 def module_of(path: Path) -> str:

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pilfr_casadi import InputError, read, read_csv, read_mat, read_npz
+from pilfr_casadi.readers import column_names, written_times
 from pilfr_casadi.timebase import step_of
 
 GOOD = "t,force,x2\n0,1,10\n0.1,2,20\n0.2,3,30\n0.3,4,40\n"
@@ -194,7 +195,7 @@ def test_wishes_that_cannot_be_met(write):
     for options, words in [
         (dict(columns={"forc": "u"}), "none of the inputs force"),
         (dict(columns={"t": "clock"}), "no column 'clock' for the time"),
-        (dict(columns={"force": "u"}), "no column 'u'; .*as in force=COLUMN"),
+        (dict(columns={"force": "u"}), "no column 'u'; .*as in columns={'force': 'COLUMN'}"),
         (dict(dt=0.0), "above zero"),
         (dict(dt=float("nan")), "above zero"),
         (dict(inputs=()), "at least one input"),
@@ -323,3 +324,36 @@ def test_read_by_suffix(write, tmp_path):
         read(write(GOOD, "a.xlsx"), "force", "x2")
     with pytest.raises(InputError, match="no file"):
         read(tmp_path / "gone.xlsx", "force", "x2")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".mat", ".npz"])
+def test_outputs_may_be_left_out(tmp_path, write, suffix):
+    path = write(GOOD) if suffix == ".csv" else save(tmp_path / f"rig{suffix}", t=T, force=U, x2=Y)
+    r = read(path, "force", ())
+    assert (r.inputs, r.outputs, r.u.shape, r.y.shape) == (("force",), (), (4, 1), (4, 0))
+    assert set(column_names(path)) >= {"t", "force", "x2"}
+
+
+def test_one_column_is_not_input_and_output(write):
+    with pytest.raises(InputError, match=r"rig\.csv: column 'x2' is taken both"):
+        read_csv(write(GOOD), "force", "x2", columns={"force": "x2"})
+
+
+def test_times_as_written(tmp_path, write):
+    text = GOOD.replace("0.1,", "1.00e-1,").replace("\n0.2", "\n\n0.20")
+    assert written_times(write(text)) == ["0", "1.00e-1", "0.20", "0.3"]
+    assert written_times(write(GOOD.replace("t,", "clock,")), {"t": "clock"})[1] == "0.1"
+    assert written_times(write(GOOD.replace("t,", "clock,"))) is None
+    assert written_times(save(tmp_path / "a.npz", t=T, force=U)) == ["0.0", "0.1", "0.2", "0.3"]
+    with pytest.raises(InputError, match="suffix"):
+        written_times(write(GOOD, "a.xlsx"))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_numbers_too_large_to_square_are_refused(tmp_path, write, suffix):
+    path = (
+        write(GOOD.replace("30", "1e308")) if suffix == ".csv" else save(tmp_path / "a.npz", t=T, force=U, x2=Y * 1e200)
+    )
+    with pytest.raises(InputError, match=r"x2.*up to 1e\+100") as caught:
+        read(path, "force", "x2")
+    sentence(caught)

@@ -78,6 +78,8 @@ NAN = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
         (dict(u=[[1.0], [1.0, 2.0]]), "real numbers"),
         (dict(u=NAN, y=np.zeros(3), inputs=("force", "volt")), "sample 1 of input 'volt' in recording 'rig' is nan"),
         (dict(y=np.full(20, np.inf)), "sample 0 of output 'y'.* is inf"),
+        (dict(u=np.r_[np.ones(19), 1e308]), "sample 19 of input 'u' .* up to 1e.100"),
+        (dict(u=[10**400] * 20), "real numbers"),
         (dict(dt=0.0), "above zero"),
         (dict(dt=np.nan), "above zero"),
         (dict(dt="fast"), "above zero"),
@@ -173,6 +175,17 @@ def test_identification_takes_what_varies():
 def test_recordings_that_do_not_fit_together(others, n_min, words):
     with pytest.raises(InputError, match=words):
         check_for_identification([recording(), *others], n_min)
+
+
+def test_a_recording_may_lack_outputs_but_cannot_be_fitted():
+    r = Recording(np.arange(9.0), np.empty((9, 0)), 0.1, name="drive")
+    assert (r.n_y, r.outputs, r.y.shape, r.slice(2).y.shape) == (0, (), (9, 0), (7, 0))
+    assert "outputs none" in repr(r)
+    assert pickle.loads(pickle.dumps(r)).n_y == 0
+    with pytest.raises(InputError, match="'drive' has no outputs"):
+        check_for_identification(r)
+    with pytest.raises(InputError, match="1 name"):
+        r.with_(outputs=("y",))
 
 
 def test_nothing_to_identify():

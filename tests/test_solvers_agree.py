@@ -135,7 +135,7 @@ def test_linear_constraints():
 
 
 def test_spectral_radius():
-    p = case("lti").problem(constraints=(stable(0.94),))
+    p = case("lti").problem(constraints=(stable(0.94, slack=0.0),))
     found = solve_all(p)
     for s in found:
         a = p.model.parameters.unpack(p.parameters(s.theta))["A"]

@@ -268,9 +268,7 @@ def _where_in_frequency(found: dict[str, Any]) -> str:
             held = float(total[j] - total[i])
             if best is None or (j - i, -held) < best[:2]:
                 best = (j - i, -held, i, j)
-    if best is None:
-        return "The mismatch is spread over all frequencies"
-    _, held, i, j = best
+    _, held, i, j = best or (0, -1.0, 0, len(share))
     amount = "Almost all" if held < -0.95 else f"{-100 * held:.0f} %"
     low, high = found["low"][i], found["high"][j - 1]
     where = f"below {high:.3g} Hz" if low == 0 else f"between {low:.3g} and {high:.3g} Hz"

@@ -101,11 +101,15 @@ def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[
         )
         for start in file.rows(training, "starts")
     ]
-    errors = file.array(file.rows(training, "nrmse"), None, "the training error", np.inf)
+    errors, linear = (
+        file.array(file.rows(training, key) if key in training else [], None, "the training error", np.inf)
+        for key in ("nrmse", "linear_nrmse")
+    )
     return {
         "solution": solution,
         "labels": tuple(variables),
         "train_nrmse": tuple(errors.ravel().tolist()),
+        "linear_nrmse": tuple(linear.ravel().tolist()),
         "active": tuple(str(name) for name in file.rows(training, "active")),
         "candidates": tuple(candidates),
         "seconds": file.number(training, "seconds"),

@@ -74,6 +74,7 @@ def _document(fit: Fit) -> dict[str, Any]:
             "sentence": solution.status.value,
             "message": solution.message,
             "nrmse": _plain(fit.train_nrmse),
+            "linear_nrmse": _plain(fit.linear_nrmse),
             "seconds": fit.seconds,
             "active": list(fit.active),
             "solve": _solve(solution),

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 from ..export import write_atomically
 from ..recording import InputError, Recording
+from .diagnosis_files import diagnosis_report
 from .page import Code, Page, Picture, Section, Table, Text, write_report
 
 if TYPE_CHECKING:
     from ..fit import Fit
 
-__all__ = ["Code", "Page", "Picture", "Section", "Table", "Text", "fit_report", "write_report"]
+__all__ = ["Code", "Page", "Picture", "Section", "Table", "Text", "diagnosis_report", "fit_report", "write_report"]
 
 
 def fit_report(

@@ -1,0 +1,104 @@
+"""What is wrong with the fields of a recording, in one plain sentence each; layer 0, knows nothing of the rest."""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .recording import Recording
+
+HOLDS = ("zero", "linear", None)
+INITIALS = ("zero", "estimate", "periodic")
+LARGEST = 1e100  # samples above cannot be squared and summed
+
+
+class InputError(ValueError):
+    """Something given by the user cannot be used; the message is one plain sentence for that user."""
+
+
+def listed(names: Sequence[str], most: int = 20) -> str:
+    """Join names for a message; of many, the first ones."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def usable(values: np.ndarray) -> np.ndarray:
+    """Where the values are finite and small enough for their squares to be summed; a boolean array of their shape."""
+    return np.abs(values) <= LARGEST  # False for nan
+
+
+def signal(
+    values: Any, names: Sequence[str], letter: str, role: str, label: str, none: bool = False
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the signal as a read-only (M, n) copy, and its names; (M, 0) only where `none` allows it."""
+    try:
+        given = np.asarray(values)
+        real = given.dtype.kind in "biuf" or given.dtype == object
+        array = np.array(given, dtype=float) if real else None
+    except (TypeError, ValueError, OverflowError):
+        array = None
+    if array is None:
+        raise InputError(f"{letter} of {label} is not an array of real numbers; give one of shape (samples, channels).")
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2 or (array.shape[1] == 0 and not none):
+        raise InputError(
+            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels)."
+        )
+    n = array.shape[1]
+    names = (names,) if isinstance(names, str) else tuple(names)
+    if not names and n:
+        names = (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
+    if len(names) != n:
+        raise InputError(f"{label} has {n} {role} column(s) but {len(names)} name(s) {listed(names)}; give one each.")
+    if len(set(names)) != n or not all(isinstance(name, str) and name for name in names):
+        raise InputError(f"the {role} names {names} of {label} must be distinct and not empty.")
+    unusable = ~usable(array)
+    if unusable.any():
+        k, i = np.argwhere(unusable)[0]
+        raise InputError(
+            f"sample {k} of {role} {names[i]!r} in {label} is {array[k, i]}; only finite numbers up to {LARGEST:g} can "
+            "be used, so repair or cut out that piece, or give it in another unit."
+        )
+    array.setflags(write=False)
+    return array, names
+
+
+def initial_state(values: Any, label: str) -> np.ndarray:
+    """Return the state at the first sample as a read-only vector."""
+    try:
+        state = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        state = np.empty(0)
+    if state.ndim != 1 or state.size == 0 or not np.isfinite(state).all():
+        raise InputError(
+            f"the initial state of {label} must be a vector of finite numbers, or one of {listed(INITIALS)}."
+        )
+    state.setflags(write=False)
+    return state
+
+
+def check_options(r: "Recording", m: int) -> None:
+    """Check the step, `hold`, `initial`, `skip` and `period` of a recording of `m` samples."""
+    if not isinstance(r.dt, (int, float, np.number)) or not math.isfinite(r.dt) or r.dt <= 0:
+        raise InputError(
+            f"{r.label} has a step dt of {r.dt!r}; give the seconds from one sample to the next, above zero."
+        )
+    if r.hold not in HOLDS:
+        raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear' or None.")
+    if isinstance(r.initial, str) and r.initial not in INITIALS:
+        raise InputError(f"initial of {r.label} is {r.initial!r}; give one of {listed(INITIALS)}, or the state itself.")
+    if not _is_count(r.skip) or not 0 <= r.skip < m:
+        raise InputError(f"{r.label} was given skip={r.skip!r}; give a number of samples from 0 to {m - 1}.")
+    if r.period is not None and (not _is_count(r.period) or not 2 <= r.period <= m - r.skip):
+        raise InputError(
+            f"{r.label} was given period={r.period!r}; it must be a whole number of samples from 2 to {m - r.skip}, so "
+            "that one period lies after the skipped samples."
+        )
+    if isinstance(r.initial, str) and r.initial == "periodic" and r.period is None:
+        raise InputError(f"{r.label} was given initial='periodic' but no period; set period=SAMPLES.")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)

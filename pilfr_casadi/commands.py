@@ -1,0 +1,284 @@
+"""What each command of `cli` does: read, check, call the Python API, write, say what was done."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .cli import DONE, INTERRUPTED, NO_RESULT, say
+from .compiled import compiler, make_engine
+from .elements import PrandtlIshlinskii
+from .export import load, write_atomically
+from .fit import Fit
+from .fit import fit as identify
+from .gauss_newton import GaussNewton
+from .interrupts import Clock, deferred_interrupt, insistent, time_limit, worker_pool
+from .ipopt import Ipopt
+from .lfr import PILFR, hammerstein, wiener
+from .metrics import nrmse
+from .operators import GeneralizedPlay, Play, Stop
+from .option_values import bounds, name_list, number, pairs
+from .order_selection import select_order
+from .progress import progress_bar
+from .readers import column_names, read, written_times
+from .recording import InputError, Recording, listed
+from .sensitivities import VirtualMachine
+from .solution import Status
+
+# options of a search with their defaults; a saved model to start from has them already
+SEARCH = {
+    "nx": None,
+    "operators": 20,
+    "operator": "play",
+    "channels": 1,
+    "structure": "lfr",
+    "bound": (),
+    "fix": (),
+    "starts": 8,
+    "seed": 0,
+}
+
+
+def fit(options: argparse.Namespace) -> int:
+    """Identify a model, write it with a report."""
+    given = [f"--{name}" for name in SEARCH if getattr(options, name) is not None]
+    if options.start_from and given:
+        raise InputError(
+            f"{listed(given)} was given together with --from, whose model has its structure and start already; "
+            "leave one of them out."
+        )
+    for name, default in SEARCH.items():
+        if getattr(options, name) is None:
+            setattr(options, name, default)
+    inputs, outputs = name_list(options.inputs, "--inputs"), name_list(options.outputs, "--outputs")
+    seen = [Path(path).resolve() for path in (*options.train, *options.test)]
+    if len(set(seen)) < len(seen):
+        raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
+    for name, least in (("starts", 1), ("seed", 0), ("workers", 1), ("operators", 0), ("channels", 1)):
+        if getattr(options, name) < least:
+            raise InputError(f"--{name} {getattr(options, name)} was given; give {least} or more.")
+    if options.time_limit is not None and not 0 < options.time_limit < math.inf:
+        raise InputError(f"--time-limit {options.time_limit:g} was given; give seconds, above zero.")
+    target = Path(options.out) / "model.json"
+    if target.exists() and not options.overwrite:
+        raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
+    saved = load(options.start_from) if options.start_from else None
+    if saved is not None:
+        _check_names(saved, inputs, outputs)
+    train = [read_file(options, path, inputs, outputs) for path in options.train]
+    tests = [read_file(options, path, inputs, outputs) for path in options.test]
+    folder = make_folder(options.out)
+    for kind, paths, recordings in (("training", options.train, train), ("test", options.test, tests)):
+        for path, r in zip(paths, recordings, strict=True):
+            names = f"inputs {listed(r.inputs)}, outputs {listed(r.outputs)}"
+            print(f"{kind} data: {path}, {len(r)} samples, step {r.dt:.6g} s, {names}", flush=True)
+    solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
+    clock = Clock()
+    try:
+        with (
+            time_limit(options.time_limit, clock),
+            worker_pool(options.workers) as pool,
+            progress_bar() as bar,
+            insistent(bar) as progress,
+        ):
+            task: PILFR | Fit = saved if saved is not None else _structure(options, _order(options, train))
+            engine = _engine(task, train[0], options.engine)
+            search = {} if saved is not None else {"starts": options.starts, "seed": options.seed, "executor": pool}
+            result = identify(task, train, solver=solver, engine=engine, progress=progress, **search)
+    except KeyboardInterrupt:
+        if clock.expired:
+            return say(f"No model was ready within --time-limit {options.time_limit:g}; give more time.", NO_RESULT)
+        raise
+    if result.status is Status.INTERRUPTED and clock.expired:
+        result = replace(result, solution=replace(result.solution, status=Status.TIME_LIMIT))
+    result = replace(result, engine=engine)
+    try:
+        with deferred_interrupt():
+            result.save(target)
+            from .report import fit_report
+        print(result)
+        if isinstance(task, PILFR) and task.element is not None and result.structure != task:
+            print("No start was finished: this is the linear model that the starts begin with.")
+        for recording in tests:
+            print(f"NRMSE on {recording.name}: {result.nrmse(recording):.4f}{_share_of_range(result, recording)}")
+        page = fit_report(result, train, tests, folder)
+        print(f"model: {target}\nreport: {page}")
+    except KeyboardInterrupt:
+        return say(f"Interrupted; the model is in {target}, a report was not written.", INTERRUPTED)
+    if result.status is Status.INTERRUPTED:
+        return INTERRUPTED
+    return (
+        DONE
+        if min(result.train_nrmse) < 1.0
+        else say("The model explains nothing of the training recording.", NO_RESULT)
+    )
+
+
+def simulate(options: argparse.Namespace) -> int:
+    """Simulate a saved model on a file's inputs; judge it where the file has outputs."""
+    out = Path(options.out)
+    for path, what in ((options.data, "recording"), (options.model, "model")):
+        if out.resolve() == Path(path).resolve():
+            raise InputError(f"--out {options.out} would overwrite the {what}; give another file.")
+    if out.suffix.lower() in (".mat", ".npz"):
+        raise InputError(f"--out {options.out} is written as CSV; give a name that ends in .csv.")
+    fitted = load(options.model)
+    inputs = name_list(options.inputs, "--inputs") if options.inputs else fitted.model.inputs
+    outputs = name_list(options.outputs, "--outputs") if options.outputs else fitted.model.outputs
+    if Path(options.data).suffix.lower() not in (".mat", ".npz"):  # there, a matrix stands for several names
+        _check_names(fitted, inputs, outputs)
+    columns = pairs(options.column, "--column")
+    there = column_names(options.data, [columns.get(name, name) for name in (*inputs, *outputs)])
+    measured = bool(options.outputs) or any(name in columns or name in there for name in outputs)
+    if not measured and options.initial == "estimate":
+        raise InputError(
+            f"--initial estimate needs measured outputs, but {options.data} has no column {listed(outputs)}; "
+            "give --initial zero, or --initial periodic with --period SAMPLES."
+        )
+    options.initial = options.initial or ("estimate" if measured else "zero")
+    columns = columns if measured else {k: v for k, v in columns.items() if k not in outputs}
+    recording = read_file(options, options.data, inputs, outputs if measured else ())
+    _check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
+    if not measured:
+        blank = np.zeros((len(recording), len(outputs)))
+        recording = recording.with_(y=blank, outputs=outputs)
+    engine = _engine(fitted, recording, "auto", quiet=True)
+    y = replace(fitted, engine=engine).simulate(recording)
+    if not np.all(np.isfinite(y)):
+        return say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
+    times = written_times(options.data, columns) or [repr(float(f"{t:.12g}")) for t in recording.t]
+    rows = np.column_stack([recording.u, y]).tolist()
+    lines = [",".join([t.strip(), *map(repr, row)]) for t, row in zip(times, rows, strict=True)]
+    header = ",".join(["t", *fitted.model.inputs, *fitted.model.outputs])
+    write_atomically(out, "\n".join([header, *lines]) + "\n")
+    if measured:
+        print(_judged(recording, y))
+    else:
+        state = "zero" if options.initial == "zero" else "that of the periodic steady state"
+        print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
+    print(f"simulated outputs: {options.out}")
+    return DONE
+
+
+def export(options: argparse.Namespace) -> int:
+    """Write a saved model as a serialized CasADi function."""
+    function, out = load(options.model).to_casadi(), Path(options.out)
+    if out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
+        raise InputError(f"--out {options.out} cannot be written; give a file in a folder that exists.")
+    if out.resolve() == Path(options.model).resolve():
+        raise InputError(f"--out {options.out} would overwrite the model; give another file.")
+    function.save(str(out))
+    print(f"casadi function: {options.out}")
+    return DONE
+
+
+def diagnose(options: argparse.Namespace) -> int:
+    """Find what a simulator leaves out."""
+    from .diagnose_command import run_diagnosis
+
+    return run_diagnosis(options)
+
+
+def demo(options: argparse.Namespace) -> int:
+    """Identify the rig whose recordings come with the package."""
+    from .demo import run_demo
+
+    if options.workers < 1:
+        raise InputError(f"--workers {options.workers} was given; give 1 or more.")
+    return run_demo(make_folder(options.out), options.workers)
+
+
+def read_file(options: argparse.Namespace, path: str, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Recording:
+    """A recording, as the options say."""
+    more = {key: getattr(options, key) for key in ("period", "hold", "skip", "dt", "time_tolerance")}
+    columns = pairs(options.column, "--column")
+    return read(path, inputs, outputs, columns=columns, initial=options.initial or "estimate", **more)
+
+
+def _check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> None:
+    """Refuse names that are not the model's, in its order: swapped ones would be simulated without a word."""
+    for role, names, own in (("inputs", inputs, fitted.model.inputs), ("outputs", outputs, fitted.model.outputs)):
+        if tuple(names) != tuple(own):
+            raise InputError(
+                f"--{role} {','.join(names)} was given but the model's {role} are {','.join(own)}, in this order; "
+                f"use its names and say which column each is, as in --column {own[0]}=COLUMN."
+            )
+
+
+def _structure(options: argparse.Namespace, nx: int) -> PILFR:
+    kind: Any = {"play": Play, "stop": Stop, "generalized_play": GeneralizedPlay}[options.operator]
+    element = PrandtlIshlinskii(kind, options.operators, options.channels) if options.operators else None
+    fixed = {name: number(value, "--fix") for name, value in pairs(options.fix, "--fix").items()}
+    if options.structure == "lfr" or element is None:
+        base = PILFR(nx, element)
+    else:
+        base = {"hammerstein": hammerstein, "wiener": wiener}[options.structure](nx, element)
+    return PILFR(nx, element, {**base.fixed, **fixed}, bounds(options.bound))
+
+
+def _order(options: argparse.Namespace, train: Sequence[Recording]) -> int:
+    if options.nx is not None:
+        print(f"order: {options.nx}, as given", flush=True)
+        return int(options.nx)
+    nx = int(select_order(train, range(1, 9), offset=True).recommended)
+    print(f"order: {nx}, chosen on the training data", flush=True)
+    return nx
+
+
+def _engine(task: PILFR | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
+    """Build the engine once, say which one it is and why; returns the choice that gives it without a warning."""
+    if choice != "vm":
+        model = task.model(recording.n_u, recording.n_y) if isinstance(task, PILFR) else task.model
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            engine = make_engine(model, choice)
+        if not isinstance(engine, VirtualMachine):
+            if not quiet:
+                print("engine: generated C, compiled", flush=True)
+            return choice
+        found = [str(w.message) for w in caught if issubclass(w.category, RuntimeWarning)]
+        reason = (
+            (found[-1].rpartition(";")[0] or found[-1])
+            if found
+            else "no C compiler was found"
+            if compiler() is None
+            else "it could not be built"
+        )
+        print(f"engine: CasADi's virtual machine, which is slower: {' '.join(reason.split())}", flush=True)
+    elif not quiet:
+        print("engine: CasADi's virtual machine, as given", flush=True)
+    return "vm"
+
+
+def make_folder(path: str) -> Path:
+    """Make the output folder before any long work, so that a bad one is said at once."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".writable-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"The folder {path} cannot be written ({error.strerror}); give another --out.") from None
+    return folder
+
+
+def _share_of_range(result: Fit, recording: Recording) -> str:
+    error = (result.simulate(recording) - recording.y)[recording.skip :]
+    share = 100 * np.sqrt(np.mean(error**2, axis=0)) / np.ptp(recording.y[recording.skip :], axis=0)
+    return f" (rms error {', '.join(f'{s:.2f}' for s in share)} % of the range)"
+
+
+def _judged(recording: Recording, y: np.ndarray) -> str:
+    try:
+        return f"NRMSE on {recording.name}: {nrmse(recording.y, y, skip=recording.skip):.4f}"
+    except InputError as error:
+        return f"no NRMSE on {recording.name}: {error}"

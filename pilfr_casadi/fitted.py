@@ -1,0 +1,319 @@
+"""What `fit` returns: a fitted model with how it came about, which simulates, judges, draws and saves itself."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from .compiled import make_engine
+from .gauge import standard_errors
+from .gauss_newton import GaussNewton
+from .lfr import PILFR
+from .metrics import nrmse, rmse_per_output
+from .model import Model
+from .multistart import PRIOR, Candidate
+from .problem import Problem
+from .recording import InputError, Recording, as_recordings
+from .sensitivities import Engine
+from .solution import Solution, Status
+
+Progress = Callable[[str, int, int, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted model and how it came about.
+
+    Attributes
+    ----------
+    model : Model
+        Closed model with the fitted values as its parameters' values.
+    structure : PILFR or None
+        What was asked for, where it was a PI-LFR.
+    solution : Solution
+        Status, cost, iterations, history, multipliers.
+    train_nrmse : tuple of float
+        NRMSE (Eq. 27) of each training recording.
+    initial : dict
+        Fingerprint of each training recording -> state with memory at its first sample.
+    labels : tuple of str
+        Names of the variables in `solution.theta`.
+    errors : dict
+        Standard errors by parameter name, in the gauge of `gauge.standard_errors`; nan where fixed or at a bound, inf
+        where the data (and the user's priors, but none of the search's own) say nothing.
+    active : tuple of str
+        Variables that are at a bound, with their values, and constraints that are at a limit.
+    linear : Model or None
+        The linear model that the search began with, `linear_nrmse` its NRMSE on each training recording.
+    candidates : tuple of Candidate
+        Every start that was tried.
+    """
+
+    model: Model
+    structure: PILFR | None
+    dt: float
+    solution: Solution
+    train_nrmse: tuple[float, ...]
+    initial: dict[str, np.ndarray]
+    labels: tuple[str, ...] = ()
+    errors: dict[str, np.ndarray] = field(default_factory=dict)
+    active: tuple[str, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
+    linear: Model | None = None
+    seconds: float = 0.0
+    units: dict[str, str] = field(default_factory=dict)
+    engine: str = "auto"
+    note: str = ""
+    linear_nrmse: tuple[float, ...] = ()
+
+    @property
+    def status(self) -> Status:
+        """How the winning solve ended."""
+        return self.solution.status
+
+    @property
+    def parameters(self) -> dict[str, np.ndarray]:
+        """Fitted values by name."""
+        return {name: p.value for name, p in self.model.parameters.items()}
+
+    @cached_property
+    def _engine(self) -> Engine:
+        return make_engine(self.model, self.engine)
+
+    def initial_state(self, recording: Recording, samples: int | None = None) -> np.ndarray:
+        """State with memory at a recording's first sample, as its `initial` says.
+
+        Where it is to be estimated, a recording of the training gets the state of the fit. For any other the model is
+        held and the state fitted to the first `samples` samples (default: ten a state, at least 50); nothing later is
+        looked at, and `nrmse` does not score them.
+        """
+        self._check(recording)
+        n = self.model.n_x + self.model.n_s
+        initial = recording.initial
+        known = self.initial.get(fingerprint(recording))
+        if known is not None:
+            return known
+        if not isinstance(initial, str):
+            given = np.asarray(initial, dtype=float).ravel()
+            states = len(self.model.states)
+            if given.size not in (states, n):
+                raise InputError(f"An initial state of {given.size} numbers was given; expected {states} or {n}.")
+            return np.concatenate([given, np.zeros(n - given.size)])
+        values = self.model.parameters.start
+        state = np.zeros(n)
+        if initial == "periodic":
+            period = self.model.drive(recording)[: (recording.period or 1) * self.model.substeps]
+            for _ in range(200):
+                before = state
+                state = self._engine.simulate(period, values, state)[1]
+                if np.max(np.abs(state - before)) <= 1e-10 * max(float(np.max(np.abs(state))), 1e-300):
+                    break
+        elif initial == "estimate" and n:
+            samples = min(len(recording), samples or self._samples_for_state)
+            held = self.model.with_parameters(
+                self.model.parameters.change(**{k: {"fixed": True, "prior": None} for k in self.model.parameters})
+            )
+            head = recording.slice(0, max(samples, 2)).with_(skip=0)
+            spread = np.std(head.y, axis=0)
+            spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
+            problem = Problem(held, head, engine=self._engine, scale=spread)
+            state = GaussNewton(max_iterations=50).solve(problem).theta
+        return state
+
+    def simulate(self, recording: Recording) -> np.ndarray:
+        """Simulated outputs for a recording's inputs, shape (M, n_y).
+
+        Raises
+        ------
+        InputError
+            If what is given is no recording, or does not fit the model.
+        """
+        return self.signals(recording)["y"]
+
+    def signals(self, recording: Recording) -> dict[str, np.ndarray]:
+        """Simulated `y` (M, n_y) with the element's `z` and `w` (M, n_w)."""
+        self._check(recording)
+        state = self.initial_state(recording)
+        y, _, z, w = self._engine.simulate(self.model.drive(recording), self.model.parameters.start, state, True)
+        return {"y": y, "z": z, "w": w}
+
+    @property
+    def _samples_for_state(self) -> int:
+        return max(10 * (self.model.n_x + self.model.n_s), 50)
+
+    def scored_from(self, recording: Recording) -> int:
+        """First sample that is scored: behind `skip`, and behind those that an initial state has been fitted to.
+
+        Raises
+        ------
+        InputError
+            If no sample is left.
+        """
+        estimated = isinstance(recording.initial, str) and recording.initial == "estimate"
+        if not estimated or fingerprint(recording) in self.initial or not self.model.n_x + self.model.n_s:
+            return recording.skip
+        first = max(recording.skip, self._samples_for_state)
+        if first >= len(recording):
+            raise InputError(
+                f"The recording has {len(recording)} samples, but its initial state is fitted to the first "
+                f"{self._samples_for_state} and these are not scored; give a longer one, or its initial state."
+            )
+        return first
+
+    def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
+        """NRMSE (Eq. 27) over outputs, averaged over recordings, in free-run simulation.
+
+        Nothing is fitted to what is scored, but for the training itself: where the initial state of another recording
+        is estimated, the samples it is fitted to are left out (`scored_from`). An output that rests in one of several
+        recordings counts next to its deviation in all of them.
+
+        Raises
+        ------
+        InputError
+            If a recording does not fit the model, is not longer than what its initial state is fitted to, or an output
+            never changes.
+        """
+        given = as_recordings(recordings)
+        first = [self.scored_from(r) for r in given]
+        pooled = np.concatenate([r.y[k:] for r, k in zip(given, first, strict=True)])
+        nrmse(pooled, pooled)  # refuses an output that never changes
+        errors = []
+        for r, k in zip(given, first, strict=True):
+            spread, size = np.std(r.y[k:], axis=0), np.max(np.abs(r.y[k:]), axis=0)
+            spread = np.where(spread <= 1e-14 * size, np.std(pooled, axis=0), spread)
+            errors.append(np.mean(rmse_per_output(r.y, self.simulate(r), k) / spread))
+        return float(np.mean(errors))
+
+    def _check(self, recording: Recording) -> None:
+        if not isinstance(recording, Recording):
+            raise InputError(
+                f"A {type(recording).__name__} was given to simulate; give a Recording, which holds inputs, outputs "
+                "and the time step."
+            )
+        n_u, n_y = len(self.model.inputs), self.model.n_y
+        unmeasured = recording.n_y == 0 and not (isinstance(recording.initial, str) and recording.initial == "estimate")
+        if recording.n_u != n_u or not (recording.n_y == n_y or unmeasured):
+            raise InputError(
+                f"The recording has {recording.n_u} inputs and {recording.n_y} outputs, "
+                f"the model {n_u} and {n_y}; they must match."
+            )
+        if abs(recording.dt / self.dt - 1) > 1e-4:
+            raise InputError(
+                f"The recording's step is {recording.dt:g} s, the model's {self.dt:g} s; resample the recording."
+            )
+
+    def plot(self, recordings: Recording | Sequence[Recording], **options: Any) -> Any:
+        """Figures of the fit over recordings; see `plots.plot_fit`."""
+        from .plots import plot_fit
+
+        return plot_fit(self, recordings, **options)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model as JSON, atomically; see `export.save`."""
+        from .export import save
+
+        save(self, path)
+
+    def to_casadi(self, name: str = "model") -> Any:
+        """`casadi.Function (x, u) -> (x_next, y)`, operator memory inside x; see `export.to_casadi`."""
+        from .export import to_casadi
+
+        return to_casadi(self, name)
+
+    def __str__(self) -> str:
+        errors = ", ".join(f"{e:.4f}" for e in self.train_nrmse)
+        lines = [
+            self.status.value,
+            f"NRMSE on the training recording{'s' if len(self.train_nrmse) > 1 else ''}: {errors}",
+            f"{self.solution.iterations} iterations in the last solve, {self.seconds:.1f} s in all",
+        ]
+        if self.candidates:
+            reached = sorted(c.error for c in self.candidates)
+            lines.append(f"{len(reached)} starts, explored to NRMSE {reached[0]:.4f} ... {reached[-1]:.4f}")
+        if self.linear_nrmse:
+            alone = ", ".join(f"{e:.4f}" for e in self.linear_nrmse)
+            lines.append(f"the linear model alone, to judge the element by: NRMSE {alone}")
+        if self.note:
+            lines.append(self.note)
+        unknown = [f"{np.sum(np.isinf(e))} of {np.size(e)} entries of {k}" for k, e in self.errors.items()]
+        unknown = [line for line in unknown if not line.startswith("0 of")]
+        if unknown:
+            lines.append(f"the data alone says nothing about {', '.join(unknown)}")
+        lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def fingerprint(recording: Recording) -> str:
+    """Short digest of a recording's numbers and of what is said about its initial state."""
+    initial = recording.initial
+    kind = f"{initial} {recording.period}".encode() if isinstance(initial, str) else np.asarray(initial).tobytes()
+    return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes() + kind).hexdigest()[:16]
+
+
+def with_solution(model: Model, problem: Problem, solution: Solution) -> Model:
+    """The model at the values of a solution."""
+    return model.with_parameters(model.parameters.at(problem.parameters(solution.theta)))
+
+
+def outcome(
+    model: Model,
+    structure: PILFR | None,
+    problem: Problem,
+    solution: Solution,
+    began: float,
+    recordings: tuple[Recording, ...],
+    candidates: tuple[Candidate, ...] = (),
+    linear: Model | None = None,
+    note: str = "",
+    linear_nrmse: tuple[float, ...] = (),
+    engine: str = "auto",
+) -> Fit:
+    """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
+
+    Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the standard
+    errors know of them.
+    """
+    fitted = with_solution(model, problem, solution)
+    judged = problem
+    if note == PRIOR:
+        asked = structure.priors if structure else {}
+        fitted = fitted.with_parameters(
+            fitted.parameters.change(**{name: {"prior": asked.get(name)} for name in ("w", "r")})
+        )
+        options: dict[str, Any] = {"constraints": problem.constraints, "noise": problem.noise, "scale": problem.scale}
+        judged = Problem(fitted, recordings, engine=problem.engine, **options)
+    theta = solution.theta
+    at_bound = [
+        f"{label} = {value:g}"
+        for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
+        if value in (low, high)
+    ]
+    limits = problem.active_constraints(theta)
+    at_bound += [name for name, active in zip(problem.g_labels, limits, strict=True) if active]
+    return Fit(
+        model=fitted,
+        structure=structure,
+        dt=recordings[0].dt,
+        solution=solution,
+        train_nrmse=tuple(problem.nrmse(theta)),
+        initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
+        labels=problem.labels,
+        errors=standard_errors(judged, theta, structure),
+        active=tuple(at_bound),
+        candidates=candidates,
+        linear=linear,
+        seconds=time.perf_counter() - began,
+        units=dict(recordings[0].units),
+        note=note,
+        linear_nrmse=linear_nrmse,
+        engine=engine,
+    )

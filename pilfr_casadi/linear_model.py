@@ -1,0 +1,99 @@
+"""The linear model that a PI-LFR begins with: subspace identification refined by output error.
+
+Krikelis et al. (2024), Sec. 5.3: the best linear approximation, least squares as in Eq. 20 without an element. Limits
+on the spectral radius are put on at the end of a solve without: an integrator lies on them, and on the way to it they
+would be in the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from .constraints import Constraint
+from .gauss_newton import GaussNewton
+from .lfr import PILFR
+from .lti import propagate
+from .model import Model
+from .problem import Problem
+from .recording import Recording
+from .solution import Iteration, Solution, Status
+from .subspace import subspace_matrices
+
+Array = np.ndarray
+Progress = Callable[[str, int, int, float], None]
+
+
+def linear_model(
+    recordings: Sequence[Recording],
+    structure: PILFR,
+    *,
+    engine: str = "auto",
+    constraints: tuple[Constraint, ...] = (),
+    solver: GaussNewton | None = None,
+    progress: Progress | None = None,
+) -> tuple[Model, Problem, Solution]:
+    """A linear state-space model: subspace identification refined by output error.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Training data.
+    structure : PILFR
+        Gives the order and whether there is an offset; its element and what it fixes are left aside.
+    engine, constraints
+        As for `Problem`.
+    solver : GaussNewton
+        By default `GaussNewton(tolerance=1e-4)`.
+    progress : callable
+        Called with ("subspace" or "linear model", done, total, smallest error so far).
+
+    Returns
+    -------
+    Model, Problem, Solution
+        The model at its start, the problem and its solution.
+
+    Raises
+    ------
+    InputError
+        If the recordings are too short for the order.
+    """
+    first, solver = recordings[0], solver or GaussNewton(tolerance=1e-4)
+    a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset, progress=progress)
+    offset = _offset(recordings, a, b, c, d) if structure.offset else np.zeros(first.n_y)
+    model = structure.linear().model(
+        first.n_u,
+        first.n_y,
+        {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset},
+        inputs=first.inputs,
+        outputs=first.outputs,
+    )
+    problem = Problem(model, recordings, engine=engine, constraints=constraints)
+    report = iterations(progress, "linear model", solver.max_iterations)
+    if not constraints:
+        return model, problem, solver.solve(problem, progress=report)
+    free = Problem(model, recordings, engine=problem.engine)
+    found = [solver.solve(free, progress=report)]
+    if found[0].status is not Status.INTERRUPTED:
+        found[0] = solver.solve(problem, found[0].theta, report)
+    limits = problem.active_constraints(found[0].theta)
+    if found[0].status is not Status.INTERRUPTED and np.any(limits):
+        found.append(solver.solve(problem, progress=report))
+    return model, problem, min(found, key=lambda s: (s.status is Status.INFEASIBLE, s.cost))
+
+
+def _offset(recordings: Sequence[Recording], a: Array, b: Array, c: Array, d: Array) -> Array:
+    """The mean (n_y,) of what a linear model leaves of the outputs, from rest."""
+    left = []
+    for r in recordings:
+        states, _ = propagate(a.T, (r.u @ b.T)[None], np.zeros((1, len(a))))
+        left.append((r.y - states[0] @ c.T - r.u @ d.T)[r.skip :])
+    return np.asarray(np.mean(np.concatenate(left), axis=0))
+
+
+def iterations(progress: Progress | None, stage: str, most: int) -> Callable[[Iteration], None] | None:
+    """A solver's progress function that reports iterations as a stage, with the error that their cost stands for."""
+    if progress is None:
+        return None
+    return lambda i: progress(stage, min(i.number, most), most, float(np.sqrt(2 * max(i.cost, 0.0))))

@@ -1,0 +1,226 @@
+"""Figures of a mismatch: over frequency and amplitude, over time, and which port and law takes it away."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+
+from .canvas import BLUE, FONT, GREEN, GREY, INK, VERMILLION, axes_or_new, finish, new_figure, plain, scaled, with_unit
+
+SHADES = "cividis"  # told apart by every kind of colour vision, and in grey
+
+
+def mismatch_map(found: Mapping[str, Any], unit: str = "", *, ax: Axes | None = None) -> Axes:
+    """Residual over frequency and amplitude, as `diagnose.mismatch` gives it; shares of the outputs' deviation in %."""
+    ax = axes_or_new(ax)
+    data, (size, label) = found["map"], _size(found, unit)
+    edges, rms = np.asarray(data["edges"]) * size, 100 * _array(data["rms"])
+    top = max(float(np.nanmax(rms, initial=0.0)), 1e-12)
+    rows = _rows(data, np.nanmax(np.nan_to_num(rms), axis=1) > 1e-3 * top)
+    y = np.append(np.asarray(data["low"])[rows], data["high"][rows.stop - 1])
+    y[0] = y[0] or y[1] / np.sqrt(2)
+    shown = np.ma.masked_invalid(np.maximum(rms[rows], 1e-300))
+    mesh = ax.pcolormesh(edges, y, shown, norm=LogNorm(top / 100, top), cmap=SHADES, rasterized=True)
+    bar = ax.figure.colorbar(mesh, ax=ax, pad=0.02, extend="min")
+    bar.set_label("residual [% of the output's deviation]", fontsize=FONT - 1)
+    _readable_log(bar.ax.yaxis, top / 100, top)
+    bar.ax.tick_params(labelsize=FONT - 1)
+    ax.set_yscale("log")
+    ax.set_facecolor("#EEEEEE")
+    finish(ax, label, "frequency [Hz]", "where it hurts")
+    ax.grid(False)
+    return ax
+
+
+def _rows(data: Mapping[str, Any], wanted: np.ndarray) -> slice:
+    """The bands from the first to the last with something in it."""
+    where = np.flatnonzero(wanted)
+    return slice(int(where[0]), int(where[-1]) + 1) if len(where) else slice(0, len(data["low"]))
+
+
+def _size(found: Mapping[str, Any], unit: str, kind: str = "amplitude") -> tuple[float, str]:
+    """Factor and label of an axis of amplitudes or rates: in the output's own unit where there is one output."""
+    per = "/s" if kind == "rate" else ""
+    if len(found["scale"]) != 1:
+        return 1.0, f"{kind} of the outputs [deviations{per}]"
+    ((name, scale),) = found["scale"].items()
+    factor, label = scaled(scale * np.asarray(found[kind]["edges"]), (unit + per) if unit else "")
+    return scale / factor, with_unit(f"{kind} of {name}", label)
+
+
+def _array(rows: Sequence[Any]) -> np.ndarray:
+    return np.array([[np.nan if v is None else v for v in row] for row in rows], dtype=float)
+
+
+def mismatch_bands(found: Mapping[str, Any], *, ax: Axes | None = None) -> Axes:
+    """Residual in each band of frequency beside the noise floor; the bands that hold most of it are filled."""
+    ax = axes_or_new(ax)
+    data = found["frequency"]
+    low, high = np.asarray(data["low"], dtype=float), np.asarray(data["high"])
+    low[0] = low[0] or high[0] / np.sqrt(2)
+    edges = np.append(low, high[-1])
+    power, floor = (100 * np.sqrt(np.asarray(data[k])) for k in ("power", "floor"))
+    share = np.asarray(data["share"])
+    bottom = 0.5 * min(floor[floor > 0].min(initial=np.inf), power[power > 0].min(initial=np.inf))
+    bottom = bottom if np.isfinite(bottom) else 1e-6
+    strong = share >= 0.1
+    ax.bar(low[strong], power[strong] - bottom, high[strong] - low[strong], bottom, align="edge", color=VERMILLION,
+           alpha=0.35, label="a tenth or more of the mismatch")  # fmt: skip
+    ax.stairs(power, edges, color=VERMILLION, linewidth=1.8, label="residual", baseline=None)
+    if np.any(floor > 0):
+        ax.stairs(floor, edges, color=GREEN, linewidth=1.6, linestyle="--", label="noise floor", baseline=None)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    return finish(ax, "frequency [Hz]", "rms a band [% of deviation]", "over frequency")
+
+
+def mismatch_growth(
+    found: Mapping[str, Any], unit: str = "", *, kind: str = "amplitude", ax: Axes | None = None
+) -> Axes:
+    """Residual over the `amplitude` or the `rate` of the output, with what an error in proportion would be."""
+    ax = axes_or_new(ax)
+    data, (size, label) = found[kind], _size(found, unit, kind)
+    edges = np.asarray(data["edges"])
+    middle = (edges[1:] + edges[:-1]) / 2
+    rms = 100 * np.array([np.nan if v is None else v for v in data["rms"]], dtype=float)
+    ax.plot(middle * size, rms, "o-", color=VERMILLION, linewidth=1.8, label="residual")
+    known = np.isfinite(rms) & (rms > 0)
+    if np.any(known):
+        k = int(np.flatnonzero(known)[len(np.flatnonzero(known)) // 2])
+        ax.plot(middle * size, rms[k] * middle / middle[k], ":", color=GREY, linewidth=1.4, label="in proportion")
+    if found["floor"] > 0:
+        ax.axhline(100 * found["floor"], color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
+    ax.set_xlim(left=0)
+    ax.set_yscale("log")
+    _readable_log(ax.yaxis, *ax.get_ylim())
+    return finish(ax, label, "residual [% of deviation]", f"over {kind}", 3)
+
+
+def mismatch_level(found: Mapping[str, Any], unit: str = "", *, ax: Axes | None = None) -> Axes:
+    """Residual over the value of the output that shows most of it: whether one side is worse."""
+    ax = axes_or_new(ax)
+    data = found["level"]
+    scale = found["scale"][data["output"]]
+    size, label = scaled(scale * np.asarray(data["edges"]), unit)
+    rms = 100 * np.array([np.nan if v is None else v for v in data["rms"]], dtype=float)
+    ax.stairs(
+        rms, scale * np.asarray(data["edges"]) / size, color=VERMILLION, linewidth=1.8, label="residual", baseline=None
+    )
+    if found["floor"] > 0:
+        ax.axhline(100 * found["floor"], color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
+    return finish(ax, with_unit(data["output"], label), "residual [% of deviation]", "over level")
+
+
+def mismatch_time(found: Mapping[str, Any], *, ax: Axes | None = None) -> Axes:
+    """Residual and motion over the time of each recording, one after the other."""
+    ax = axes_or_new(ax)
+    at = 0.0
+    for k, part in enumerate(found["time"]):
+        t = np.asarray(part["t"])
+        step = t[1] - t[0] if len(t) > 1 else 1.0
+        edges = at + np.append(t - step / 2, t[-1] + step / 2)
+        first = k == 0
+        motion = 100 * np.asarray(part["output"])
+        ax.stairs(motion, edges, color=BLUE, linewidth=1.4, baseline=None,
+                  label="motion of the output" if first else None)  # fmt: skip
+        left = 100 * np.asarray(part["rms"])
+        ax.stairs(left, edges, color=VERMILLION, linewidth=1.8, baseline=None, label="residual" if first else None)
+        if not first:
+            ax.axvline(at, color=GREY, linewidth=0.8)
+        if len(found["time"]) > 1 and part["name"]:
+            ax.annotate(plain(part["name"][:24]), (edges[0], 1), (4, -4), xycoords=("data", "axes fraction"),
+                        textcoords="offset points", va="top", fontsize=FONT - 2, color=INK)  # fmt: skip
+        at = edges[-1]
+    if found["floor"] > 0:
+        ax.axhline(100 * found["floor"], color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
+    ax.set_yscale("log")
+    _readable_log(ax.yaxis, *ax.get_ylim())
+    ax.margins(x=0.01)
+    return finish(ax, "time [s]", "rms [% of deviation]", "over time", 3)
+
+
+def port_law_map(
+    rows: Sequence[tuple[str, str, float]],
+    best: Sequence[tuple[str, str]] = (),
+    without: float | None = None,
+    floor: float | None = None,
+) -> Axes:
+    """Error on data not fitted of every port and law; blank where the quick test left a pair out.
+
+    Parameters
+    ----------
+    rows : sequence of (port, law, error)
+    best : sequence of (port, law)
+        Pairs that are framed.
+    without, floor : float, optional
+        Error of the simulator without any law, and of noise alone: the ends of the scale.
+    """
+    ports = list(dict.fromkeys(p for p, _, _ in rows))
+    smallest: dict[tuple[str, str], float] = {}
+    for port, law, error in rows:
+        if np.isfinite(error) and error > 0:
+            smallest[port, law] = min(error, smallest.get((port, law), np.inf))
+    by_law = {law: min((v for (_, k), v in smallest.items() if k == law), default=np.inf) for _, law, _ in rows}
+    laws = sorted(by_law, key=by_law.__getitem__)
+    grid = np.full((len(laws), len(ports)), np.nan)
+    for (port, law), error in smallest.items():
+        grid[laws.index(law), ports.index(port)] = 100 * error
+    figure = new_figure(max(2.4 + 0.95 * len(ports), 5.2), max(1.4 + 0.28 * len(laws), 2.7))
+    ax = figure.add_subplot()
+    top = 100 * without if without else float(np.nanmax(grid, initial=1e-9))
+    low = min(float(np.nanmin(grid, initial=top)), 100 * floor if floor else np.inf, top / 2)
+    norm = LogNorm(low, top)
+    mesh = ax.pcolormesh(np.ma.masked_invalid(grid), norm=norm, cmap=SHADES, edgecolors="white", linewidth=1)
+    for i, j in np.argwhere(np.isfinite(grid)):
+        dark = norm(grid[i, j]) < 0.55
+        text = f"{grid[i, j]:.2g}" if grid[i, j] < 100 else f"{grid[i, j]:.0f}"
+        framed = (ports[j], laws[i]) in best
+        ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", fontsize=FONT - 1,
+                color="white" if dark else INK, fontweight="bold" if framed else "normal")  # fmt: skip
+        if framed:
+            ax.add_patch(_frame(j, i))
+    ax.set_xticks(np.arange(len(ports)) + 0.5, [_wrapped(p) for p in ports], fontsize=FONT - 1)
+    ax.set_yticks(np.arange(len(laws)) + 0.5, [plain(law) for law in laws], fontsize=FONT - 1)
+    ax.invert_yaxis()
+    ax.xaxis.tick_top()
+    ax.tick_params(length=0)
+    ax.set_facecolor("#F0F0F0")
+    for side in ax.spines.values():
+        side.set_visible(False)
+    bar = figure.colorbar(mesh, ax=ax, pad=0.02)
+    bar.set_label("error on data not fitted [%]", fontsize=FONT - 1)
+    _readable_log(bar.ax.yaxis, low, top)
+    bar.ax.tick_params(labelsize=FONT - 1)
+    return ax
+
+
+def _wrapped(name: str, most: int = 12, lines: int = 3) -> str:
+    """A name broken after colons, hyphens and underscores where it is long, and shortened where it is longer."""
+    rows = [""]
+    for piece in re.findall(r"[^:_-]*[:_-]*", name):
+        if rows[-1] and len(rows[-1] + piece) > most:
+            rows.append("")
+        rows[-1] += piece
+    short = [row if len(row) <= most else row[: most - 1] + "…" for row in rows if row]
+    return plain("\n".join([*short[: lines - 1], "…"] if len(short) > lines else short))
+
+
+def _readable_log(axis: Any, low: float, high: float) -> None:
+    """Ticks of a logarithmic axis as plain numbers, few enough to be read."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    subs = (1.0,) if high > 300 * low else (1.0, 2.0, 5.0) if high > 3 * low else tuple(np.arange(1.0, 10.0))
+    axis.set_major_locator(LogLocator(10, subs))
+    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}" if 1e-4 < v < 1e5 else f"{v:.0e}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _frame(j: int, i: int) -> Any:
+    from matplotlib.patches import Rectangle
+
+    return Rectangle((j + 0.03, i + 0.05), 0.94, 0.9, fill=False, edgecolor=VERMILLION, linewidth=2.2, zorder=5)

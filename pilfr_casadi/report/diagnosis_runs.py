@@ -1,0 +1,56 @@
+"""Simulations before and after, for the page of a diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..compiled import make_engine
+from ..diagnose import Diagnosis
+from ..diagnose.workbench import Fitted, Workbench
+from ..gauss_newton import GaussNewton
+from ..recording import InputError, Recording
+from ..simulator import Simulator
+
+
+def replay(bench: Workbench, simulator: Simulator) -> Fitted | None:
+    """Run a simulator at its own values, initial states fitted; None where it diverges."""
+    held = simulator.with_parameters({k: replace(p, fixed=True) for k, p in simulator.parameters.items()})
+    try:
+        model = bench.model(held)
+        if model.n_x and any(isinstance(r.initial, str) and r.initial == "estimate" for r in bench.recordings):
+            return bench.fit(held, solver=GaussNewton(max_iterations=20))
+        engine = make_engine(model, bench.engine)
+        freed = model.with_parameters(model.parameters.change(**{k: {"fixed": False} for k in model.parameters}))
+        problem = bench.problem(freed, engine)
+        values = {k: p.value for k, p in model.parameters.items()}
+        found = bench.result(held, values, problem.first_states(problem.start), engine, model)
+    except (InputError, ValueError, np.linalg.LinAlgError):
+        return None
+    return found if np.isfinite(found.cost) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A recording with its outputs simulated before (refitted) and after (effects put back); None where it diverges."""
+
+    recording: Recording
+    role: str
+    before: np.ndarray | None
+    after: np.ndarray | None
+
+
+def comparisons(bench: Workbench, recordings: Sequence[Recording], diagnosis: Diagnosis, role: str) -> list[Comparison]:
+    """Simulate recordings before and after; what gates put right in the training recordings is put right here too."""
+    for change in (getattr(g, "change", None) for g in diagnosis.gates if role == "test"):
+        recordings = [change(r) for r in recordings] if change is not None else recordings
+    part = bench.on(recordings)
+    before = replay(part, diagnosis.refitted)
+    after = replay(part, diagnosis.corrected) if diagnosis.corrected.elements else None
+    out = []
+    for i, r in enumerate(part.recordings):
+        named = r.with_(name=r.name or (role if len(part.recordings) == 1 else f"{role} {i + 1}"))
+        out.append(Comparison(named, role, *(None if f is None else f.residual[i] + r.y for f in (before, after))))
+    return out

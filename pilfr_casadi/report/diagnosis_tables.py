@@ -1,0 +1,252 @@
+"""Tables and words of a diagnosis: errors, effects, candidates, parameters, notes, and how to use the result."""
+
+from __future__ import annotations
+
+import pprint
+import re
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ..diagnose import Diagnosis
+from ..diagnose.result import plain
+from ..parameters import ParameterSet
+from .fit_tables import _cell
+from .page import Block, Code, Table, Text, number_text
+
+TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
+ALIKE = 1.03  # errors within this factor are as good
+RANKED = 12  # rows of the ranked table that are not folded away
+PEOPLE = ("coulomb", "stribeck")
+FORMS = {"bouc_wen": "Bouc-Wen", "prandtl_ishlinskii": "Prandtl-Ishlinskii", "hertz": "Hertz"}
+STEPS = {"nominal": "as given", "before": "refitted", "after": "with the effects put back"}
+
+
+def words(law: str) -> str:
+    """The id of a law or form as words."""
+    if law in FORMS:
+        return FORMS[law]
+    text = law.replace("_", " ")
+    return text.capitalize() if text.split(" ")[0] in PEOPLE else text
+
+
+def percent(value: float | None) -> str:
+    """A relative error for people."""
+    if value is None or not np.isfinite(value):
+        return "diverges"
+    return f"{number_text(100 * value, 3)}\u00a0%"
+
+
+def judged(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
+    """The recordings that count, and their errors."""
+    errors = diagnosis.errors.get("test")
+    return ("test", errors) if errors else ("training", diagnosis.errors["train"] or {})
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """The verdict with its numbers."""
+    role, errors = judged(diagnosis)
+    on = "On held-out recordings" if role == "test" else "On the training recordings (no test was given)"
+    text = f"{diagnosis.sentence.rstrip('. ')}. {on} the error is {percent(errors.get('nominal'))} as given"
+    text += f", {percent(errors.get('before'))} refitted"
+    if diagnosis.effects:
+        what = " and ".join(words(e.law) for e in diagnosis.effects)
+        text += f", {percent(errors.get('after'))} with {what} put back"
+    return f"{text}; the noise floor is {percent(diagnosis.floor['nrmse'])}."
+
+
+def facts(diagnosis: Diagnosis) -> dict[str, str]:
+    """Figures of merit."""
+    role, errors = judged(diagnosis)
+    steps = list(STEPS) if diagnosis.effects else ["nominal", "before"]
+    out = {f"{role} error, {STEPS[k]}": percent(errors.get(k)) for k in steps}
+    kind = {"periods": "from periods", "repeats": "from repeats"}.get(diagnosis.floor["source"], "estimated")
+    out[f"noise floor, {kind}"] = percent(diagnosis.floor["nrmse"])
+    if diagnosis.effects:
+        out["confidence"] = " / ".join(f"{e.confidence:.2f}" for e in diagnosis.effects)
+    return out
+
+
+def error_table(diagnosis: Diagnosis) -> Table:
+    """Errors before and after, training and test."""
+    steps = list(STEPS) if diagnosis.effects else ["nominal", "before"]
+    rows: list[list[Any]] = []
+    for kind, name in (("train", "training"), ("test", "test (held out)")):
+        errors = diagnosis.errors.get(kind)
+        if errors:
+            rows.append([name, *(percent(errors.get(k)) for k in steps), percent(diagnosis.floor["nrmse"])])
+    note = "Rms error of the free-run simulation over the standard deviation of the measured output, mean over outputs."
+    if diagnosis.floor["source"] == "estimated":
+        note += " The noise floor is estimated from the residual; coloured noise would make it larger."
+    return Table(["recordings", *(STEPS[k] for k in steps), "noise floor"], rows, note=note, emphasis=[len(rows) - 1])
+
+
+def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
+    """What is missing: the law, its parameters, and what could be meant instead."""
+    e = diagnosis.effects[number]
+    form = f" ({words(e.form)})" if e.form else ""
+    out: list[Block] = [
+        Text(f"At {e.port}: {words(e.law)}{form}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
+    ]
+    out.append(Code(e.equation))
+    rows = [[name, _cell(p["value"], _number(p["std"])), p["unit"] or "–"] for name, p in e.parameters.items()]
+    if rows:
+        given = any(np.isfinite(_number(p["std"])) for p in e.parameters.values())
+        note = "± one standard deviation." if given else ""
+        out.append(Table(["parameter", "value", "unit"], rows, note=note))
+    if e.indistinguishable:
+        others = "; ".join(f"{words(law)} at {port}" for port, law in e.indistinguishable)
+        out.append(Text(f"These recordings cannot tell it apart from: {others}."))
+    best = [r for rows in passes(diagnosis)[number : number + 1] for r in rows]
+    mine = min((score(r) for r in best if (r["port"], r["law"]) == (e.port, e.law)), default=np.nan)
+    known = {(e.port, e.law), *e.indistinguishable}
+    close = list(dict.fromkeys((r["port"], r["law"]) for r in best if score(r) < ALIKE * mine))
+    wider = "; ".join(f"{words(law)} at {port}" for port, law in close if (port, law) not in known)
+    if wider:
+        out.append(Text(f"As good, but with more freedom than needed: {wider}."))
+    elif not e.indistinguishable:
+        out.append(Text("No other port and law does as well on these recordings."))
+    return out
+
+
+def _number(value: Any) -> float:
+    return np.nan if value is None else float(value)
+
+
+def passes(diagnosis: Diagnosis) -> list[list[dict[str, Any]]]:
+    """Candidates of each pass, best first: the second is fitted with the first effect in place."""
+    search = diagnosis.evidence.get("search")
+    sizes = [len(p.candidates) for p in search.passes] if search is not None else []
+    rows = list(diagnosis.candidates)
+    if sum(sizes) != len(rows):
+        sizes = [len(rows)]
+    cuts = np.cumsum([0, *sizes])
+    out = [sorted(rows[a:b], key=score) for a, b in pairwise(cuts)]
+    return [part for part in out if part]
+
+
+def score(row: Mapping[str, Any]) -> float:
+    """Geometric mean of the errors on the fitted part and on the rest."""
+    a, b = (np.inf if row.get(k) is None else float(row[k]) for k in ("nrmse_train", "nrmse_validation"))
+    return float(np.sqrt(a) * np.sqrt(b)) if np.isfinite(a * b) else np.inf
+
+
+def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, str]], title: str) -> list[Block]:
+    """The ranking with margins, best first; the tail is folded."""
+    winner = next((i for i, r in enumerate(rows) if (r["port"], r["law"]) in chosen), None)
+    best = score(rows[winner or 0])
+    cells = []
+    for i, r in enumerate(rows):
+        form = f" ({words(r['form'])})" if r.get("form") else ""
+        margin = score(r) / best if best > 0 and np.isfinite(score(r)) else np.inf
+        gain = np.inf if r["delta_bic"] is None else r["delta_bic"]
+        cells.append(
+            [
+                f"{i + 1}. {words(r['law'])}{form}",
+                r["port"],
+                percent(r["nrmse_train"]),
+                percent(r["nrmse_validation"]),
+                f"{margin:.2f} ×" if margin < 10 else f"{margin:.3g} ×" if np.isfinite(margin) else "–",
+                f"{gain:+.0f}".replace("-", "−") if np.isfinite(gain) else "–",
+            ]
+        )
+    emphasis = [] if winner is None else [winner]
+    columns = ["law", "port", "error, fitted part", "error, not fitted part", "margin", "ΔBIC"]
+    note = "Each is fitted together with the simulator's own parameters to the first part of the recordings, and "
+    note += "judged on the rest. Margin: error (mean of both parts) over the winner's. "
+    note += "ΔBIC: below zero is better than no law."
+    out: list[Block] = [
+        Table(columns, cells[:RANKED], caption=title, note=note, emphasis=[i for i in emphasis if i < RANKED])
+    ]
+    if len(cells) > RANKED:
+        rest = [i - RANKED for i in emphasis if i >= RANKED]
+        title = f"{len(cells) - RANKED} more that did worse"
+        out.append(Table(columns, cells[RANKED:], caption=title, emphasis=rest, folded=True))
+    return out
+
+
+def flexible_table(diagnosis: Diagnosis) -> Table | None:
+    """How much of the mismatch an arbitrary force at each port could explain."""
+    search = diagnosis.evidence.get("search")
+    if search is None or not search.open_before:
+        return None
+    rows = [[port, percent(share)] for port, share in sorted(search.open_before.items(), key=lambda item: -item[1])]
+    note = (
+        "A flexible force of the local coordinate and its rate, in place of a law of the catalogue. With few outputs "
+    )
+    note += "several ports can do it; a simple law, seen in the pictures, tells which."
+    title = "What a flexible force at each port could explain"
+    return Table(["port", "share of the mismatch explained"], rows, caption=title, note=note, emphasis=[0])
+
+
+def parameter_table(diagnosis: Diagnosis) -> Table:
+    """The simulator's own parameters: nominal, refitted, and with the effects in place."""
+    rows = []
+    for name, p in diagnosis.parameters.items():
+        columns = ("nominal", "refit_without", "refit_with")
+        given, without, after = (np.ravel(np.asarray(p[k], dtype=float)) for k in columns)
+        std = np.ravel(np.full(given.shape, np.nan) if p["std"] is None else np.asarray(p["std"], dtype=float))
+        for i in range(len(given)):
+            label = name if len(given) == 1 else f"{name}[{i}]"
+            row = [label, _cell(given[i], np.nan), _cell(without[i], np.nan)]
+            if diagnosis.effects:
+                change = after[i] / given[i] - 1 if given[i] else np.nan
+                row += [_cell(after[i], std[i] if i < len(std) else np.nan)]
+                row += [f"{100 * change:+.1f}\u00a0%".replace("-", "−") if np.isfinite(change) else "–"]
+            rows.append([*row, p["unit"] or "–"])
+    more = ["refitted with the effects", "change from nominal"] if diagnosis.effects else []
+    note = "A refit without the missing physics bends the other parameters to make up for it." if more else ""
+    return Table(["parameter", "nominal", "refitted as it is", *more, "unit"], rows, note=note)
+
+
+def note_table(diagnosis: Diagnosis) -> Table | None:
+    """What the gates found."""
+    if not diagnosis.gates:
+        return None
+    rows = [[g.channel, words(g.finding), g.sentence, "yes" if g.corrected else "no"] for g in diagnosis.gates]
+    return Table(["channel", "finding", "in words", "corrected here"], rows)
+
+
+def usage(diagnosis: Diagnosis) -> str:
+    """Lines of Python that make the corrected simulator from the user's own and simulate a recording with it."""
+    simulator = diagnosis.corrected
+    fitted = {k: plain(np.asarray(p.value)) for k, p in ParameterSet(dict(simulator.parameters)).items()}
+    values = {k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters}
+    laws: dict[str, set[str]] = {}
+    for e in simulator.elements:
+        laws.setdefault(_home(type(e.law)), set()).add(type(e.law).__name__)
+    lines = ["import numpy as np", "import pilfr_casadi as pilfr", "from pilfr_casadi.compiled import make_engine"]
+    lines += ["from pilfr_casadi.diagnose.workbench import Workbench"]
+    lines += [f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(laws.items())]
+    lines += ["from rig import simulator  # your simulator", ""]
+    for e in simulator.elements:
+        own = {k.removeprefix(e.prefix): v for k, v in fitted.items() if k.startswith(e.prefix)}
+        limits = {k: tuple(map(_literal, v)) for k, v in e.law.limits.items()}
+        lines.append(f"law = {type(e.law).__name__}(")
+        for key, value in (("values", own), ("limits", limits)):
+            text = pprint.pformat(value, width=90, sort_dicts=False, compact=True)
+            text = re.sub(r"(?<![\w'])inf(?![\w'])", "np.inf", text)
+            lines.append(f"    {key}={text},".replace("\n", "\n" + " " * (len(key) + 5)))
+        lines += [")", f"simulator = simulator.with_element({e.port!r}, law)"]
+    shown = pprint.pformat(values, width=100, sort_dicts=False)
+    lines += [f"values = {shown}".replace("\n", "\n" + " " * 9), "own = simulator.parameters"]
+    lines += ["corrected = simulator.with_parameters(own.at(own.pack(values)))", ""]
+    inputs = f"inputs={list(simulator.inputs)!r}, outputs={list(simulator.output_names)!r}"
+    lines += [f'recording = pilfr.read_csv("new.csv", {inputs})']
+    lines += [f"model = Workbench.of(corrected, [recording], {diagnosis.hold!r}).model(corrected)"]
+    lines += ["x0 = np.zeros(model.n_x)  # states, then the laws' memory"]
+    lines += ["y = make_engine(model).simulate(model.drive(recording), model.parameters.start, x0)[0]"]
+    return "\n".join([*lines, "step = model.closed  # casadi.Function (x, u, p) -> (x_next, y), for controllers"])
+
+
+def _home(law: type) -> str:
+    from .. import laws
+
+    return laws.__name__ if getattr(laws, law.__name__, None) is law else law.__module__
+
+
+def _literal(value: Any) -> Any:
+    found = np.asarray(value, dtype=float)
+    return found.tolist()

@@ -1,0 +1,139 @@
+"""A real positioning axis with friction, found from a simulator that has only viscous friction (`python -m problems.emps`).
+
+    M q'' = g_tau vir - F_v q'            (what an engineer writes first)
+
+Recordings: electro-mechanical positioning system, 24.8 s at 1 kHz; Janot, Gautier & Brunot (2019), "Data set and
+reference models of EMPS"; data not included here. Train on DATA_EMPS, judge on DATA_EMPS_PULSES, where unknown force
+pulses are added; the first 20 samples may set the initial state. The axis is a free integrator, so an open-loop run
+drifts away by whatever little force is wrong; it is used in closed loop, which is simulated from the reference as well:
+
+    vir = k_v (k_p (q_g - q) - q')
+
+Published rms errors of the open-loop test run: dynoNet 2.64 mm, CT-SUBNET 4.61 mm (arXiv 2405.10779), recurrent networks
+74 to 220 mm.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pilfr_casadi.diagnose import diagnose
+from pilfr_casadi.diagnose.result import Diagnosis
+from pilfr_casadi.parameters import Parameter
+from pilfr_casadi.readers import read_csv
+from pilfr_casadi.recording import Recording
+from pilfr_casadi.simulator import Port, Simulator
+
+from .diagnosed import answer, free_run, rmse, table
+from .measured_data import measured
+
+GAIN = 35.15065  # N/V, from the drive's voltage to the force
+K_P, K_V = 160.18, 243.45  # 1/s, V s/m
+FIRST = 20  # samples that may set the initial state
+PUBLISHED = (("dynoNet", 2.64), ("CT-SUBNET", 4.61), ("LSTM", 74.1), ("RNN", 89.2), ("GRU", 220.3))  # mm
+
+
+def recordings(folder: Path) -> dict[str, Recording]:
+    """`train` and `test`: u in V, q in m, sampled each millisecond."""
+    names: dict[str, Any] = {"inputs": "u_vir_V", "outputs": "y_qm_m", "hold": "zero"}
+    names["units"] = {"u_vir_V": "V", "y_qm_m": "m"}
+    return {
+        "train": read_csv(folder / "emps_train.csv", name="train", **names),
+        "test": read_csv(folder / "emps_test_pulses.csv", name="pulses", **names),
+    }
+
+
+def references(folder: Path, name: str) -> Recording:
+    """The reference in the place of the voltage, for the closed loop."""
+    return read_csv(folder / name, inputs="qg_reference_m", outputs="y_qm_m", hold="linear", name="closed loop")
+
+
+def dynamics(x: Any, u: Any, p: Any) -> dict[str, Any]:
+    """A mass with viscous friction, pushed by the drive."""
+    return {"pos": x.vel, "vel": (GAIN * u.u_vir_V - p.F_v * x.vel) / p.M}
+
+
+def outputs(x: Any) -> dict[str, Any]:
+    """The encoder."""
+    return {"y_qm_m": x.pos}
+
+
+def simulator() -> Simulator:
+    """The naive simulator; mass and friction are guesses from the drawing, 10 to 20 % off."""
+    return Simulator(
+        dynamics,
+        outputs,
+        states=("pos", "vel"),
+        inputs=("u_vir_V",),
+        parameters={
+            "M": Parameter(105.0, unit="kg", bounds=(50.0, 200.0)),
+            "F_v": Parameter(240.0, unit="N s/m", bounds=(0.0, 1000.0)),
+        },
+        ports=(
+            Port(
+                "axis", lambda p: {"vel": -1 / p.M}, lambda x: x.pos, lambda x: x.vel, unit="N", across_unit="m"
+            ),
+        ),
+    )
+
+
+def in_closed_loop(axis: Simulator) -> Simulator:
+    """The axis under its position controller, driven by the reference."""
+
+    def driven(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        voltage = K_V * (K_P * (u.qg_reference_m - x.pos) - x.vel)
+        return {"pos": x.vel, "vel": (GAIN * voltage - p.F_v * x.vel) / p.M}
+
+    return replace(axis, dynamics=driven, inputs=("qg_reference_m",))
+
+
+def judge(folder: Path, diagnosis: Diagnosis) -> dict[str, dict[str, float]]:
+    """Rms errors in mm: `before` and `after` -> `train`, `test`, `closed loop`."""
+    data = recordings(folder)
+    loop = references(folder, "emps_test_pulses.csv")
+    out = {}
+    for name, axis in (("before", diagnosis.refitted), ("after", diagnosis.corrected)):
+        out[name] = {kind: 1e3 * rmse(free_run(axis, r, diagnosis.hold, FIRST)) for kind, r in data.items()}
+        parallel = all(e.port == "axis" for e in axis.elements)
+        out[name]["closed loop"] = (
+            1e3 * rmse(free_run(in_closed_loop(axis), loop, "linear", FIRST)) if parallel else np.nan
+        )
+    return out
+
+
+def run(folder: Path, **options: Any) -> tuple[Diagnosis, dict[str, dict[str, float]]]:
+    """Diagnose on the training recording, judge on the test."""
+    data = recordings(folder)
+    diagnosis = diagnose(simulator(), data["train"], test=data["test"], **options)
+    return diagnosis, judge(folder, diagnosis)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print what was found, and the errors beside the published ones."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(arguments)
+    folder = measured("emps")
+    if folder is None:
+        print("The EMPS recordings are not here; put them into DATA/emps and run with PILFR_DATA=DATA.")
+        return 1
+    diagnosis, errors = run(folder)
+    print(diagnosis)
+    for port, law, form, sure in answer(diagnosis):
+        print(f"found: {law} ({form}) at {port}, confidence {sure:.2f}")
+    kinds = ("train", "test", "closed loop")
+    rows: list[tuple[str, Sequence[float | None]]] = [
+        ("viscous friction only, refitted", [errors["before"][k] for k in kinds]),
+        ("with what was found", [errors["after"][k] for k in kinds]),
+        *((name, [None, value, None]) for name, value in PUBLISHED),
+    ]
+    print(table("rms error [mm], free run", rows, kinds))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,212 @@
+"""`pilfr diagnose`: a whole run from files, and one plain sentence with exit status 2 for what cannot be used."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from pilfr_casadi import multisine
+from pilfr_casadi.cli import main
+
+RIG = """
+from pilfr_casadi import Parameter, Port, Simulator
+
+
+def dynamics(x, u, p):
+    return dict(pos=x.vel, vel=(u.force - p.k * x.pos - p.d * x.vel) / p.m)
+
+
+def outputs(x, u, p):
+    return dict(position=x.pos)
+
+
+simulator = Simulator(
+    dynamics, outputs, states=("pos", "vel"), inputs=("force",),
+    parameters=dict(
+        m=Parameter(1.0, unit="kg", fixed=True), k=Parameter(90.0, unit="N/m", bounds=(20, 400)),
+        d=Parameter(1.5, unit="N s/m", bounds=(0.1, 20)),
+    ),
+    ports=(Port("ground-mass", into=lambda p: dict(vel=-1 / p.m), across=lambda x: x.pos, unit="N", across_unit="m"),),
+)
+"""
+DT = 0.02
+
+
+def rig(seed, m=800, k=100.0, cubic=4000.0):
+    """Force and position of a mass on a stiffening spring, as the world makes them."""
+    rng = np.random.default_rng(seed)
+    force = 12 * multisine(m, f_max=4.0, fs=1 / DT, rng=rng)
+
+    def f(t, x):
+        return [x[1], force[min(int(t / DT + 1e-9), m - 1)] - k * x[0] - cubic * x[0] ** 3 - 2.0 * x[1]]
+
+    x, out = np.zeros(2), np.zeros(m)
+    for i in range(m):
+        out[i] = x[0]
+        x = solve_ivp(f, (i * DT, (i + 1) * DT - 1e-9), x, rtol=1e-8, atol=1e-10).y[:, -1]
+    return force, out + 1e-4 * rng.standard_normal(m)
+
+
+def write_csv(path, force, position, names=("t", "force", "position"), t=None):
+    t = np.arange(len(force)) * DT if t is None else t
+    rows = zip(t, force, position, strict=True)
+    path.write_text(",".join(names) + "\n" + "\n".join(",".join(map(str, r)) for r in rows) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return {"train": rig(0), "test": rig(1)}
+
+
+@pytest.fixture
+def files(tmp_path, truth):
+    (tmp_path / "rig.py").write_text(RIG)
+    for name, data in truth.items():
+        write_csv(tmp_path / f"{name}.csv", *data)
+    return tmp_path
+
+
+def run(capsys, *arguments):
+    try:
+        status = main([str(a) for a in arguments])
+    except SystemExit as stop:
+        status = stop.code
+    out = capsys.readouterr()
+    return status, out.out, out.err
+
+
+def arguments(folder, *more, simulator="rig.py", train="train.csv", test="test.csv"):
+    source = ("--simulated", folder / "simulated.csv") if simulator is None else (folder / simulator,)
+    return (
+        "diagnose",
+        *source,
+        folder / train,
+        "--test",
+        folder / test,
+        "--out",
+        folder / "out",
+        "--workers",
+        1,
+        *more,
+    )
+
+
+def refused(capsys, *given, says):
+    status, _, err = run(capsys, *given)
+    assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err, err
+    assert status == 2, err
+    for word in says if isinstance(says, tuple) else (says,):
+        assert word in err, err
+
+
+def test_a_whole_diagnosis(capsys, files):
+    given = arguments(files, "--hold", "zero", "--initial", "zero")
+    status, out, err = run(capsys, *given)
+    assert status == 0 and err == ""
+    found = json.loads((files / "out" / "diagnosis.json").read_text(), parse_constant=lambda c: pytest.fail(c))
+    assert found["verdict"] == "missing-physics"
+    (effect,) = found["effects"]
+    assert (effect["port"], effect["law"]) == ("ground-mass", "cubic_stiffness")
+    value = {name: p["value"] for name, p in effect["parameters"].items()}
+    at_0_2 = value["k_3"] * 0.2**3 if "k_3" in value else value["k_n"] * 0.2 ** value["n"]
+    assert at_0_2 == pytest.approx(32.0, rel=0.05)  # 4000 N/m^3 at 0.2 m
+    assert all("N/m" in p["unit"] for name, p in effect["parameters"].items() if name != "n")
+    errors = found["fit"]["test"]
+    assert errors["after"] < 0.2 * errors["before"]
+    assert "cubic stiffness at ground-mass" in out and "->" in out and "noise floor" in out
+    assert f"report: {files / 'out' / 'report.html'}" in out
+    assert "<html" in (files / "out" / "report.html").read_text().lower()
+    assert not list(files.rglob("__pycache__"))
+    before = (files / "out" / "diagnosis.json").read_text()
+    refused(capsys, *given, says=("diagnosis.json exists", "--overwrite"))
+    assert (files / "out" / "diagnosis.json").read_text() == before
+
+
+BAD_SIMULATORS = {
+    "syntax error": (("def outputs(x, u, p):", "def outputs(x, u, p)"), ("rig.py, line 9",)),
+    "exception": (("p.k * x.pos", "p.k * x.position"), ("rig.py, line 6", "'position'")),
+    "no simulator": (("simulator = ", "rig = "), ("'simulator'",)),
+    "state without derivative": (("pos=x.vel, ", ""), ("derivative", "'pos'")),
+    "port into an unknown state": (("dict(vel=-1", "dict(speed=-1"), ("'ground-mass'", "'speed'")),
+    "recording lacks an input": (('("force",)', '("force", "heat")'), ("'heat'", "--column heat=COLUMN")),
+    "recording lacks an output": (("dict(position=x.pos)", "dict(place=x.pos)"), ("'place'", "--column place=COLUMN")),
+    "diverging simulator": (("- p.d * x.vel", "+ 1e3 * x.vel"), ("diverges",)),
+    "diverging at once": (("- p.d * x.vel", "+ 1e6 * x.vel**3"), ("diverges",)),
+    "far too fast": (("p.k * x.pos", "1e16 * x.pos"), ("fast",)),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SIMULATORS)
+def test_bad_simulators_are_refused(capsys, files, case):
+    (old, new), says = BAD_SIMULATORS[case]
+    assert old in RIG
+    (files / "rig.py").write_text(RIG.replace(old, new))
+    refused(capsys, *arguments(files, "--initial", "zero"), says=says)
+    assert not (files / "out" / "diagnosis.json").exists()
+
+
+BAD_RECORDINGS = {
+    "NaN in the middle": (lambda f, y: (f, np.r_[y[:400], np.nan, y[401:]]), ("nan", "402")),
+    "infinite": (lambda f, y: (np.r_[f[:9], np.inf, f[10:]], y), ("inf", "11")),
+    "text": (lambda f, y: ([*map(str, f[:5]), "off", *map(str, f[6:])], y), ("off", "7")),
+    "input never moves": (lambda f, y: (0 * f + 1.0, y), ("force", "never changes")),
+    "output never moves": (lambda f, y: (f, 0 * y), ("position", "never changes")),
+    "too short": (lambda f, y: (f[:10], y[:10]), ("samples",)),
+}
+
+
+@pytest.mark.parametrize("case", BAD_RECORDINGS)
+def test_bad_recordings_are_refused(capsys, files, truth, case):
+    change, says = BAD_RECORDINGS[case]
+    write_csv(files / "train.csv", *change(*truth["train"]))
+    refused(capsys, *arguments(files), says=says)
+
+
+def test_a_test_that_equals_the_training_is_refused(capsys, files, truth):
+    refused(capsys, *arguments(files, test="train.csv"), says="twice")
+    write_csv(files / "copy.csv", *truth["train"])
+    refused(capsys, *arguments(files, test="copy.csv"), says=("copy.csv", "train.csv", "says nothing"))
+
+
+def test_files_that_are_missing_or_in_the_wrong_place(capsys, files):
+    refused(capsys, *arguments(files, simulator="nowhere.py"), says="nowhere.py")
+    refused(capsys, *arguments(files, train="nowhere.csv"), says="nowhere.csv")
+    refused(capsys, *arguments(files, simulator="train.csv", train="test.csv"), says=("--simulated", "train.csv"))
+    refused(capsys, "diagnose", files / "train.csv", files / "rig.py", "--out", files / "out", says="--simulated")
+    refused(capsys, "diagnose", files / "rig.py", "--out", files / "out", says="No training recording")
+    refused(capsys, *arguments(files, "--inputs", "force"), says=("--inputs", "--simulated"))
+    refused(capsys, *arguments(files, "--workers", 0), says="--workers 0")
+    (files / "file").write_text("kept")
+    refused(capsys, *arguments(files)[:-4], "--out", files / "file" / "below", says="--out")
+
+
+def test_recordings_that_do_not_fit_each_other(capsys, files, truth):
+    write_csv(files / "test.csv", *truth["test"], t=np.arange(800) * 0.01)
+    refused(capsys, *arguments(files), says=("test.csv", "0.01 s", "0.02 s"))
+
+
+def test_an_interrupted_diagnosis_says_so(files):
+    code = "import sys; from pilfr_casadi.cli import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments(files))],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert "simulator:" in process.stdout.readline()
+        time.sleep(2.0)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130 and "Traceback" not in err
+    assert "nterrupted" in err + out

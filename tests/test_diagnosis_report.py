@@ -1,0 +1,295 @@
+"""The page of a diagnosis says what was found, for every verdict, and its files are what the contract asks for."""
+
+import functools
+import http.server
+import json
+import re
+import subprocess
+import sys
+import threading
+import types
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_report import CHROMIUM, EVIL, WRAPPER, Quiet, Reader
+
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose import Diagnosis, Effect
+from pilfr_casadi.diagnose.gates import Gate
+from pilfr_casadi.diagnose.workbench import Workbench
+from pilfr_casadi.laws import BoucWen, CubicStiffness, Saturation
+from pilfr_casadi.parameters import Parameter
+from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi.report import diagnosis_report
+from pilfr_casadi.report.diagnosis_files import diagnosis_report as same
+from pilfr_casadi.report.diagnosis_force import hidden_force
+from pilfr_casadi.report.diagnosis_runs import replay
+from pilfr_casadi.report.diagnosis_tables import usage
+from pilfr_casadi.simulator import Port, Simulator
+
+SCHEMA = json.loads((Path(__file__).parent / "diagnosis.schema.json").read_text())
+DT, NOISE = 0.01, 1e-3
+
+
+def rig(k=400.0, d=4.0, name="ground", outputs=("pos",)):
+    """A mass on a spring, measured at its position (and velocity)."""
+    return Simulator(
+        lambda x, u, p: dict(pos=x.vel, vel=u.force - p.k * x.pos - p.d * x.vel),
+        lambda x: {n: x["vel" if n == "vel" else "pos"] for n in outputs},
+        states=("pos", "vel"),
+        inputs=("force",),
+        parameters=dict(k=Parameter(k, unit="N/m", bounds=(50, 2000)), d=Parameter(d, unit="N s/m", bounds=(0, 50))),
+        ports=(Port(name, {"vel": -1.0}, lambda x: x.pos, lambda x: x.vel, "N", "m"),),
+    )
+
+
+LAWS = {
+    "ground": CubicStiffness().at({"k_3": 2.0e4}),
+    "hysteresis": BoucWen().at({"k_h": 300.0, "q_0": 0.02, "s": 0.5, "n": 1.0}),
+    "actuator:force": Saturation().at({"L": 10.0}),
+}
+PAIRS = [("ground", "ground"), ("ground", "hysteresis"), ("actuator:force", "actuator:force")]
+
+
+def recorded(true, seed, samples=700, **more):
+    """A simulated recording with white noise, from rest."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(samples) * DT
+    tones = [np.cos(2 * np.pi * f * t + rng.uniform(0, 6.28)) for f in np.linspace(0.4, 6, 25)]
+    u = (8 * np.sum(tones, axis=0) * (0.4 + 0.6 * t / t[-1]))[:, None] / 2
+    blank = Recording(u, np.zeros((samples, len(true.output_names))), DT, ("force",), true.output_names, initial="zero")
+    model = Workbench.of(true, [blank.with_(y=rng.standard_normal(blank.y.shape))], "zero").model(true)
+    y = make_engine(model, "vm").simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_x))[0]
+    return blank.with_(y=y + NOISE * np.std(y, axis=0) * rng.standard_normal(y.shape), **more)
+
+
+def example(verdict="missing-physics", port="ground", law="ground", test=True, outputs=("pos",), **more):
+    """A diagnosis as `diagnose` returns it, with the truth filled in by hand."""
+    clean = rig(name=port if ":" not in port else "ground", outputs=outputs)
+    true = clean.with_element(port, LAWS[law]) if verdict in ("missing-physics", "unexplained") else clean
+    train, held_out = [recorded(true, s) for s in (0, 1)], recorded(true, 2, name="slow & steady")
+    refit = rig(430.0, 5.0, clean.ports[0].name, outputs)
+    element = LAWS[law]
+    effect = Effect(
+        port,
+        element.id,
+        0.93,
+        element.sentence,
+        element.equation,
+        {k: {"value": float(v), "std": 0.01 * abs(v), "unit": "N/m^3"} for k, v in element.values.items()},
+        (("sensor:pos", "creep"),),
+        element.form,
+    )
+    columns = ("port", "law", "form", "nrmse_train", "nrmse_validation", "delta_bic")
+    tried = [
+        (port, element.id, element.form, 1e-3, 1.1e-3, -900.0),
+        ("sensor:pos", "creep", "", 1e-3, 1.2e-3, -880.0),
+        ("sensor:pos", "delay", "", 0.2, np.inf, np.nan),
+        *((port, f"law_{i}", "", 0.3, 0.3, 2.0) for i in range(15)),
+    ]
+    rows = [dict(zip(columns, row, strict=True)) for row in tried]
+    named = verdict == "missing-physics"
+    errors = {"nominal": 0.4, "before": 0.2, "after": NOISE if named else 0.2}
+    gate = Gate("pos", "wrong_sign", -1.0, "The sign of pos is the wrong way round.", True)
+    fields = dict(
+        verdict=verdict,
+        sentence={"missing-physics": f"The simulator leaves out {element.id} at {port}."}.get(
+            verdict, f"It is {verdict}."
+        ),
+        effects=(effect,) if named else (),
+        candidates=tuple(rows),
+        gates=(gate,) if verdict == "recording-fault" else (),
+        mismatch={"sentence": ""},
+        parameters={
+            n: {"nominal": v, "refit_without": 1.1 * v, "refit_with": np.asarray(v), "std": None, "unit": "N/m"}
+            for n, v in {"k": 380.0, "d": 4.4}.items()
+        },
+        errors={"train": errors, "test": errors if test else None},
+        floor={"nrmse": NOISE, "source": "estimated"},
+        corrected=true if named else refit,
+        refitted=refit,
+        hold="zero",
+        train=tuple(train),
+        test=(held_out,) if test else (),
+        seconds=3.0,
+    )
+    return Diagnosis(**{**fields, **more})
+
+
+def problems(value, schema, where="$"):
+    """What in a JSON value breaks the part of JSON Schema that the contract uses."""
+    schema = SCHEMA["$defs"][schema["$ref"].rsplit("/", 1)[1]] if "$ref" in schema else schema
+    out = []
+    if "anyOf" in schema and all(problems(value, option) for option in schema["anyOf"]):
+        out.append(f"{where}: none of the options")
+    if "const" in schema and value != schema["const"]:
+        out.append(f"{where}: not {schema['const']}")
+    if "enum" in schema and value not in schema["enum"]:
+        out.append(f"{where}: {value!r} not in {schema['enum']}")
+    if "type" in schema:
+        kinds = [schema["type"]] if isinstance(schema["type"], str) else schema["type"]
+        types_ = {
+            "object": dict,
+            "array": list,
+            "string": str,
+            "number": (int, float),
+            "null": type(None),
+            "boolean": bool,
+        }
+        if not any(isinstance(value, types_[k]) and not (k == "number" and isinstance(value, bool)) for k in kinds):
+            out.append(f"{where}: {type(value).__name__} is not {kinds}")
+    if isinstance(value, int | float) and not schema.get("minimum", -np.inf) <= value <= schema.get("maximum", np.inf):
+        out.append(f"{where}: {value} out of range")
+    if isinstance(value, dict):
+        out += [f"{where}: no {key}" for key in schema.get("required", ()) if key not in value]
+        for key, item in value.items():
+            more = schema.get("additionalProperties")
+            inner = schema.get("properties", {}).get(key, more if isinstance(more, dict) else None)
+            out += problems(item, inner, f"{where}.{key}") if inner else []
+    if isinstance(value, list) and "items" in schema:
+        out += [p for i, item in enumerate(value) for p in problems(item, schema["items"], f"{where}[{i}]")]
+    return out
+
+
+def test_the_checker_can_fail():
+    good = example().to_dict()
+    assert problems(good, SCHEMA) == []
+    assert problems({**good, "verdict": "perhaps"}, SCHEMA)
+    assert problems({**good, "effects": [{**good["effects"][0], "confidence": 1.2}]}, SCHEMA)
+    assert problems({k: v for k, v in good.items() if k != "mismatch"}, SCHEMA)
+    assert problems({**good, "fit": {**good["fit"], "test": {"nominal": "x"}}}, SCHEMA)
+
+
+@pytest.mark.parametrize("verdict", ["missing-physics", "complete", "unexplained", "recording-fault"])
+def test_every_verdict_has_its_files(verdict, tmp_path):
+    d = example(verdict)
+    path = diagnosis_report(d, tmp_path / "new" / "folder")
+    assert path == tmp_path / "new" / "folder" / "report.html"
+    content = json.loads((path.parent / "diagnosis.json").read_text(), parse_constant=pytest.fail)
+    assert problems(content, SCHEMA) == [] and content["verdict"] == verdict
+    reader = Reader(path.read_text())
+    titles = re.findall(r"<h2>(.*?)</h2>", path.read_text())
+    assert d.sentence.rstrip(".") in reader.text
+    assert "On held-out recordings the error is 40\xa0% as given, 20\xa0% refitted" in path.read_text()
+    figures = sorted((path.parent / "figures").iterdir())
+    assert len(figures) == len(reader.all("img")) > 8
+    assert all(f.read_bytes()[:4] == b"\x89PNG" for f in figures)
+    assert all(i["alt"] for i in reader.all("img"))
+    assert not list(path.parent.rglob("*.tmp"))
+    tone = {"missing-physics": "good", "complete": "good", "unexplained": "warning"}.get(verdict, "bad")
+    assert f'class="status {tone}"' in path.read_text()
+    assert ("The hidden force" in titles) == (verdict in ("missing-physics", "unexplained"))
+    if verdict == "missing-physics":
+        assert titles[0] == "What is missing" and "0.1\xa0% with cubic stiffness put back" in path.read_text()
+        assert "cannot tell it apart from: creep at sensor:pos" in reader.text
+        assert "3 more" not in reader.text and "6 more that did worse" in reader.text
+    if verdict == "recording-fault":
+        assert titles[0] == "What the recordings" + "&#39; checks found" and "wrong way round" in reader.text
+
+
+def test_without_test_recordings_it_says_so(tmp_path):
+    text = Reader(diagnosis_report(example(test=False), tmp_path).read_text()).text
+    assert "no test was given" in text and "none held out" in text and "test (held out)" not in text
+
+
+def test_old_figures_go_and_other_files_stay(tmp_path):
+    (tmp_path / "figures").mkdir()
+    old, mine = (tmp_path / "figures" / name for name in ("diagnosis-99-old.png", "mine.png"))
+    old.touch(), mine.touch()
+    same(example("complete"), tmp_path)
+    assert not old.exists() and mine.exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be made"):
+        diagnosis_report(example("complete"), tmp_path / "file" / "folder")
+
+
+def test_users_text_is_text(tmp_path):
+    evil = EVIL.replace("\\", "")
+    d = example(port=evil)
+    d = replace(
+        d,
+        sentence=EVIL,
+        effects=(replace(d.effects[0], sentence=EVIL, equation=EVIL, form=EVIL),),
+        gates=(Gate(EVIL, EVIL, 1, EVIL, False),),
+        next_experiment={"sentence": EVIL, "amplitude": 3.0, EVIL: EVIL},
+        test=tuple(r.with_(name=EVIL) for r in d.test),
+    )
+    html = diagnosis_report(d, tmp_path).read_text()
+    reader = Reader(html)
+    assert "<script" not in html and not any("onload" in attrs for _, attrs in reader.tags)
+    assert reader.text.count("alert(1)") > 10
+    assert all("<" not in f.name and "/" not in f.name for f in (tmp_path / "figures").iterdir())
+    assert not re.search(r"https?://|@import|url\(", html.replace("data:", ""))
+
+
+@pytest.mark.parametrize(("port", "law"), PAIRS)
+def test_the_recovered_force_is_the_hidden_one(port, law):
+    d = example(port=port, law=law)
+    bench = Workbench.of(d.refitted, d.train, d.hold)
+    fitted = replay(bench, d.corrected)
+    hidden = hidden_force(bench, fitted, port, 0, NOISE * bench.scale)
+    assert np.std(hidden.force - hidden.law_held) < 0.2 * np.std(hidden.law)
+    assert np.corrcoef(hidden.force, hidden.law_held)[0, 1] > 0.98
+    assert np.median(np.abs(hidden.force - hidden.law_held) / hidden.std) < 2
+
+
+def test_the_recovered_force_owes_nothing_to_the_law():
+    d = example()
+    bench = Workbench.of(d.refitted, d.train, d.hold)
+    blind = replay(bench, rig())
+    hidden = hidden_force(bench, blind, "ground", None, NOISE * bench.scale)
+    true = 2.0e4 * hidden.z**3
+    assert len(hidden.law) == 0
+    assert np.std(hidden.force - true) < 0.25 * np.std(true)
+    wrong = rig().with_element("ground", CubicStiffness().at({"k_3": 1.0e4}))
+    other = hidden_force(bench, replay(bench, wrong), "ground", 0, NOISE * bench.scale)
+    assert np.std(other.force - hidden.force) < 0.1 * np.std(hidden.force)
+
+
+@pytest.mark.parametrize(("port", "law"), PAIRS)
+def test_the_lines_of_code_run(port, law, tmp_path, monkeypatch):
+    d = example(port=port, law=law)
+    module = types.ModuleType("rig")
+    module.simulator = rig(380.0, 4.4)
+    monkeypatch.setitem(sys.modules, "rig", module)
+    monkeypatch.chdir(tmp_path)
+    r = d.train[0]
+    rows = np.column_stack([r.t, r.u, r.y])
+    np.savetxt("new.csv", rows, delimiter=",", header="t,force,pos", comments="", fmt="%.12g")
+    space = {}
+    exec(usage(d), space)
+    assert np.sqrt(np.mean((space["y"] - r.y) ** 2)) / np.std(r.y) < 3 * NOISE
+    assert space["step"].n_in() == 3
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("width", [390, 1280])
+def test_in_a_browser(width, tmp_path):
+    d = example(outputs=("pos", "vel"), law="hysteresis", port="a_port_with_a_name_that_goes_on_and_on_without_a_blank")
+    long_name = "a_recording_with_a_name_that_goes_on_and_on_without_a_single_blank_in_it"
+    d = replace(d, test=tuple(r.with_(name=long_name) for r in d.test))
+    diagnosis_report(d, tmp_path)
+    (tmp_path / "wrapper.html").write_text(WRAPPER % width)
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=tmp_path))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
+    flags += " --disable-component-update --disable-sync --hide-scrollbars --enable-logging=stderr --dump-dom"
+    flags += f" --window-size={width + 40},1000 --virtual-time-budget=20000 --user-data-dir={tmp_path / 'profile'}"
+    address = f"http://127.0.0.1:{server.server_address[1]}/wrapper.html"
+    try:
+        done = subprocess.run(
+            [CHROMIUM, *flags.split(), address], capture_output=True, text=True, timeout=120, check=True
+        )
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert "CONSOLE" not in done.stderr, done.stderr
+    seen = json.loads(re.search(r'<pre id="out">(.*?)</pre>', done.stdout, re.S).group(1))
+    assert seen["title"] == "Diagnosis of a simulator: force → pos, vel"
+    assert seen["width"] == width and seen["overflow"] <= 0
+    assert seen["images"] == seen["shown"] > 15
+    assert seen["colours"] > 20
+    assert seen["font"] >= 13
+    assert seen["columns"] == (1 if width == 390 else 2)

@@ -1,0 +1,276 @@
+"""What a fit says about itself: errors, limits, noise and priors, initial states, what is scored, and interrupts."""
+
+import importlib
+import signal
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from random_models import random_input, random_lfr, reference
+
+from pilfr_casadi.constraints import Constraint
+from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi.fit import fit
+from pilfr_casadi.fitted import outcome
+from pilfr_casadi.gauge import standard_errors
+from pilfr_casadi.gauss_newton import GaussNewton
+from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.metrics import nrmse
+from pilfr_casadi.multistart import PRIOR
+from pilfr_casadi.operators import Play
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi.solution import Status
+
+fit_module = importlib.import_module("pilfr_casadi.fit")
+X0 = np.array([3.0, -3.0, 0.0, 0.0, 0.0, 0.0])
+SHORT = GaussNewton(max_iterations=3)
+
+
+@dataclass
+class Watching:
+    """Gauss-Newton that keeps what it was given: each problem, and the cost it started at."""
+
+    problems: list = field(default_factory=list)
+    costs: list = field(default_factory=list)
+
+    def solve(self, problem, start=None, progress=None):
+        self.problems.append(problem)
+        self.costs.append(problem.cost(problem.start if start is None else start))
+        return GaussNewton(tolerance=1e-4).solve(problem, start)
+
+
+def simulated(seed, samples, state, noise=0.01):
+    _, values = random_lfr(3, nx=2, n=4)
+    u = random_input(seed, samples)
+    y = reference(Play, values, u, state)[0]
+    return u, y + noise * y.std() * np.random.default_rng(seed).normal(size=y.shape)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    structure, values = random_lfr(3, nx=2, n=4)
+    return structure, values, structure.model(1, 1, values)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return Recording(*simulated(1, 1500, np.zeros(6)), 0.01, initial="zero")
+
+
+@pytest.fixture(scope="module")
+def moving():
+    return Recording(*simulated(2, 1500, X0), 0.01, initial="estimate")
+
+
+@pytest.fixture(scope="module")
+def of_moving(truth, moving):
+    return fit(truth[2], moving)
+
+
+@pytest.fixture(scope="module")
+def of_record(truth, record):
+    return fit(truth[2], record)
+
+
+# errors
+
+
+def test_the_searchs_own_prior_is_not_taken_for_knowledge(truth, record):
+    structure, values, model = truth
+    tight = {k: {"prior": (values[k], 1e-4 * np.ones_like(values[k]))} for k in ("w", "r")}
+    held = model.with_parameters(model.parameters.change(**tight))
+    problems = [Problem(m, record, noise=0.01) for m in (held, model)]
+    solution = GaussNewton().solve(problems[0])
+    found = outcome(held, structure, problems[0], solution, 0.0, (record,), note=PRIOR)
+    with_prior, without = (standard_errors(p, solution.theta, structure) for p in problems)
+    assert np.all(with_prior["r"] < 0.1 * without["r"])
+    for name in ("w", "r"):
+        np.testing.assert_allclose(found.errors[name], without[name], rtol=1e-9)
+        assert found.model.parameters[name].prior is None
+
+
+def test_what_nothing_is_known_about_is_said(of_record):
+    errors = {"r": np.array([[0.1, np.inf, np.inf]]), "w": np.ones((1, 3))}
+    told = replace(of_record, errors=errors, linear_nrmse=(0.25,))
+    assert "the data alone says nothing about 2 of 3 entries of r" in str(told)
+    assert "of w" not in str(told) and "says nothing" not in str(replace(told, errors={"w": errors["w"]}))
+    assert "the linear model alone, to judge the element by: NRMSE 0.2500" in str(told)
+
+
+def test_the_linear_model_is_judged_as_well(record):
+    found = fit(PILFR(2, PrandtlIshlinskii(Play, 3)), record, starts=1)
+    linear = fit(PILFR(2), record)
+    assert found.linear_nrmse == pytest.approx(linear.train_nrmse, rel=0.01)
+    assert found.train_nrmse[0] < 0.8 * found.linear_nrmse[0]
+
+
+# limits
+
+
+@pytest.mark.parametrize("low, high, listed", [(1.2, np.inf, True), (-np.inf, 0.8, True), (0.1, 10.0, False)])
+def test_limits_on_either_side_are_listed(truth, record, low, high, listed):
+    _, values, model = truth
+    total = float(values["r"][0, 0])
+    limit = Constraint(lambda p: p["r"][0, 0], low * total, high * total, name="first threshold")
+    assert ("first threshold" in fit(model, record, constraints=[limit]).active) is listed
+
+
+@pytest.mark.parametrize("path", ["linear", "refit", "search"])
+def test_the_radius_is_limited_on_every_way(record, of_record, path):
+    watching = Watching()
+    task = {
+        "linear": PILFR(2, fixed={"D_yu": 0.0}),
+        "refit": replace(of_record, structure=PILFR(2, PrandtlIshlinskii(Play, 4))),
+        "search": PILFR(2, PrandtlIshlinskii(Play, 3)),
+    }[path]
+    fit(task, record, solver=watching, starts=1, stable=0.99)
+    assert all("spectral radius <= 0.99" in p.g_labels for p in watching.problems) and watching.problems
+    again = Watching()
+    fit(task, record, solver=again, starts=1, stable=False)
+    assert not any(p.g_labels for p in again.problems)
+
+
+def test_a_recording_at_rest_among_others(truth, record):
+    rest = Recording(np.zeros((200, 1)), np.zeros((200, 1)), 0.01, initial="zero")
+    model = truth[2]
+    calm = model.with_parameters(model.parameters.change(y_0={"value": np.zeros(1)}))
+    found = fit(calm, [record, rest], solver=SHORT)
+    assert np.all(np.isfinite(found.train_nrmse))
+    pooled = np.std(np.concatenate([record.y, rest.y]))
+    expected = np.sqrt(np.mean(found.simulate(rest) ** 2)) / pooled
+    assert found.train_nrmse[1] == pytest.approx(expected)
+    assert found.nrmse([record, rest]) == pytest.approx((found.nrmse(record) + expected) / 2)
+    with pytest.raises(InputError, match="never changes"):
+        found.nrmse(rest)
+
+
+# noise and priors
+
+
+def test_a_prior_means_the_same_on_every_way(truth, record):
+    _, values, model = truth
+    mean = values["D_yu"] + 0.1
+    pulled = model.with_parameters(model.parameters.change(D_yu={"prior": (mean, 0.05)}))
+    found = fit(pulled, record)
+    error = found.train_nrmse[0]
+    assert error < 0.0105  # with noise = 1 the prior would hold D_yu 0.1 off
+    again, given = fit(found, record), fit(pulled, record, noise=error)
+    assert again.parameters["D_yu"] == pytest.approx(found.parameters["D_yu"], abs=2e-4)
+    assert given.parameters["D_yu"] == pytest.approx(found.parameters["D_yu"], abs=2e-4)
+    strong = fit(pulled, record, noise=1.0)
+    assert abs(strong.parameters["D_yu"] - found.parameters["D_yu"]) > 0.015
+
+
+@pytest.mark.parametrize("element", [None, PrandtlIshlinskii(Play, 3)], ids=["linear", "pi-lfr"])
+def test_the_noise_is_what_was_reached(record, element):
+    watching = Watching()
+    structure = PILFR(2, element, priors={"D_yu": (0.5, 0.1)})
+    found = fit(structure, record, solver=watching, starts=1)
+    last = watching.problems[-1].noise
+    assert last == pytest.approx(found.train_nrmse[0], rel=0.1)
+    if element:
+        assert watching.problems[0].noise < 0.2  # what the search has reached
+    fixed = Watching()
+    fit(structure, record, solver=fixed, starts=1, noise=0.3)
+    assert {p.noise for p in fixed.problems} == {0.3}
+
+
+# initial states
+
+
+def test_states_are_known_by_recording_and_kind(of_moving, moving, of_record, record):
+    np.testing.assert_allclose(of_moving.initial_state(moving)[:2], X0[:2], rtol=0.2)
+    assert not of_moving.initial_state(moving.with_(initial="zero")).any()
+    steady = of_moving.initial_state(moving.with_(initial="periodic", period=len(moving)))
+    assert np.max(np.abs(steady[:2] - X0[:2])) > 1.0
+    assert of_record.initial_state(record.with_(initial="estimate")).any()
+
+
+def test_a_fit_starts_again_where_it_ended(of_moving, moving):
+    watching = Watching()
+    fit(of_moving, moving, solver=watching)
+    assert watching.costs[0] == pytest.approx(of_moving.solution.cost, rel=1e-9)
+    other = Recording(*simulated(5, 600, X0), 0.01)
+    fit(of_moving, other, solver=watching)
+    assert watching.costs[1] < 1e-3  # from rest it would be more than 0.01
+
+
+def test_only_the_head_tells_the_initial_state(of_record):
+    u, y = simulated(6, 400, X0)
+    other = y.copy()
+    other[60:] = 7.0
+    one, two = (of_record.initial_state(Recording(u, values, 0.01)) for values in (y, other))
+    np.testing.assert_array_equal(one, two)
+    assert np.any(one != of_record.initial_state(Recording(u, np.roll(y, 5, axis=0), 0.01)))
+
+
+def test_what_the_state_was_fitted_to_is_not_scored(of_record, of_moving, moving):
+    u, y = simulated(6, 400, X0)
+    test = Recording(u, y, 0.01)
+    assert of_record.scored_from(test) == 60  # ten a state, operators included
+    assert of_record.nrmse(test) == nrmse(y, of_record.simulate(test), skip=60)
+    assert of_record.scored_from(test.with_(skip=90)) == 90
+    assert of_record.scored_from(test.with_(initial="zero")) == 0
+    assert of_moving.scored_from(moving) == 0
+    assert of_moving.nrmse(moving) == pytest.approx(of_moving.train_nrmse[0])
+    with pytest.raises(InputError, match="has 60 samples, but its initial state is fitted to the first 60"):
+        of_record.nrmse(Recording(u[:60], y[:60], 0.01))
+    assert of_record.simulate(Recording(u[:60], y[:60], 0.01)).shape == (60, 1)
+
+
+def test_outputs_are_not_needed_to_simulate(of_record):
+    u, y = simulated(6, 400, np.zeros(6))
+    bare, full = (Recording(u, outputs, 0.01, initial="zero") for outputs in (np.zeros((400, 0)), y))
+    np.testing.assert_array_equal(of_record.simulate(bare), of_record.simulate(full))
+    with pytest.raises(InputError, match="1 inputs and 0 outputs"):
+        of_record.simulate(bare.with_(initial="estimate"))
+
+
+@pytest.mark.parametrize("engine", ["c", "vm"])
+def test_the_engine_is_kept(truth, record, engine):
+    assert fit(truth[2], record, engine=engine, solver=SHORT).engine == engine
+
+
+# interrupts
+
+
+def test_ctrl_c_after_the_last_solve_loses_nothing(truth, record, monkeypatch):
+    def struck(*args, **more):
+        signal.raise_signal(signal.SIGINT)
+        return outcome(*args, **more)
+
+    monkeypatch.setattr(fit_module, "outcome", struck)
+    found = fit(truth[2], record)
+    assert found.status is Status.INTERRUPTED and found.train_nrmse[0] < 0.0105
+
+
+@pytest.mark.parametrize("priors", [{}, {"D_yu": (0.5, 0.1)}], ids=["plain", "with a prior"])
+@pytest.mark.parametrize("at", ["solve", "standard errors"])
+def test_an_interrupt_by_the_progress_function(record, at, priors):
+    def strike(stage, *_):
+        if stage == at:
+            raise KeyboardInterrupt
+
+    structure = PILFR(2, PrandtlIshlinskii(Play, 3), priors=priors)
+    found = fit(structure, record, starts=1, progress=strike)
+    assert found.status is Status.INTERRUPTED and found.structure == structure
+    assert found.train_nrmse[0] < found.linear_nrmse[0] and len(found.candidates) == 1
+
+
+def test_an_interrupt_between_two_solves(record, monkeypatch):
+    structure = PILFR(2, PrandtlIshlinskii(Play, 3), priors={"D_yu": (0.5, 0.1)})
+
+    def struck(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fit_module._Job, "settled", struck)
+    for task in (structure, structure.model(1, 1, {"D_yu": 0.4}), PILFR(2, priors={"D_yu": (0.5, 0.1)})):
+        found = fit(task, record, starts=1)
+        assert found.status is Status.INTERRUPTED and np.isfinite(found.train_nrmse[0])
+
+
+def test_constraints_are_found_by_name(record, truth):
+    limit = Constraint(lambda p: ca.sum1(ca.vec(p["w"])), upper=1.0, name="sum of the weights")
+    assert "sum of the weights" in fit(truth[2], record, constraints=limit).active

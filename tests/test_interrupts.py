@@ -1,0 +1,154 @@
+"""Ctrl-C, time limits and workers: a run ends soon, keeps what it has, and leaves no process behind."""
+
+import contextlib
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import pilfr_casadi
+from pilfr_casadi.interrupts import Clock, deferred_interrupt, insistent, time_limit, worker_pool
+
+TRAIN = Path(pilfr_casadi.__file__).parent / "demo_data" / "train.csv"
+PILFR = [sys.executable, "-c", "import sys; from pilfr_casadi.cli import main; sys.exit(main(sys.argv[1:]))"]
+linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are counted in /proc")
+
+
+def test_an_interrupt_is_deferred():
+    steps = []
+    with pytest.raises(KeyboardInterrupt), deferred_interrupt():
+        signal.raise_signal(signal.SIGINT)
+        steps.append("went on")
+    assert steps == ["went on"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_time_limit_interrupts_only_what_it_limits():
+    clock = Clock()
+    with pytest.raises(KeyboardInterrupt), time_limit(0.05, clock):
+        time.sleep(20)
+    assert clock.expired
+    clock = Clock()
+    with time_limit(0.2, clock):
+        pass
+    time.sleep(0.4)
+    assert not clock.expired and threading.active_count() < 20
+
+
+def test_a_swallowed_interrupt_is_not_forgotten():
+    seen = []
+    with insistent(lambda *news: seen.append(news)) as progress:
+        progress("starts", 1, 2, 0.5)
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            progress("starts", 2, 2, 0.4)
+        progress("polish", 1, 1, 0.3)
+    assert len(seen) == 3 and signal.set_wakeup_fd(-1) == -1
+
+
+@pytest.mark.parametrize("leave", ["done", "interrupted"])
+def test_no_worker_is_left(leave):
+    before = set(multiprocessing.active_children())
+    began = time.monotonic()
+    try:
+        with worker_pool(2) as pool:
+            assert pool.submit(abs, -3).result() == 3
+            if leave == "interrupted":
+                for _ in range(9):
+                    pool.submit(time.sleep, 60)
+                raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        assert leave == "interrupted"
+    while set(multiprocessing.active_children()) - before:
+        assert time.monotonic() - began < 20
+        time.sleep(0.05)
+    with worker_pool(1) as nothing:
+        assert nothing is None
+
+
+def session(leader):
+    """Processes of a session that are alive, by number."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (entry / "stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == leader and fields[0] != "Z":
+            found.append(int(entry.name))
+    return found
+
+
+def struck(arguments, until):
+    """Run a command, strike its whole process group once `until(process)`; status, stdout, stderr, processes."""
+    process = subprocess.Popen(
+        [*PILFR, *map(str, arguments)],
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    try:
+        end = time.monotonic() + 60
+        while not until(process):
+            assert process.poll() is None and time.monotonic() < end
+            time.sleep(0.02)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+        end = time.monotonic() + 10
+        while (left := session(process.pid)) and time.monotonic() < end:
+            time.sleep(0.05)
+        return process.returncode, out, err, left
+    finally:
+        for number in {process.pid, *session(process.pid)}:
+            try:
+                os.kill(number, signal.SIGKILL)
+            except ProcessLookupError:
+                continue
+        process.wait()
+
+
+@linux
+@pytest.mark.parametrize("pause", [0.0, 0.3, 1.0, 2.5])
+def test_the_first_ctrl_c_ends_a_run_with_workers(tmp_path, pause):
+    """Struck `pause` seconds after its workers have begun."""
+    out_dir, since = tmp_path / "out", []
+
+    def until(process):
+        if not since and len(session(process.pid)) >= 3:
+            since.append(time.monotonic())
+        return since and time.monotonic() - since[0] >= pause
+
+    names = ("--inputs", "u", "--outputs", "x2", "--initial", "zero", "--nx", 5, "--starts", 500, "--workers", 2)
+    status, out, err, left = struck(("fit", TRAIN, *names, "--out", out_dir), until)
+    assert status == 130 and left == []
+    assert "Traceback" not in err and "Exception" not in err
+    written = (out_dir / "model.json").exists()
+    assert ("before there was anything to write" in err) == (not written)
+    if written:
+        assert "interrupted" in out
+        assert json.loads((out_dir / "model.json").read_text())["parameters"]["A"]
+
+
+@linux
+def test_ctrl_c_in_the_demo_writes_the_best_so_far(tmp_path):
+    """Struck once three processes are at work and the linear model, which takes a fraction of that, may be there."""
+    began = time.monotonic()
+
+    def until(process):
+        return len(session(process.pid)) >= 3 and time.monotonic() - began > 3
+
+    status, out, err, left = struck(("demo", "--workers", 2, "--out", tmp_path), until)
+    assert status == 130 and left == [] and "Traceback" not in err
+    written = (tmp_path / "model.json").exists()
+    assert ("before there was anything to write" in err) == (not written)
+    assert written == ("interrupted" in out.lower())

@@ -1,0 +1,136 @@
+"""Multistart with the paper's start: every start is polished, none is lost, and the user's solver has the last word."""
+
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from random_models import random_lfr
+
+from pilfr_casadi import multistart
+from pilfr_casadi.demo import demo_recordings, structure
+from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi.gauss_newton import GaussNewton
+from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.linear_model import linear_model
+from pilfr_casadi.multistart import POLISH, Candidate, Search, explore, polish, search_starts, stability
+from pilfr_casadi.operators import Play
+from pilfr_casadi.solution import Solution, Status
+from pilfr_casadi.start import grid_start, paper_start, unit_states
+
+
+@dataclass
+class Counting:
+    """Gauss-Newton that keeps what it was asked and what it gave."""
+
+    solver: GaussNewton = field(default_factory=lambda: GaussNewton(max_iterations=200, tolerance=1e-4))
+    given: list = field(default_factory=list)
+
+    def solve(self, problem, start=None):
+        solution = self.solver.solve(problem, start)
+        self.given.append(solution)
+        return solution
+
+
+@pytest.fixture(scope="module")
+def search():
+    train = (demo_recordings()["train"],)
+    model = structure(5)
+    linear, problem, solution = linear_model(train, model)
+    parameters = linear.parameters.at(problem.parameters(solution.theta))
+    blocks = {k: p.value for k, p in parameters.items()}
+    return Search(model, train, blocks, POLISH, stability(model), start="paper")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_papers_start_is_polished(search, seed):
+    sequence = np.random.SeedSequence(seed)
+    scaled, _ = unit_states(search.linear, [r.u for r in search.recordings])
+    model = search.model(paper_start(search.structure, scaled, np.random.default_rng(sequence)))
+    problem = search.problem(model)
+    alone = POLISH.solve(problem).theta
+    e = problem.residual(alone)
+    candidate = explore(search, seed, sequence)
+    # the prior that wins ties may cost a tenth
+    assert candidate.error <= 1.1 * np.sqrt(np.mean(e**2))
+    again = explore(search, seed, sequence)
+    np.testing.assert_array_equal(candidate.theta, again.theta)
+
+
+def test_the_users_solver_has_the_last_word(search):
+    counting = Counting()
+    candidate = explore(replace(search, solver=counting), 1, np.random.SeedSequence(1))
+    assert len(counting.given) == 2
+    np.testing.assert_array_equal(candidate.theta, counting.given[-1].theta)
+    assert candidate.solution is counting.given[-1]
+    assert polish(search, candidate).error <= 1.1 * candidate.error
+
+
+def test_the_limit_with_the_elements_full_slope():
+    structure, values = random_lfr(1, nx=3, n_w=2, n=3)
+    model = structure.model(1, 1, values)
+    limits = stability(structure)
+    p = {name: ca.DM(parameter.value) for name, parameter in model.parameters.items()}
+    slipping = values["A"] + values["B_w"] @ np.diag(values["w"].sum(axis=1)) @ values["C_z"]
+    for limit, matrix in zip(limits, (values["A"], slipping), strict=True):
+        radius = np.max(np.abs(np.linalg.eigvals(matrix)))
+        assert float(limit.expression(p)) == pytest.approx(np.log(radius), abs=1e-4)
+    assert stability(PILFR(0, PrandtlIshlinskii(Play, 3))) == ()
+
+
+def test_the_users_priors_stay():
+    structure, values = random_lfr(1, nx=2, n=3)
+    structure = replace(structure, priors={"w": (1.0, 0.5)})
+    model = multistart._with_prior(structure.model(1, 1, values), values, 0.02)
+    assert model.parameters["w"].prior == (1.0, 0.5)
+    np.testing.assert_array_equal(model.parameters["r"].prior[0], values["r"])
+
+
+def test_every_seed_has_its_own_starts(search, monkeypatch):
+    drawn = []
+
+    def draw(search, index, sequence):
+        drawn.append(np.random.default_rng(sequence).uniform())
+        return Candidate(index, None, np.zeros(0), drawn[-1], Solution(np.zeros(0), 0.0, Status.CONVERGED, 0, 0.0))
+
+    monkeypatch.setattr(multistart, "explore", draw)
+    for seed in (0, 1, 0):
+        search_starts(search, 3, seed, None, lambda _: None)
+    assert len(set(drawn)) == 6 and drawn[:3] == drawn[6:]
+
+
+def test_the_first_starts_place_the_element(search, monkeypatch):
+    places = []
+
+    def kept(*args):
+        places.append(args[-1])
+        return grid_start(*args)
+
+    monkeypatch.setattr(multistart, "grid_start", kept)
+    monkeypatch.setattr(multistart, "EXPLORE", GaussNewton(max_iterations=1))
+    search_starts(replace(search, start="grid"), 4, 0, None, lambda _: None, keep=0)
+    assert places == ["output", "input", "random", "random"]
+
+
+@pytest.mark.parametrize("last", [1, 2, 3])
+def test_an_interrupted_polish_ends_with_the_best(search, monkeypatch, last):
+    candidate = explore(replace(search, start="grid"), 0, np.random.SeedSequence(0))
+    errors = []
+
+    class Struck:
+        def solve(self, problem, start=None):
+            solution = POLISH.solve(problem, start)
+            errors.append(np.sqrt(np.mean(problem.residual(solution.theta) ** 2)))
+            return replace(solution, status=Status.INTERRUPTED) if len(errors) == last else solution
+
+    monkeypatch.setattr(multistart, "POLISH", Struck())
+    found = polish(search, candidate)
+    assert found.solution.status is Status.INTERRUPTED and len(errors) == last
+    assert found.error == min([candidate.error, *errors])
+
+
+def test_priors_are_weighed_against_the_noise_that_is_known(search):
+    model = search.model({})
+    assert search.problem(model).noise == 1.0 and replace(search, level=0.2).problem(model).noise == 0.2
+    assert replace(search, level=0.2).problem(model, noise=0.1).noise == 0.1
+    assert replace(search, level=0.2, noise=0.3).problem(model, noise=0.1).noise == 0.3
