@@ -51,13 +51,24 @@ def scaled(kind: str, index: int, factor: float) -> Change:
     return change
 
 
-def shifted(kind: str, index: int, seconds: float, rate: float = 0.0) -> Change:
-    """Read one channel at `t + seconds + rate t`, interpolated; ends held."""
+def shifted(kind: str, index: int, seconds: float, rate: float = 0.0, cut: bool = True) -> Change:
+    """Read one channel at `t + seconds + rate t`, interpolated.
+
+    What lies before the recording is skipped and what lies behind it cut off, unless `cut` is off: then ends are held.
+    A periodic recording goes round.
+    """
 
     def change(r: Recording) -> Recording:
-        values = np.array(getattr(r, kind))
-        values[:, index] = np.interp(r.t * (1 + rate) + seconds, r.t, values[:, index])
-        return r.with_(**{kind: values})
+        values, at = np.array(getattr(r, kind)), r.t * (1 + rate) + seconds
+        end = len(r) * r.dt if r.period and len(r) % r.period == 0 and not rate else None
+        values[:, index] = np.interp(at, r.t, values[:, index], period=end)
+        other = r.with_(**{kind: values})
+        if end is not None or not cut:
+            return other
+        early, late = int(np.sum(at < 0)), int(np.sum(at > r.t[-1] + 1e-9 * r.dt))
+        if early:
+            other = other.with_(skip=min(max(r.skip, early), len(r) - 2))
+        return other.slice(0, max(len(r) - late, other.skip + 2)) if late else other
 
     return change
 

@@ -186,6 +186,8 @@ def _tasks(
             continue
         chosen = [law() for law in laws if ("series" if port.series else "parallel") in law.places]
         pairs = [(law, list(law.shapes(local))) for law in chosen if usable(law, local)]
+        if not pairs:
+            continue
         forces = np.hstack([trace(law, part, shapes).reshape(len(part.z), -1) for law, shapes in pairs])
         forces = np.where(np.abs(forces) < 1e100, forces, 0.0)
         size = np.sqrt(np.mean(forces**2, axis=0))

@@ -25,6 +25,7 @@ from .verdict import Choice, choose
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
+FEWEST = 100.0  # effective samples that a comparison is made on at least
 MORE = 0.06  # share of the excess that has to be left for a second effect to be looked for
 MOSTLY = 0.5  # share of the rest that a second effect may leave
 HINT = 0.1  # share of a residual that a flexible force has to explain
@@ -96,6 +97,7 @@ class Search:
                 break
             assert found.choice is not None
             self.base = self._polished(found.choice.winner).fitted
+            self._prefer_what_leaves_nothing()
             if number:
                 self._look_back()
             self.open_after = self._open(self.base)
@@ -136,7 +138,7 @@ class Search:
             for i, c in enumerate(candidates)
         ]
         best = min(kept, key=lambda c: c.error, default=None)
-        samples = max(effective_size(best.fitted.residual if best else self.base.residual), 30.0)
+        samples = max(effective_size(best.fitted.residual if best else self.base.residual), FEWEST)
         choice = choose(kept, before, self.floor2, samples)
         accepted = choice is not None and choice.gain > ROOM and (not number or choice.remains < MOSTLY)
         self._timed("choice", began)
@@ -145,7 +147,7 @@ class Search:
     def _choose(self, candidates: Sequence[Candidate], before: tuple[float, float]) -> Choice | None:
         best = min(candidates, key=lambda c: c.error, default=None)
         n = effective_size(best.fitted.residual if best else self.base.residual)
-        return choose(candidates, before, self.floor2, max(n, 30.0))
+        return choose(candidates, before, self.floor2, max(n, FEWEST))
 
     def _judged(self, fitted: Fitted) -> tuple[float, float]:
         """Errors of a simulator fitted to the first part only, on both parts."""
@@ -159,6 +161,22 @@ class Search:
 
     def _polished(self, candidate: Candidate) -> Candidate:
         return candidate if np.isfinite(candidate.full) else polish(self.bench, candidate)
+
+    def _prefer_what_leaves_nothing(self) -> None:
+        """Where the winner leaves what a flexible force explains, and a closer law at its port does not: take that."""
+        found = self.passes[-1]
+        assert found.choice is not None
+        winner = found.choice.winner
+        still = self._open(self.base).get(winner.port, 0.0)
+        closer = [c for c in found.candidates if c.port == winner.port and c.error < 0.95 * winner.error]
+        if still < HINT or not closer:
+            return
+        rival = self._polished(min(closer, key=lambda c: c.error))
+        if np.isfinite(rival.full) and self._open(rival.fitted).get(winner.port, 0.0) < 0.5 * still:
+            self.base = rival.fitted
+            margin = winner.error / rival.error
+            choice = replace(found.choice, winner=rival, margin=min(margin, found.choice.margin), alike=())
+            self.passes[-1] = replace(found, choice=choice)
 
     def _look_back(self) -> None:
         """With the second effect in place: its rivals in the first's place, and the second alone."""

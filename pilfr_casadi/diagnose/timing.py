@@ -9,6 +9,7 @@ that comes before its cause is nothing else.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -58,31 +59,30 @@ def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, F
     if len(bench.simulator.inputs) > 1:
         channels += [("u", i, name) for i, name in enumerate(bench.simulator.inputs)]
     straight = _remainder(bench, plain, basis, lambda r: r, False)
-    trials: list[tuple[float, str, str, float, Callable[[float], Change], bool, str]] = []
+    trials: list[tuple[float, str, str, float, str, int]] = []
     for kind, i, name in channels:
         for what, values in (("alignment", dt * np.arange(-FARTHEST, FARTHEST + 1)), ("clock", RATES)):
             for value in values:
                 make = _maker(kind, i, what)
                 left = _remainder(bench, plain, basis, make(value), kind == "u")
-                trials.append((left, name, what, float(value), make, kind == "u", kind))
+                trials.append((left, name, what, float(value), kind, i))
     best: tuple[float, str, str, float, Workbench, Fitted, Change] | None = None
-    for left, name, what, value, make, is_input, kind in sorted(trials, key=lambda t: t[0])[:3]:
+    for left, name, what, value, kind, i in _best_of_each(trials):
         if left > 0.7 * straight:
             continue
-        now, current, at = bench, plain, value
-        for _ in range(3):
-            other = changed(bench, make(at))
-            found = refit(other, current)
-            if found is None:
-                break
-            now, current = other, found
-            step = _refined(bench, now, current, make, at, dt if what == "alignment" else 0.2 * abs(at), is_input)
-            if abs(step - at) < 1e-3 * (dt if what == "alignment" else abs(at)):
-                break
-            at = step
+        make, cut = _maker(kind, i, what), _maker(kind, i, what, cut=True)
+        unit = dt if what == "alignment" else abs(value)
+        found = _settled(bench, plain, make, cut, value, unit)
+        if found is None:
+            continue
+        at, now, current = found
+        if what == "alignment":
+            near = _refit_at(bench, cut, round(at / dt) * dt, current)
+            if near is not None and near[1].cost < 1.02 * current.cost:
+                at, (now, current) = round(at / dt) * dt, near
         relative = current.cost * float(np.mean((now.scale / bench.scale) ** 2))
-        if current is not plain and (best is None or relative < best[0]):
-            best = (relative, name, what, at if kind == "y" else -at, now, current, make(at))
+        if best is None or relative < best[0]:
+            best = (relative, name, what, at if kind == "y" else -at, now, current, cut(at))
     if best is None or best[0] > DROP * plain.cost:
         return bench, plain, []
     relative, name, what, value, other, found, change = best
@@ -90,20 +90,63 @@ def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, F
     return (other, found, [gate]) if gate else (bench, plain, [])
 
 
-def _maker(kind: str, i: int, what: str) -> Callable[[float], Change]:
+def _refit_at(
+    bench: Workbench, cut: Callable[[float], Change], at: float, previous: Fitted
+) -> tuple[Workbench, Fitted] | None:
+    other = changed(bench, cut(at))
+    found = refit(other, previous)
+    return None if found is None else (other, found)
+
+
+def _settled(
+    bench: Workbench,
+    plain: Fitted,
+    make: Callable[[float], Change],
+    cut: Callable[[float], Change],
+    value: float,
+    unit: float,
+) -> tuple[float, Workbench, Fitted] | None:
+    """Shift and parameters in turn, until the shift stays where it is."""
+    best: tuple[float, Workbench, Fitted] | None = None
+    at, previous = value, plain
+    for _ in range(8):
+        found = _refit_at(bench, cut, at, previous)
+        if found is None:
+            break
+        if best is None or found[1].cost < best[2].cost:
+            best = (at, *found)
+        previous = found[1]
+        step = _refined(bench, found[0], previous, make, at, unit)
+        if abs(step - at) < 2e-3 * unit:
+            break
+        at = step
+    return best
+
+
+def _best_of_each(
+    trials: list[tuple[float, str, str, float, str, int]],
+) -> list[tuple[float, str, str, float, str, int]]:
+    """The best shift and the best clock of each channel, best first, three at most."""
+    best: dict[tuple[str, str], tuple[float, str, str, float, str, int]] = {}
+    for trial in sorted(trials, key=lambda t: t[0]):
+        best.setdefault(trial[1:3], trial)
+    return list(best.values())[:3]
+
+
+def _maker(kind: str, i: int, what: str, cut: bool = False) -> Callable[[float], Change]:
     if what == "alignment":
-        return lambda value: shifted(kind, i, value)
-    return lambda value: shifted(kind, i, 0.0, value)
+        return lambda value: shifted(kind, i, value, 0.0, cut)
+    return lambda value: shifted(kind, i, 0.0, value, cut)
 
 
 def _refined(
-    bench: Workbench, now: Workbench, fitted: Fitted, make: Callable[[float], Change], at: float, width: float, u: bool
+    bench: Workbench, now: Workbench, fitted: Fitted, make: Callable[[float], Change], at: float, width: float
 ) -> float:
     """Shift of the original recordings that fits best around `at`."""
     from scipy.optimize import minimize_scalar
 
-    basis = nominal_directions(now, fitted)
-    original = bench.on(bench.recordings)
+    original = replace(bench, scale=now.scale)
+    basis = nominal_directions(original, fitted)
 
     def left(value: float) -> float:
         parts = []

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from .search import Search
 
 AT_FLOOR = 1.15  # times a measured floor that counts as being at it
-COLOURED = 15.0  # times the white part of a residual that coloured noise may have
+COLOURED, LOUD = 15.0, 0.015  # times the white part of a residual that coloured noise may have, and its size then
+SOMEWHAT = 4.0  # the same times, for noise of any size
 HINT = 0.1  # share of a residual that a flexible force has to explain to count
 PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name that only comes near
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
@@ -138,7 +139,10 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     error, floor = search.without.cost**0.5, search.floor2**0.5
     if not accepted:
         open_now = max(search.open_before.values(), default=0.0)
-        bare = error < (AT_FLOOR if search.floor.source != "estimated" else COLOURED) * floor
+        if search.floor.source != "estimated":
+            bare = error < AT_FLOOR * floor
+        else:
+            bare = error < SOMEWHAT * floor or (error < COLOURED * floor and error < LOUD)
         if faults and (bare or open_now < HINT):
             return "recording-fault", faults[0].sentence
         if bare and open_now < HINT:

@@ -25,6 +25,7 @@ from .memory import (
     PlayHysteresis,
     Relaxation,
     Resonance,
+    Settling,
     StopHysteresis,
 )
 from .stiffness import (
@@ -85,6 +86,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     Relaxation,
     Creep,
     Drift,
+    Settling,
     PeriodicForce,
     Lag,
     Resonance,

@@ -326,3 +326,22 @@ class Drift(Law):
 
     def force(self, t: Any, p: Any) -> Any:
         return p.a * t + p.b * t**2
+
+
+class Settling(Drift):
+    """A warm-up that comes to an end."""
+
+    form = "settling"
+    equation = "w = a (1 - exp(-t / T))"
+    source = "Ljung (1999), System Identification, sec. 14.1; Incropera et al. (2007), sec. 5.1"
+    units: ClassVar[Mapping[str, str]] = {"a": "w", "T": "s"}
+    strength: ClassVar[tuple[str, ...]] = ("a",)
+
+    def force(self, t: Any, p: Any) -> Any:
+        return p.a * (1 - ca.exp(-t / p.T))
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(T=local.duration * np.array([0.05, 0.15, 0.4, 1.0]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"T": (0.02 * local.duration, 3 * local.duration)}
