@@ -2,7 +2,8 @@
 
 A state space becomes equations whose matrix entries are parameters: entries that are exactly 0, 1 or -1 are structure
 and stay, the others may move within a factor of two. A fitted model runs in discrete time as it is, with its memory
-among the states, and its parameters held: it has been fitted already, what is asked is what it lacks.
+among the states and its parameters held: it has been fitted already, what is asked is what it lacks. Only a gain near
+one and an offset of each output are free.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from .recording import InputError, Recording
 from .simulator import Named, Simulator
 
 FACTOR = 2.0
+GAIN = (0.7, 1.3)
 SAME_STEP = 1e-3
 
 
@@ -44,10 +46,10 @@ def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
     if isinstance(thing, Simulator):
         return thing
     if isinstance(thing, Model):
-        return _of_model(thing)
+        return _of_model(thing, recordings)
     if isinstance(getattr(thing, "model", None), Model):  # a Fit
         _check_step(float(thing.dt), recordings)
-        return _of_model(thing.model, getattr(thing, "units", {}))
+        return _of_model(thing.model, recordings, getattr(thing, "units", {}))
     if type(thing).__module__.partition(".")[0] == "control" and hasattr(thing, "ninputs"):
         return _of_system(thing, recordings)
     what = "a class" if isinstance(thing, type) else f"a {type(thing).__name__}"
@@ -60,12 +62,17 @@ def _check_step(dt: float, recordings: Sequence[Recording]) -> None:
             raise InputError(f"The model's step is {dt:g} s, that of {r.label} {r.dt:g} s; resample the recording.")
 
 
-def _of_model(model: Model, units: Mapping[str, str] | None = None) -> Simulator:
+def _of_model(model: Model, recordings: Sequence[Recording] = (), units: Mapping[str, str] | None = None) -> Simulator:
     if model.n_w and model.element is None:
         raise InputError("The model has an open port; close it with close_loop first.")
     if model.reads != ("u",) or model.substeps != 1:
         raise InputError("The model was made from a simulator; give the simulator itself.")
-    own, held = model.parameters, {k: Parameter(p.value, p.unit, fixed=True) for k, p in model.parameters.items()}
+    own, parameters = model.parameters, {k: Parameter(p.value, p.unit, fixed=True) for k, p in model.parameters.items()}
+    for name in model.outputs:
+        seen = [np.std(r.y[:, r.outputs.index(name)]) for r in recordings if name in r.outputs]
+        reach = float(max(seen, default=np.inf))
+        parameters[f"gain_{name}"] = Parameter(1.0, bounds=GAIN)
+        parameters[f"offset_{name}"] = Parameter(0.0, bounds=(-reach, reach))
     states = tuple(model.states)
     states += tuple(f"memory{i + 1}" for i in range(model.n_x + model.n_s - len(states)))
 
@@ -78,9 +85,11 @@ def _of_model(model: Model, units: Mapping[str, str] | None = None) -> Simulator
         return {n: step(x, u, p)[0][i] for i, n in enumerate(states)}
 
     def outputs(x: Named, u: Named, p: Named) -> dict[str, Any]:
-        return {n: step(x, u, p)[1][i] for i, n in enumerate(model.outputs)}
+        y = step(x, u, p)[1]
+        return {n: p[f"gain_{n}"] * y[i] + p[f"offset_{n}"] for i, n in enumerate(model.outputs)}
 
-    return Simulator(dynamics, outputs, states, model.inputs, held, discrete=True, hold="zero", units=dict(units or {}))
+    units = dict(units or {})
+    return Simulator(dynamics, outputs, states, model.inputs, parameters, discrete=True, hold="zero", units=units)
 
 
 def _of_system(system: Any, recordings: Sequence[Recording]) -> Simulator:

@@ -108,7 +108,7 @@ def fit(options: argparse.Namespace) -> int:
         if isinstance(task, PILFR) and task.element is not None and result.structure != task:
             print("No start was finished: this is the linear model that the starts begin with.")
         for recording in tests:
-            print(f"NRMSE on {recording.name}: {result.nrmse(recording):.4f}{_share_of_range(result, recording)}")
+            print(_tested(result, recording))
         page = fit_report(result, train, tests, folder)
         print(f"model: {target}\nreport: {page}")
     except KeyboardInterrupt:
@@ -147,9 +147,6 @@ def simulate(options: argparse.Namespace) -> int:
     columns = columns if measured else {k: v for k, v in columns.items() if k not in outputs}
     recording = read_file(options, options.data, inputs, outputs if measured else ())
     _check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
-    if not measured:
-        blank = np.zeros((len(recording), len(outputs)))
-        recording = recording.with_(y=blank, outputs=outputs)
     engine = _engine(fitted, recording, "auto", quiet=True)
     y = replace(fitted, engine=engine).simulate(recording)
     if not np.all(np.isfinite(y)):
@@ -160,7 +157,7 @@ def simulate(options: argparse.Namespace) -> int:
     header = ",".join(["t", *fitted.model.inputs, *fitted.model.outputs])
     write_atomically(out, "\n".join([header, *lines]) + "\n")
     if measured:
-        print(_judged(recording, y))
+        print(_judged(fitted, recording, y))
     else:
         state = "zero" if options.initial == "zero" else "that of the periodic steady state"
         print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
@@ -271,14 +268,20 @@ def make_folder(path: str) -> Path:
     return folder
 
 
-def _share_of_range(result: Fit, recording: Recording) -> str:
-    error = (result.simulate(recording) - recording.y)[recording.skip :]
-    share = 100 * np.sqrt(np.mean(error**2, axis=0)) / np.ptp(recording.y[recording.skip :], axis=0)
-    return f" (rms error {', '.join(f'{s:.2f}' for s in share)} % of the range)"
-
-
-def _judged(recording: Recording, y: np.ndarray) -> str:
+def _tested(result: Fit, recording: Recording) -> str:
     try:
-        return f"NRMSE on {recording.name}: {nrmse(recording.y, y, skip=recording.skip):.4f}"
+        error, first = result.nrmse(recording), result.scored_from(recording)
+    except InputError as reason:
+        return f"no NRMSE on {recording.name}: {reason}"
+    left = (result.simulate(recording) - recording.y)[first:]
+    share = 100 * np.sqrt(np.mean(left**2, axis=0)) / np.ptp(recording.y[first:], axis=0)
+    text = f"NRMSE on {recording.name}: {error:.4f} (rms error {', '.join(f'{s:.2f}' for s in share)} % of the range)"
+    fitted = first > recording.skip
+    return text + (f"; its initial state is fitted to the first {first} samples, not scored" if fitted else "")
+
+
+def _judged(fitted: Fit, recording: Recording, y: np.ndarray) -> str:
+    try:
+        return f"NRMSE on {recording.name}: {nrmse(recording.y, y, skip=fitted.scored_from(recording)):.4f}"
     except InputError as error:
         return f"no NRMSE on {recording.name}: {error}"

@@ -38,7 +38,7 @@ PUBLISHED: Mapping[str, tuple[float, float, float]] = {
     "PI-LFR N=15": (0.0078, 0.0143, 0.0144),
     "PI-LFR N=20": (0.0073, 0.0134, 0.0153),
 }
-SHOWN = ("LTI", "PI-LFR N=10", "PI-LFR N=20")
+SHOWN = ("LTI", "PI-LFR N=20")
 
 
 def demo_recordings() -> dict[str, Recording]:
@@ -88,7 +88,7 @@ def diagnose_rig(folder: Path, workers: int, console: Console) -> int:
     try:
         with progress_bar() as bar, insistent(bar) as progress:
             found = diagnose(
-                simulator, recordings["train"], test=recordings["test"], workers=workers, progress=progress
+                simulator, recordings["train"], test=recordings["test"], effects=1, workers=workers, progress=progress
             )
         page = diagnosis_report(found, folder)
     except KeyboardInterrupt:

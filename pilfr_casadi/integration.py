@@ -6,8 +6,8 @@ Within a sub-step of length h the inputs are held or follow their chord, and
     x⁺ = x + h (k₁ + 2 k₂ + 2 k₃ + k₄) / 6.
 
 Laws are evaluated inside every stage; one with memory (`step(z, s, p)`, such as a play) is evaluated from the memory at
-the sub-step's begin and its memory is moved on once, at the sub-step's end. A law with differential equations of its
-own (`flow`) adds states. The model's state is [x; laws' states; laws' memory].
+the sub-step's begin and its memory is moved on once, at the sub-step's end (a delay's shift register at its begin). A
+law with differential equations of its own (`flow`) adds states. The model's state is [x; laws' states; laws' memory].
 """
 
 from __future__ import annotations
@@ -151,17 +151,22 @@ def discretise(
     def at(state: Any, memory: Any, u: Any, time: Any) -> tuple[Any, ...]:
         return equations.evaluate(_Values(state, memory, u, slope, time))
 
-    k1, y, memory, _ = at(x, s, u0, t)
+    k1, y, begun, _ = at(x, s, u0, t)
+    # a shift register (a law that says `shifts`) takes in the signal at the step's begin, where it is measured; others move on
+    # with the step, from a memory that has seen its begin (which matters at the first sample)
+    shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
+    seen = ca.vertcat(ca.SX(0, 1), *(s[i] if shift else begun[i] for i, shift in enumerate(shifts)))
     n_own = len(simulator.states)
     if simulator.discrete:  # laws' own states move with z held over the sample
         q = x[n_own:] + h * k1[n_own:]
-        x_next, memory_next = ca.vertcat(k1[:n_own], q), memory
+        x_next, memory_next = ca.vertcat(k1[:n_own], q), begun
     else:
-        k2 = at(x + h / 2 * k1, s, middle, t + h / 2)[0]
-        k3 = at(x + h / 2 * k2, s, middle, t + h / 2)[0]
-        k4 = at(x + h * k3, s, end, t + h)[0]
+        k2 = at(x + h / 2 * k1, seen, middle, t + h / 2)[0]
+        k3 = at(x + h / 2 * k2, seen, middle, t + h / 2)[0]
+        k4 = at(x + h * k3, seen, end, t + h)[0]
         x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        memory_next = at(x_next, s, end, t + h)[2] if s.numel() else s
+        ended = at(x_next, seen, end, t + h)[2] if s.numel() else s
+        memory_next = ca.vertcat(ca.SX(0, 1), *(begun[i] if shift else ended[i] for i, shift in enumerate(shifts)))
     state, following = ca.vertcat(x, s), ca.vertcat(x_next, memory_next)
     everything = ca.vertcat(following, y)
     reads = ["u"]

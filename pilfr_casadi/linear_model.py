@@ -87,8 +87,8 @@ def _offset(recordings: Sequence[Recording], a: Array, b: Array, c: Array, d: Ar
     """The mean (n_y,) of what a linear model leaves of the outputs, from rest."""
     left = []
     for r in recordings:
-        states, _ = propagate(a.T, (r.u @ b.T)[None], np.zeros((1, len(a))))
-        left.append((r.y - states[0] @ c.T - r.u @ d.T)[r.skip :])
+        states = propagate(a.T, (r.u @ b.T)[None], np.zeros((1, len(a))))[0][0] if len(a) else np.zeros((len(r), 0))
+        left.append((r.y - states @ c.T - r.u @ d.T)[r.skip :])
     return np.asarray(np.mean(np.concatenate(left), axis=0))
 
 

@@ -2,8 +2,8 @@
 
 1. `linear_model`: subspace identification refined by output error, states scaled to unit variance (Krikelis et al.,
    Sec. 5.3).
-2. Exploration: from each seed a short Gauss-Newton run. Most of what a start will ever reach shows within some forty
-   steps.
+2. Exploration: from each start a short Gauss-Newton run. Most of what a start will ever reach shows within some forty
+   steps. The first two have the element at the output and at the input, the others anywhere (`start.grid_start`).
 3. The best few are re-gridded (`start.regrid`) and run again: thresholds that have clustered or fallen asleep are
    spread along the density the fit has found. This is done twice, the second time with thresholds beyond the visited
    range and a weak prior that holds the weights to the smoothed density, which decides what the data leaves open.

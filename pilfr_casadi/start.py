@@ -1,10 +1,11 @@
 """Start values: from a linear approximation to a PI-LFR worth optimising.
 
-`paper_start` is Krikelis et al. (2024), Eq. 22-24. `grid_start` keeps its random direction of z but spreads the
-thresholds over the range that z visits, instead of drawing them from `U(0, R)`: idle or identical thresholds hardly
-separate again. `regrid` takes a fitted element, smooths its density of weights, and places the thresholds anew so
-that each stands for an equal share of `density^0.4` (the knots of a good piecewise-linear approximation of the
-loading curve). It continues the tail of the density beyond the visited range, where data alone says nothing.
+`paper_start` is Krikelis et al. (2024), Eq. 22-24. `grid_start` keeps its random direction of z, in units that do not
+matter, or takes the linear model's output or input for z, and spreads the thresholds over the range that z visits,
+instead of drawing them from `U(0, R)`: idle or identical thresholds hardly separate again. `regrid` takes a fitted
+element, smooths its density of weights, and places the thresholds anew so that each stands for an equal share of
+`density^0.4` (the knots of a good piecewise-linear approximation of the loading curve). It continues the tail of the
+density beyond the visited range, where data alone says nothing.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ import numpy as np
 from pilfr_casadi.recording import Recording
 from pilfr_casadi.signals import multisine
 
-DT, SAMPLES, NOISE, FINE = 0.01, 1200, 5e-5, 100
+DT, SAMPLES, NOISE, FINE = 0.01, 1000, 1e-4, 100
 FOLDER = Path(__file__).parent.parent / "pilfr_casadi" / "demo_data"
 M1, M2, K1, K2, D1, D2 = 1.2, 0.8, 420.0, 900.0, 2.0, 1.5
 SIGMA0, SIGMA1, F_C, F_S, V_S = 5000.0, 5.0, 1.1, 1.25, 0.05

@@ -18,16 +18,19 @@ from pilfr_casadi.recording import Recording
 from pilfr_casadi.simulator import Simulator
 
 
-def free_run(simulator: Simulator, recording: Recording, hold: str, first: int) -> np.ndarray:
-    """Simulated minus measured outputs (M, n_y), the state at the start fitted to the `first` samples."""
+def free_run(simulator: Simulator, recording: Recording, hold: str, first: int = 0) -> np.ndarray:
+    """Simulated minus measured outputs (M, n_y), the state at the start as given, or fitted to the `first` samples."""
     held = simulator.with_parameters({k: replace(p, fixed=True) for k, p in simulator.parameters.items()})
-    bench = Workbench.of(held, [recording.slice(0, first).with_(skip=0, initial="estimate")], hold)
+    bench = Workbench.of(held, [recording.slice(0, first).with_(skip=0) if first else recording], hold)
     model = bench.model(held)
-    if model.n_x + model.n_s:
+    state = np.zeros(model.n_x + model.n_s)
+    if not isinstance(recording.initial, str):
+        state[: len(recording.initial)] = recording.initial
+    elif first and len(state):
         fitted = bench.fit(held, solver=THOROUGH)
         return started(fitted, recording, hold, fitted.initial[0])
     engine = make_engine(model)
-    return np.asarray(engine.simulate(model.drive(recording), model.parameters.start, np.zeros(0))[0] - recording.y)
+    return np.asarray(engine.simulate(model.drive(recording), model.parameters.start, state)[0] - recording.y)
 
 
 def started(fitted: Fitted, recording: Recording, hold: str, state: np.ndarray) -> np.ndarray:

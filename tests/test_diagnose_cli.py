@@ -1,5 +1,6 @@
 """`pilfr diagnose`: a whole run from files, and one plain sentence with exit status 2 for what cannot be used."""
 
+import importlib
 import json
 import os
 import signal
@@ -190,6 +191,41 @@ def test_files_that_are_missing_or_in_the_wrong_place(capsys, files):
 def test_recordings_that_do_not_fit_each_other(capsys, files, truth):
     write_csv(files / "test.csv", *truth["test"], t=np.arange(800) * 0.01)
     refused(capsys, *arguments(files), says=("test.csv", "0.01 s", "0.02 s"))
+
+
+def test_what_a_simulation_answered_stands_in_for_it(capsys, files):
+    write_csv(files / "simulated.csv", *rig(5, m=1200, k=95.0, cubic=0.0))
+    status, out, err = run(capsys, *arguments(files, "--hold", "zero", "--initial", "zero", simulator=None))
+    assert status == 0 and err == ""
+    assert "inputs force, outputs position, as found in the files" in out
+    assert "which it follows to NRMSE 0.00" in out and "ports mode:1.5" in out
+    found = json.loads((files / "out" / "diagnosis.json").read_text())
+    assert found["verdict"] == "missing-physics"
+    effect = found["effects"][0]
+    assert effect["port"].startswith("mode:1.5") and effect["law"] == "cubic_stiffness"
+    assert found["fit"]["test"]["after"] < 0.1 * found["fit"]["test"]["before"]
+
+
+def test_inputs_of_a_simulation_are_the_columns_that_agree(capsys, files, truth, monkeypatch):
+    seen = {}
+
+    def stop(simulator, recordings, **options):
+        seen.update(simulator=simulator, names=(recordings[0].inputs, recordings[0].outputs))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose"), "diagnose", stop)
+    force, position = truth["train"]
+    linear = np.convolve(force, 0.01 * 0.9 ** np.arange(200))[: len(force)]
+    write_csv(files / "simulated.csv", linear, force, names=("t", "here", "drive"))
+    write_csv(files / "train.csv", position, force, names=("t", "here", "drive"))
+    status, out, err = run(capsys, *arguments(files, simulator=None)[:4], "--out", files / "out")
+    assert status == 130 and "nothing was written" in err
+    assert "inputs drive, outputs here, as found in the files" in out and seen["names"] == (("drive",), ("here",))
+    assert list((files / "out").iterdir()) == []
+    given = arguments(files, simulator=None, test="test.csv")
+    refused(capsys, *given, says=("--inputs", "(none is shared)"))
+    refused(capsys, *given, "--inputs", "drive", says=("--inputs and --outputs",))
+    refused(capsys, *given, "--inputs", "drive", "--outputs", "here", says=("test.csv", "'drive'"))
 
 
 def test_an_interrupted_diagnosis_says_so(files):

@@ -25,8 +25,9 @@ def test_example(path, tmp_path):
 
 
 def test_snippets_of_the_readme(tmp_path):
-    for name in ("train", "multisine", "sweep"):
-        shutil.copy(ROOT / "pilfr_casadi" / "demo_data" / f"{name}.csv", tmp_path)
+    for path in (ROOT / "pilfr_casadi" / "demo_data").iterdir():
+        if path.is_file():
+            shutil.copy(path, tmp_path)
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
     assert snippets
     script = tmp_path / "readme.py"

@@ -274,3 +274,16 @@ def test_an_interrupt_between_two_solves(record, monkeypatch):
 def test_constraints_are_found_by_name(record, truth):
     limit = Constraint(lambda p: ca.sum1(ca.vec(p["w"])), upper=1.0, name="sum of the weights")
     assert "sum of the weights" in fit(truth[2], record, constraints=limit).active
+
+
+def test_the_command_line_says_what_is_not_scored(of_record):
+    from pilfr_casadi.commands import _tested
+
+    u, y = simulated(6, 400, X0)
+    line = _tested(of_record, Recording(u, y, 0.01, name="test"))
+    assert line.startswith(f"NRMSE on test: {of_record.nrmse(Recording(u, y, 0.01)):.4f}")
+    assert line.endswith("its initial state is fitted to the first 60 samples, not scored")
+    assert "not scored" not in _tested(of_record, Recording(u, y, 0.01, initial="zero"))
+    assert _tested(of_record, Recording(u[:50], y[:50], 0.01, name="short")).startswith(
+        "no NRMSE on short: The recording"
+    )

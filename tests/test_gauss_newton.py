@@ -160,6 +160,28 @@ def test_too_high_an_order_without_noise(nx):
     assert found.status is Status.CONVERGED and found.train_nrmse[0] < 1e-9
 
 
+def test_states_that_nothing_excites_are_no_obstacle():
+    """A third state with responses of the size of rounding, and an offset that is far off."""
+    turn = 0.9 * np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    a, b, c = np.zeros((3, 3)), np.array([[1.0], [0.5], [1e-16]]), np.array([[1.0, 0.3, 1e-16]])
+    a[:2, :2], a[2] = turn, [1e-16, 2e-16, 0.5]
+    u = np.random.default_rng(0).normal(size=(2000, 1))
+    silent = Recording(u, np.zeros((2000, 1)), 0.1, initial="zero")
+    problem = Problem(PILFR(3).model(1, 1, {"A": a, "B_u": b, "C_y": c}), silent, scale=np.ones(1))
+    record = Recording(u, problem.simulate(problem.start)[0], 0.1, initial="zero")
+    shifted = PILFR(3).model(1, 1, {"A": 0.99 * a, "B_u": b, "C_y": c, "y_0": [1.0]})
+    found = GaussNewton().solve(Problem(shifted, record))
+    assert found.status is Status.CONVERGED and found.cost < 1e-18
+
+
+def test_an_unstable_system_is_fitted_within_the_limit():
+    u = np.random.default_rng(0).normal(size=(400, 1))
+    silent = Recording(u, np.zeros((400, 1)), 0.1, initial="zero")
+    problem = Problem(PILFR(1).model(1, 1, {"A": [[1.01]], "B_u": [[1.0]], "C_y": [[1.0]]}), silent, scale=np.ones(1))
+    record = Recording(u, problem.simulate(problem.start)[0], 0.1, initial="zero")
+    assert 0.999 < fit(PILFR(1), record).parameters["A"][0, 0] <= 1.0001
+
+
 def test_the_offset_starts_where_the_linear_model_leaves_it():
     structure, values = random_lfr(5, nx=2, n_w=0, radius=0.9)
     u = 3.0 + random_input(4, 800)

@@ -1,4 +1,4 @@
-"""A simulator as a design office would write it: two masses, linear springs and dampers, parameters from the drawings."""
+"""A simulator as a design office writes it: two masses, linear springs and dampers, parameters from the drawings."""
 
 from typing import Any
 

@@ -33,6 +33,7 @@ class Gate:
     corrected: bool
     fault: bool = False
     change: Change | None = None
+    parameter: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """As in diagnosis.json."""

@@ -11,6 +11,7 @@ from ..recording import Recording
 from ..simulator import Simulator
 from .floor import Floor, measured_floor, white_part
 from .gates import Gate, choose_hold, opened, unclip, wrong_scale
+from .offset import offsets
 from .proof import errors_of
 from .timing import timing
 from .workbench import THOROUGH, Fitted, Workbench
@@ -54,6 +55,8 @@ def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | N
     gates += more
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     bench, without, more = timing(bench, without, float(np.mean((floor.deviation / bench.scale) ** 2)))
+    gates += more
+    bench, without, more = offsets(bench, without)
     gates += more
     if gates:
         without = bench.fit(bench.simulator, [without.values], solver=THOROUGH)

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from ..accepted import as_simulator
 from ..laws import CATALOGUE, Law, readable_unit
 from ..recording import InputError, Recording, as_recordings, check_for_identification
-from ..simulator import Simulator
 from ..threads import one_blas_thread
 from .experiment import next_experiment, placebo
 from .explain import Candidate
+from .gates import Gate
 from .mismatch import mismatch
 from .prepare import prepare
 from .proof import deviations, nrmse, parameter_table, test_errors
@@ -28,7 +29,7 @@ Progress = Callable[[str, int, int, float], None]
 
 @one_blas_thread
 def diagnose(
-    simulator: Simulator,
+    simulator: Any,
     train: Recording | Sequence[Recording],
     *,
     test: Recording | Sequence[Recording] | None = None,
@@ -43,7 +44,7 @@ def diagnose(
 
     Parameters
     ----------
-    simulator : Simulator
+    simulator : Simulator, control.StateSpace, or a fitted PI-LFR
         The simulator, with nominal parameters, bounds and ports.
     train : Recording or sequence of Recording
         What is fitted and chosen on.
@@ -72,6 +73,7 @@ def diagnose(
     began = time.perf_counter()
     workers = workers or min(os.cpu_count() or 1, 4)
     say = progress or (lambda stage, done, total, best: None)
+    simulator = as_simulator(simulator, as_recordings(train))
     recordings = check_for_identification([arranged(simulator, r) for r in as_recordings(train)], 20)
     tests = tuple(arranged(simulator, r) for r in as_recordings(test)) if test is not None else ()
     _check_apart(recordings, tests)
@@ -101,7 +103,7 @@ def diagnose(
         sentence=sentence,
         effects=effects_found,
         candidates=tuple(_row(c, p) for p in search.passes for c in p.candidates),
-        gates=ready.gates,
+        gates=tuple(g for g in ready.gates if _still(g, after, std)),
         mismatch=mismatch(
             bench.recordings,
             without.residual,
@@ -151,6 +153,14 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
         form=winner.law.form,
         placebo={"own": own, "unrelated": unrelated},
     )
+
+
+def _still(gate: Gate, after: Fitted, std: dict[str, np.ndarray]) -> bool:
+    """Whether an offset is still one with the effects in place."""
+    if not gate.parameter:
+        return True
+    value, error = float(after.values[gate.parameter]), float(std[gate.parameter])
+    return abs(value) > 3 * error and abs(value) > 0.1 * abs(gate.value)
 
 
 def _next(search: Search, accepted: Sequence[Pass]) -> dict[str, Any] | None:

@@ -112,7 +112,7 @@ class Search:
         self.say("screen", 0, 1, self.base.cost**0.5)
         scored, signs, gain = screen(self.bench, self.base, self.laws, self.floor.deviation)
         self._timed("screen", began)
-        taken = {e.port for e in self.base.simulator.elements}
+        taken = {e.port for e in self.base.simulator.elements[len(self.bench.simulator.elements) :]}
         scored = [s for s in scored if s.port not in taken]
         most = max((s.share for s in scored), default=0.0)
         nothing = max(most, max(self.open_after.values(), default=0.0)) < NOTHING and self.base.cost < 0.0025

@@ -72,10 +72,10 @@ def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, F
             continue
         make, cut = _maker(kind, i, what), _maker(kind, i, what, cut=True)
         unit = dt if what == "alignment" else abs(value)
-        found = _settled(bench, plain, make, cut, value, unit)
-        if found is None:
+        settled = _settled(bench, plain, make, cut, value, unit)
+        if settled is None:
             continue
-        at, now, current = found
+        at, now, current = settled
         if what == "alignment":
             near = _refit_at(bench, cut, round(at / dt) * dt, current)
             if near is not None and near[1].cost < 1.02 * current.cost:

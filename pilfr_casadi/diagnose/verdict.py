@@ -43,6 +43,8 @@ FORMS = {
     "soft asymmetric": 1.05,
     "power": 1.1,
     "quintic": 1.05,
+    "geometric": 1.05,
+    "gradual": 1.05,
     "root": 1.1,
     "polynomial": 1.05,
     "attached mass": 1.1,
@@ -170,5 +172,5 @@ def confidence(choice: Choice, search: Search) -> float:
     """How sure the name is: from the margin over true rivals, lowered by what stays unexplained."""
     remains, still = left_open(search)
     lead = 1 - np.exp(-8 * np.log(max(min(choice.margin, 10.0), 1.0)))
-    doubt = (1 - min(4 * remains, 1.0)) * (1 - 0.3 * still)
+    doubt = (1 - min(4 * remains, 1.0)) / (1 + (still / 0.3) ** 2)
     return float(np.clip(lead * doubt / (1 + len(choice.alike)), 0.0, 0.99))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .base import Law, Local, readable_unit
+from .density import SmoothHysteresis
 from .friction import (
     AsymmetricFriction,
     CoulombFriction,
@@ -11,7 +12,15 @@ from .friction import (
     QuadraticDrag,
     StribeckFriction,
 )
-from .limits import AsymmetricDeadZone, AsymmetricSaturation, DeadZone, Saturation, SkewSaturation, SoftSaturation
+from .limits import (
+    AsymmetricDeadZone,
+    AsymmetricSaturation,
+    DeadZone,
+    GradualSaturation,
+    Saturation,
+    SkewSaturation,
+    SoftSaturation,
+)
 from .memory import (
     Attached,
     Backlash,
@@ -27,11 +36,13 @@ from .memory import (
     Resonance,
     Settling,
     StopHysteresis,
+    TwoStageCreep,
 )
 from .stiffness import (
     Clearance,
     Cubic,
     CubicStiffness,
+    GeometricStiffness,
     HertzContact,
     Magnitude,
     OffCentreClearance,
@@ -51,6 +62,7 @@ from .stiffness import (
 CATALOGUE: tuple[type[Law], ...] = (
     CubicStiffness,
     PowerStiffness,
+    GeometricStiffness,
     QuinticStiffness,
     QuadraticStiffness,
     PiecewiseStiffness,
@@ -66,6 +78,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     QuadraticDrag,
     CubicDamping,
     StopHysteresis,
+    SmoothHysteresis,
     PlayHysteresis,
     GeneralizedHysteresis,
     BoucWen,
@@ -74,6 +87,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     AsymmetricSaturation,
     SoftSaturation,
     SkewSaturation,
+    GradualSaturation,
     DeadZone,
     AsymmetricDeadZone,
     Quadratic,
@@ -85,6 +99,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     Delay,
     Relaxation,
     Creep,
+    TwoStageCreep,
     Drift,
     Settling,
     PeriodicForce,

@@ -89,6 +89,8 @@ class Law:
         Strengths must oppose motion.
     order : int
         States of its own.
+    shifts : bool
+        Its memory is a shift register, which takes in the signal at the begin of a step.
     """
 
     id: ClassVar[str]
@@ -101,6 +103,7 @@ class Law:
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     dissipative: ClassVar[bool] = False
     order: ClassVar[int] = 0
+    shifts: ClassVar[bool] = False
 
     values: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)

@@ -1,17 +1,17 @@
 """Hysteresis with a smooth density of thresholds: rounded loops from three numbers.
 
-A Prandtl-Ishlinskii layer whose stops have thresholds `R q` of density `g(q) = a^a q^(a - 1) exp(-a q) / Gamma(a)`, mean R,
+A Prandtl-Ishlinskii layer whose stops have thresholds `R q` of density `g(q) = a^a q^(a - 1) exp(-a q) / Gamma(a)`,
 
     w = k_h int_0^inf g(q) stop_{R q}[z] dq.
 
-a = 1 is the (extended) Masing spring `k_h R (1 - exp(-z / R))` of Krikelis et al. (2024), Eq. 26 with n = 1; a large a comes
-near to a single Jenkins element. The density follows Iwan (1966) and Segalman (2005).
+a = 1 is the (extended) Masing spring `k_h R (1 - exp(-z / R))` of Krikelis et al. (2024), Eq. 26 with n = 1; a large a
+comes near to a single Jenkins element. The density follows Iwan (1966) and Segalman (2005).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -33,8 +33,8 @@ class SmoothHysteresis(Law):
     equation = "w = k_h sum_i g_i stop_{R q_i}[z],  g_i ~ q_i^(a - 1) exp(-a q_i)"
     source = "Segalman (2005), J. Appl. Mech. 72(5); Krikelis et al. (2024), Eq. 26"
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
-    units = {"k_h": "w/z", "R": "z", "a": ""}
-    strength = ("k_h",)
+    units: ClassVar[Mapping[str, str]] = {"k_h": "w/z", "R": "z", "a": ""}
+    strength: ClassVar[tuple[str, ...]] = ("k_h",)
     dissipative = True
     memory = NODES
 

@@ -68,6 +68,23 @@ class SoftSaturation(Saturation):
         return {"L": (0.1 * local.reach, 10 * local.reach)}
 
 
+class GradualSaturation(Saturation):
+    """A limit whose knee may be sharp or wide."""
+
+    form = "gradual"
+    equation = "w = u / (1 + |u / L|^n)^(1/n) - u"
+    units: ClassVar[Mapping[str, str]] = {"L": "z", "n": ""}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return z / (1 + (ca.fabs(z / p.L) + 1e-9) ** p.n) ** (1 / p.n) - z
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(L=local.reach * np.array([0.5, 1.0, 2.0]), n=[1.0, 2.0, 5.0])
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"L": (0.1 * local.reach, 20 * local.reach), "n": (0.7, 12.0)}
+
+
 class SkewSaturation(AsymmetricSaturation):
     """A limit on either side that is approached gradually."""
 

@@ -45,11 +45,12 @@ class StopHysteresis(Law):
         }
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield {"r": local.half * np.geomspace(0.03, 1.4, self.n)}
+        yield {"r": local.half * np.geomspace(0.03, 0.95, self.n)}
         yield {"r": local.half * np.geomspace(0.005, 0.5, self.n)}
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"r": (1e-4 * local.half, 3.0 * local.half)}
+        # a stop that never slips is a spring, a play that never moves a constant: both belong elsewhere
+        return {"r": (1e-4 * local.half, 0.97 * local.half)}
 
 
 class PlayHysteresis(StopHysteresis):
@@ -164,6 +165,7 @@ class Delay(Law):
     sentence = "a pure delay: the signal arrives later than the simulator has it"
     units: ClassVar[Mapping[str, str]] = {"T": "s"}
     places: ClassVar[tuple[str, ...]] = ("series",)
+    shifts: ClassVar[bool] = True
     h: float = 0.0  # length of a step, s
 
     def on_grid(self, h: float) -> Delay:
@@ -229,6 +231,32 @@ class Creep(Relaxation):
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c * q
+
+
+class TwoStageCreep(Creep):
+    """Creep with a fast and a slow part."""
+
+    form = "two-stage"
+    equation = "w = c_1 q_1 + c_2 q_2,  dq_i/dt = (u - q_i) / T_i"
+    units: ClassVar[Mapping[str, str]] = {"c_1": "", "c_2": "", "T_1": "s", "T_2": "s"}
+    strength: ClassVar[tuple[str, ...]] = ("c_1", "c_2")
+    order = 2
+
+    def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
+        return p.c_1 * q[0] + p.c_2 * q[1]
+
+    def flow(self, z: Any, q: Any, p: Any) -> Any:
+        """Both parts."""
+        return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        times = np.geomspace(20 * local.dt, local.duration / 2, 5)
+        for i, fast in enumerate(times):
+            for slow in times[i + 1 :]:
+                yield {"T_1": float(fast), "T_2": float(slow)}
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {name: (5 * local.dt, 2 * local.duration) for name in ("T_1", "T_2")}
 
 
 class Lag(Law):

@@ -43,6 +43,25 @@ class PowerStiffness(CubicStiffness):
         return {"n": (1.7, 6.0)}
 
 
+class GeometricStiffness(CubicStiffness):
+    """A spring across the direction of motion, such as a taut string: cubic at first, a plain spring at last."""
+
+    form = "geometric"
+    equation = "w = k z (1 - L / sqrt(L^2 + z^2))"
+    source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 2.1"
+    units: ClassVar[Mapping[str, str]] = {"k": "w/z", "L": "z"}
+    strength: ClassVar[tuple[str, ...]] = ("k",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k * z * (1 - p.L / ca.sqrt(p.L**2 + z**2))
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(L=local.reach * np.array([0.15, 0.4, 1.0]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"L": (0.03 * local.reach, 3 * local.reach)}
+
+
 class QuinticStiffness(CubicStiffness):
     """A hardening spring that follows its cube only at first."""
 

@@ -8,10 +8,11 @@ from .canvas import new_figure
 from .law import loading_curve, loop, virgin_curve, weights
 from .measured import best_linear_approximation, compared_spread, frequency_response, loops, operators_demo, spread
 from .overview import convergence, plot_fit
-from .signals import amplitude_density, linear_simulation, output_over_input, remains, spectrum, time, traces
+from .signals import amplitude_density, as_scored, linear_simulation, output_over_input, remains, spectrum, time, traces
 
 __all__ = [
     "amplitude_density",
+    "as_scored",
     "best_linear_approximation",
     "compared_spread",
     "convergence",

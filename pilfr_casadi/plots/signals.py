@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 def time(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
     """Measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
+    recording = as_scored(fit, recording)
     ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
     size, unit = scaled(y, _unit(fit, recording, recording.outputs[output]))
     line(ax, t, y / size, "measured output", BLUE, linewidth=0.9)
@@ -88,6 +89,7 @@ def _busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
 
 def remains(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
     """What the fit leaves over, alone over time and in its own scale."""
+    recording = as_scored(fit, recording)
     ax, y = axes_or_new(ax), _column(recording.y, output, "output")
     residual = drawable(fit.simulate(recording)[:, output] - y, np.ptp(y))
     size, unit = scaled(residual[np.isfinite(residual)], _unit(fit, recording, recording.outputs[output]))
@@ -215,6 +217,14 @@ def linear_simulation(fit: Fit, recording: Recording) -> np.ndarray:
     return replace(fit, model=fit.linear, linear=None, initial={}).simulate(
         recording.with_(initial="estimate") if given else recording
     )
+
+
+def as_scored(fit: Fit, recording: Recording) -> Recording:
+    """The recording with `skip` at the first sample that is scored: behind those that its state was fitted to."""
+    try:
+        return recording.with_(skip=fit.scored_from(recording))
+    except InputError:  # it is no longer than that
+        return recording
 
 
 def _compares(fit: Fit) -> bool:

@@ -60,7 +60,8 @@ def _numbered(word: str, i: int, recordings: Sequence[Recording]) -> str:
 
 
 def _errors(fit: Fit, recording: Recording, role: str) -> list[dict[str, Any]]:
-    """Errors of one recording, output by output."""
+    """Errors of one recording, output by output, over the samples that are scored (`Fit.scored_from`)."""
+    recording = plots.as_scored(fit, recording)
     y, y_hat = recording.y, fit.simulate(recording)
     scored = y[recording.skip :]
     rms, sigma, extent = rmse_per_output(y, y_hat, recording.skip), np.std(scored, axis=0), np.ptp(scored, axis=0)
@@ -114,7 +115,8 @@ def _error_table(rows: list[dict[str, Any]]) -> Table:
         "NRMSE: rms error of the free-run simulation over the standard deviation of the measured output "
         "(0 is perfect, 1 is no better than its mean)."
     )
-    note += " Test recordings were not used to fit or to choose." if any(r["role"] == "test" for r in rows) else ""
+    if any(r["role"] == "test" for r in rows):
+        note += " Test recordings were not used to fit or to choose; samples that an initial state was fitted to are left out."
     emphasis = [i for i, r in enumerate(rows) if r["role"] == "test"]
     return Table(
         [*columns, f"rms error{unit}", "rms error, % of range", "length [s]", "used for"],

@@ -1,0 +1,98 @@
+"""Gate of constants: an unknown offset at an input or an output (a bias of an amplifier, the zero of a sensor).
+
+An offset moves the working point, and without it a search bends other laws until they give one. It is tested to first
+order (projected off what parameters and initial states can follow), confirmed by a refit, and then kept as a parameter
+of the simulator, so that every law is fitted together with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..laws.base import Law
+from ..recording import InputError
+from .floor import effective_size
+from .gates import Gate
+from .linearise import Probe, propagate, run
+from .screen import block_diagonal, orthonormal
+from .workbench import THOROUGH, Fitted, Workbench
+
+ROOM = 12.0  # nats that an offset has to gain
+LEAST = 0.01  # share of the mean square that it has to take away
+
+
+class Offset(Law):
+    """A constant added to a signal."""
+
+    id = "offset"
+    equation = "w = w_0"
+    source = "Ljung (1999), System Identification, sec. 14.1"
+    sentence = "a constant offset of the signal"
+    units: ClassVar[Mapping[str, str]] = {"w_0": "w"}
+    strength: ClassVar[tuple[str, ...]] = ("w_0",)
+    places: ClassVar[tuple[str, ...]] = ("series",)
+
+    def force(self, p: Any) -> Any:
+        """The constant."""
+        return p.w_0
+
+
+def first_order(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
+    """Share of the mean square that a constant at each port takes away, to first order."""
+    probe = Probe.of(bench, fitted)
+    n_free, n = len(probe.free) - len(probe.ports), probe.model.substeps
+    blocks, errors = [], []
+    for i, r in enumerate(bench.recordings):
+        one = run(bench, probe, fitted, i)
+        forces = [(probe.ports.index(name), np.ones((len(r), 1))) for name in ports]
+        y = propagate(one, forces, n_free, n, True) / bench.scale[:, None]
+        blocks.append(y[r.skip :].reshape(-1, y.shape[2]))
+        errors.append((one.error / bench.scale)[r.skip :].ravel())
+    first = blocks[0].shape[1] - len(ports)
+    base = orthonormal(block_diagonal([b[:, :first] for b in blocks], n_free))
+    left, columns = np.concatenate(errors), np.concatenate([b[:, first:] for b in blocks])
+    total = float(left @ left)
+    size = np.linalg.norm(columns, axis=0)
+    left = left - base @ (base.T @ left)
+    columns = columns - base @ (base.T @ columns)
+    rest = np.linalg.norm(columns, axis=0)
+    seen = rest > 1e-6 * np.maximum(size, 1e-300)  # a constant that the initial state can follow is not
+    drop = np.where(seen, (columns.T @ left) ** 2 / np.maximum(rest, 1e-300) ** 2, 0.0)
+    return dict(zip(ports, (drop / max(total, 1e-300)).tolist(), strict=True))
+
+
+def offsets(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Constants at inputs and outputs, the most useful first, as parameters of the simulator."""
+    gates: list[Gate] = []
+    ports = [f"actuator:{n}" for n in bench.simulator.inputs]
+    ports += [f"sensor:{n}" for n in bench.simulator.output_names]
+    while ports:
+        share = first_order(bench, plain, ports)
+        port = max(share, key=lambda name: share[name])
+        if share[port] < LEAST:
+            break
+        placed = bench.simulator.with_element(port, Offset())
+        other = replace(bench, simulator=placed)
+        with_law = plain.simulator.with_element(port, Offset())
+        try:
+            found = other.fit(with_law, [plain.values], solver=THOROUGH)
+        except InputError:
+            break
+        n = max(effective_size(found.residual), 30.0)
+        if 0.5 * n * np.log(plain.cost / found.cost) - 0.5 * np.log(n) < ROOM:
+            break
+        kind, name = port.split(":", 1)
+        value = float(found.values[with_law.elements[-1].prefix + "w_0"])
+        where = "input" if kind == "actuator" else "output"
+        sentence = (
+            f"The {where} {name} has a constant offset of about {value:.3g}; with it as a parameter the refitted error "
+            f"falls from {plain.cost**0.5:.3g} to {found.cost**0.5:.3g} of the outputs' deviation."
+        )
+        gates.append(Gate(name, "offset", value, sentence, True, parameter=with_law.elements[-1].prefix + "w_0"))
+        bench, plain = other, found
+        ports.remove(port)
+    return bench, plain, gates

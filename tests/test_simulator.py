@@ -1,0 +1,311 @@
+"""A simulator as a model: against an independent integrator, with laws at every kind of port, in both engines."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, multisine, play
+from pilfr_casadi.compiled import compiler, make_engine
+from pilfr_casadi.gauss_newton import GaussNewton
+from pilfr_casadi.integration import MOST, REACH, choose_substeps, discretise
+from pilfr_casadi.laws import (
+    Backlash,
+    BoucWen,
+    CoulombFriction,
+    CubicStiffness,
+    Delay,
+    Relaxation,
+    Saturation,
+    StopHysteresis,
+)
+from pilfr_casadi.parameters import ParameterSet
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.sensitivities import VirtualMachine
+
+DT, M = 0.02, 250
+VALUES = {"m": 1.3, "k": 90.0, "d": 1.1}
+
+
+def dynamics(x, u, p):
+    return dict(pos=x.vel, vel=(u.force - p.k * x.pos - p.d * x.vel) / p.m)
+
+
+def rig(**options):
+    ports = (
+        Port("ground", lambda p: dict(vel=-1 / p.m), lambda x: x.pos),
+        Port("damper on the table", lambda p: dict(vel=-1 / p.m, load=1.0), lambda x, u: x.pos - u.table),
+    )
+    given = dict(
+        dynamics=dynamics,
+        outputs=lambda x: dict(position=x.pos, load=0.0),
+        states=("pos", "vel"),
+        inputs=("force", "table"),
+        parameters={n: Parameter(v) for n, v in VALUES.items()},
+        ports=ports,
+    )
+    return Simulator(**{**given, **options})
+
+
+@pytest.fixture(scope="module")
+def record():
+    rng = np.random.default_rng(0)
+    u = np.column_stack([20 * multisine(M, f_max=4.0, fs=1 / DT, rng=rng), 0.3 * multisine(M, 4.0, 1 / DT, rng=rng)])
+    return Recording(u, np.zeros((M, 2)), DT, ("force", "table"), ("position", "load"), initial="zero")
+
+
+def run(simulator, record, hold="zero", substeps=1, state=None, engine=None):
+    model = discretise(simulator, record.dt, hold, substeps)
+    state = np.zeros(model.n_x + model.n_s) if state is None else state
+    made = VirtualMachine(model) if engine is None else make_engine(model, engine)
+    return made.simulate(model.drive(record), model.parameters.start, np.asarray(state, dtype=float))[0]
+
+
+def reference(rates, record, hold, n=2, seen=lambda t, s, u: [s[0], 0.0], start=None):
+    """The same equations by `solve_ivp`, sample by sample."""
+    s, out = np.zeros(n) if start is None else np.array(start, dtype=float), []
+    for k, u in enumerate(record.u):
+        after = record.u[min(k + 1, len(record) - 1)] if hold == "linear" else u
+        out.append(seen(k * DT, s, u))
+
+        def f(t, x, k=k, u=u, after=after):
+            return rates(t, x, u + (after - u) * (t - k * DT) / DT)
+
+        s = solve_ivp(f, (k * DT, (k + 1) * DT), s, method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+    return np.array(out)
+
+
+def linear_rates(t, s, u, w=0.0):
+    return [s[1], (u[0] - VALUES["k"] * s[0] - VALUES["d"] * s[1] - w) / VALUES["m"]]
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_the_linear_rig_is_solve_ivps(record, hold):
+    expected = reference(linear_rates, record, hold)
+    errors = [np.max(np.abs(run(rig(), record, hold, n) - expected)) for n in (1, 2, 4, 8)]
+    assert errors[-1] < 1e-7 * np.max(np.abs(expected))
+    for coarse, fine in pairwise(errors):  # fourth order: half the step, a sixteenth of the error
+        assert 12 < coarse / fine < 20
+    other = {"zero": "linear", "linear": "zero"}[hold]
+    assert np.max(np.abs(run(rig(), record, other, 8) - expected)) > 1e-3 * np.max(np.abs(expected))
+
+
+def test_time_reaches_the_equations(record):
+    def shaken(x, u, p, t):
+        return dict(pos=x.vel, vel=dynamics(x, u, p)["vel"] + 5 * ca.sin(3 * t) / p.m)
+
+    expected = reference(lambda t, s, u: linear_rates(t, s, u, -5 * np.sin(3 * t)), record, "zero")
+    assert np.max(np.abs(run(rig(dynamics=shaken), record, substeps=8) - expected)) < 1e-7
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_a_law_inside_the_dynamics(record, hold):
+    closed = rig().with_element("ground", CubicStiffness(values={"k_3": 700.0}))
+    expected = reference(lambda t, s, u: linear_rates(t, s, u, 700 * s[0] ** 3), record, hold)
+    assert np.max(np.abs(run(closed, record, hold, 16) - expected)) < 1e-7
+
+
+def test_a_law_with_equations_of_its_own(record):
+    law = Relaxation(values={"k_v": 60.0, "T": 0.2})
+    expected = reference(
+        lambda t, s, u: [*linear_rates(t, s, u, 60 * (s[0] - s[2])), (s[0] - s[2]) / 0.2], record, "zero", n=3
+    )
+    assert np.max(np.abs(run(rig().with_element("ground", law), record, substeps=8) - expected)) < 1e-7
+    law = BoucWen(values={"k_h": 80.0, "q_0": 0.1, "s": 0.6, "n": 1.0})
+
+    def hysteretic(t, s, u):
+        size = (abs(s[2] / 0.1) + 1e-9) ** 1.0
+        flow = s[1] * (1 - 0.4 * size) - 0.6 * abs(s[1]) * np.sign(s[2]) * size
+        return [*linear_rates(t, s, u, 80 * s[2]), flow]
+
+    expected = reference(hysteretic, record, "zero", n=3)
+    assert np.max(np.abs(run(rig().with_element("ground", law), record, substeps=16) - expected)) < 1e-3
+
+
+def test_a_port_across_an_input_into_an_output(record):
+    """A damper between the mass and a moving table, whose force is an output: its rate sees the table's speed."""
+    law = CoulombFriction(values={"F_c": 2.0, "v_0": 0.3})
+    slope = np.diff(record.u[:, 1], append=record.u[-1, 1]) / DT
+
+    def force(t, s):
+        return 2 * np.tanh((s[1] - slope[min(int(t / DT + 1e-9), M - 1)]) / 0.3)
+
+    expected = reference(
+        lambda t, s, u: linear_rates(t, s, u, force(np.floor(t / DT + 1e-7) * DT, s)),
+        record,
+        "linear",
+        seen=lambda t, s, u: [s[0], force(t, s)],
+    )
+    found = run(rig().with_element("damper on the table", law), record, "linear", 16)
+    assert np.max(np.abs(found - expected)[1:-1]) < 1e-5 * np.max(np.abs(expected))
+
+
+def test_series_at_actuator_and_sensor(record):
+    plain = run(rig(), record, substeps=4)
+    clipped = record.with_(u=np.column_stack([np.clip(record.u[:, 0], -9, 9), record.u[:, 1]]))
+    limited = rig().with_element("actuator:force", Saturation(values={"L": 9.0}))
+    assert np.allclose(run(limited, record, substeps=4), run(rig(), clipped, substeps=4), rtol=0, atol=1e-13)
+    seen = run(rig().with_element("sensor:position", Saturation(values={"L": 0.05})), record, substeps=4)
+    assert np.allclose(seen[:, 0], np.clip(plain[:, 0], -0.05, 0.05), rtol=0, atol=1e-13)
+
+
+def test_parallel_laws_add_and_series_laws_follow_each_other(record):
+    one, two = CubicStiffness(values={"k_3": 300.0}), CubicStiffness(values={"k_3": 400.0})
+    both = rig().with_element("ground", one).with_element("ground", two)
+    assert tuple(both.parameters)[-2:] == ("ground.k_3", "ground#2.k_3")
+    whole = rig().with_element("ground", CubicStiffness(values={"k_3": 700.0}))
+    assert np.allclose(run(both, record), run(whole, record), rtol=0, atol=1e-13)
+    first, second = Saturation(values={"L": 9.0}), Backlash(values={"r": 2.0})
+    closed = rig().with_element("actuator:force", first).with_element("actuator:force", second)
+    u, q = np.clip(record.u[:, 0], -9, 9), 0.0
+    for k, value in enumerate(u):
+        u[k] = q = play(value, q, 2.0)
+    moved = record.with_(u=np.column_stack([u, record.u[:, 1]]))
+    assert np.allclose(run(closed, record), run(rig(), moved), rtol=0, atol=1e-12)
+
+
+def test_two_laws_at_two_ports(record):
+    closed = rig().with_element("ground", CubicStiffness(values={"k_3": 700.0}))
+    closed = closed.with_element("sensor:position", Saturation(values={"L": 0.1}))
+    expected = reference(
+        lambda t, s, u: linear_rates(t, s, u, 700 * s[0] ** 3),
+        record,
+        "zero",
+        seen=lambda t, s, u: [np.clip(s[0], -0.1, 0.1), 0.0],
+    )
+    assert np.max(np.abs(run(closed, record, substeps=16) - expected)) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("port", "steps"), [("sensor:position", 3.0), ("sensor:position", 2.25), ("actuator:force", 2.0)]
+)
+def test_a_delay_is_as_long_as_it_says(record, port, steps):
+    law = Delay(values={"T": steps * DT}, limits={"T": (0.0, 0.2)})
+    found, plain = run(rig().with_element(port, law), record)[:, 0], run(rig(), record)[:, 0]
+    if port.startswith("sensor"):
+        expected = np.interp(np.arange(M) - steps, np.arange(M), plain, left=0.0)
+    else:
+        late = np.r_[np.zeros(int(steps)), record.u[: -int(steps), 0]]
+        expected = run(rig(), record.with_(u=np.column_stack([late, record.u[:, 1]])))[:, 0]
+    assert np.max(np.abs(found - expected)[4:]) < 1e-12
+
+
+def hysteretic(law=None):
+    law = law or StopHysteresis(values={"w": np.full(6, 15.0), "r": np.linspace(0.01, 0.2, 6)})
+    return rig().with_element("ground", law)
+
+
+def test_memory_inside_the_stages(record):
+    """Stops on a very fine grid against a memory that moves once a step."""
+    w, r = np.full(6, 15.0), np.linspace(0.01, 0.2, 6)
+    s, state, h = np.zeros(6), np.zeros(2), DT / 400
+    expected = []
+    for u in record.u:
+        expected.append(state[0])
+        for _ in range(400):
+            s = np.clip(s, state[0] - r, state[0] + r)
+            v = state[1] + h * linear_rates(0, state, u, w @ (state[0] - s))[1]
+            state = np.array([state[0] + h * v, v])
+    errors = [np.max(np.abs(run(hysteretic(), record, substeps=n)[:, 0] - expected)) for n in (1, 8)]
+    assert errors[1] < 2e-3 * np.max(np.abs(expected)) and errors[0] < 2e-2 * np.max(np.abs(expected))
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+@pytest.mark.parametrize("what", ["linear", "memory", "series", "flow", "time"])
+def test_both_engines_agree(record, hold, what):
+    simulator = {
+        "linear": rig,
+        "memory": hysteretic,
+        "series": lambda: rig().with_element("actuator:force", Backlash(values={"r": 2.0})),
+        "flow": lambda: rig().with_element("ground", BoucWen(values={"k_h": 80.0, "q_0": 0.1, "s": 0.6, "n": 1.3})),
+        "time": lambda: rig(dynamics=lambda x, u, p, t: dict(pos=x.vel, vel=dynamics(x, u, p)["vel"] + ca.sin(t))),
+    }[what]()
+    one, other = (run(simulator, record, hold, 2, engine=e) for e in ("c", "vm"))
+    assert np.max(np.abs(one - other)) < 1e-10
+    model = discretise(simulator, DT, hold, 2)
+    costs = [Problem(model, record, engine=e, scale=np.ones(2)) for e in ("c", "vm")]
+    jacobians = [p.normal_equations(p.start) if hasattr(p, "normal_equations") else p.cost(p.start) for p in costs]
+    for a, b in zip(np.atleast_1d(jacobians[0]), np.atleast_1d(jacobians[1]), strict=True):
+        assert np.allclose(np.asarray(a, dtype=float), np.asarray(b, dtype=float), rtol=1e-8, atol=1e-10)
+
+
+def test_a_static_device_and_its_memory():
+    device = Simulator(
+        dynamics=lambda: {},
+        outputs=lambda u, p: dict(travel=p.gain * u.volt),
+        inputs=("volt",),
+        parameters=dict(gain=Parameter(0.4)),
+    )
+    rng = np.random.default_rng(1)
+    u = 10 * multisine(200, f_max=5.0, fs=50.0, rng=rng)
+    record = Recording(u, np.zeros(200), DT, ("volt",), ("travel",), initial="zero")
+    assert np.array_equal(run(device, record)[:, 0], 0.4 * u)
+    q, expected = 0.0, []
+    for value in u:
+        q = play(value, q, 3.0)
+        expected.append(0.4 * q)
+    closed = device.with_element("actuator:volt", Backlash(values={"r": 3.0}))
+    for hold in ("zero", "linear"):
+        assert np.max(np.abs(run(closed, record, hold)[:, 0] - expected)) < 1e-12
+
+
+def test_the_memory_at_the_first_sample_is_estimated(record):
+    law = Backlash(values={"r": 6.0})
+    truth = [0.02, -0.3, 5.0]
+    closed = rig().with_element("actuator:force", law)
+    y = run(closed, record, state=truth)
+    held = closed.with_parameters({k: replace(p, fixed=True) for k, p in closed.parameters.items()})
+    model = discretise(held, DT)
+    problem = Problem(model, record.with_(y=y, initial="estimate"), scale=np.ones(2))
+    theta = problem.start.copy()
+    theta[-1] = 3.0
+    solution = GaussNewton(max_iterations=100).solve(problem, theta)
+    found = problem.first_states(solution.theta)[0]
+    assert found[:2] == pytest.approx(truth[:2], abs=1e-6)
+    assert np.max(np.abs(run(closed, record, state=found) - y)) < 1e-7
+
+
+def test_substeps_follow_the_fastest_eigenvalue(record):
+    counts = [choose_substeps(rig(parameters={**rig().parameters, "k": Parameter(k)}), [record]) for k in (90.0, 9e3)]
+    assert counts[0] == 1 and counts[1] == int(np.ceil(np.sqrt(9e3 / 1.3) * DT / REACH))
+    too_fast = rig(parameters={**rig().parameters, "k": Parameter(90.0 * (MOST * 50) ** 2)})
+    with pytest.raises(InputError, match="too fast"):
+        choose_substeps(too_fast, [record])
+
+
+def test_a_discrete_simulator_steps_once_a_sample(record):
+    a = np.array([[0.9, 0.2], [-0.3, 0.8]])
+    simulator = rig(
+        dynamics=lambda x, u: dict(pos=0.9 * x.pos + 0.2 * x.vel, vel=-0.3 * x.pos + 0.8 * x.vel + u.force),
+        discrete=True,
+        ports=(),
+    )
+    x, expected = np.zeros(2), []
+    for u in record.u:
+        expected.append(x[0])
+        x = a @ x + [0.0, u[0]]
+    assert np.max(np.abs(run(simulator, record)[:, 0] - expected)) < 1e-10
+    assert [p.name for p in simulator.all_ports()][:2] == ["actuator:force", "actuator:table"]
+
+
+def test_equation_ports_stand_in_for_declared_ones(record):
+    free = rig(ports=())
+    names = [p.name for p in free.all_ports()]
+    assert names[:2] == ["equation:pos", "equation:vel"]
+    cubic = free.with_element("equation:vel", CubicStiffness(values={"k_3": 700.0 / 1.3}))  # z is the position there
+    whole = rig().with_element("ground", CubicStiffness(values={"k_3": 700.0}))
+    assert np.allclose(run(cubic, record), run(whole, record), rtol=0, atol=1e-12)
+
+
+def test_misplaced_laws_are_refused():
+    with pytest.raises(InputError, match="in series"):
+        rig().with_element("actuator:force", CubicStiffness())
+    with pytest.raises(InputError, match="in parallel"):
+        rig().with_element("ground", Saturation())
+    with pytest.raises(InputError, match="no port 'roof'"):
+        rig().with_element("roof", CubicStiffness())
+    assert ParameterSet(dict(rig().parameters)).size == 3
