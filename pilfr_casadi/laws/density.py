@@ -22,7 +22,9 @@ from .base import Law, Local, grid
 NODES = 24
 # thresholds so close that the polygon through them stays equally near to the curve of a = 1 everywhere
 Q = -2 * np.log(1 - np.arange(1, NODES + 1) / (NODES + 1))
-WIDTH = np.gradient(Q)
+EDGES = np.append(0.0, Q)
+SLOPES = np.append(-np.diff(np.exp(-EDGES)) / np.diff(EDGES), 0.0)
+WIDTH = (SLOPES[:-1] - SLOPES[1:]) * np.exp(Q)  # weights of the chords' polygon over the density of a = 1
 
 
 class SmoothHysteresis(Law):

@@ -70,6 +70,10 @@ class PlayHysteresis(StopHysteresis):
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield {"r": local.half * np.linspace(0.0, 0.9, self.n)}
 
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        # plays lag behind the signal where their weights are positive (Kuhnen 2003); the first is the gain
+        return {**super().bounds(local), "w": (np.append(-1.0, np.zeros(self.n - 1)), np.inf)}
+
 
 class GeneralizedHysteresis(PlayHysteresis):
     """Asymmetric hysteresis: plays of a bent signal (Al Janaideh, Rakheja & Su 2011)."""

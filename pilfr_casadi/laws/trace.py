@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..parameters import ParameterSet
 from .base import Law, Local
 
 BLOCK = 100  # samples unrolled
@@ -37,73 +38,93 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
     """
     if not shapes:
         return np.zeros((len(local.z), 0, columns(law)))
-    law = law.on_grid(local.dt)
-    z, dz, t = ca.SX.sym("z"), ca.SX.sym("dz"), ca.SX.sym("t")
-    following, dz_next = ca.SX.sym("z_next"), ca.SX.sym("dz_next")
-    n_q, n_s = law.order, int(getattr(law, "memory", 0)) if hasattr(law, "step") else 0
-    memory = ca.SX.sym("memory", (n_q + n_s) * len(shapes))
-    forces, after = [], []
-    for i, shape in enumerate(shapes):
-        own = memory[i * (n_q + n_s) : (i + 1) * (n_q + n_s)]
-        for values in _units(law, shape):
-            p = _Values(values)
-            if n_s:
-                w, end = law.step(z, own, p)  # type: ignore[attr-defined]
-            else:
-                w = _call(law.force, z=z, dz=dz, q=own, t=t, p=p)
-                end = _advance(law, own, (z, following), (dz, dz_next), t, p, local.dt) if n_q else own
-            forces.append(w)
-        after.append(end)
-    outputs = [ca.vertcat(*after), ca.vertcat(*forces)]
-    step = ca.Function("trace", [memory, ca.vertcat(z, dz, t, following, dz_next)], outputs)
+    step, runs = _functions(type(law), len(shapes), local.dt if law.shifts else 0.0)
+    p = law.at(shapes[0]).parameters()
+    names = [name for name in p if name not in law.strength]
+    table = [np.concatenate([np.ravel(shape.get(n, p[n].value)) for n in names] or [[]]) for shape in shapes]
+    vector = np.append(np.concatenate(table), local.dt)
     found, at = [], 0
     for m in local.lengths:
         zs, dzs = local.z[at : at + m], local.dz[at : at + m]
         rows = np.vstack([zs, dzs, local.dt * np.arange(m), np.append(zs[1:], zs[-1]), np.append(dzs[1:], dzs[-1])])
         at += m
-        if n_q + n_s:
-            found.append(_accumulate(step, rows))
+        if step.size1_in(0):
+            found.append(_accumulate(step, runs, rows, vector))
         else:
-            found.append(np.asarray(step(np.zeros((0, m)), rows)[1]).T)
+            found.append(np.asarray(step(np.zeros((0, m)), rows, np.tile(vector[:, None], (1, m)))[1]).T)
     return np.vstack(found).reshape(len(local.z), len(shapes), -1)
 
 
-def _accumulate(step: ca.Function, rows: np.ndarray) -> np.ndarray:
-    """Outputs of a step from rest, shape (M, n); some samples unrolled at a time, which costs little to set up."""
-    state, found, m, at = np.zeros(step.size1_in(0)), [], rows.shape[1], 0
-    for length in (BLOCK, 1):
-        run = step.mapaccum("run", length) if at + length <= m else step
-        while at + length <= m:
-            states, out = run(state, rows[:, at : at + length])
-            state = states[:, -1]
-            found.append(np.asarray(out))
-            at += length
+@functools.lru_cache(maxsize=256)
+def _functions(kind: type[Law], lanes: int, grid: float) -> tuple[ca.Function, ca.Function]:
+    """`(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`, and its block."""
+    law = kind()
+    law = law.on_grid(grid) if law.shifts else law
+    p = law.parameters()
+    names = [name for name in p if name not in law.strength]
+    sizes = [p[n].size for n in names]
+    vector, signals = ca.SX.sym("shapes", sum(sizes) * lanes + 1), ca.SX.sym("signals", 5)
+    z, dz, t, following, dz_next = ca.vertsplit(signals)
+    h = vector[-1]
+    n_q, n_s = law.order, int(getattr(law, "memory", 0)) if hasattr(law, "step") else 0
+    memory = ca.SX.sym("memory", (n_q + n_s) * lanes)
+    forces, after = [], []
+    for i in range(lanes):
+        own = memory[i * (n_q + n_s) : (i + 1) * (n_q + n_s)]
+        edges = i * sum(sizes) + np.cumsum([0, *sizes])
+        spans = zip(names, edges[:-1], edges[1:], strict=True)
+        shape = {n: vector[int(a) : int(b)] for n, a, b in spans}
+        for strength in _units(law):
+            values = _Values({**shape, **strength})
+            if n_s:
+                w, end = law.step(z, own, values)  # type: ignore[attr-defined]
+            else:
+                w = _call(law.force, z=z, dz=dz, q=own, t=t, p=values)
+                end = _advance(law, own, (z, following), (dz, dz_next), t, values, h) if n_q else own
+            forces.append(w)
+        after.append(end)
+    step = ca.Function("trace", [memory, signals, vector], [ca.vertcat(*after), ca.vertcat(*forces)])
+    return step, step.mapaccum("run", BLOCK) if n_q + n_s else step
+
+
+def _accumulate(step: ca.Function, run: ca.Function, rows: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Outputs of a step from rest, shape (M, n); some samples unrolled at a time."""
+    state, found, m = np.zeros(step.size1_in(0)), [], rows.shape[1]
+    whole = m // BLOCK * BLOCK
+    repeated = np.tile(vector[:, None], (1, BLOCK))
+    for at in range(0, whole, BLOCK):
+        states, out = run(state, rows[:, at : at + BLOCK], repeated)
+        state = states[:, -1]
+        found.append(np.asarray(out))
+    for at in range(whole, m):
+        state, out = step(state, rows[:, at], vector)
+        found.append(np.asarray(out))
     return np.hstack(found).T
 
 
-def _units(law: Law, shape: dict[str, Any]) -> list[dict[str, Any]]:
-    """Parameter values with one strength at one and the others at zero, in turn."""
-    p = ParameterSet(law.at(shape).parameters())
-    base = {name: ca.DM(v.value) for name, v in p.items()}
-    if not law.strength:
-        return [base]
+def _units(law: Law) -> list[dict[str, Any]]:
+    """Strengths with one entry at one and the others at zero, in turn."""
+    p = law.parameters()
     zero = {name: ca.DM(np.zeros(p[name].value.shape)) for name in law.strength}
     out = []
     for name in law.strength:
         for j in range(p[name].size):
             one = np.zeros(p[name].size)
             one[j] = 1.0
-            out.append({**base, **zero, name: ca.DM(one)})
-    return out
+            out.append({**zero, name: ca.DM(one)})
+    return out or [{}]
+
+
+@functools.cache
+def _names(function: Any) -> tuple[str, ...]:
+    return tuple(inspect.signature(function).parameters)
 
 
 def _call(function: Any, **available: Any) -> Any:
-    import inspect
-
-    return function(**{k: available[k] for k in inspect.signature(function).parameters})
+    return function(**{k: available[k] for k in _names(function)})
 
 
-def _advance(law: Law, q: Any, z: tuple[Any, Any], dz: tuple[Any, Any], t: Any, p: Any, h: float) -> Any:
+def _advance(law: Law, q: Any, z: tuple[Any, Any], dz: tuple[Any, Any], t: Any, p: Any, h: Any) -> Any:
     """One Runge-Kutta step of a law's own states along the chord of z."""
 
     def flow(state: Any, share: float) -> Any:
