@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
         "files",
         nargs="+",
         metavar="FILE",
-        help="a Python file that sets `simulator`, then training recordings (.csv, .mat, .npz)",
+        help="a Python file that sets `simulator` (or a model.json), then training recordings (.csv, .mat, .npz)",
     )
     diagnose.add_argument(
         "--simulated",

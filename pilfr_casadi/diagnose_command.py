@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from .accepted import as_simulator
 from .cli import DONE, INTERRUPTED, NO_RESULT, say
 from .commands import make_folder, read_file
-from .export import write_atomically
+from .export import load, write_atomically
 from .interrupts import deferred_interrupt, insistent
-from .load_simulator import load_simulator
+from .load_simulator import simulator_variable
 from .option_values import name_list, pairs
 from .progress import progress_bar
 from .readers import column_names
@@ -34,7 +35,8 @@ def run_diagnosis(options: argparse.Namespace) -> int:
     if target.exists() and not options.overwrite:
         raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
     if source is not None:
-        simulator = load_simulator(source)
+        given = load(source) if Path(source).suffix.lower() == ".json" else simulator_variable(source)
+        simulator = as_simulator(given)
         inputs, outputs = simulator.inputs, simulator.output_names
     else:
         inputs, outputs = _simulated_names(options, train)
@@ -44,7 +46,9 @@ def run_diagnosis(options: argparse.Namespace) -> int:
     _check_steps([*zip([*train, *options.test], [*recordings, *tests], strict=True)])
     folder = make_folder(options.out)
     notes: list[str] = []
-    if source is None:
+    if source is not None:
+        simulator = as_simulator(given, recordings)
+    else:
         simulator, notes = _surrogate(options, inputs, outputs)
     _announce(simulator, source, [("training", train, recordings), ("test", options.test, tests)])
     for note in notes:
@@ -84,7 +88,7 @@ def write(diagnosis: Any, folder: Path) -> int:
         reason = f"{type(error).__name__}: {error}"
         return say(f"The diagnosis is in {target}, but a report could not be written ({reason}).", NO_RESULT)
     print(f"diagnosis: {target}\nreport: {page}")
-    return DONE
+    return INTERRUPTED if getattr(diagnosis, "interrupted", False) else DONE
 
 
 def _check_files(options: argparse.Namespace, source: str | None, train: Sequence[str]) -> None:

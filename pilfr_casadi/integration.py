@@ -152,8 +152,8 @@ def discretise(
         return equations.evaluate(_Values(state, memory, u, slope, time))
 
     k1, y, begun, _ = at(x, s, u0, t)
-    # a shift register (a law that says `shifts`) takes in the signal at the step's begin, where it is measured; others move on
-    # with the step, from a memory that has seen its begin (which matters at the first sample)
+    # a shift register takes in the signal at the step's begin, where it is measured; others move on with the step, from
+    # a memory that has seen its begin (which matters at the first sample)
     shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
     seen = ca.vertcat(ca.SX(0, 1), *(s[i] if shift else begun[i] for i, shift in enumerate(shifts)))
     n_own = len(simulator.states)

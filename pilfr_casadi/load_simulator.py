@@ -10,6 +10,7 @@ import os
 import sys
 import traceback
 import types
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,6 +42,17 @@ def load_simulator(path: str | os.PathLike[str]) -> Simulator:
     InputError
         If the file cannot be read, does not run, or defines no simulator; with the line where there is one.
     """
+    return as_simulator(simulator_variable(path))
+
+
+def simulator_variable(path: str | os.PathLike[str]) -> Any:
+    """What a simulator file calls `simulator`, as it stands there; see `load_simulator`.
+
+    Raises
+    ------
+    InputError
+        As there.
+    """
     path = Path(path)
     code = _compiled(path, _source(path))
     module = types.ModuleType(f"_simulator_{''.join(c if c.isalnum() else '_' for c in path.stem)}")
@@ -55,9 +67,10 @@ def load_simulator(path: str | os.PathLike[str]) -> Simulator:
             there = f"it calls a Simulator {names[0]!r}; rename it" if names else "end with simulator = Simulator(...)"
             raise InputError(f"{path} does not set the variable {VARIABLE!r}: {there}.")
         try:
-            return as_simulator(vars(module)[VARIABLE])
+            as_simulator(vars(module)[VARIABLE])
         except InputError as error:
             raise InputError(f"In {path}, the variable {VARIABLE!r}: {error}") from error
+    return vars(module)[VARIABLE]
 
 
 def _source(path: Path) -> bytes:
@@ -88,7 +101,9 @@ def _own_imports(folder: Path, module: types.ModuleType) -> Iterator[None]:
     sys.path.insert(0, where)
     sys.modules[module.__name__] = module
     try:
-        yield
+        with warnings.catch_warnings():  # np.sin(symbol) works, and casadi's remark on it is not for the user's eyes
+            warnings.filterwarnings("ignore", category=FutureWarning, module="casadi")
+            yield
     finally:
         sys.dont_write_bytecode = wrote
         if where in sys.path:

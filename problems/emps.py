@@ -84,11 +84,7 @@ def simulator() -> Simulator:
             "M": Parameter(105.0, unit="kg", bounds=(50.0, 200.0)),
             "F_v": Parameter(240.0, unit="N s/m", bounds=(0.0, 1000.0)),
         },
-        ports=(
-            Port(
-                "axis", lambda p: {"vel": -1 / p.M}, lambda x: x.pos, lambda x: x.vel, unit="N", across_unit="m"
-            ),
-        ),
+        ports=(Port("axis", lambda p: {"vel": -1 / p.M}, lambda x: x.pos, lambda x: x.vel, unit="N", across_unit="m"),),
     )
 
 
@@ -124,7 +120,9 @@ def run(folder: Path, **options: Any) -> tuple[Diagnosis, dict[str, dict[str, fl
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print what was found, and the errors beside the published ones."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(arguments)
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(
+        arguments
+    )
     folder = measured("emps")
     if folder is None:
         print("The EMPS recordings are not here; put them into DATA/emps and run with PILFR_DATA=DATA.")

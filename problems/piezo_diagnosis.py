@@ -62,7 +62,9 @@ def run(folder: Path, **options: Any) -> tuple[Diagnosis, dict[str, float]]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print what was found, and the errors beside the reference figures."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(arguments)
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(
+        arguments
+    )
     folder = measured("piezo_dbo")
     if folder is None:
         print("The piezo recordings are not here; put them into DATA/piezo_dbo and run with PILFR_DATA=DATA.")

@@ -75,9 +75,7 @@ def simulator() -> Simulator:
             "k": Parameter(1.7e5, unit="1/s^2", bounds=(1e4, 1e6)),
             "d": Parameter(30.0, unit="1/s", bounds=(0.0, 1000.0)),
         },
-        ports=(
-            Port("feedback", {"rate": -1.0}, lambda x: x.v, lambda x: x.rate, unit="V/s^2", across_unit="V"),
-        ),
+        ports=(Port("feedback", {"rate": -1.0}, lambda x: x.v, lambda x: x.rate, unit="V/s^2", across_unit="V"),),
     )
 
 
@@ -101,7 +99,9 @@ def run(folder: Path, **options: Any) -> tuple[Diagnosis, dict[str, dict[str, fl
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print what was found, and the errors beside the published ones."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(arguments)
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(
+        arguments
+    )
     folder = measured("silverbox")
     if folder is None:
         print("The Silverbox recordings are not here; put them into DATA/silverbox and run with PILFR_DATA=DATA.")
@@ -109,7 +109,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     diagnosis, errors = run(folder)
     print(diagnosis)
     for port, law, form, sure in answer(diagnosis):
-        print(f"found: {law} ({form}) at {port}, confidence {sure:.2f}" if form else f"found: {law} at {port}, {sure:.2f}")
+        print(
+            f"found: {law} ({form}) at {port}, confidence {sure:.2f}" if form else f"found: {law} at {port}, {sure:.2f}"
+        )
     kinds = ("multisine", "arrow", "arrow inside")
     rows: list[tuple[str, Sequence[float | None]]] = [
         ("linear circuit, refitted", [errors["before"][k] for k in kinds]),

@@ -95,7 +95,9 @@ def judge(folder: Path, diagnosis: Diagnosis) -> dict[str, dict[str, float]]:
     out = {}
     for name, key in (("before", "without"), ("after", "after")):
         fitted = diagnosis.evidence[key]
-        out[name] = {k: rmse(started(fitted, r, diagnosis.hold, np.asarray(fitted.initial[0]))) for k, r in data.items()}
+        out[name] = {
+            k: rmse(started(fitted, r, diagnosis.hold, np.asarray(fitted.initial[0]))) for k, r in data.items()
+        }
     return out
 
 
@@ -108,7 +110,9 @@ def run(folder: Path, root: bool, **options: Any) -> tuple[Diagnosis, dict[str, 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print what was found, and the errors beside the published ones."""
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(arguments)
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(
+        arguments
+    )
     folder = measured("cascaded_tanks")
     if folder is None:
         print("The tanks' recordings are not here; put them into DATA/cascaded_tanks and run with PILFR_DATA=DATA.")

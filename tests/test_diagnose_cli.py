@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -222,10 +223,50 @@ def test_inputs_of_a_simulation_are_the_columns_that_agree(capsys, files, truth,
     assert status == 130 and "nothing was written" in err
     assert "inputs drive, outputs here, as found in the files" in out and seen["names"] == (("drive",), ("here",))
     assert list((files / "out").iterdir()) == []
+    write_csv(files / "named.csv", force, position, names=("t", "u_vir_V", "position"))
+    column = ("--column", "force=u_vir_V", "--out", files / "out")
+    status, out, _ = run(capsys, "diagnose", files / "rig.py", files / "named.csv", *column)
+    assert status == 130 and seen["names"] == (("force",), ("position",))
     given = arguments(files, simulator=None, test="test.csv")
     refused(capsys, *given, says=("--inputs", "(none is shared)"))
     refused(capsys, *given, "--inputs", "drive", says=("--inputs and --outputs",))
     refused(capsys, *given, "--inputs", "drive", "--outputs", "here", says=("test.csv", "'drive'"))
+
+
+def test_a_saved_model_is_diagnosed_like_a_simulator(capsys, files, monkeypatch):
+    seen = {}
+
+    def stop(simulator, recordings, **options):
+        seen["simulator"] = simulator
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose"), "diagnose", stop)
+    names = ("--inputs", "force", "--outputs", "position", "--nx", 2, "--operators", 0)
+    assert run(capsys, "fit", files / "train.csv", *names, "--out", files / "fit")[0] == 0
+    given = ("diagnose", files / "fit" / "model.json", files / "test.csv", "--out", files / "out")
+    assert run(capsys, *given)[0] == 130
+    assert seen["simulator"].discrete and seen["simulator"].inputs == ("force",)
+    (files / "rig.py").write_text("import control\nsimulator = control.tf([1.0], [1.0, 1.5, 90.0])\n")
+    given = ("diagnose", files / "rig.py", files / "test.csv", "--out", files / "out")
+    refused(capsys, *given, says="--column u=COLUMN")
+    assert run(capsys, *given, "--column", "u=force", "--column", "y=position")[0] == 130
+    assert seen["simulator"].inputs == ("u",) and len(seen["simulator"].states) == 2
+    (files / "rig.py").write_text("import control\nsimulator = control.tf([1.0], [1.0, 0.5], 0.05)\n")
+    refused(capsys, *given, "--column", "u=force", "--column", "y=position", says=("0.05 s", "0.02 s"))
+
+
+def test_the_demonstration_finds_what_its_rig_hides(tmp_path):
+    from rich.console import Console
+
+    from pilfr_casadi.demo import diagnose_rig
+
+    with (tmp_path / "out.txt").open("w") as file:
+        assert diagnose_rig(tmp_path, 1, Console(file=file, width=120)) == 0
+    out = (tmp_path / "out.txt").read_text()
+    assert "where     ground-m2" in out and "what      coulomb friction" in out
+    before, after, floor = re.search(r"(0\.\d+) -> (0\.\d+) -> noise floor (0\.\d+)", out).groups()
+    assert float(after) < 0.05 * float(before) and float(after) < 2 * float(floor)
+    assert (tmp_path / "report.html").exists() and json.loads((tmp_path / "diagnosis.json").read_text())["effects"]
 
 
 def test_an_interrupted_diagnosis_says_so(files):

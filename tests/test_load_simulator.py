@@ -64,6 +64,10 @@ def test_a_dataclass_may_be_defined_in_the_file(tmp_path):
     assert load_simulator(write(tmp_path, extra + RIG)).states == ("pos", "vel")
 
 
+def test_numpy_functions_work_on_symbols(tmp_path):
+    assert load_simulator(write(tmp_path, RIG, ("p.k * x.pos", "__import__('numpy').tanh(p.k * x.pos)"))).inputs
+
+
 ERRORS = {
     "syntax": (("def dynamics(x, u, p):", "def dynamics(x, u, p)"), ("line 5", "':'", "def dynamics(x, u, p)")),
     "indentation": (("    return dict(position", "return dict(position"), ("line 10",)),

@@ -63,11 +63,11 @@ def test_a_mode_beyond_the_sampling_is_refused():
 def test_modes_are_the_system(seed):
     a, b, c, d = random_system(seed)
     found = modes(a, b, c)
-    assert [m.oscillates for m in found].count(True) == 2 and len(found) == 3
+    assert [m.second_order for m in found].count(True) == 2 and len(found) == 3
     for w in (0.1, 4.0, 25.0):
         s, total = 1j * w, d.astype(complex)
         for m in found:
-            if m.oscillates:
+            if m.second_order:
                 w0, two_zw = abs(m.value), -2 * m.value.real
                 q = np.linalg.solve(np.array([[s, -1], [w0**2, s + two_zw]]), m.into)
             else:
@@ -131,6 +131,22 @@ def test_a_lag_has_one_real_mode():
     assert error < 1e-3
     assert float(simulator.parameters["rate1"].value) == pytest.approx(2.5, rel=1e-3)
     assert simulator.ports[0].name == "mode:0.398 Hz"
+
+
+@pytest.mark.parametrize("drag", [2.0, 0.1, 0.0])
+def test_a_mass_on_a_rail_is_one_mode(drag):
+    """Two real eigenvalues, one of them zero, are a displacement and its rate, so that friction has where to act."""
+    a, b, c, d = np.array([[0, 1], [0, -drag]]), np.array([[0.0], [0.5]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
+    sampled = cont2discrete((a, b, c, d), 0.01)[:4]
+    u = multisine(2000, f_max=5.0, fs=100.0, rng=np.random.default_rng(0))
+    y = control.forced_response(control.ss(*sampled, 0.01), U=u).outputs
+    record = Recording(u, y, 0.01, ("force",), ("position",), initial="zero", hold="zero")
+    simulator, error = surrogate(record)
+    assert error < 1e-6 and [p.name for p in simulator.ports] == ["mode:0 Hz"]
+    assert simulator.states == ("q1", "v1")
+    assert float(simulator.parameters["drag1"].value) == pytest.approx(drag, rel=1e-4, abs=1e-4)
+    assert float(simulator.parameters["shape1_position"].value) == pytest.approx(0.5, rel=1e-4)
+    assert np.max(np.abs(run(simulator, record) - record.y)) < 1e-5 * np.max(np.abs(y))
 
 
 def test_a_simulation_that_is_not_linear_has_a_poor_surrogate():

@@ -68,7 +68,11 @@ def heads(recordings: Sequence[Recording], share: float = HEAD) -> tuple[Recordi
         most = int(len(r) * min(1.0, LONG / (share * total)))
         cut = max(int(share * most), min(len(r), r.skip + 20))
         part = r.slice(0, cut)
-        out.append(part.with_(initial="estimate", period=None) if isinstance(part.initial, str) and part.initial == "periodic" else part)
+        out.append(
+            part.with_(initial="estimate", period=None)
+            if isinstance(part.initial, str) and part.initial == "periodic"
+            else part
+        )
     return tuple(out)
 
 

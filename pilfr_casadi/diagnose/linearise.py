@@ -157,6 +157,16 @@ def _states(
     return np.vstack([x[None], found])
 
 
+def along(bench: Workbench, fitted: Fitted, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """Some states of the user's equations (count, n_x) and inputs (count, n_u) along the longest fitted run."""
+    i = int(np.argmax([len(r) for r in bench.recordings]))
+    r, model, n_x = bench.recordings[i], fitted.model, len(bench.simulator.states)
+    short = r.slice(0, min(len(r), 3000))
+    states = _states(model, model.drive(short), fitted.vector, fitted.initial[i], short, None)[:: model.substeps, :n_x]
+    step = max(len(states) // count, 1)
+    return states[::step], short.u[::step]
+
+
 def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarray:
     """Gain of an observer with process noise at every port, each strong enough to explain the residual alone."""
     first = runs[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from ..recording import Recording
 from ..simulator import Simulator
 from .floor import Floor, measured_floor, white_part
 from .gates import Gate, choose_hold, opened, unclip, wrong_scale
+from .linearise import along
 from .offset import offsets
 from .proof import errors_of
 from .timing import timing
@@ -43,14 +44,18 @@ class Prepared:
 def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | None, engine: str) -> Prepared:
     """Open the bench, look at the dull causes, refit, and measure the floor."""
     bench, gates = opened(simulator, tuple(recordings), hold or "zero", engine)
-    hold, more = choose_hold(simulator, bench.recordings, hold, engine)
-    gates = [*gates, *more]
-    bench = Workbench.of(simulator, bench.recordings, hold, engine)
+    between, notes = choose_hold(simulator, bench.recordings, hold, engine)
+    bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, simulator)
     without = bench.fit(simulator, solver=THOROUGH)
     if without.cost > SUSPECT:
         bench, without, more = wrong_scale(bench, without)
-        gates += more
+        gates = [*gates, *more]
+        if more:  # what looked better on wrong data says nothing
+            between, notes = choose_hold(simulator, bench.recordings, hold, engine)
+            bench = Workbench.of(simulator, bench.recordings, between, engine)
+            without = bench.fit(simulator, [without.values, {}], solver=THOROUGH)
+    gates = [*gates, *notes]
     bench, without, more = unclip(bench, without)
     gates += more
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
@@ -61,4 +66,5 @@ def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | N
     if gates:
         without = bench.fit(bench.simulator, [without.values], solver=THOROUGH)
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+    bench = replace(bench, typical=along(bench, without))
     return Prepared(bench, without, nominal, tuple(gates), floor)

@@ -158,7 +158,9 @@ def columns_of(
     base = orthonormal(block_diagonal([b[:, :first] for b in blocks], n_free))
     left = error - base @ (base.T @ error)
     phi = np.concatenate([b[:, first:] for b in blocks])
+    size = np.linalg.norm(phi, axis=0)
     phi -= base @ (base.T @ phi)
+    phi[:, np.linalg.norm(phi, axis=0) < 1e-6 * size] = 0.0  # what the simulator's own parameters follow entirely
     return tasks, phi, left
 
 

@@ -28,6 +28,7 @@ ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
 FEWEST = 100.0  # effective samples that a comparison is made on at least
 MORE = 0.06  # share of the excess that has to be left for a second effect to be looked for
 MOSTLY = 0.5  # share of the rest that a second effect may leave
+UNSEEN = 0.7  # share of the mean square on the unseen part that a second effect may leave
 HINT = 0.1  # share of a residual that a flexible force has to explain
 NOTHING = 0.01  # below this share nothing is explained
 
@@ -140,7 +141,10 @@ class Search:
         best = min(kept, key=lambda c: c.error, default=None)
         samples = max(effective_size(best.fitted.residual if best else self.base.residual), FEWEST)
         choice = choose(kept, before, self.floor2, samples)
-        accepted = choice is not None and choice.gain > ROOM and (not number or choice.remains < MOSTLY)
+        accepted = choice is not None and choice.gain > ROOM
+        if accepted and number:  # what is not fitted has to improve as well
+            assert choice is not None
+            accepted = choice.remains < MOSTLY and choice.winner.tail < UNSEEN * before[1]
         self._timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 

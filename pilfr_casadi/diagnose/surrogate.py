@@ -47,26 +47,30 @@ class Mode:
     Attributes
     ----------
     value : complex
-        Eigenvalue in rad/s, the one with positive imaginary part of a pair.
+        Eigenvalue in rad/s; of a pair the one with positive imaginary part, of two real ones the faster.
     into : array, shape (1 or 2, n_u)
         How inputs enter q (and v).
     out : array, shape (n_y, 1 or 2)
         How q (and v) are seen.
+    spring : (float, float), optional
+        For two real eigenvalues -a and -b taken together: a b and a + b.
     """
 
     value: complex
     into: Array
     out: Array
+    spring: tuple[float, float] | None = None
 
     @property
-    def oscillates(self) -> bool:
-        """Whether it is a pair."""
+    def second_order(self) -> bool:
+        """Whether it has a displacement and a rate."""
         return bool(len(self.into) == 2)
 
     @property
     def label(self) -> str:
         """Readable name: the frequency in Hz, of a pair the undamped natural one."""
-        return f"{abs(self.value) / (2 * np.pi):.3g} Hz"
+        rate = np.sqrt(abs(self.spring[0])) if self.spring else abs(self.value)
+        return f"{rate / (2 * np.pi):.3g} Hz" if rate > 1e-5 else "0 Hz"
 
 
 def surrogate(
@@ -200,7 +204,21 @@ def modes(a: Array, b: Array, c: Array) -> list[Mode]:
         output = np.real(np.column_stack([seen, np.conj(seen)]) @ np.linalg.inv(basis))
         scale = _unit(entering[1:])
         out.append(Mode(complex(value), entering / scale, output * scale))
-    return sorted(out, key=lambda mode: abs(mode.value))
+    return sorted(_together(out), key=lambda mode: abs(mode.value))
+
+
+def _together(found: list[Mode]) -> list[Mode]:
+    """Two real modes that inputs enter alike and whose jumps cancel are one mass: `q'' = -a b q - (a + b) q' + u`."""
+    real = [mode for mode in found if not mode.second_order]
+    if len(real) != 2 or not np.allclose(real[0].into, real[1].into, rtol=0.0, atol=0.02):
+        return found
+    (one, two), jump = real, real[0].out + real[1].out
+    if np.max(np.abs(jump)) > 0.02 * np.max(np.abs(one.out)):
+        return found
+    a, b = -one.value.real, -two.value.real
+    into, out = np.vstack([0 * one.into, one.into]), np.column_stack([one.out * b + two.out * a, jump])
+    rest = [mode for mode in found if mode.second_order]
+    return [*rest, Mode(complex(-max(a, b, key=abs)), into, out, (a * b, a + b))]
 
 
 def _unit(into: Array) -> float:
@@ -231,10 +249,17 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
         parameters[name] = Parameter(value, unit=unit, bounds=(value - reach, value + reach), fixed=held)
 
     for i, mode in enumerate(found, 1):
-        speed = np.array([1.0, abs(mode.value)])[: len(mode.into)]  # v is this much larger than q
+        speed = np.array([1.0, max(abs(mode.value), 1 / (len(like) * like.dt))])[
+            : len(mode.into)
+        ]  # v is this much larger than q
         entering = float(np.max(np.abs(mode.into) * (speed[::-1])[:, None]))
         leaving = float(np.max(np.abs(mode.out) * speed))
-        if mode.oscillates:
+        if mode.spring:
+            rate = max(abs(mode.value), 1 / (len(like) * like.dt))
+            free(f"stiffness{i}", mode.spring[0], "1/s^2", rate**2)
+            free(f"drag{i}", mode.spring[1], "1/s", rate)
+            states += [f"q{i}", f"v{i}"]
+        elif mode.second_order:
             w = abs(mode.value)
             free(f"frequency{i}", w / (2 * np.pi), "Hz")
             free(f"damping{i}", -mode.value.real / w)
@@ -242,7 +267,7 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
         else:
             parameters[f"rate{i}"] = _rate(-mode.value.real)
             states.append(f"q{i}")
-        kinds = ("rate_gain", "gain") if mode.oscillates else ("gain",)
+        kinds = ("rate_gain", "gain") if mode.second_order else ("gain",)
         for row, kind, faster in zip(mode.into, kinds, speed[::-1], strict=True):
             for name, value in zip(inputs, row, strict=True):
                 if value == 1.0:  # the gain of the strongest input is one; what is seen of the mode has its size
@@ -265,10 +290,15 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
     def dynamics(x: Named, u: Named, p: Named) -> dict[str, Any]:
         out: dict[str, Any] = {}
         for i, mode in enumerate(found, 1):
-            if mode.oscillates:
-                w, q, v = 2 * np.pi * p[f"frequency{i}"], x[f"q{i}"], x[f"v{i}"]
+            if mode.second_order:
+                q, v = x[f"q{i}"], x[f"v{i}"]
+                if mode.spring:
+                    pull = p[f"stiffness{i}"] * q + p[f"drag{i}"] * v
+                else:
+                    w = 2 * np.pi * p[f"frequency{i}"]
+                    pull = w**2 * q + 2 * p[f"damping{i}"] * w * v
                 out[f"q{i}"] = v + driven(u, p, "rate_gain", i)
-                out[f"v{i}"] = -(w**2) * q - 2 * p[f"damping{i}"] * w * v + driven(u, p, "gain", i)
+                out[f"v{i}"] = driven(u, p, "gain", i) - pull
             else:
                 out[f"q{i}"] = -p[f"rate{i}"] * x[f"q{i}"] + driven(u, p, "gain", i)
         return out
@@ -279,7 +309,7 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
             y = p[f"offset_{name}"] + sum((p[f"direct_{name}_{n}"] * u[n] for n in inputs), start=ca.SX(0))
             for i, mode in enumerate(found, 1):
                 y = y + p[f"shape{i}_{name}"] * x[f"q{i}"]
-                if mode.oscillates:
+                if mode.second_order:
                     y = y + p[f"rate_shape{i}_{name}"] * x[f"v{i}"]
             out[name] = y
         return out
@@ -294,7 +324,7 @@ def _rate(value: float) -> Parameter:
 
 
 def _port(name: str, i: int, mode: Mode) -> Port:
-    if not mode.oscillates:
+    if not mode.second_order:
         return Port(name, {f"q{i}": -1.0}, lambda x: x[f"q{i}"])
     return Port(name, {f"v{i}": -1.0}, lambda x: x[f"q{i}"], lambda x: x[f"v{i}"])
 

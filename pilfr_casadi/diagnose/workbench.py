@@ -10,7 +10,7 @@ import numpy as np
 
 from ..compiled import make_engine
 from ..gauss_newton import GaussNewton
-from ..integration import choose_substeps, discretise
+from ..integration import REACH, choose_substeps, discretise, fastest
 from ..model import Model
 from ..observer import GAMMA, led
 from ..parameters import ParameterSet
@@ -70,6 +70,7 @@ class Workbench:
     substeps: int
     scale: np.ndarray
     engine: str = "auto"
+    typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
 
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
@@ -104,6 +105,11 @@ class Workbench:
             wanted = choose_substeps(simulator, self.recordings)
         except InputError:
             wanted = 0
+        if self.typical is not None:  # a contact is not felt at rest
+            p = ParameterSet(dict(simulator.parameters)).start
+            rates = fastest(simulator, *self.typical, p)
+            if np.any(np.isfinite(rates)):
+                wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / REACH)))
         return int(np.clip(wanted, self.substeps, FINER * self.substeps))
 
     def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:

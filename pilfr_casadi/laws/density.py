@@ -20,11 +20,12 @@ from ..operators import play
 from .base import Law, Local, grid
 
 NODES = 24
-# thresholds so close that the polygon through them stays equally near to the curve of a = 1 everywhere
-Q = -2 * np.log(1 - np.arange(1, NODES + 1) / (NODES + 1))
-EDGES = np.append(0.0, Q)
-SLOPES = np.append(-np.diff(np.exp(-EDGES)) / np.diff(EDGES), 0.0)
-WIDTH = (SLOPES[:-1] - SLOPES[1:]) * np.exp(Q)  # weights of the chords' polygon over the density of a = 1
+# cells that are equally far from the curve of a = 1, each one stop at its centre of gravity with its weight
+_LOW = -2 * np.log(1 - np.arange(NODES) / NODES)
+_MASS = np.append(-np.diff(np.exp(-_LOW)), np.exp(-_LOW[-1]))
+_MOMENT = np.append(-np.diff((_LOW + 1) * np.exp(-_LOW)), (_LOW[-1] + 1) * np.exp(-_LOW[-1]))
+Q = _MOMENT / _MASS
+WIDTH = _MASS * np.exp(Q)  # for the density exp(-q) at the centres
 
 
 class SmoothHysteresis(Law):

@@ -13,12 +13,14 @@ from matplotlib.axes import Axes
 
 from ..recording import InputError, Recording, as_recordings
 from ..start import density
-from .canvas import BLUE, INK, SKY, VERMILLION, axes_or_new, finish
+from .canvas import BLUE, INK, SKY, VERMILLION, axes_or_new, finish, with_unit
+from .signals import as_scored
 
 if TYPE_CHECKING:
     from ..fit import Fit
 
 Curve = Callable[[np.ndarray], np.ndarray]
+FEWEST = 4  # operators whose weights make up a density
 
 
 def loop(fit: Fit, recording: Recording, *, channel: int = 0, bare: bool = False, ax: Axes | None = None) -> Axes:
@@ -28,16 +30,16 @@ def loop(fit: Fit, recording: Recording, *, channel: int = 0, bare: bool = False
     """
     _check_channel(fit, channel)
     signals, index = fit.signals(recording), _index(fit, channel)
-    z, w = (signals[key][:, channel] for key in "zw")
+    first = as_scored(fit, recording).skip
+    z, w = (signals[key][first:, channel] for key in "zw")
     what, title = f"w{index}", "loop"
     if bare:
         slope = float(z @ w / (z @ z)) if np.any(z) else 0.0
         w, what, title = w - slope * z, f"w{index} − {slope:.3g} z{index}", "loop without its slope"
     ax = axes_or_new(ax)
     ax.plot(z, w, color=BLUE, linewidth=0.7, rasterized=True)
-    return finish(
-        ax, f"z{index} (model scale)", f"{what} (model scale)", ", ".join(filter(None, (title, recording.name)))
-    )
+    across, up = _label(fit, "z", channel), _label(fit, "w", channel, what)
+    return finish(ax, across, up, ", ".join(filter(None, (title, recording.name))))
 
 
 def loading_curve(
@@ -61,9 +63,7 @@ def loading_curve(
     if reference is not None:
         ax.plot(z, reference(z), color=INK, linewidth=1.4, linestyle="--", label="reference")
     ax.margins(x=0)
-    return finish(
-        ax, f"z{_index(fit, channel)} (model scale)", f"w{_index(fit, channel)} (model scale)", "loading curve"
-    )
+    return finish(ax, _label(fit, "z", channel), _label(fit, "w", channel), "loading curve")
 
 
 def virgin_curve(fit: Fit, z: np.ndarray, channel: int = 0) -> np.ndarray:
@@ -86,7 +86,7 @@ def weights(
 ) -> Axes:
     """Weight over threshold of every operator, and the density of weights over thresholds that they stand for.
 
-    `reference` is a density to compare with, from r (G,) to weight per unit of r (G,), in the scale of the model.
+    Fewer than four operators in use stand for themselves: no density is drawn of them. `reference` is a density to compare with, from r (G,) to weight per unit of r (G,), in the scale of the model.
     """
     _check_channel(fit, channel)
     values = fit.parameters
@@ -102,17 +102,21 @@ def weights(
     errors = fit.errors.get("w")
     spread = None if errors is None else np.nan_to_num(errors[channel][order], posinf=0.0)
     ax.errorbar(r, w, yerr=spread, fmt="o", markersize=4, color=BLUE, elinewidth=1, label="weights w (left)")
-    right = ax.twinx()
-    grid = np.linspace(0.0, limit, 300)
-    right.plot(grid, density(r, w, grid, limit / 12), color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
-    if reference is not None:
-        right.plot(grid, reference(grid), color=INK, linestyle="--", linewidth=1.4, label="reference density (right)")
-    finish(right, "", "density dw/dr", legend=False).grid(False)
-    right.spines["right"].set_visible(True)
-    finish(
-        ax, f"threshold r{_index(fit, channel)} (model scale)", "weight w", "weights over thresholds", 1, beside=right
-    )
-    right.set_ylim(bottom=0)
+    grid, right = np.linspace(0.0, limit, 300), None
+    smooth = np.count_nonzero(w) >= FEWEST
+    if smooth or reference is not None:
+        right = ax.twinx()
+        if smooth:
+            drawn = density(r, w, grid, limit / 12)
+            right.plot(grid, drawn, color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
+        if reference is not None:
+            drawn = reference(grid)
+            right.plot(grid, drawn, color=INK, linestyle="--", linewidth=1.4, label="reference density (right)")
+        finish(right, "", "density dw/dr", legend=False).grid(False)
+        right.spines["right"].set_visible(True)
+        right.set_ylim(bottom=0)
+    across = _label(fit, "z", channel, f"threshold r{_index(fit, channel)}")
+    finish(ax, across, "weight w", "weights over thresholds", 1, beside=right)
     ax.set_ylim(bottom=0)
     ax.set_xlim(-0.02 * limit, limit)
     return ax
@@ -127,6 +131,24 @@ def _check_channel(fit: Fit, channel: int) -> None:
 
 def _index(fit: Fit, channel: int) -> str:
     return str(channel + 1) if fit.model.n_w > 1 else ""
+
+
+def _label(fit: Fit, signal: str, channel: int, name: str = "") -> str:
+    """Axis label of an element's signal: in units where it is an input or output of the model, else in its scale."""
+    index = _index(fit, channel)
+    blocks, names = (
+        (("C_z", "D_zu"), fit.model.inputs) if signal == "z" else (("C_y", "D_yu", "D_yw"), fit.model.outputs)
+    )
+    parameters, name = fit.model.parameters, name or f"{signal}{index}"
+    if set(blocks) <= set(parameters) and (signal == "z" or len(names) == fit.model.n_w):
+        rows = [parameters[block].value[channel] for block in blocks]
+        held = all(np.all(np.broadcast_to(parameters[b].fixed, parameters[b].value.shape)[channel]) for b in blocks)
+        *others, last = rows
+        own = int(np.argmax(last))
+        alone = np.count_nonzero(last) == 1 and last[own] == 1.0 and not any(np.any(row) for row in others)
+        if held and alone and (signal == "z" or own == channel):
+            return with_unit(name, fit.units.get(names[own], ""))
+    return f"{name} (model scale)"
 
 
 def _reach(fit: Fit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:

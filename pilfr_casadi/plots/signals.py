@@ -39,8 +39,11 @@ def time(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = N
     """Measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
     recording = as_scored(fit, recording)
     ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
-    size, unit = scaled(y, _unit(fit, recording, recording.outputs[output]))
-    line(ax, t, y / size, "measured output", BLUE, linewidth=0.9)
+    level = _level(y[recording.skip :])
+    plain_unit = _unit(fit, recording, recording.outputs[output])
+    size, unit = scaled(y - level, plain_unit)
+    what = "measured output" + (f" less its mean {level:.6g} {plain_unit}".rstrip() if level else "")
+    line(ax, t, (y - level) / size, what, BLUE, linewidth=0.9)
     for label, residual, colour in _residuals(fit, recording, output):
         line(ax, t, drawable(residual, np.ptp(y)) / size, label, colour, linewidth=1.1)
     if recording.skip:
@@ -111,9 +114,10 @@ def remains(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None 
 def output_over_input(
     fit: Fit, recording: Recording, *, input: int = 0, output: int = 0, ax: Axes | None = None
 ) -> Axes:
-    """Measured and simulated output over an input: the nested loops of a quasi-static device."""
+    """Measured and simulated output over an input, where scored: the nested loops of a quasi-static device."""
     ax, u, y = axes_or_new(ax), _column(recording.u, input, "input"), _column(recording.y, output, "output")
     name, simulated = recording.outputs[output], fit.simulate(recording)[:, output]
+    u, y, simulated = (column[as_scored(fit, recording).skip :] for column in (u, y, simulated))
     size, unit = scaled(y, _unit(fit, recording, name))
     ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
     ax.plot(u, drawable(simulated, np.ptp(y)) / size, color=INK, linewidth=0.5, label="this model", rasterized=True)
@@ -225,6 +229,12 @@ def as_scored(fit: Fit, recording: Recording) -> Recording:
         return recording.with_(skip=fit.scored_from(recording))
     except InputError:  # it is no longer than that
         return recording
+
+
+def _level(y: np.ndarray) -> float:
+    """What to take off a signal (M,) so that its swings can be seen beside residuals around zero: its mean, or 0."""
+    mean = float(np.mean(y))
+    return mean if abs(mean) > np.ptp(y) > 0 else 0.0
 
 
 def _compares(fit: Fit) -> bool:

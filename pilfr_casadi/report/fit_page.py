@@ -116,7 +116,7 @@ def _error_table(rows: list[dict[str, Any]]) -> Table:
         "(0 is perfect, 1 is no better than its mean)."
     )
     if any(r["role"] == "test" for r in rows):
-        note += " Test recordings were not used to fit or to choose; samples that an initial state was fitted to are left out."
+        note += " Test recordings were not used to fit or to choose; samples that a state was fitted to are left out."
     emphasis = [i for i, r in enumerate(rows) if r["role"] == "test"]
     return Table(
         [*columns, f"rms error{unit}", "rms error, % of range", "length [s]", "used for"],

@@ -1,0 +1,60 @@
+"""Diagnoses of real recordings, and of the paper's rig: what has to be named, and how well the rest is followed."""
+
+import pytest
+
+from problems import emps, masing_diagnosis, piezo_diagnosis, silverbox, tanks
+from problems.measured_data import measured
+
+pytestmark = pytest.mark.slow
+
+
+def folder_of(name):
+    folder = measured(name)
+    if folder is None:
+        pytest.skip(f"the recordings of {name} are not beside the repository; see PILFR_DATA")
+    return folder
+
+
+def named(diagnosis):
+    assert diagnosis.verdict == "missing-physics", diagnosis.sentence
+    return [(e.port, e.law) for e in diagnosis.effects]
+
+
+def test_axis_lacks_friction():
+    diagnosis, errors = emps.run(folder_of("emps"))
+    port, law = named(diagnosis)[0]
+    assert port == "axis"
+    assert law in ("coulomb_friction", "stribeck_friction")
+    assert errors["after"]["test"] <= 8.0
+    assert errors["after"]["closed loop"] <= 0.1
+
+
+def test_silverbox_lacks_a_cubic_stiffness_and_its_input_is_interpolated():
+    diagnosis, errors = silverbox.run(folder_of("silverbox"))
+    assert diagnosis.hold == "linear"
+    assert named(diagnosis)[0] == ("feedback", "cubic_stiffness")
+    assert errors["after"]["arrow"] <= 1.0
+    assert errors["after"]["arrow inside"] <= 0.8
+    assert errors["before"]["arrow"] > 10
+
+
+@pytest.mark.parametrize("root", [False, True])
+def test_tanks_overflow(root):
+    diagnosis, errors = tanks.run(folder_of("cascaded_tanks"), root)
+    assert any(law == "piecewise_stiffness" and port.startswith("upper") for port, law in named(diagnosis))
+    assert errors["after"]["test"] <= 0.20
+
+
+def test_piezo_stack_has_hysteresis_at_its_actuator():
+    diagnosis, errors = piezo_diagnosis.run(folder_of("piezo_dbo"))
+    assert named(diagnosis)[0] == ("actuator:u_control_V", "hysteresis")
+    assert errors["after"] <= 2.2
+    assert errors["before"] > 5
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rig_without_its_spring(seed):
+    diagnosis, errors = masing_diagnosis.run(seed)
+    assert named(diagnosis) == [("ground-m1", "hysteresis")]
+    assert max(abs(v) for v in masing_diagnosis.off(diagnosis).values()) <= 3.0
+    assert max(errors["after"].values()) <= 0.006
