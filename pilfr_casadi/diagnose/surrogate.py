@@ -66,11 +66,10 @@ class Mode:
         """Whether it has a displacement and a rate."""
         return bool(len(self.into) == 2)
 
-    @property
-    def label(self) -> str:
-        """Readable name: the frequency in Hz, of a pair the undamped natural one."""
+    def label(self, slowest: float) -> str:
+        """Readable name: the frequency in Hz, of a pair the undamped natural one; zero below `slowest` rad/s."""
         rate = np.sqrt(abs(self.spring[0])) if self.spring else abs(self.value)
-        return f"{rate / (2 * np.pi):.3g} Hz" if rate > 1e-5 else "0 Hz"
+        return f"{rate / (2 * np.pi):.3g} Hz" if rate > slowest else "0 Hz"
 
 
 def surrogate(
@@ -238,7 +237,7 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
         Constants of the outputs.
     """
     found = modes(*matrices[:3])
-    names = _distinct([mode.label for mode in found])
+    names = _distinct([mode.label(0.05 / (len(like) * like.dt)) for mode in found])
     parameters: dict[str, Parameter] = {}
     states: list[str] = []
     inputs, outputs = like.inputs, like.outputs

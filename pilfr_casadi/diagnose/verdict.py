@@ -27,7 +27,7 @@ HINT = 0.1  # share of a residual that a flexible force has to explain to count
 PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name that only comes near
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
 LIKE = 0.03  # rivals whose error is within this share cannot be told apart
-# (a flexible law, what it imitates) -> factor by which its error must be smaller; "*" is any other law at that port
+# a law that can imitate others -> factor by which its error must be smaller
 FLEXIBLE: dict[str, float] = {
     "hysteresis": 1.25,
     "static_curve": 1.1,
@@ -35,6 +35,8 @@ FLEXIBLE: dict[str, float] = {
     "stribeck_friction": 1.05,
     "periodic_force": 1.25,
 }
+# a law -> what it has as special cases: it always does as well, and is no rival of theirs
+CONTAINS = {"hysteresis": ("backlash", "coulomb_friction"), "stribeck_friction": ("coulomb_friction",)}
 IMITATES = {("hysteresis", "coulomb_friction"): 1.4}
 FORMS = {
     "mode": 1.15,
@@ -119,7 +121,11 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
         ratio = c.error / winner.error
         if ratio < 1 + LIKE and c.size <= winner.size:
             alike.append(c)
-        elif not (c.port == winner.port and ratio < 1 + LIKE):  # a refinement of the winner is no rival
+        elif c.port == winner.port and (
+            ratio < 1 + LIKE or (winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > 1 - LIKE)
+        ):
+            continue  # a refinement of the winner is no rival
+        else:
             margin = min(margin, max(ratio, excess(c) / excess(winner)))
     remains = (winner.error**2 - floor) / max(before**2 - floor, 1e-300)
     return Choice(winner, tuple(alike), float(gain), float(np.clip(remains, 0, 1)), float(margin))

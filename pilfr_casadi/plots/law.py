@@ -86,7 +86,8 @@ def weights(
 ) -> Axes:
     """Weight over threshold of every operator, and the density of weights over thresholds that they stand for.
 
-    Fewer than four operators in use stand for themselves: no density is drawn of them. `reference` is a density to compare with, from r (G,) to weight per unit of r (G,), in the scale of the model.
+    Fewer than four operators in use stand for themselves: no density is drawn of them. `reference` is a density to
+    compare with, from r (G,) to weight per unit of r (G,), in the scale of the model.
     """
     _check_channel(fit, channel)
     values = fit.parameters
@@ -101,10 +102,12 @@ def weights(
     ax.vlines(r, 0, w, color=SKY, linewidth=1.5)
     errors = fit.errors.get("w")
     spread = None if errors is None else np.nan_to_num(errors[channel][order], posinf=0.0)
-    ax.errorbar(r, w, yerr=spread, fmt="o", markersize=4, color=BLUE, elinewidth=1, label="weights w (left)")
     grid, right = np.linspace(0.0, limit, 300), None
     smooth = np.count_nonzero(w) >= FEWEST
-    if smooth or reference is not None:
+    two = smooth or reference is not None
+    label = "weights w (left)" if two else "weights w"
+    ax.errorbar(r, w, yerr=spread, fmt="o", markersize=4, color=BLUE, elinewidth=1, label=label)
+    if two:
         right = ax.twinx()
         if smooth:
             drawn = density(r, w, grid, limit / 12)
@@ -136,9 +139,8 @@ def _index(fit: Fit, channel: int) -> str:
 def _label(fit: Fit, signal: str, channel: int, name: str = "") -> str:
     """Axis label of an element's signal: in units where it is an input or output of the model, else in its scale."""
     index = _index(fit, channel)
-    blocks, names = (
-        (("C_z", "D_zu"), fit.model.inputs) if signal == "z" else (("C_y", "D_yu", "D_yw"), fit.model.outputs)
-    )
+    reads, writes = (("C_z", "D_zu"), fit.model.inputs), (("C_y", "D_yu", "D_yw"), fit.model.outputs)
+    blocks, names = reads if signal == "z" else writes
     parameters, name = fit.model.parameters, name or f"{signal}{index}"
     if set(blocks) <= set(parameters) and (signal == "z" or len(names) == fit.model.n_w):
         rows = [parameters[block].value[channel] for block in blocks]

@@ -27,6 +27,7 @@ from .canvas import (
     finish,
     limit_depth,
     line,
+    plain,
     scaled,
     with_unit,
 )
@@ -45,7 +46,8 @@ def time(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = N
     what = "measured output" + (f" less its mean {level:.6g} {plain_unit}".rstrip() if level else "")
     line(ax, t, (y - level) / size, what, BLUE, linewidth=0.9)
     for label, residual, colour in _residuals(fit, recording, output):
-        line(ax, t, drawable(residual, np.ptp(y)) / size, label, colour, linewidth=1.1)
+        drawn, note = _moved(drawable(residual, np.ptp(y)), np.ptp(y), plain_unit)
+        line(ax, t, drawn / size, label + note, colour, linewidth=1.1)
     if recording.skip:
         ax.axvspan(0, recording.skip * recording.dt, color="#EEEEEE", label="not scored")
     ax.margins(x=0.01)
@@ -68,13 +70,15 @@ def traces(
         raise InputError(
             f"From {begin:g} to {end:g} s there are no two samples; the recording lasts {len(y) * recording.dt:g} s."
         )
-    size, unit = scaled(y[part], _unit(fit, recording, recording.outputs[output]))
+    plain_unit = _unit(fit, recording, recording.outputs[output])
+    size, unit = scaled(y[part], plain_unit)
     line(ax, recording.t[part], y[part] / size, "measured", BLUE, linewidth=3.2, alpha=0.55)
     models = [("this model", fit.simulate(recording), INK)]
     if _compares(fit):
         models.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
     for label, simulated, colour in models:
-        line(ax, recording.t[part], drawable(simulated[part, output], np.ptp(y)) / size, label, colour)
+        error, note = _moved(drawable((simulated[:, output] - y), np.ptp(y)), np.ptp(y), plain_unit)
+        line(ax, recording.t[part], (y + error)[part] / size, label + note, colour)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", with_unit(recording.outputs[output], unit), recording.name, 3)
 
@@ -119,8 +123,9 @@ def output_over_input(
     name, simulated = recording.outputs[output], fit.simulate(recording)[:, output]
     u, y, simulated = (column[as_scored(fit, recording).skip :] for column in (u, y, simulated))
     size, unit = scaled(y, _unit(fit, recording, name))
+    error, note = _moved(drawable(simulated - y, np.ptp(y)), np.ptp(y), _unit(fit, recording, name))
     ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
-    ax.plot(u, drawable(simulated, np.ptp(y)) / size, color=INK, linewidth=0.5, label="this model", rasterized=True)
+    ax.plot(u, (y + error) / size, color=INK, linewidth=0.5, label=plain(f"this model{note}"), rasterized=True)
     across = recording.inputs[input]
     return finish(ax, with_unit(across, _unit(fit, recording, across)), with_unit(name, unit), recording.name)
 
@@ -235,6 +240,14 @@ def _level(y: np.ndarray) -> float:
     """What to take off a signal (M,) so that its swings can be seen beside residuals around zero: its mean, or 0."""
     mean = float(np.mean(y))
     return mean if abs(mean) > np.ptp(y) > 0 else 0.0
+
+
+def _moved(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
+    """An error (M,) that is little but an offset beyond the measured span, less that offset, and a note that says so."""
+    known = error[np.isfinite(error)]
+    if not known.size or abs(np.mean(known)) <= span or np.ptp(known) > 3 * span or not span:
+        return error, ""
+    return error - np.mean(known), f", less its offset of {np.mean(known):.3g} {unit}".rstrip()
 
 
 def _compares(fit: Fit) -> bool:
