@@ -1,35 +1,33 @@
 """`fit`: the verb that takes a model and recordings and returns one immutable result.
 
 Three ways lead to it: from an earlier fit or a closed model of one's own (`_from_values`), to a linear model
-(`_linear`), and from nothing to a PI-LFR (`_from_starts`; `multistart` says how). Where an L1 penalty is asked for, a
-last solve follows (`penalty`).
+(`_linear`), and from nothing to a PI-LFR (`_from_starts`; `multistart` says how). What they share stands in `job`.
+Where an L1 penalty is asked for, a last solve follows (`penalty`).
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import signal
-import time
 from collections.abc import Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from .constraints import Constraint
 from .elements import PrandtlIshlinskii
-from .fitted import Fit, Progress, fingerprint, outcome, with_solution
-from .gauss_newton import GaussNewton
-from .interrupts import deferred_interrupt
-from .ipopt import Ipopt
+from .fitted import Fit, Progress, fingerprint
+from .job import Job, interrupted, penalised, rms_error
 from .lfr import PILFR
-from .linear_model import iterations, linear_model
+from .linear_model import linear_model
 from .model import Model
 from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability
-from .penalty import check_penalty, element_alone, merged, restored, sentence, unit_weights, without_idle
+from .outcome import with_solution
+from .penalty import check_penalty
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings, check_for_identification
 from .solution import Solution, Status
@@ -44,62 +42,6 @@ NO_GUARD = (
     "The worker processes could not begin: where processes are spawned, each runs the script again from its top, so "
     'put the call of fit below `if __name__ == "__main__":`, or use workers=1.'
 )
-
-
-Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
-ROUNDS, AGREE = 5, 0.05  # of noise estimates: how many at most, and the relative change that ends them
-
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """What the ways to a fit share."""
-
-    recordings: tuple[Recording, ...]
-    solver: Any
-    limits: tuple[Constraint, ...]
-    l1: dict[str, float]
-    noise: float | None
-    engine: str
-    progress: Progress | None
-    began: float = field(default_factory=time.perf_counter)
-
-    def problem(self, model: Model, noise: float = 1.0, **options: Any) -> Problem:
-        """The simulation-error problem of a model."""
-        given = {"constraints": self.limits, "noise": self.noise or noise, "engine": self.engine, **options}
-        return Problem(model, self.recordings, **given)
-
-    def settled(self, problem: Problem, solution: Solution, stage: str, **options: Any) -> tuple[Problem, Solution]:
-        """Problem and solution with the noise at the error that is reached, where priors are weighed against it."""
-        priors = any(p.prior is not None and not np.all(p.fixed) for p in problem.model.parameters.values())
-        for _ in range(ROUNDS if priors and self.noise is None else 0):
-            error = _error(problem, solution)
-            if abs(error / problem.noise - 1) < AGREE or error == 0 or solution.status is Status.INTERRUPTED:
-                break
-            problem = self.problem(problem.model, error, **{**options, "engine": problem.engine})
-            solution = self.solve(problem, stage, solution.theta)
-        return problem, solution
-
-    def solve(self, problem: Problem, stage: str, start: np.ndarray | None = None) -> Solution:
-        """The solver's solution; those of the package report their iterations."""
-        if not isinstance(self.solver, GaussNewton | Ipopt):
-            solution: Solution = self.solver.solve(problem, start)
-            return solution
-        return self.solver.solve(problem, start, iterations(self.progress, stage, self.solver.max_iterations))
-
-    def result(self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, **more: Any) -> Fit:
-        """What a solution of a problem amounts to; Ctrl-C waits until it is known, and is told by the status."""
-        found: list[Fit] = []
-        given = {"engine": self.engine, **more}
-        try:
-            with deferred_interrupt():
-                found.append(outcome(model, structure, problem, solution, self.began, self.recordings, **given))
-            if self.progress:
-                self.progress("standard errors", 1, 1, np.nan)
-        except KeyboardInterrupt:
-            if not found:
-                raise
-            return replace(found[0], solution=replace(solution, status=Status.INTERRUPTED))
-        return found[0]
 
 
 def fit(
@@ -183,7 +125,7 @@ def fit(
         shown = nullcontext(progress or None)
     pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and isinstance(model, PILFR) else None
     with shown as report:
-        job = _Job((), solver, further, dict(l1 or {}), noise, engine, report)
+        job = Job((), solver, further, dict(l1 or {}), noise, engine, report)
         try:
             return _fit(model, train, job, stable, starts, seed, start, executor or pool)
         except BrokenProcessPool:
@@ -198,7 +140,7 @@ def fit(
 def _fit(
     model: PILFR | Model | Fit,
     train: Recording | Sequence[Recording],
-    job: _Job,
+    job: Job,
     stable: bool | float,
     starts: int,
     seed: int,
@@ -234,7 +176,7 @@ def _fit(
     return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
 
 
-def _from_values(model: Model, structure: PILFR | None, job: _Job, earlier: Fit | None) -> Fit:
+def _from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit | None) -> Fit:
     """A closed model or an earlier fit, from its values, and from the initial states that the fit has or estimates."""
     if job.l1:
         check_penalty(job.l1, model.parameters, structure is not None and structure.element is None)
@@ -252,25 +194,14 @@ def _from_values(model: Model, structure: PILFR | None, job: _Job, earlier: Fit 
         problem, solution = job.settled(problem, latest[2], "solve", **options)
         latest = model, problem, solution, ""
         if job.l1 and structure:
-            latest = _penalised(model, problem, solution, job, problem.noise)
+            latest = penalised(model, problem, solution, job, problem.noise)
     except KeyboardInterrupt:
-        latest = _interrupted(*latest)
+        latest = interrupted(*latest)
     model, problem, solution, note = latest
     return job.result(model, structure, problem, solution, note=note)
 
 
-def _interrupted(model: Model, problem: Problem, solution: Solution, note: str) -> Stage:
-    """The same, its solution marked as interrupted."""
-    return model, problem, replace(solution, status=Status.INTERRUPTED), note
-
-
-def _error(problem: Problem, solution: Solution) -> float:
-    """Root mean square of the normalised residuals."""
-    e = problem.residual(solution.theta)
-    return float(np.sqrt(np.mean(e**2)))
-
-
-def _linear(structure: PILFR, fitted: Model, job: _Job) -> Fit:
+def _linear(structure: PILFR, fitted: Model, job: Job) -> Fit:
     """A linear model with the structure's bounds and fixed blocks, from the one without."""
     values = {k: p.value for k, p in fitted.parameters.items()}
     first = job.recordings[0]
@@ -289,7 +220,7 @@ def _from_starts(
     linear: Model,
     problem: Problem,
     solution: Solution,
-    job: _Job,
+    job: Job,
     starts: int,
     seed: int,
     start: str,
@@ -299,7 +230,7 @@ def _from_starts(
     blocks = {k: p.value for k, p in linear.parameters.items()}
     options: dict[str, Any] = {"engine": job.engine, "start": start, "noise": job.noise}
     search = Search(
-        structure, job.recordings, blocks, job.solver, job.limits, level=_error(problem, solution), **options
+        structure, job.recordings, blocks, job.solver, job.limits, level=rms_error(problem, solution), **options
     )
     seen: list[float] = []
 
@@ -323,36 +254,18 @@ def _from_starts(
     latest = model, problem, best.solution, note
     try:
         if stopped:
-            latest = _interrupted(*latest)
+            latest = interrupted(*latest)
         elif start != "paper":
             latest = model, problem, job.solve(problem, "solve", best.theta), note
         if structure.priors and not stopped:
             problem, result = job.settled(problem, latest[2], "solve")
             latest = model, problem, result, note
         if l1:
-            latest = _penalised(model, problem, latest[2], job, problem.noise)
+            latest = penalised(model, problem, latest[2], job, problem.noise)
     except KeyboardInterrupt:
-        latest = _interrupted(*latest)
+        latest = interrupted(*latest)
     model, problem, result, note = latest
     return job.result(model, structure, problem, result, candidates=tuple(candidates), note=note, **compared)
-
-
-def _penalised(model: Model, problem: Problem, solution: Solution, job: _Job, noise: float) -> Stage:
-    """The model, problem and solution with the L1 penalty, from the solution without, and a note; see `penalty`."""
-    if solution.status is Status.INTERRUPTED:
-        return model, problem, solution, "interrupted before the L1 penalty was applied"
-    found = unit_weights(with_solution(model, problem, solution))
-    states = solution.theta[int(problem.free.sum()) :]
-    options: dict[str, Any] = {"engine": problem.engine, "l1": job.l1}
-    whole, held = (job.problem(m, noise, **options) for m in (found, element_alone(found, job.l1)))
-    begin = merged(held, np.concatenate([held.start[: int(held.free.sum())], states]))
-    states = begin[int(held.free.sum()) :]
-    last = without_idle(held.model.with_parameters(held.model.parameters.at(held.parameters(begin))))
-    if np.any(last.parameters.free):
-        held = job.problem(last, noise, **options)
-    begin = np.concatenate([held.start[: int(held.free.sum())], states])
-    result = restored(job.solve(held, "L1 penalty", begin), held, whole)
-    return found, whole, result, sentence(with_solution(found, whole, result), job.l1)
 
 
 def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:

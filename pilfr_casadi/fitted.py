@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from .compiled import make_engine
-from .gauge import standard_errors
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .metrics import nrmse, rmse_per_output
 from .model import Model
-from .multistart import PRIOR, Candidate
+from .multistart import Candidate
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings
 from .sensitivities import Engine
@@ -257,63 +255,3 @@ def fingerprint(recording: Recording) -> str:
     initial = recording.initial
     kind = f"{initial} {recording.period}".encode() if isinstance(initial, str) else np.asarray(initial).tobytes()
     return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes() + kind).hexdigest()[:16]
-
-
-def with_solution(model: Model, problem: Problem, solution: Solution) -> Model:
-    """The model at the values of a solution."""
-    return model.with_parameters(model.parameters.at(problem.parameters(solution.theta)))
-
-
-def outcome(
-    model: Model,
-    structure: PILFR | None,
-    problem: Problem,
-    solution: Solution,
-    began: float,
-    recordings: tuple[Recording, ...],
-    candidates: tuple[Candidate, ...] = (),
-    linear: Model | None = None,
-    note: str = "",
-    linear_nrmse: tuple[float, ...] = (),
-    engine: str = "auto",
-) -> Fit:
-    """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
-
-    Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the standard
-    errors know of them.
-    """
-    fitted = with_solution(model, problem, solution)
-    judged = problem
-    if note == PRIOR:
-        asked = structure.priors if structure else {}
-        fitted = fitted.with_parameters(
-            fitted.parameters.change(**{name: {"prior": asked.get(name)} for name in ("w", "r")})
-        )
-        options: dict[str, Any] = {"constraints": problem.constraints, "noise": problem.noise, "scale": problem.scale}
-        judged = Problem(fitted, recordings, engine=problem.engine, **options)
-    theta = solution.theta
-    at_bound = [
-        f"{label} = {value:g}"
-        for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
-        if value in (low, high)
-    ]
-    limits = problem.active_constraints(theta)
-    at_bound += [name for name, active in zip(problem.g_labels, limits, strict=True) if active]
-    return Fit(
-        model=fitted,
-        structure=structure,
-        dt=recordings[0].dt,
-        solution=solution,
-        train_nrmse=tuple(problem.nrmse(theta)),
-        initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
-        labels=problem.labels,
-        errors=standard_errors(judged, theta, structure),
-        active=tuple(at_bound),
-        candidates=candidates,
-        linear=linear,
-        seconds=time.perf_counter() - began,
-        units=dict(recordings[0].units),
-        note=note,
-        linear_nrmse=linear_nrmse,
-        engine=engine,
-    )

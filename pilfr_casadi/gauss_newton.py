@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -26,60 +25,12 @@ from .constraints import TOLERATED
 from .damping import without_rounding
 from .magnitude import Neighbours
 from .problem import Problem
+from .quadratic_program import QuadraticProgram
 from .recording import InputError
 from .solution import Iteration, Progress, Solution, Status
 
 FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
 NOTHING = 1e-24  # a cost that is rounding: outputs are off by 1e-12 of their size
-
-
-class _QuadraticProgram:
-    """Dense QP; solves for a step inside limits.
-
-    Where the unconstrained step lies inside all of them it is the solution, for the price of a Cholesky factorisation.
-    Else `ca.conic`, built when it is first needed, finds out which limits hold it.
-    """
-
-    def __init__(self, n: int, n_g: int, plugin: str) -> None:
-        self._size, self._plugin = (n, n_g), plugin
-
-    @cached_property
-    def _solve(self) -> ca.Function:
-        (n, n_g), plugin = self._size, self._plugin
-        structure = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(n_g, n)}
-        quiet = {"daqp": {}, "qrqp": {"print_iter": False, "print_header": False, "print_info": False}}.get(plugin, {})
-        return ca.conic("qp", plugin, structure, {**quiet, "error_on_fail": False})
-
-    def __call__(
-        self,
-        h: np.ndarray,
-        g: np.ndarray,
-        lbx: np.ndarray,
-        ubx: np.ndarray,
-        a: np.ndarray,
-        lba: np.ndarray,
-        uba: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, bool]:
-        d = _unconstrained(h, g)
-        if d is not None and np.all((lbx <= d) & (d <= ubx)):
-            slack = a @ d
-            if np.all((lba <= slack) & (slack <= uba)):
-                return d, np.zeros(len(d) + len(slack)), True
-        out = self._solve(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
-        d = np.asarray(out["x"]).ravel()
-        multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])
-        return d, multipliers, bool(self._solve.stats()["success"]) and bool(np.all(np.isfinite(d)))
-
-
-def _unconstrained(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
-    """`-h⁻¹ g` for a positive definite h, else None."""
-    from scipy.linalg import cho_factor, cho_solve
-
-    try:
-        d = -cho_solve(cho_factor(h, lower=True, check_finite=False), g, check_finite=False)
-    except np.linalg.LinAlgError:
-        return None
-    return d if np.all(np.isfinite(d)) else None
 
 
 @dataclass(frozen=True)
@@ -138,7 +89,7 @@ class _Run:
         self.theta = np.clip(np.asarray(start, dtype=float), problem.lower, problem.upper)
         self.n_g = len(problem.g_lower)
         self.unit, self.known = np.ones(self.n_g), np.zeros(self.n_g, dtype=bool)
-        self.qp = _QuadraticProgram(problem.size, self.n_g, options.qp)
+        self.qp = QuadraticProgram(problem.size, self.n_g, options.qp)
         self.damping, self.growth, self.penalty = options.damping, 2.0, 0.0
         self.multipliers = np.zeros(problem.size + self.n_g)
         self.history: list[Iteration] = []

@@ -11,6 +11,7 @@ Identification: A Frequency Domain Approach, 2nd ed., 2012, chapter 7; the BLA i
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -19,6 +20,9 @@ from .bla import BLA
 from .recording import InputError, Recording, check_for_identification
 
 Array = np.ndarray
+UNCERTAIN = 0.5  # relative deviation from which an estimate tells nothing
+INFLATED = 1e6  # times the variance without leakage; broadband inputs have less than 10, a tone beside its line 1e13
+REMEDY = "give an input that excites many frequencies by itself, or whole periods with `period` set."
 
 
 def plain_bla(
@@ -56,6 +60,12 @@ def plain_bla(
     InputError
         When samples are too few for the window, or the inputs cannot be told apart.
 
+    Warns
+    -----
+    RuntimeWarning
+        Where at half of the frequencies or more the deviation is above 50 % of the response, or the input cannot be
+        told from leakage, as a tone beside its line.
+
     References
     ----------
     Pintelon & Schoukens (2012), Sec. 7.2.2 and 7.3.5; Krikelis et al. (2024), Eq. 21.
@@ -90,13 +100,35 @@ def plain_bla(
     per_frequency = sum(share) * n_poly * (n_u + n_rec)
     chunk = max(1, int(4e6) // per_frequency)
     parts = [_local_polynomials(grid[k : k + chunk], lines, share, order) for k in range(0, len(grid), chunk)]
-    G, var, good = (np.concatenate(p) for p in zip(*parts, strict=True))
+    G, var, good, inflation = (np.concatenate(p) for p in zip(*parts, strict=True))
     if not good.any():
         raise InputError(
             f"the {n_u} inputs {', '.join(records[0].inputs)} move together at every frequency; excite them "
             "independently or add recordings with other inputs."
         )
+    _warn_of_nonsense(G[good], var[good], inflation[good], records[0])
     return BLA(grid[good], G[good] / scale, None, var[good] / scale**2, records[0].dt)
+
+
+def _warn_of_nonsense(G: Array, var: Array, inflation: Array, record: Recording) -> None:
+    """Warn where the estimate (F, n_y, n_u), inputs of unit size, or an input's part in it tells next to nothing."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.nan_to_num(np.sqrt(np.sum(var, axis=2) / np.sum(np.abs(G) ** 2, axis=2)), nan=0.0, posinf=np.inf)
+    typical, hidden = np.median(share, axis=0), np.median(inflation, axis=0)
+    if np.max(hidden) > INFLATED:
+        warnings.warn(
+            f"The spectrum of the input {record.inputs[int(np.argmax(hidden))]!r} cannot be told from leakage at most "
+            f"frequencies, so its best linear approximation is not to be trusted; {REMEDY}",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    elif np.max(typical) > UNCERTAIN:
+        warnings.warn(
+            f"The best linear approximation of the output {record.outputs[int(np.argmax(typical))]!r} deviates by "
+            f"{np.max(typical):.0%} of its own size at most frequencies; record longer with less noise, or {REMEDY}",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 def _excited_spectrum(r: Recording, scale: Array, floor: float) -> tuple[Array, Array, Array]:
@@ -115,8 +147,11 @@ def _excited_spectrum(r: Recording, scale: Array, floor: float) -> tuple[Array, 
 
 def _local_polynomials(
     grid: Array, lines: list[tuple[Array, Array, Array]], share: list[int], order: int
-) -> tuple[Array, Array, Array]:
-    """Local least squares at the frequencies `grid`: response, its variance, and whether it can be told."""
+) -> tuple[Array, Array, Array, Array]:
+    """Local least squares at the frequencies `grid`: response, its variance, whether it can be told, and at what price.
+
+    The last is, by input, the variance times that input's power over that of the noise: 1 for one input without leakage.
+    """
     n_u, n_y, n_rec, n_poly = lines[0][1].shape[1], lines[0][2].shape[1], len(lines), order + 1
     ends = np.concatenate([[0], np.cumsum(share)])
     K = np.zeros((len(grid), ends[-1], n_poly * (n_u + n_rec)), dtype=complex)
@@ -147,4 +182,5 @@ def _local_polynomials(
     var = (np.sum(np.abs(Y) ** 2, axis=1) - np.sum(np.abs(coefficients) ** 2, axis=1)) / dof
     response = (inverse[:, :n_u] @ coefficients).swapaxes(1, 2)
     gain = np.sum(np.abs(inverse[:, :n_u]) ** 2, axis=2)
-    return response, np.maximum(var, 0.0)[:, :, None] * gain[:, None, :], good
+    inflation = gain * np.sum(np.abs(U) ** 2, axis=1)
+    return response, np.maximum(var, 0.0)[:, :, None] * gain[:, None, :], good, inflation

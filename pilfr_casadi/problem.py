@@ -12,12 +12,12 @@ of the record, so memory does not grow with its length.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from .compiled import make_engine
 from .constraints import Constraint, compile_constraints
+from .layout import lay_out
 from .magnitude import Neighbours
 from .model import Model
 from .nlp import Horizon, to_nlp
@@ -25,17 +25,6 @@ from .recording import InputError, Recording, as_recordings
 from .sensitivities import Engine
 
 STRETCH = 2_000_000  # numbers in the piece of the Jacobian that is held at a time
-
-
-@dataclass(frozen=True)
-class _Part:
-    """One recording inside the problem: its first variable (or None), what drives it, and what is run before it."""
-
-    recording: Recording
-    first: int | None
-    state: np.ndarray
-    drive: np.ndarray
-    warm_up: np.ndarray
 
 
 class Problem:
@@ -91,7 +80,7 @@ class Problem:
                     f"the model {len(model.inputs)} and {model.n_y}; they must match."
                 )
         self.scale = _output_scale(self.recordings) if scale is None else np.asarray(scale, dtype=float)
-        self._parts = list(self._lay_out(n_free, periods))
+        self._parts = list(lay_out(model, self.recordings, self.engine, n_free, periods))
         self._residuals = sum((len(p.recording) - p.recording.skip) * model.n_y for p in self._parts)
         n_state = model.n_x + model.n_s
         n_initial = sum(n_state for p in self._parts if p.first is not None)
@@ -110,45 +99,6 @@ class Problem:
         self._set_penalties(l1 or {}, noise)
         compiled = compile_constraints(self.constraints, parameters)
         self._g, self._g_slope, self.g_lower, self.g_upper, self.g_labels, self._g_units = compiled
-
-    def _lay_out(self, at: int, periods: int | None) -> Iterator[_Part]:
-        n_state = self.model.n_x + self.model.n_s
-        for r in self.recordings:
-            zero, drive = np.zeros(n_state), self.model.drive(r)
-            nothing = drive[:0]
-            if isinstance(r.initial, str):
-                if r.initial == "zero":
-                    yield _Part(r, None, zero, drive, nothing)
-                elif r.initial == "estimate":
-                    yield _Part(r, at, zero, drive, nothing)
-                    at += n_state
-                else:
-                    if r.period is None:
-                        raise InputError(
-                            "A recording in periodic steady state needs its period in samples; give `period=`."
-                        )
-                    one = drive[: r.period * self.model.substeps]
-                    yield _Part(r, None, zero, drive, self._periods_before(one, periods))
-            else:
-                given = np.asarray(r.initial, dtype=float).ravel()
-                if given.size not in (len(self.model.states), n_state):
-                    raise InputError(
-                        f"An initial state of {given.size} numbers was given; "
-                        f"expected {len(self.model.states)} or {n_state}."
-                    )
-                yield _Part(r, None, np.concatenate([given, zero[given.size :]]), drive, nothing)
-
-    def _periods_before(self, one: np.ndarray, periods: int | None) -> np.ndarray:
-        """What drives the periods before a periodic recording: as many as the start model takes to settle, 2 to 50."""
-        state = np.zeros(self.model.n_x + self.model.n_s)
-        for count in range(1, 51 if periods is None else 1):
-            before, state = state, self.engine.simulate(one, self._base, state)[1]
-            if not np.all(np.isfinite(state)):
-                break
-            periods = max(count, 2)
-            if np.max(np.abs(state - before), initial=0.0) <= 1e-6 * np.max(np.abs(state), initial=0.0):
-                break
-        return np.tile(one, (periods or 2, 1))
 
     def _set_penalties(self, l1: dict[str, float], noise: float) -> None:
         parameters = self.model.parameters

@@ -2,8 +2,9 @@
 
     y = g u + y_0            (what an engineer writes first)
 
-Recordings as in `piezo_stack`: trained on the 1 Hz sine, judged on the varying amplitude. For comparison (rms error in % of
-the range of the varying-amplitude record): twelve plays fitted to the sine by least squares leave 2.3 %, a gain 5.6 %.
+Recordings as in `piezo_stack`: trained on the 1 Hz sine, judged on the varying amplitude. For comparison (rms error in
+% of the range of the varying-amplitude record): twelve plays fitted to the sine by least squares leave 2.3 %, a
+gain 5.6 %.
 """
 
 from __future__ import annotations

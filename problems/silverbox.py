@@ -2,14 +2,14 @@
 
     v'' = b u - k v - d v'            (what an engineer writes first)
 
-Recordings: Silverbox, a circuit that realises a Duffing oscillator, 610.35 Hz; Wigren & Schoukens (2013), "Three free data
-sets for development and benchmarking in nonlinear system identification", ECC; data not included here. Trained on the first
-three quarters of the multisine; judged on its last quarter, on the arrow (noise of growing amplitude, which leaves the
-trained amplitudes at its end) and on the arrow's first 32000 samples, which do not. The first 50 samples may set the
-initial state. What the input does between samples is not said by the recordings.
+Recordings: Silverbox, a circuit that realises a Duffing oscillator, 610.35 Hz; Wigren & Schoukens (2013), "Three free
+data sets for development and benchmarking in nonlinear system identification", ECC; data not included here. Trained on
+the first three quarters of the multisine; judged on its last quarter, on the arrow (noise of growing amplitude, which
+leaves the trained amplitudes at its end) and on the arrow's first 32000 samples, which do not. The first 50 samples may
+set the initial state. What the input does between samples is not said by the recordings.
 
-Published rms errors in mV (multisine / arrow / arrow without extrapolation): DT-SUBNET 0.36 / 1.4 / 0.32, PNLSS 0.26 on the
-arrow (arXiv 2405.10779), GRU 1.49 / 2.80 / 0.95, FIR network 18.9 / 20.2 / 15.3.
+Published rms errors in mV (multisine / arrow / arrow without extrapolation): DT-SUBNET 0.36 / 1.4 / 0.32, PNLSS 0.26 on
+the arrow (arXiv 2405.10779), GRU 1.49 / 2.80 / 0.95, FIR network 18.9 / 20.2 / 15.3.
 """
 
 from __future__ import annotations

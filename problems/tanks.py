@@ -2,12 +2,13 @@
 
     h_1' = k_4 u - k_1 f(h_1),    h_2' = k_1 f(h_1) - k_3 f(h_2),    y = h_2 + y_0,    f(h) = h  or  sqrt(h)
 
-Levels are in volts of the sensor, which is not calibrated: its zero is a parameter. Recordings: 1024 samples each, 4 s apart; Schoukens, Mattsson, Wigren & Noel (2016),
-"Cascaded tanks benchmark combining soft and hard nonlinearities"; data not included here. The initial levels are unknown and
-the same in both recordings, so the test starts from those estimated on the training recording.
+Levels are in volts of the sensor, which is not calibrated: its zero is a parameter. Recordings: 1024
+samples each, 4 s apart; Schoukens, Mattsson, Wigren & Noel (2016), "Cascaded tanks benchmark combining soft and hard
+nonlinearities"; data not included here. The initial levels are unknown and the same in both recordings, so the test
+starts from those estimated on the training recording.
 
-Published rms errors of the test simulation in V: grey-box model with overflow 0.18 and 0.19, CT-SUBNET 0.31, TSEM 0.33, NLSS2
-0.34, PNLSS 0.45, Volterra 0.54, linear 0.75.
+Published rms errors of the test simulation in V: grey-box model with overflow 0.18 and 0.19, CT-SUBNET 0.31, TSEM 0.33,
+NLSS2 0.34, PNLSS 0.45, Volterra 0.54, linear 0.75.
 """
 
 from __future__ import annotations

@@ -47,7 +47,8 @@ def table(seed: int | None = None) -> str:
         line = f"{name:15}{problem.size:4d}{problem.cost(problem.start):11.3e}{case.floor:11.3e}"
         line += f"{one.cost:15.4e}{one.iterations:5d}{one.seconds:6.2f}"
         line += f"{two.cost:12.4e}{two.iterations:5d}{two.seconds:6.2f}"
-        lines.append(f"{line}{two.cost / one.cost - 1:9.2%}  {', '.join(problem.labels[i] for i in at) or '-'}")
+        line += f"{two.cost / one.cost - 1:9.2%}  {', '.join(problem.labels[i] for i in at) or '-'}"
+        lines.append(f"{line}  ({one.cost / case.floor:.1f} x the floor: {case.remark})" if case.remark else line)
     return "\n".join(lines)
 
 

@@ -35,6 +35,8 @@ class Case:
         True parameters by name, where the model is of the truth's own form and they are unique.
     exact : bool
         Whether the model class holds the truth, so that a global minimum lies at or below `floor`.
+    remark : str
+        What keeps the fit above the floor, where it is not exact.
     """
 
     model: Model
@@ -42,6 +44,7 @@ class Case:
     clean: tuple[np.ndarray, ...]
     truth: Mapping[str, Any] = field(default_factory=dict)
     exact: bool = True
+    remark: str = ""
 
     def problem(self, **options: Any) -> Problem:
         """The simulation-error problem; options go to `Problem`."""

@@ -248,6 +248,27 @@ def test_plain_bla_does_not_depend_on_units():
     np.testing.assert_allclose(second.var_total, first.var_total * (b[:, None] / a) ** 2, rtol=1e-8)
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_plain_bla_warns_of_a_tone_with_leakage(noise):
+    """Beside its line a tone is leakage, and the residual does not tell: without noise it is next to nothing."""
+    u = np.sin(2 * np.pi * 7.77 * DT * np.arange(2000))[:, None]
+    y = simulate_lti(system(), u) + noise * np.random.default_rng(0).standard_normal(u.shape)
+    with pytest.warns(RuntimeWarning, match=r"the input 'u' cannot be told from leakage .* `period` set\.$") as found:
+        bla = plain_bla(Recording(u, y, DT))
+    assert len(found) == 1 and found[0].filename == __file__
+    true = frequency_response(system(), bla.frequency)
+    assert np.median(np.abs(bla.G - true) / np.abs(true)) > 10
+
+
+def test_plain_bla_warns_of_noise():
+    rng = np.random.default_rng(0)
+    (r,) = random_recordings(system(n_y=2), [2000], rng, 0.01)
+    plain_bla(r)  # warnings are errors
+    drowned = r.with_(y=r.y + np.array([0.0, 100.0]) * rng.standard_normal(r.y.shape))
+    with pytest.warns(RuntimeWarning, match=r"the output 'y2' deviates by \d+% of its own size"):
+        plain_bla(drowned)
+
+
 def test_the_print_says_what_it_holds():
     rng = np.random.default_rng(0)
     text = repr(robust_bla([cubic(2, rng) for _ in range(3)]))

@@ -11,7 +11,7 @@ import pilfr_casadi
 from pilfr_casadi.constraints import Constraint
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.fit import Fit, fit
-from pilfr_casadi.gauss_newton import GaussNewton, _QuadraticProgram
+from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.ipopt import Ipopt
 from pilfr_casadi.lfr import PILFR, hammerstein, wiener
 from pilfr_casadi.linear_model import linear_model
@@ -19,6 +19,7 @@ from pilfr_casadi.operators import Play
 from pilfr_casadi.order_selection import select_order
 from pilfr_casadi.penalty import element_alone, unit_weights
 from pilfr_casadi.problem import Problem
+from pilfr_casadi.quadratic_program import QuadraticProgram, unconstrained
 from pilfr_casadi.recording import InputError
 from problems.zoo_case import excitation, noisy, plays, simulate_lfr
 
@@ -244,7 +245,7 @@ def test_a_step_inside_its_limits_is_that_of_the_quadratic_program():
         h, g, a = root @ root.T + 0.1 * np.eye(n), rng.standard_normal(n), rng.standard_normal((n_g, n))
         room = 10.0 ** rng.uniform(-1, 3)
         limits = (np.full(n, -room), np.full(n, room), a, np.full(n_g, -room), np.full(n_g, room))
-        ours, qrqp = _QuadraticProgram(n, n_g, "daqp"), _QuadraticProgram(n, n_g, "qrqp")
+        ours, qrqp = QuadraticProgram(n, n_g, "daqp"), QuadraticProgram(n, n_g, "qrqp")
         d, multipliers, good = ours(h, g, *limits)
         expected = np.asarray(
             qrqp._solve(h=h, g=g, lbx=limits[0], ubx=limits[1], a=a, lba=limits[3], uba=limits[4])["x"]
@@ -256,10 +257,8 @@ def test_a_step_inside_its_limits_is_that_of_the_quadratic_program():
 
 
 def test_an_indefinite_or_broken_matrix_is_left_to_the_solver():
-    from pilfr_casadi.gauss_newton import _unconstrained
-
-    assert _unconstrained(-np.eye(2), np.ones(2)) is None
-    assert _unconstrained(np.full((2, 2), np.nan), np.ones(2)) is None
+    assert unconstrained(-np.eye(2), np.ones(2)) is None
+    assert unconstrained(np.full((2, 2), np.nan), np.ones(2)) is None
 
 
 # ---- workers ----

@@ -12,18 +12,18 @@ from random_models import random_input, random_lfr, reference
 from pilfr_casadi.constraints import Constraint
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.fit import fit
-from pilfr_casadi.fitted import outcome
 from pilfr_casadi.gauge import standard_errors
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.metrics import nrmse
 from pilfr_casadi.multistart import PRIOR
 from pilfr_casadi.operators import Play
+from pilfr_casadi.outcome import outcome
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import InputError, Recording
 from pilfr_casadi.solution import Status
 
-fit_module = importlib.import_module("pilfr_casadi.fit")
+job_module = importlib.import_module("pilfr_casadi.job")
 X0 = np.array([3.0, -3.0, 0.0, 0.0, 0.0, 0.0])
 SHORT = GaussNewton(max_iterations=3)
 
@@ -241,7 +241,7 @@ def test_ctrl_c_after_the_last_solve_loses_nothing(truth, record, monkeypatch):
         signal.raise_signal(signal.SIGINT)
         return outcome(*args, **more)
 
-    monkeypatch.setattr(fit_module, "outcome", struck)
+    monkeypatch.setattr(job_module, "outcome", struck)
     found = fit(truth[2], record)
     assert found.status is Status.INTERRUPTED and found.train_nrmse[0] < 0.0105
 
@@ -265,7 +265,7 @@ def test_an_interrupt_between_two_solves(record, monkeypatch):
     def struck(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fit_module._Job, "settled", struck)
+    monkeypatch.setattr(job_module.Job, "settled", struck)
     for task in (structure, structure.model(1, 1, {"D_yu": 0.4}), PILFR(2, priors={"D_yu": (0.5, 0.1)})):
         found = fit(task, record, starts=1)
         assert found.status is Status.INTERRUPTED and np.isfinite(found.train_nrmse[0])

@@ -17,7 +17,7 @@ from pilfr_casadi import plots
 from pilfr_casadi.bla import BLA, robust_bla
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.fit import Fit
-from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.lfr import PILFR, hammerstein, wiener
 from pilfr_casadi.multistart import Candidate
 from pilfr_casadi.operators import Play, Stop
 from pilfr_casadi.plots import canvas
@@ -201,6 +201,46 @@ def test_legends_are_honest(fitted, data):
     for ax in (plots.time(fitted, dollars), plots.output_over_input(fitted, dollars)):
         pixels(ax.figure)  # a dollar sign in a name is not a formula
         assert ax.get_legend().get_title().get_text() == "\\$x^2 {\\frac"
+
+
+def test_offsets_do_not_flatten_a_picture(fitted, data):
+    away = data.with_(y=data.y + 7.0)
+    swing = np.ptp(data.y)
+    ax = plots.time(fitted, away)  # a model without the offset of the data
+    assert legend_of(ax)[0] == f"measured output less its mean {np.mean(away.y):.6g} m"
+    assert legend_of(ax)[2].endswith(", less -7 m")
+    assert 1e-3 * np.ptp(ax.get_ylim()) < 2 * swing
+    for picture in (plots.traces, plots.output_over_input):
+        ax = picture(fitted, away)
+        assert legend_of(ax)[-1] == "this model, less -7 m"
+        assert np.ptp(ax.get_ylim()) < 2 * swing
+        assert legend_of(picture(fitted, data))[-1] == "this model"
+
+
+def test_loops_show_what_is_scored(fitted, data):
+    ax = plots.output_over_input(fitted, data.with_(skip=150))
+    assert [len(line.get_xdata()) for line in ax.get_lines()] == [len(data) - 150] * 2
+    assert len(plots.loop(fitted, data.with_(skip=150)).get_lines()[0].get_xdata()) == len(data) - 150
+
+
+def test_signals_of_an_element_have_units_where_they_are_inputs_or_outputs(fitted):
+    def labels(structure):
+        model = structure.model(1, 1, {**BLOCKS, **structure.fixed}, inputs=("force",), outputs=("x",))
+        ax = plots.loading_curve(replace(fitted, model=model, structure=structure))
+        return ax.get_xlabel(), ax.get_ylabel()
+
+    element = PrandtlIshlinskii(Play, 3)
+    assert labels(hammerstein(2, element)) == ("z [N]", "w (model scale)")
+    assert labels(wiener(2, element)) == ("z (model scale)", "w [m]")
+    assert labels(PILFR(2, element)) == ("z (model scale)", "w (model scale)")
+
+
+def test_few_operators_have_no_density(fitted, data):
+    assert legend_of(plots.weights(fitted, data)) == ["weights w"]
+    values = {**BLOCKS, "w": [[0.5, 0.3, 0.2, 0.1]], "r": [[0.2, 0.9, 1.7, 2.0]]}
+    model = PILFR(2, PrandtlIshlinskii(Play, 4)).model(1, 1, values, inputs=("force",), outputs=("x",))
+    four = replace(fitted, model=model, structure=None)
+    assert legend_of(plots.weights(four, data)) == ["weights w (left)", "smoothed density (right)"]
 
 
 def test_a_simulation_that_runs_away_is_drawn_as_far_as_it_goes(fitted, data):

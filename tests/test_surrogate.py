@@ -10,7 +10,8 @@ from scipy.signal import cont2discrete
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Recording, multisine
 from pilfr_casadi.accepted import as_simulator
-from pilfr_casadi.diagnose.surrogate import POOR, modal_simulator, modes, surrogate, to_continuous
+from pilfr_casadi.diagnose.modes import modes, to_continuous
+from pilfr_casadi.diagnose.surrogate import POOR, modal_simulator, surrogate
 from pilfr_casadi.fit import fit
 from pilfr_casadi.integration import discretise
 from pilfr_casadi.sensitivities import VirtualMachine

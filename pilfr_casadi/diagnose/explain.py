@@ -202,7 +202,7 @@ def _quick_cost(part: Workbench, model: Any, engine: Any, start: Mapping[str, An
 
 def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     """Fit a candidate to everything."""
-    placed = candidate.fitted.simulator
+    placed = candidate.fitted.corrected()  # sub-steps for the law as it was fitted
     try:
         fitted = bench.fit(placed, [candidate.fitted.values], solver=THOROUGH)
     except InputError:
@@ -228,7 +228,8 @@ def explain(
         done += 1
         report(done, len(pairs) + min(len(pairs), REFINED), error)
 
-    with ThreadPoolExecutor(workers) as pool:
+    pool = ThreadPoolExecutor(workers)
+    try:
         tasks = [pool.submit(prepare, bench, entries, without, signs[port], gain) for port, _, entries in pairs]
         prepared = []
         for task in tasks:
@@ -240,4 +241,6 @@ def explain(
         for refined in again:
             found.append(refined.result())
             step(min((c.error for c in found if c), default=np.inf))
+    finally:
+        pool.shutdown(cancel_futures=True)
     return sorted((c for c in found if c is not None), key=lambda c: c.error)

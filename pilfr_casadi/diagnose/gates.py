@@ -181,17 +181,14 @@ def unclip(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gat
 def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
     """Sign and unit slips of each channel, and of the time."""
     best, found = plain, None
-    n_y = len(bench.scale)
     trials: list[tuple[str, str, float, Change]] = []
-    several = len(bench.simulator.inputs) + n_y > 2
     sizes = _sizes(bench)
     for i, name in enumerate(bench.simulator.output_names):
         trials.append((name, "sign", -1.0, scaled("y", i, -1.0)))
         trials += [(name, "unit", f, scaled("y", i, f)) for f in FACTORS if _near(f * sizes[i])]
     for i, name in enumerate(bench.simulator.inputs):
-        if several:
-            trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
-            trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if np.any([_near(v / f) for v in sizes])]
+        trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
+        trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if np.any([_near(v / f) for v in sizes])]
     for factor in (1e-3, 1e3, 60.0, 1 / 60):
         trials.append(("time", "time-unit", factor, slower_by(factor)))
     for name, finding, value, change in trials:

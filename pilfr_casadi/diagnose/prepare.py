@@ -17,7 +17,7 @@ from .proof import errors_of
 from .timing import timing
 from .workbench import THOROUGH, Fitted, Workbench
 
-SUSPECT = 0.06  # mean square error beyond which wrong signs and units are looked for
+SUSPECT, LEAST = 25.0, 4e-4  # times the noise, and mean square error, beyond which signs and units are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,8 @@ def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | N
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, simulator)
     without = bench.fit(simulator, solver=THOROUGH)
-    if without.cost > SUSPECT:
+    first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+    if without.cost > SUSPECT * float(np.mean((first.deviation / bench.scale) ** 2)) and without.cost > LEAST:
         bench, without, more = wrong_scale(bench, without)
         gates = [*gates, *more]
         if more:  # what looked better on wrong data says nothing

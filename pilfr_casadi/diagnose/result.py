@@ -81,6 +81,7 @@ class Diagnosis:
     next_experiment: dict[str, Any] | None = None
     seconds: float = 0.0
     times: Mapping[str, float] = field(default_factory=dict)
+    interrupted: bool = False
     evidence: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -107,7 +108,8 @@ class Diagnosis:
         diagnosis_report(self, folder)
 
     def __str__(self) -> str:
-        lines = [self.sentence]
+        lines = ["Interrupted: this is what was found until then."] if self.interrupted else []
+        lines.append(self.sentence)
         for e in self.effects:
             lines.append(f"{e.port}: {e.law}{f' ({e.form})' if e.form else ''}, confidence {e.confidence:.2f}")
             lines.append(f"  {e.sentence}: {e.equation}")

@@ -77,6 +77,11 @@ def diagnose(
     recordings = check_for_identification([arranged(simulator, r) for r in as_recordings(train)], 20)
     tests = tuple(arranged(simulator, r) for r in as_recordings(test)) if test is not None else ()
     _check_apart(recordings, tests)
+    for r in tests:
+        if abs(r.dt / recordings[0].dt - 1) > 1e-4:
+            raise InputError(
+                f"The test recording's step is {r.dt:g} s, the training's {recordings[0].dt:g} s; resample it."
+            )
     say("refit", 0, 1, np.inf)
     ready = prepare(simulator, recordings, hold, engine)
     prepared_at = time.perf_counter()
@@ -84,6 +89,11 @@ def diagnose(
     search = Search(bench, without, ready.floor, laws, workers, say).run(effects)
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, ready.gates)
+    if search.interrupted and not accepted:
+        sentence = (
+            "The search was interrupted before it came to an answer; refitted, the simulator is off by "
+            f"{without.cost**0.5:.3g} of the outputs' deviation."
+        )
     explained = verdict == "missing-physics"
     after = search.base if explained else without
     std = deviations(bench, after)
@@ -122,6 +132,7 @@ def diagnose(
         next_experiment=experiment,
         seconds=now - began,
         times=times,
+        interrupted=search.interrupted,
         evidence={"search": search, "without": without, "after": after},
     )
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..laws import Law
+from ..laws import FINER, Law
 from ..recording import InputError
 from ..simulator import Simulator
 from .explain import Candidate, explain, heads, judged, polish
@@ -70,6 +70,7 @@ class Search:
     open_before: dict[str, float] = field(default_factory=dict)
     open_after: dict[str, float] = field(default_factory=dict)
     times: dict[str, float] = field(default_factory=dict)
+    interrupted: bool = False
 
     @property
     def floor2(self) -> float:
@@ -86,8 +87,15 @@ class Search:
         return found
 
     def run(self, effects: int) -> Search:
-        """Look for effects, one after the other."""
+        """Look for effects, one after the other; an interrupt ends the search with what there is."""
         self.base = self.without
+        try:
+            self._run(effects)
+        except KeyboardInterrupt:
+            self.interrupted = True
+        return self
+
+    def _run(self, effects: int) -> None:
         self.open_before = self.open_after = self._open(self.without)
         for number in range(effects):
             if number and not self._more():
@@ -99,10 +107,10 @@ class Search:
             assert found.choice is not None
             self.base = self._polished(found.choice.winner).fitted
             self._prefer_what_leaves_nothing()
+            self._put_more_finely()
             if number:
                 self._look_back()
             self.open_after = self._open(self.base)
-        return self
 
     def _more(self) -> bool:
         excess = (self.base.cost - self.floor2) / max(self.without.cost - self.floor2, 1e-300)
@@ -181,6 +189,35 @@ class Search:
             margin = winner.error / rival.error
             choice = replace(found.choice, winner=rival, margin=min(margin, found.choice.margin), alike=())
             self.passes[-1] = replace(found, choice=choice)
+
+    def _put_more_finely(self) -> None:
+        """The named law in a finer form, where there is one that fits better."""
+        found = self.passes[-1]
+        assert found.choice is not None
+        winner = found.choice.winner
+        element = self.base.simulator.elements[-1]
+        bare = replace(self.base.simulator, elements=self.base.simulator.elements[:-1])
+        own = {k: p for k, p in bare.parameters.items() if not k.startswith(element.prefix)}
+        bare = replace(bare, parameters=own)
+        local = next((s.local for s in found.scored if s.port == winner.port), None)
+        for kind in FINER.get(type(winner.law), ()):
+            if local is None:
+                return
+            began = time.perf_counter()
+            total = float(np.sum(self.base.values[f"{element.prefix}w"]))
+            best = None
+            for shape in kind().shapes(local):
+                law = kind()
+                law = law.at({**shape, **dict.fromkeys(law.strength, total)}, law.bounds(local))
+                tried = self._attempt(bare.with_element(element.port, law), self.base.values)
+                if tried is not None and (best is None or tried.error < best.error):
+                    best = tried
+            if best is not None and best.error < 0.97 * winner.error:
+                finer = self._polished(best)
+                if finer.full < self.base.cost:
+                    self.base = finer.fitted
+                    self.passes[-1] = replace(found, choice=replace(found.choice, winner=finer))
+            self._timed("finer form", began)
 
     def _look_back(self) -> None:
         """With the second effect in place: its rivals in the first's place, and the second alone."""

@@ -1,23 +1,17 @@
 r"""A linear stand-in for a simulation of which only inputs and outputs are known, in modes with names.
 
-A discrete model identified from the simulation's own record is taken to continuous time,
-
-.. math:: A_c = \log(A) / \Delta t, \qquad B_c = \left(\int_0^{\Delta t} e^{A_c s} ds\right)^{-1} B
-   \quad\text{(inputs held)},
-
-with the first-order-hold counterpart where inputs are interpolated, and split into real modes. A pair of eigenvalues
-`-ζ ω ± j ω √(1 - ζ²)` becomes a displacement `q` and its rate `v`,
+A discrete model identified from the simulation's own record is taken to continuous time and split into real modes (see
+`modes`). A pair of eigenvalues `-ζ ω ± j ω √(1 - ζ²)` becomes a displacement `q` and its rate `v`,
 
 .. math:: \dot q = v + b_q u, \qquad \dot v = -\omega^2 q - 2 ζ ω v + b_v u, \qquad y = c_q q + c_v v,
 
-a real eigenvalue `-r` the equation `q' = -r (q - b u)`. Frequencies, dampings and gains are parameters. The
-conversions are those of Franklin, Powell & Workman (1998), Digital Control of Dynamic Systems, Sec. 4.3 and 6.3.
+a real eigenvalue `-r` the equation `q' = -r q + b u`. Frequencies, dampings and gains are parameters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -29,47 +23,15 @@ from ..metrics import nrmse
 from ..parameters import Parameter
 from ..recording import InputError, Recording, as_recordings, check_for_identification
 from ..simulator import Named, Port, Simulator
+from .modes import Mode, modes, to_continuous
 
 POOR = 0.02  # NRMSE above which the simulation is not linear enough for a surrogate to stand for it
 FREE = 0.3  # share by which parameters may move
-FAST = 0.9  # eigenvalues closer to the Nyquist frequency than this share have no continuous counterpart to trust
 EXACT = 1e-3  # NRMSE at which no higher order is looked for
 HIGHEST = 8
 SMALL = 1e-3  # share of an output below which a coefficient is held
 Array = np.ndarray
 Progress = Callable[[str, int, int, float], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Mode:
-    """A real mode: one eigenvalue, or a conjugate pair.
-
-    Attributes
-    ----------
-    value : complex
-        Eigenvalue in rad/s; of a pair the one with positive imaginary part, of two real ones the faster.
-    into : array, shape (1 or 2, n_u)
-        How inputs enter q (and v).
-    out : array, shape (n_y, 1 or 2)
-        How q (and v) are seen.
-    spring : (float, float), optional
-        For two real eigenvalues -a and -b taken together: a b and a + b.
-    """
-
-    value: complex
-    into: Array
-    out: Array
-    spring: tuple[float, float] | None = None
-
-    @property
-    def second_order(self) -> bool:
-        """Whether it has a displacement and a rate."""
-        return bool(len(self.into) == 2)
-
-    def label(self, slowest: float) -> str:
-        """Readable name: the frequency in Hz, of a pair the undamped natural one; zero below `slowest` rad/s."""
-        rate = np.sqrt(abs(self.spring[0])) if self.spring else abs(self.value)
-        return f"{rate / (2 * np.pi):.3g} Hz" if rate > slowest else "0 Hz"
 
 
 def surrogate(
@@ -142,88 +104,6 @@ def _identified(
     simulator = replace(modal_simulator(matrices, np.ravel(p["y_0"]), records[0]), hold=between)
     errors = [nrmse(r.y, found.simulate(r), skip=r.skip) for r in records]
     return float(np.mean(errors)), simulator
-
-
-def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) -> tuple[Array, Array, Array, Array]:
-    """A discrete state space in continuous time, for inputs that are held or interpolated between the samples.
-
-    Parameters
-    ----------
-    a, b, c, d : array
-        Shapes (n, n), (n, n_u), (n_y, n), (n_y, n_u).
-    dt : float
-        Sampling interval, s.
-    hold : {"zero", "linear"}
-
-    Raises
-    ------
-    InputError
-        Where an eigenvalue lies on the negative real axis, or too near the Nyquist frequency or zero.
-    """
-    from scipy.linalg import expm, logm
-
-    n = len(a)
-    if not n:
-        return a, b, c, d
-    values = np.linalg.eigvals(a)
-    angle = np.abs(np.angle(values))
-    if np.any(angle > FAST * np.pi) or np.any(np.abs(values) < 1e-4):
-        raise InputError("The model has a mode too fast for its step; simulate at a shorter step.")
-    a_c = np.real(logm(a)) / dt
-    # ∫ e^{A s} ds and ∫ e^{A (Δ - s)} s ds / Δ in one exponential (Van Loan, 1978)
-    block = np.zeros((3 * n, 3 * n))
-    block[:n, :n], block[:n, n : 2 * n], block[n : 2 * n, 2 * n :] = a_c * dt, np.eye(n) * dt, np.eye(n)
-    whole = expm(block)
-    gamma_1, gamma_2 = whole[:n, n : 2 * n], whole[:n, 2 * n :]
-    if hold == "zero":
-        return a_c, np.linalg.solve(gamma_1, b), c, d
-    # x⁺ = A x + (Γ₁ - Γ₂) B u + Γ₂ B u⁺ is x⁺ = A x' + B_d u with x' = x - Γ₂ B u:  B_d = (Γ₁ - Γ₂ + A Γ₂) B
-    b_c = np.linalg.solve(gamma_1 - gamma_2 + a @ gamma_2, b)
-    return a_c, b_c, c, d - c @ gamma_2 @ b_c
-
-
-def modes(a: Array, b: Array, c: Array) -> list[Mode]:
-    """Real modes of a state space, slowest first."""
-    values, right = np.linalg.eig(a)
-    left = np.linalg.inv(right)
-    out: list[Mode] = []
-    for k, value in enumerate(values):
-        if value.imag < -1e-9 * abs(value):
-            continue
-        into, seen = left[k] @ b, c @ right[:, k]
-        if abs(value.imag) <= 1e-9 * abs(value):
-            scale = _unit(np.real(into[None, :]))
-            out.append(Mode(complex(value.real), np.real(into[None, :]) / scale, np.real(seen[:, None]) * scale))
-            continue
-        # contribution 2 Re(seen s), s' = value s + into u; q and v = q' span (Re s, Im s): q = 2 Re(m s) for any m
-        turn = np.conj(into[np.argmax(np.abs(into))])
-        m = turn / (1j * abs(turn)) if abs(turn) else 1.0 + 0j  # the strongest input enters v alone
-        basis = np.array([[m, np.conj(m)], [m * value, np.conj(m * value)]])  # (q, v) = basis (s, s*)
-        entering = np.real(basis @ np.array([into, np.conj(into)]))
-        output = np.real(np.column_stack([seen, np.conj(seen)]) @ np.linalg.inv(basis))
-        scale = _unit(entering[1:])
-        out.append(Mode(complex(value), entering / scale, output * scale))
-    return sorted(_together(out), key=lambda mode: abs(mode.value))
-
-
-def _together(found: list[Mode]) -> list[Mode]:
-    """Two real modes that inputs enter alike and whose jumps cancel are one mass: `q'' = -a b q - (a + b) q' + u`."""
-    real = [mode for mode in found if not mode.second_order]
-    if len(real) != 2 or not np.allclose(real[0].into, real[1].into, rtol=0.0, atol=0.02):
-        return found
-    (one, two), jump = real, real[0].out + real[1].out
-    if np.max(np.abs(jump)) > 0.02 * np.max(np.abs(one.out)):
-        return found
-    a, b = -one.value.real, -two.value.real
-    into, out = np.vstack([0 * one.into, one.into]), np.column_stack([one.out * b + two.out * a, jump])
-    rest = [mode for mode in found if mode.second_order]
-    return [*rest, Mode(complex(-max(a, b, key=abs)), into, out, (a * b, a + b))]
-
-
-def _unit(into: Array) -> float:
-    """A scale that leaves the largest gain of the inputs at one."""
-    largest = into.ravel()[np.argmax(np.abs(into))]
-    return float(largest) if largest else 1.0
 
 
 def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, like: Recording) -> Simulator:

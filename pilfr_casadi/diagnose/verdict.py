@@ -178,5 +178,6 @@ def confidence(choice: Choice, search: Search) -> float:
     """How sure the name is: from the margin over true rivals, lowered by what stays unexplained."""
     remains, still = left_open(search)
     lead = 1 - np.exp(-8 * np.log(max(min(choice.margin, 10.0), 1.0)))
+    still *= min(1.0, remains / 0.03)  # of next to nothing, all may be explainable
     doubt = (1 - min(4 * remains, 1.0)) / (1 + (still / 0.3) ** 2)
     return float(np.clip(lead * doubt / (1 + len(choice.alike)), 0.0, 0.99))

@@ -137,6 +137,9 @@ class Workbench:
         """
         model = model or self.model(simulator, gain)
         engine = engine or make_engine(model, self.engine)
+        estimated = any(isinstance(r.initial, str) and r.initial == "estimate" for r in self.recordings)
+        if not np.any(model.parameters.free) and not (estimated and model.n_x):
+            return self._as_it_is(simulator, model, engine)
         best: tuple[float, np.ndarray, Problem] | None = None
         for start in starts:
             for path in ((), tuple(anneal)) if anneal else ((),):
@@ -151,6 +154,16 @@ class Workbench:
         values = model.parameters.unpack(problem.parameters(theta))
         values.pop(GAMMA, None)
         return self.result(simulator, values, problem.first_states(theta), engine, model)
+
+    def _as_it_is(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
+        """Nothing to estimate: the simulator as it stands."""
+        freed = model.parameters.change(**{name: {"fixed": False} for name in model.parameters})
+        problem = self.problem(model.with_parameters(freed), engine)
+        values = {k: p.value for k, p in model.parameters.items()}
+        found = self.result(simulator, values, problem.first_states(problem.start), engine, model)
+        if not np.isfinite(found.cost):
+            raise InputError("The simulation diverges at the given values; check the parameters' values and units.")
+        return found
 
     def _run(
         self,

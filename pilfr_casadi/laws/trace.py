@@ -38,11 +38,12 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
     """
     if not shapes:
         return np.zeros((len(local.z), 0, columns(law)))
-    step, runs = _functions(type(law), len(shapes), local.dt if law.shifts else 0.0)
+    kind: Any = type(law)
+    step, runs = _functions(kind, len(shapes), local.dt if law.shifts else 0.0)
     p = law.at(shapes[0]).parameters()
     names = [name for name in p if name not in law.strength]
-    table = [np.concatenate([np.ravel(shape.get(n, p[n].value)) for n in names] or [[]]) for shape in shapes]
-    vector = np.append(np.concatenate(table), local.dt)
+    table = [np.ravel(shape.get(n, p[n].value)) for shape in shapes for n in names]
+    vector = np.concatenate([*table, [local.dt]])
     found, at = [], 0
     for m in local.lengths:
         zs, dzs = local.z[at : at + m], local.dz[at : at + m]

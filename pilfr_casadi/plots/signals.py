@@ -243,11 +243,11 @@ def _level(y: np.ndarray) -> float:
 
 
 def _moved(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
-    """An error (M,) that is little but an offset beyond the measured span, less that offset, and a note that says so."""
+    """An error (M,), less its offset where that is beyond the measured span and nearly all of it, and a note of it."""
     known = error[np.isfinite(error)]
     if not known.size or abs(np.mean(known)) <= span or np.ptp(known) > 3 * span or not span:
         return error, ""
-    return error - np.mean(known), f", less its offset of {np.mean(known):.3g} {unit}".rstrip()
+    return error - np.mean(known), f", less {np.mean(known):.3g} {unit}".rstrip()
 
 
 def _compares(fit: Fit) -> bool:

@@ -1,0 +1,75 @@
+"""What the solution of a problem amounts to: the model at its values, and the `Fit` with its standard errors."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from .fitted import Fit, fingerprint
+from .gauge import standard_errors
+from .lfr import PILFR
+from .model import Model
+from .multistart import PRIOR, Candidate
+from .problem import Problem
+from .recording import Recording
+from .solution import Solution
+
+
+def with_solution(model: Model, problem: Problem, solution: Solution) -> Model:
+    """The model at the values of a solution."""
+    return model.with_parameters(model.parameters.at(problem.parameters(solution.theta)))
+
+
+def outcome(
+    model: Model,
+    structure: PILFR | None,
+    problem: Problem,
+    solution: Solution,
+    began: float,
+    recordings: tuple[Recording, ...],
+    candidates: tuple[Candidate, ...] = (),
+    linear: Model | None = None,
+    note: str = "",
+    linear_nrmse: tuple[float, ...] = (),
+    engine: str = "auto",
+) -> Fit:
+    """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
+
+    Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the standard
+    errors know of them.
+    """
+    fitted = with_solution(model, problem, solution)
+    judged = problem
+    if note == PRIOR:
+        asked = structure.priors if structure else {}
+        fitted = fitted.with_parameters(
+            fitted.parameters.change(**{name: {"prior": asked.get(name)} for name in ("w", "r")})
+        )
+        options: dict[str, Any] = {"constraints": problem.constraints, "noise": problem.noise, "scale": problem.scale}
+        judged = Problem(fitted, recordings, engine=problem.engine, **options)
+    theta = solution.theta
+    at_bound = [
+        f"{label} = {value:g}"
+        for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
+        if value in (low, high)
+    ]
+    limits = problem.active_constraints(theta)
+    at_bound += [name for name, active in zip(problem.g_labels, limits, strict=True) if active]
+    return Fit(
+        model=fitted,
+        structure=structure,
+        dt=recordings[0].dt,
+        solution=solution,
+        train_nrmse=tuple(problem.nrmse(theta)),
+        initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
+        labels=problem.labels,
+        errors=standard_errors(judged, theta, structure),
+        active=tuple(at_bound),
+        candidates=candidates,
+        linear=linear,
+        seconds=time.perf_counter() - began,
+        units=dict(recordings[0].units),
+        note=note,
+        linear_nrmse=linear_nrmse,
+        engine=engine,
+    )
