@@ -150,7 +150,7 @@ def _local_polynomials(
 ) -> tuple[Array, Array, Array, Array]:
     """Local least squares at the frequencies `grid`: response, its variance, whether it can be told, and at what price.
 
-    The last is, by input, the variance times that input's power over that of the noise: 1 for one input without leakage.
+    The last is, by input, variance times the input's power over the noise's: 1 for one input without leakage.
     """
     n_u, n_y, n_rec, n_poly = lines[0][1].shape[1], lines[0][2].shape[1], len(lines), order + 1
     ends = np.concatenate([[0], np.cumsum(share)])
