@@ -56,7 +56,7 @@ def case(seed: int) -> Case:
     for attempt in range(40):
         try:
             return _Draw(np.random.default_rng([seed, 2, attempt]), seed, kind).case()
-        except (Unsuited, FloatingPointError, np.linalg.LinAlgError):
+        except (Unsuited, FloatingPointError, np.linalg.LinAlgError, RuntimeError):
             continue
     raise RuntimeError(f"no case could be drawn from seed {seed}")
 
