@@ -93,37 +93,8 @@ class Fit:
         looked at, and `nrmse` does not score them.
         """
         self._check(recording)
-        n = self.model.n_x + self.model.n_s
-        initial = recording.initial
         known = self.initial.get(fingerprint(recording))
-        if known is not None:
-            return known
-        if not isinstance(initial, str):
-            given = np.asarray(initial, dtype=float).ravel()
-            states = len(self.model.states)
-            if given.size not in (states, n):
-                raise InputError(f"An initial state of {given.size} numbers was given; expected {states} or {n}.")
-            return np.concatenate([given, np.zeros(n - given.size)])
-        values = self.model.parameters.start
-        state = np.zeros(n)
-        if initial == "periodic":
-            period = self.model.drive(recording)[: (recording.period or 1) * self.model.substeps]
-            for _ in range(200):
-                before = state
-                state = self._engine.simulate(period, values, state)[1]
-                if np.max(np.abs(state - before)) <= 1e-10 * max(float(np.max(np.abs(state))), 1e-300):
-                    break
-        elif initial == "estimate" and n:
-            samples = min(len(recording), samples or self._samples_for_state)
-            held = self.model.with_parameters(
-                self.model.parameters.change(**{k: {"fixed": True, "prior": None} for k in self.model.parameters})
-            )
-            head = recording.slice(0, max(samples, 2)).with_(skip=0)
-            spread = np.std(head.y, axis=0)
-            spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
-            problem = Problem(held, head, engine=self._engine, scale=spread)
-            state = GaussNewton(max_iterations=50).solve(problem).theta
-        return state
+        return first_state(self.model, self._engine, recording, samples) if known is None else known
 
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulated outputs for a recording's inputs, shape (M, n_y).
@@ -142,10 +113,6 @@ class Fit:
         y, _, z, w = self._engine.simulate(self.model.drive(recording), self.model.parameters.start, state, True)
         return {"y": y, "z": z, "w": w}
 
-    @property
-    def _samples_for_state(self) -> int:
-        return max(10 * (self.model.n_x + self.model.n_s), 50)
-
     def scored_from(self, recording: Recording) -> int:
         """First sample that is scored: behind `skip`, and behind those that an initial state has been fitted to.
 
@@ -157,11 +124,11 @@ class Fit:
         estimated = isinstance(recording.initial, str) and recording.initial == "estimate"
         if not estimated or fingerprint(recording) in self.initial or not self.model.n_x + self.model.n_s:
             return recording.skip
-        first = max(recording.skip, self._samples_for_state)
+        first = max(recording.skip, samples_for_state(self.model))
         if first >= len(recording):
             raise InputError(
                 f"The recording has {len(recording)} samples, but its initial state is fitted to the first "
-                f"{self._samples_for_state} and these are not scored; give a longer one, or its initial state."
+                f"{samples_for_state(self.model)} and these are not scored; give a longer one, or its initial state."
             )
         return first
 
@@ -255,3 +222,46 @@ def fingerprint(recording: Recording) -> str:
     initial = recording.initial
     kind = f"{initial} {recording.period}".encode() if isinstance(initial, str) else np.asarray(initial).tobytes()
     return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes() + kind).hexdigest()[:16]
+
+
+def samples_for_state(model: Model) -> int:
+    """Samples that an unknown initial state is fitted to: ten a state, at least 50."""
+    return max(10 * (model.n_x + model.n_s), 50)
+
+
+def first_state(model: Model, engine: Engine, recording: Recording, samples: int | None = None) -> np.ndarray:
+    """State with memory at a recording's first sample, as its `initial` says; the model's parameters are held.
+
+    Where it is to be estimated, it is fitted to the first `samples` samples; nothing later is looked at.
+
+    Raises
+    ------
+    InputError
+        If a given state has another number of entries.
+    """
+    n, initial, values = model.n_x + model.n_s, recording.initial, model.parameters.start
+    if not isinstance(initial, str):
+        given = np.asarray(initial, dtype=float).ravel()
+        states = len(model.states)
+        if given.size not in (states, n):
+            raise InputError(f"An initial state of {given.size} numbers was given; expected {states} or {n}.")
+        return np.concatenate([given, np.zeros(n - given.size)])
+    state = np.zeros(n)
+    if initial == "periodic":
+        period = model.drive(recording)[: (recording.period or 1) * model.substeps]
+        for _ in range(200):
+            before = state
+            state = engine.simulate(period, values, state)[1]
+            if np.max(np.abs(state - before), initial=0.0) <= 1e-10 * max(np.max(np.abs(state), initial=0.0), 1e-300):
+                break
+    elif initial == "estimate" and n:
+        samples = min(len(recording), samples or samples_for_state(model))
+        held = model.with_parameters(
+            model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
+        )
+        head = recording.slice(0, max(samples, 2)).with_(skip=0)
+        spread = np.std(head.y, axis=0)
+        spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
+        problem = Problem(held, head, engine=engine, scale=spread)
+        state = GaussNewton(max_iterations=50).solve(problem).theta
+    return state

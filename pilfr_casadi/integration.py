@@ -20,7 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .model import Model
+from .model import Model, portless
 from .parameters import ParameterSet
 from .recording import InputError, Recording
 from .simulator import Named, Placed, Simulator, call
@@ -30,7 +30,7 @@ MOST = 200  # sub-steps a sample
 
 
 @dataclass(frozen=True, eq=False)
-class _Values:
+class Instant:
     """What is known at one instant inside a sub-step."""
 
     x: Any  # simulator's states and laws' states
@@ -40,7 +40,7 @@ class _Values:
     t: Any
 
 
-class _Equations:
+class Equations:
     """The closed equations of a simulator with its laws, on symbols."""
 
     def __init__(self, simulator: Simulator, vector: Any) -> None:
@@ -66,7 +66,7 @@ class _Equations:
         memory = [s[int(a) : int(b)] for a, b in pairwise(at_s)]
         return q, memory, x[:n_x]
 
-    def evaluate(self, v: _Values) -> tuple[Any, Any, Any, dict[int, tuple[Any, Any, Any]]]:
+    def evaluate(self, v: Instant) -> tuple[Any, Any, Any, dict[int, tuple[Any, Any, Any]]]:
         """Derivatives of [x; q], outputs, next memory, and each element's (z, dz, w)."""
         simulator, p, t = self.simulator, self.p, v.t
         q, s, x_only = self._parts(v.x, v.s)
@@ -98,7 +98,6 @@ class _Equations:
         f = simulator.derivatives(x, inputs, p, t)
         y = simulator.measured(x, inputs, p, t)
         rates = self.local(x_only, ca.vertcat(*u.values()), v.slope, t, self.vector)[1]
-        open_f = f
         for i, e in placed:
             if e.port.startswith(("actuator:", "sensor:")):
                 continue
@@ -107,7 +106,7 @@ class _Equations:
             w = apply(i, z, rates[self.rows[e.port]])
             for name, factor in simulator.into(port, x, inputs, p, t).items():
                 if name in simulator.states:
-                    unit = ca.SX.zeros(open_f.shape)
+                    unit = ca.SX.zeros(f.shape)
                     unit[simulator.states.index(name)] = factor
                     f = f + unit * w
                 else:
@@ -119,9 +118,13 @@ class _Equations:
         return ca.vertcat(f, *flow), ca.vertcat(*y.values()), ca.vertcat(ca.SX(0, 1), *memory), signals
 
 
-def discretise(
-    simulator: Simulator, dt: float, hold: str = "zero", substeps: int = 1, parameters: ParameterSet | None = None
-) -> Model:
+def on_grid(simulator: Simulator, h: float) -> Simulator:
+    """The simulator with its laws made for steps of length h, s."""
+    placed = (replace(e, law=e.law.on_grid(h)) if hasattr(e.law, "on_grid") else e for e in simulator.elements)
+    return replace(simulator, elements=tuple(placed))
+
+
+def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: int = 1) -> Model:
     """The simulator with its laws as a closed discrete-time model.
 
     Parameters
@@ -134,13 +137,10 @@ def discretise(
     substeps : int
         Runge-Kutta steps a sample; see `choose_substeps`.
     """
-    placed = [
-        replace(e, law=e.law.on_grid(dt / substeps)) if hasattr(e.law, "on_grid") else e for e in simulator.elements
-    ]
-    simulator = replace(simulator, elements=tuple(placed))
-    own = parameters or ParameterSet(dict(simulator.parameters))
+    simulator = on_grid(simulator, dt / substeps)
+    own = ParameterSet(dict(simulator.parameters))
     vector = ca.SX.sym("p", own.size)
-    equations = _Equations(simulator, vector)
+    equations = Equations(simulator, vector)
     n_x, n_u = len(simulator.states) + sum(equations.n_q), len(simulator.inputs)
     x, s = ca.SX.sym("x", n_x), ca.SX.sym("s", sum(equations.n_s))
     u0, u1, t = ca.SX.sym("u", n_u), ca.SX.sym("next", n_u), ca.SX.sym("t")
@@ -149,7 +149,7 @@ def discretise(
     middle = (u0 + end) / 2
 
     def at(state: Any, memory: Any, u: Any, time: Any) -> tuple[Any, ...]:
-        return equations.evaluate(_Values(state, memory, u, slope, time))
+        return equations.evaluate(Instant(state, memory, u, slope, time))
 
     k1, y, begun, _ = at(x, s, u0, t)
     # a shift register takes in the signal at the step's begin, where it is measured; others move on with the step, from
@@ -175,22 +175,28 @@ def discretise(
         reads, columns = [*reads, "next"], [*columns, u1]
     if ca.depends_on(everything, t):
         reads, columns = [*reads, "t"], [*columns, t]
-    drive, w = ca.vertcat(*columns), ca.SX.sym("w", 0)
     following, y = ca.cse([following, y])
-    names = ["x", "u", "w", "p"]
-    z_in, none = ca.SX.sym("z", 0), ca.SX.sym("s", 0)
-    return Model(
-        step=ca.Function("step", [state, drive, w, vector], [following, y], names, ["x_next", "y"]),
-        port=ca.Function("port", [state, drive, vector], [ca.SX(0, 1)], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [z_in, none, vector], [w, none], ["z", "s", "p"], ["w", "s_next"]),
-        parameters=own,
-        element=None,
+    return portless(
+        state,
+        ca.vertcat(*columns),
+        vector,
+        following,
+        y,
+        own,
         states=simulator.states,
         inputs=simulator.inputs,
         outputs=simulator.output_names,
         reads=tuple(reads),
         substeps=substeps,
     )
+
+
+def states_along(model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """States at the start of each step of a run from x, shape (K, n_x); p (n_p,), or (n_p, K) where it changes."""
+    columns = p if p.ndim == 2 else np.tile(p[:, None], (1, len(drive)))
+    with np.errstate(all="ignore"):
+        found = np.asarray(model.closed.mapaccum("run", len(drive))(x, drive.T, columns)[0]).T
+    return np.vstack([x[None], found[:-1]])
 
 
 def signals(simulator: Simulator) -> ca.Function:
@@ -234,10 +240,10 @@ def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -
     if not n_x or simulator.discrete:
         return np.zeros(len(x))
     vector = ca.SX.sym("p", len(p))
-    equations = _Equations(simulator, vector)
+    equations = Equations(simulator, vector)
     xs, us = ca.SX.sym("x", n_x + sum(equations.n_q)), ca.SX.sym("u", len(simulator.inputs))
     s = ca.SX.zeros(sum(equations.n_s))
-    f = equations.evaluate(_Values(xs, s, us, ca.SX.zeros(us.shape), ca.SX(0.0)))[0]
+    f = equations.evaluate(Instant(xs, s, us, ca.SX.zeros(us.shape), ca.SX(0.0)))[0]
     jacobian = ca.Function("f_x", [xs, us, vector], [ca.densify(ca.jacobian(f, xs))])
     out = np.full(len(x), np.nan)
     for k, (row, inputs) in enumerate(zip(x, u, strict=True)):
@@ -276,9 +282,7 @@ def _along_a_run(simulator: Simulator, recording: Recording, p: np.ndarray, rate
     """A high quantile of the rates along a run from rest, if that runs."""
     model = discretise(simulator, recording.dt, "zero", substeps=20)
     short = recording.slice(0, min(len(recording), 400))
-    run = model.closed.mapaccum("run", len(short) * model.substeps)
-    with np.errstate(all="ignore"):
-        states = np.asarray(run(np.zeros(model.n_x), model.drive(short).T, p)[0]).T[:: model.substeps]
+    states = states_along(model, model.drive(short), p, np.zeros(model.n_x))[:: model.substeps]
     found = fastest(simulator, states[40::20], short.u[40::20], p)
     found = found[np.isfinite(found)]
     return min(rate, float(np.quantile(found, 0.9))) if len(found) > 5 else rate

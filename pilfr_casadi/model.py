@@ -183,14 +183,48 @@ def open_model(
     )
 
 
-def close_loop(model: Model, element: Element) -> Model:
-    """Put an element into the model's port.
+def portless(
+    x: Any,
+    u: Any,
+    p: Any,
+    x_next: Any,
+    y: Any,
+    parameters: ParameterSet,
+    *,
+    states: tuple[str, ...],
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    reads: tuple[str, ...] = ("u",),
+    substeps: int = 1,
+) -> Model:
+    """A model without a port, from expressions of the symbols x, u and p; fields as in `Model`."""
+    w, z, s = ca.SX.sym("w", 0), ca.SX.sym("z", 0), ca.SX.sym("s", 0)
+    return Model(
+        step=ca.Function("step", [x, u, w, p], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),
+        port=ca.Function("port", [x, u, p], [ca.SX(0, 1)], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [z, s, p], [w, s], ["z", "s", "p"], ["w", "s_next"]),
+        parameters=parameters,
+        element=None,
+        states=states,
+        inputs=inputs,
+        outputs=outputs,
+        reads=reads,
+        substeps=substeps,
+    )
+
+
+def close_loop(model: Any, element: Element, port: str | None = None) -> Any:
+    """Put an element into a model's port, or into a port of a simulator by its name; the result is of the same kind.
 
     Raises
     ------
     InputError
-        If the port is already closed, or the element has another number of channels.
+        If the port is already closed or unknown, or the element has another number of channels.
     """
+    if not isinstance(model, Model):
+        if port is None or not hasattr(model, "with_element"):
+            raise InputError("An element is put into an open Model, or into a Simulator with `port=` its port's name.")
+        return model.with_element(port, element)
     if model.element is not None:
         raise InputError("The model's port is closed already; close an open model.")
     if element.channels != model.n_w:

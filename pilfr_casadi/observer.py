@@ -8,12 +8,10 @@ the truth are annealed through it.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import casadi as ca
 import numpy as np
 
-from .model import Model
+from .model import Model, portless
 from .parameters import Parameter
 
 GAMMA = "observer"
@@ -41,15 +39,18 @@ def led(model: Model, gain: np.ndarray) -> Model:
     full = np.zeros((model.n_x, model.n_y))
     full[: len(gain)] = gain
     following = following + p[-1] * (ca.DM(full) @ (measured - y))
-    drive = ca.vertcat(u, measured)
-    z, s = ca.SX.sym("z", 0), ca.SX.sym("s", 0)
-    return replace(
-        model,
-        step=ca.Function("step", [x, drive, w, p], [following, y], ["x", "u", "w", "p"], ["x_next", "y"]),
-        port=ca.Function("port", [x, drive, p], [ca.SX(0, 1)], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [z, s, p], [w, s], ["z", "s", "p"], ["w", "s_next"]),
-        parameters=parameters,
+    return portless(
+        x,
+        ca.vertcat(u, measured),
+        p,
+        following,
+        y,
+        parameters,
+        states=model.states,
+        inputs=model.inputs,
+        outputs=model.outputs,
         reads=(*model.reads, "y"),
+        substeps=model.substeps,
     )
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -196,7 +197,7 @@ class Simulator:
             raise InputError("The simulator's outputs must be a dict {output: expression} with at least one entry.")
         return dict(zip(found, _row(found, tuple(found), "outputs", "expression"), strict=True))
 
-    @property
+    @cached_property
     def output_names(self) -> tuple[str, ...]:
         """Names of the outputs."""
         return tuple(self.measured(*self._symbols()))
@@ -228,29 +229,13 @@ class Simulator:
 
     def all_ports(self) -> tuple[Port, ...]:
         """Declared ports (else one for each state's equation), then actuators and sensors."""
+        return self._every_port
+
+    @cached_property
+    def _every_port(self) -> tuple[Port, ...]:
         inner = self.ports or (() if self.discrete else tuple(map(self._equation, self.states)))
-        actuators = (
-            Port(
-                f"actuator:{n}",
-                {},
-                lambda u, n=n: u[n],
-                unit=self.units.get(n, ""),
-                across_unit=self.units.get(n, ""),
-                series=True,
-            )
-            for n in self.inputs
-        )
-        sensors = (
-            Port(
-                f"sensor:{n}",
-                {},
-                lambda: 0,
-                unit=self.units.get(n, ""),
-                across_unit=self.units.get(n, ""),
-                series=True,
-            )
-            for n in self.output_names
-        )
+        actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units) for n in self.inputs)
+        sensors = (_series("sensor", n, lambda: 0, self.units) for n in self.output_names)
         return (*inner, *actuators, *sensors)
 
     def _equation(self, state: str) -> Port:
@@ -286,6 +271,17 @@ class Simulator:
             parameters=ParameterSet(dict(self.parameters)) | own,
             elements=(*self.elements, Placed(port, law, prefix)),
         )
+
+    def without_last_element(self) -> Simulator:
+        """The simulator before the last `with_element`."""
+        *kept, last = self.elements
+        own = {k: p for k, p in self.parameters.items() if not k.startswith(last.prefix)}
+        return replace(self, parameters=ParameterSet(own), elements=tuple(kept))
+
+
+def _series(kind: str, name: str, across: Expression, units: Mapping[str, str]) -> Port:
+    unit = units.get(name, "")
+    return Port(f"{kind}:{name}", {}, across, None, unit, unit, series=True)
 
 
 def _check_expressions(found: Mapping[str, Any], known: list[Any]) -> None:

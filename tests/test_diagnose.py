@@ -9,7 +9,7 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi.laws import CATALOGUE
 from pilfr_casadi.laws.friction import CoulombFriction
-from pilfr_casadi.laws.memory import Backlash
+from pilfr_casadi.laws.hysteresis import Backlash
 from pilfr_casadi.laws.stiffness import CubicStiffness
 
 IDS = {

@@ -1,19 +1,16 @@
 """The page of a diagnosis says what was found, for every verdict, and its files are what the contract asks for."""
 
-import functools
-import http.server
 import json
 import re
-import subprocess
 import sys
-import threading
 import types
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_report import CHROMIUM, EVIL, WRAPPER, Quiet, Reader
+from browser import CHROMIUM, in_a_browser
+from test_report import EVIL, Reader
 
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.diagnose import Diagnosis, Effect
@@ -271,25 +268,6 @@ def test_in_a_browser(width, tmp_path):
     long_name = "a_recording_with_a_name_that_goes_on_and_on_without_a_single_blank_in_it"
     d = replace(d, test=tuple(r.with_(name=long_name) for r in d.test))
     diagnosis_report(d, tmp_path)
-    (tmp_path / "wrapper.html").write_text(WRAPPER % width)
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=tmp_path))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    flags = "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
-    flags += " --disable-component-update --disable-sync --hide-scrollbars --enable-logging=stderr --dump-dom"
-    flags += f" --window-size={width + 40},1000 --virtual-time-budget=20000 --user-data-dir={tmp_path / 'profile'}"
-    address = f"http://127.0.0.1:{server.server_address[1]}/wrapper.html"
-    try:
-        done = subprocess.run(
-            [CHROMIUM, *flags.split(), address], capture_output=True, text=True, timeout=120, check=True
-        )
-    finally:
-        server.shutdown()
-        server.server_close()
-    assert "CONSOLE" not in done.stderr, done.stderr
-    seen = json.loads(re.search(r'<pre id="out">(.*?)</pre>', done.stdout, re.S).group(1))
+    seen = in_a_browser(tmp_path, width)
     assert seen["title"] == "Diagnosis of a simulator: force → pos, vel"
-    assert seen["width"] == width and seen["overflow"] <= 0
     assert seen["images"] == seen["shown"] > 15
-    assert seen["colours"] > 20
-    assert seen["font"] >= 13
-    assert seen["columns"] == (1 if width == 390 else 2)

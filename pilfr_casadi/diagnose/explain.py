@@ -110,8 +110,8 @@ def survivors(scored: Sequence[Scored], keep: int = 10) -> list[tuple[str, type[
 
 def closed(
     simulator: Simulator, entry: Scored, start: Mapping[str, Any], sign: int
-) -> tuple[Simulator, dict[str, Any], str]:
-    """The simulator with the law in its port, start values by full name, and the prefix of the law's parameters."""
+) -> tuple[Simulator, dict[str, Any]]:
+    """The simulator with the law in its port, and its start values by full name."""
     law = entry.law
     limits: dict[str, tuple[Any, Any]] = dict(law.at(start).bounds(entry.local))
     if law.dissipative and sign:
@@ -119,7 +119,7 @@ def closed(
     inside = {k: np.clip(v, *limits[k]) if k in limits else v for k, v in start.items()}
     placed = simulator.with_element(entry.port, law.at(inside, limits))
     prefix = placed.elements[-1].prefix
-    return placed, {f"{prefix}{k}": v for k, v in inside.items()}, prefix
+    return placed, {f"{prefix}{k}": v for k, v in inside.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,59 +130,57 @@ class _Pair:
     model: Any
     engine: Any
     starts: list[dict[str, Any]]
-    port: str
-    candidate: Candidate | None = None
+    candidate: Candidate | None
 
 
 def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: int, gain: np.ndarray | None) -> _Pair:
     """Compile a pair and fit it briefly from its best start."""
     part = bench.on(heads(bench.recordings))
     first = entries[0]
-    placed, _, _ = closed(without.simulator, first, first.starts[0], sign)
+    placed, _ = closed(without.simulator, first, first.starts[0], sign)
     model = part.model(placed, gain)
     engine = make_engine(model, bench.engine)
     nominal = {k: p.value for k, p in without.simulator.parameters.items()}
     starts: list[dict[str, Any]] = []
     for entry in entries:
         for i, own in enumerate(entry.starts):
-            _, named, _ = closed(without.simulator, entry, own, sign)
+            _, named = closed(without.simulator, entry, own, sign)
             starts.append({**without.values, **named})
             if i == 0:
                 starts.append({**nominal, **named})
     ranked = sorted(starts, key=lambda s: _quick_cost(part, model, engine, s, without))
-    pair = _Pair(placed, model, engine, ranked, first.port)
-    return replace(pair, candidate=_attempt(bench, part, pair, ranked[:1], None, BRIEF))
+    brief = attempt(bench, placed, ranked[:1], solver=BRIEF, model=model, engine=engine)
+    return _Pair(placed, model, engine, ranked, brief)
 
 
-def refine(bench: Workbench, pair: _Pair, gain: np.ndarray | None, runs: int = 3) -> Candidate | None:
-    """Fit a pair from several starts, led by the observer as well."""
-    part = bench.on(heads(bench.recordings))
+def refine(bench: Workbench, pair: _Pair, led: bool, runs: int = 3) -> Candidate | None:
+    """Fit a pair from several starts, and `led` by the observer as well."""
     starts = pair.starts[:runs]
     if pair.candidate is not None:
         starts = [pair.candidate.fitted.values, *starts[1:]]
-    found = [pair.candidate, _attempt(bench, part, pair, starts, gain, QUICK)]
-    if gain is not None:
-        found.append(_attempt(bench, part, pair, pair.starts[:1], gain, QUICK, (1.0, 0.1)))
-    return min((c for c in found if c is not None), key=lambda c: c.head, default=None)
+    ways: list[tuple[list[dict[str, Any]], tuple[float, ...]]] = [(starts, ())]
+    if led:
+        ways.append((pair.starts[:1], (1.0, 0.1)))
+    found = [attempt(bench, pair.placed, s, anneal=a, model=pair.model, engine=pair.engine) for s, a in ways]
+    return min((c for c in (pair.candidate, *found) if c is not None), key=lambda c: c.head, default=None)
 
 
-def _attempt(
-    bench: Workbench,
-    part: Workbench,
-    pair: _Pair,
-    starts: Sequence[Mapping[str, Any]],
-    gain: np.ndarray | None,
-    solver: GaussNewton,
-    anneal: tuple[float, ...] = (),
+def attempt(
+    bench: Workbench, simulator: Simulator, starts: Sequence[Mapping[str, Any]], **options: Any
 ) -> Candidate | None:
+    """Fit a simulator to the first parts and judge it on the rest; its last element is the candidate's law.
+
+    `options` are those of `Workbench.fit`; None where every start diverges.
+    """
+    part = bench.on(heads(bench.recordings))
     try:
-        fitted = part.fit(pair.placed, starts, anneal=anneal, solver=solver, model=pair.model, engine=pair.engine)
+        fitted = part.fit(simulator, starts, **{"solver": QUICK, **options})
     except InputError:
         return None
     head, tail = judged(bench, fitted)
-    law = pair.placed.elements[-1].law
-    size = sum(p.size for p in law.parameters().values())
-    return Candidate(pair.port, law, fitted, head, tail if np.isfinite(tail) else 1e12, size)
+    element = simulator.elements[-1]
+    size = sum(p.size for p in element.law.parameters().values())
+    return Candidate(element.port, element.law, fitted, head, tail if np.isfinite(tail) else 1e12, size)
 
 
 def _quick_cost(part: Workbench, model: Any, engine: Any, start: Mapping[str, Any], without: Fitted) -> float:
@@ -236,7 +234,7 @@ def explain(
             prepared.append(task.result())
             step(min((p.candidate.error for p in prepared if p.candidate), default=np.inf))
         prepared.sort(key=lambda p: p.candidate.error if p.candidate else np.inf)
-        again = [pool.submit(refine, bench, pair, gain) for pair in prepared[:REFINED]]
+        again = [pool.submit(refine, bench, pair, gain is not None) for pair in prepared[:REFINED]]
         found = [p.candidate for p in prepared[REFINED:]]
         for refined in again:
             found.append(refined.result())

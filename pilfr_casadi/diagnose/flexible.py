@@ -14,7 +14,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..laws.base import Law, Local
-from ..laws.memory import Creep, PlayHysteresis, Relaxation, StopHysteresis
+from ..laws.dynamic import Creep, Relaxation
+from ..laws.hysteresis import PlayHysteresis, StopHysteresis
 from ..parameters import Parameter
 from .linearise import Probe, run
 from .screen import columns_of, folds, held_out

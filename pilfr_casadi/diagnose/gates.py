@@ -200,10 +200,10 @@ def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, lis
             continue
         result = refit(other)
         if result is not None and result.cost < best.cost:
-            best, found = result, (name, finding, value, other)
+            best, found = result, (name, finding, value, change, other)
     if found is None or best.cost > 0.12 * plain.cost or best.cost > 0.3:
         return bench, plain, []
-    name, finding, value, other = found
+    name, finding, value, change, other = found
     words = {
         "sign": f"{name} has the wrong sign",
         "unit": f"{name} is off by a factor of {1 / value:.4g}, as from a wrong unit",
@@ -213,8 +213,7 @@ def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, lis
         f"In the recordings {words}: with it corrected the refitted simulator's error falls from "
         f"{np.sqrt(plain.cost):.3g} to {np.sqrt(best.cost):.3g} of the outputs' deviation."
     )
-    changes = {t[:3]: t[3] for t in trials}
-    return other, best, [Gate(name, finding, value, sentence, True, True, changes[name, finding, value])]
+    return other, best, [Gate(name, finding, value, sentence, True, True, change)]
 
 
 def _sizes(bench: Workbench) -> np.ndarray:

@@ -18,11 +18,10 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ..integration import discretise, signals
+from ..integration import discretise, signals, states_along
 from ..laws.base import Law, Local
 from ..model import Model
-from ..observer import kalman_gain
-from ..recording import Recording
+from ..observer import kalman_gain, led
 from ..simulator import Simulator
 from .workbench import Fitted, Workbench
 
@@ -116,7 +115,11 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     n = model.substeps
     p = model.parameters.pack({k: v for k, v in fitted.values.items() if k in model.parameters})
     drive, x = model.drive(r), np.asarray(fitted.initial[i], dtype=float)[: model.n_x]
-    states = _states(model, drive, p, x, r, gain)
+    if gain is None:
+        states = states_along(model, drive, p, x)
+    else:
+        seen = led(model, gain)
+        states = states_along(seen, seen.drive(r), np.append(p, 1.0), x)
     m = len(drive)
     _, y, a, b, c, d = (np.asarray(v) for v in probe.step(states.T, drive.T, np.tile(p[:, None], (1, m))))
     n_x, n_y, n_c = model.n_x, model.n_y, len(probe.free)
@@ -141,28 +144,12 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     return Run(*blocks, error=y.T[::n] - r.y, z=z, dz=dz, states=states, sign=sign)
 
 
-def _states(
-    model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray, r: Recording, gain: np.ndarray | None
-) -> np.ndarray:
-    """States at the start of each step, shape (K, n_x)."""
-    xs, us, ps, ys = (ca.SX.sym(k, n) for k, n in (("x", model.n_x), ("u", model.n_u), ("p", len(p)), ("y", model.n_y)))
-    following, y = model.closed(xs, us, ps)
-    rows = np.hstack([drive, np.repeat(r.y, model.substeps, axis=0)])
-    if gain is not None:
-        following = following + ca.DM(gain) @ (ys - y)
-    step = ca.Function("step", [xs, ca.vertcat(us, ys), ps], [following])
-    found = (
-        np.asarray(step.mapaccum("run", len(rows) - 1)(x, rows[:-1].T, p)).T if len(rows) > 1 else np.zeros((0, len(x)))
-    )
-    return np.vstack([x[None], found])
-
-
 def along(bench: Workbench, fitted: Fitted, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
     """Some states of the user's equations (count, n_x) and inputs (count, n_u) along the longest fitted run."""
     i = int(np.argmax([len(r) for r in bench.recordings]))
     r, model, n_x = bench.recordings[i], fitted.model, len(bench.simulator.states)
     short = r.slice(0, min(len(r), 3000))
-    states = _states(model, model.drive(short), fitted.vector, fitted.initial[i], short, None)[:: model.substeps, :n_x]
+    states = states_along(model, model.drive(short), fitted.vector, fitted.initial[i])[:: model.substeps, :n_x]
     step = max(len(states) // count, 1)
     return states[::step], short.u[::step]
 
@@ -189,10 +176,9 @@ def propagate(
     forces: list[tuple[int, np.ndarray]],
     n_free: int,
     substeps: int,
-    start: bool,
     gain: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Output changes of free parameters, the initial state (where `start`), and forces at ports.
+    """Output changes of free parameters, the initial state, and forces at ports.
 
     Parameters
     ----------
@@ -201,15 +187,15 @@ def propagate(
 
     Returns
     -------
-    array, shape (M, n_y, n_free + n_x * start + total n)
+    array, shape (M, n_y, n_free + n_x + total n)
     """
     steps, n_x, _ = r.a.shape
-    n_y, extra = r.c.shape[1], n_x if start else 0
+    n_y, first = r.c.shape[1], n_free + n_x
     widths = [f.shape[1] for _, f in forces]
     a, b = r.a, r.b
     if gain is not None:
         a, b = a - gain @ r.c, b - gain @ r.d
-    edges = n_free + extra + np.cumsum([0, *widths])
+    edges = first + np.cumsum([0, *widths])
     spans = [slice(i, j) for i, j in pairwise(edges)]
     moving = [
         (n_free + port, span, (f + np.vstack([f[1:], f[-1:]])) / 2)
@@ -217,9 +203,9 @@ def propagate(
         if b[:, :, n_free + port].any()
     ]
     # columns that reach no state are not carried along
-    end = max((span.stop for _, span, _ in moving), default=n_free + extra)
+    end = max((span.stop for _, span, _ in moving), default=first)
     x = np.zeros((n_x, end))
-    x[:, n_free : n_free + extra] = np.eye(n_x)[:, :extra]
+    x[:, n_free:first] = np.eye(n_x)
     carried = np.empty((steps // substeps, n_x, end))
     for k in range(steps):
         sample = k // substeps

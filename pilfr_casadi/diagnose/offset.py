@@ -49,7 +49,7 @@ def first_order(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[
     for i, r in enumerate(bench.recordings):
         one = run(bench, probe, fitted, i)
         forces = [(probe.ports.index(name), np.ones((len(r), 1))) for name in ports]
-        y = propagate(one, forces, n_free, n, True) / bench.scale[:, None]
+        y = propagate(one, forces, n_free, n) / bench.scale[:, None]
         blocks.append(y[r.skip :].reshape(-1, y.shape[2]))
         errors.append((one.error / bench.scale)[r.skip :].ravel())
     first = blocks[0].shape[1] - len(ports)

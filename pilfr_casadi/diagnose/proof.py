@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..compiled import make_engine
-from ..gauss_newton import GaussNewton
+from ..fitted import first_state, samples_for_state
+from ..metrics import nrmse
 from ..parameters import ParameterSet
-from ..recording import InputError, Recording
+from ..recording import Recording
 from ..simulator import Simulator
+from .floor import effective_size
 from .gates import Gate
 from .workbench import Fitted, Workbench
 
 
-def nrmse(bench: Workbench, fitted: Fitted) -> float:
+def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
     """NRMSE averaged over outputs and recordings."""
-    out = []
-    for e, r in zip(fitted.residual, bench.recordings, strict=True):
-        out.append(np.mean(np.sqrt(np.mean(e[r.skip :] ** 2, axis=0)) / np.std(r.y[r.skip :], axis=0)))
-    return float(np.mean(out))
+    pairs = zip(fitted.residual, bench.recordings, strict=True)
+    return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
 
 
 def errors_of(bench: Workbench, simulator: Simulator) -> float:
@@ -30,38 +29,20 @@ def errors_of(bench: Workbench, simulator: Simulator) -> float:
 
     Initial states that are to be estimated are fitted to the first part of each recording, which is not scored then.
     """
-    held = simulator.with_parameters({k: replace(p, fixed=True) for k, p in simulator.parameters.items()})
-    model = bench.model(held)
+    model = bench.model(simulator)
     engine = make_engine(model, bench.engine)
-    vector, errors = model.parameters.start, []
+    errors = []
     for r in bench.recordings:
-        first, state = r.skip, None
-        if isinstance(r.initial, str) and r.initial == "estimate":
-            used = min(max(10 * model.n_x, 50), len(r) // 3)
-            head = r.slice(0, max(used, 2)).with_(skip=0)
-            try:
-                problem = bench.problem(model, engine, [head])
-                with np.errstate(all="ignore"):
-                    state = GaussNewton(max_iterations=30).solve(problem).theta
-            except (InputError, RuntimeError):
-                state = np.zeros(model.n_x)
-            first = max(first, used)
-        elif isinstance(r.initial, str) and r.initial == "periodic":
-            state, drive = np.zeros(model.n_x), model.drive(r)[: (r.period or len(r)) * model.substeps]
-            with np.errstate(all="ignore"):
-                for _ in range(60):
-                    state = engine.simulate(drive, vector, state)[1]
-        elif isinstance(r.initial, str):
-            state = np.zeros(model.n_x)
-        else:
-            given = np.asarray(r.initial, dtype=float).ravel()
-            state = np.concatenate([given, np.zeros(model.n_x - len(given))])
+        estimated = isinstance(r.initial, str) and r.initial == "estimate" and model.n_x > 0
+        used = min(samples_for_state(model), len(r) // 3) if estimated else 0
         with np.errstate(all="ignore"):
-            y = engine.simulate(model.drive(r), vector, state)[0]
-            e = np.sqrt(np.mean((y - r.y)[first:] ** 2, axis=0)) / np.std(r.y[first:], axis=0)
-        errors.append(float(np.mean(e)))
-    value = float(np.mean(errors))
-    return value if np.isfinite(value) else np.inf
+            try:
+                state = first_state(model, engine, r, used or None)
+                y = engine.simulate(model.drive(r), model.parameters.start, state)[0]
+            except (RuntimeError, FloatingPointError):  # a quadratic program of huge numbers
+                return np.inf
+            errors.append(nrmse(r.y, y, skip=max(r.skip, used)) if np.all(np.isfinite(y)) else np.inf)
+    return float(np.mean(errors))
 
 
 def test_errors(
@@ -84,8 +65,6 @@ def test_errors(
 
 def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
     """Standard errors of free parameters, from the residual and its correlation time; nan where held or at a bound."""
-    from .floor import effective_size
-
     free = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
     problem = bench.problem(free, fitted.engine)
     n_free = int(problem.free.sum())

@@ -18,7 +18,7 @@ from .explain import Candidate
 from .gates import Gate
 from .mismatch import mismatch
 from .prepare import prepare
-from .proof import deviations, nrmse, parameter_table, test_errors
+from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import Pass, Search
 from .verdict import confidence, judge
@@ -99,7 +99,7 @@ def diagnose(
     std = deviations(bench, after)
     searched_at = time.perf_counter()
     errors = {
-        "train": {"nominal": ready.nominal, "before": nrmse(bench, without), "after": nrmse(bench, after)},
+        "train": {"nominal": ready.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
         "test": test_errors(bench, tests, ready.gates, simulator, without.corrected(), after.corrected())
         if tests
         else None,

@@ -152,7 +152,7 @@ def columns_of(
     blocks = []
     for i, r in enumerate(short):
         forces = [(t.index, t.forces[edges[i] : edges[i + 1]]) for t in tasks]
-        y = propagate(r, forces, n_free, n, True, gain) / bench.scale[:, None]
+        y = propagate(r, forces, n_free, n, gain) / bench.scale[:, None]
         blocks.append(y.reshape(-1, y.shape[2]))
     first = n_free + short[0].a.shape[1]
     base = orthonormal(block_diagonal([b[:, :first] for b in blocks], n_free))

@@ -8,28 +8,24 @@ against its rivals, with the second in place, and dropped where the second does 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from ..laws import FINER, Law
-from ..recording import InputError
-from ..simulator import Simulator
-from .explain import Candidate, explain, heads, judged, polish
+from .explain import Candidate, attempt, explain, heads, judged, polish
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .screen import Scored, screen
-from .verdict import Choice, choose
-from .workbench import QUICK, THOROUGH, Fitted, Workbench
+from .verdict import HINT, Choice, choose
+from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
 FEWEST = 100.0  # effective samples that a comparison is made on at least
 MORE = 0.06  # share of the excess that has to be left for a second effect to be looked for
 MOSTLY = 0.5  # share of the rest that a second effect may leave
 UNSEEN = 0.7  # share of the mean square on the unseen part that a second effect may leave
-HINT = 0.1  # share of a residual that a flexible force has to explain
 NOTHING = 0.01  # below this share nothing is explained
 
 Say = Callable[[str, int, int, float], None]
@@ -44,7 +40,7 @@ class Pass:
     scored: tuple[Scored, ...]
     before: tuple[float, float]
     accepted: bool
-    samples: float = 30.0
+    samples: float = FEWEST
 
 
 @dataclass(eq=False)
@@ -146,8 +142,7 @@ class Search:
             polish(self.bench, c) if i < 4 and c.error < 1.5 * candidates[0].error else c
             for i, c in enumerate(candidates)
         ]
-        best = min(kept, key=lambda c: c.error, default=None)
-        samples = max(effective_size(best.fitted.residual if best else self.base.residual), FEWEST)
+        samples = self._samples(kept)
         choice = choose(kept, before, self.floor2, samples)
         accepted = choice is not None and choice.gain > ROOM
         if accepted and number:  # what is not fitted has to improve as well
@@ -156,10 +151,10 @@ class Search:
         self._timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
-    def _choose(self, candidates: Sequence[Candidate], before: tuple[float, float]) -> Choice | None:
+    def _samples(self, candidates: Sequence[Candidate]) -> float:
+        """Effective samples of the best candidate's residual."""
         best = min(candidates, key=lambda c: c.error, default=None)
-        n = effective_size(best.fitted.residual if best else self.base.residual)
-        return choose(candidates, before, self.floor2, max(n, FEWEST))
+        return max(effective_size(best.fitted.residual if best else self.base.residual), FEWEST)
 
     def _judged(self, fitted: Fitted) -> tuple[float, float]:
         """Errors of a simulator fitted to the first part only, on both parts."""
@@ -196,9 +191,7 @@ class Search:
         assert found.choice is not None
         winner = found.choice.winner
         element = self.base.simulator.elements[-1]
-        bare = replace(self.base.simulator, elements=self.base.simulator.elements[:-1])
-        own = {k: p for k, p in bare.parameters.items() if not k.startswith(element.prefix)}
-        bare = replace(bare, parameters=own)
+        bare = self.base.simulator.without_last_element()
         local = next((s.local for s in found.scored if s.port == winner.port), None)
         for kind in FINER.get(type(winner.law), ()):
             if local is None:
@@ -209,7 +202,7 @@ class Search:
             for shape in kind().shapes(local):
                 law = kind()
                 law = law.at({**shape, **dict.fromkeys(law.strength, total)}, law.bounds(local))
-                tried = self._attempt(bare.with_element(element.port, law), self.base.values)
+                tried = attempt(self.bench, bare.with_element(element.port, law), [self.base.values])
                 if tried is not None and (best is None or tried.error < best.error):
                     best = tried
             if best is not None and best.error < 0.97 * winner.error:
@@ -227,12 +220,10 @@ class Search:
         assert second.choice is not None
         kept = self.base.simulator.elements[-1]
         bare = self.bench.simulator
-        current = replace(second.choice.winner, fitted=self.base)
-        alone = self._attempt(bare.with_element(kept.port, kept.law), self.base.values)
-        if alone is not None and alone.error < 1.1 * current.error:
-            self.base = self._polished(replace(alone, port=kept.port, law=kept.law)).fitted
-            choice = replace(second.choice, winner=replace(alone, port=kept.port, law=kept.law))
-            self.passes[-2:] = [replace(second, choice=choice)]
+        alone = attempt(self.bench, bare.with_element(kept.port, kept.law), [self.base.values])
+        if alone is not None and alone.error < 1.1 * second.choice.winner.error:
+            self.base = self._polished(alone).fitted
+            self.passes[-2:] = [replace(second, choice=replace(second.choice, winner=alone))]
             self._timed("look back", began)
             return
         rivals: list[Candidate] = []
@@ -243,13 +234,13 @@ class Search:
             own = c.fitted.simulator.elements[-1]
             placed = bare.with_element(own.port, own.law).with_element(kept.port, kept.law)
             values = {**self.base.values, **{k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}}
-            found = self._attempt(placed, values)
+            found = attempt(self.bench, placed, [values])
             if found is not None:
                 rivals.append(replace(found, port=own.port, law=own.law, size=c.size))
-        own_now = self._attempt(self.base.simulator, self.base.values)
+        own_now = attempt(self.bench, self.base.simulator, [self.base.values])
         if own_now is not None and rivals:
             stay = replace(own_now, port=winner.port, law=winner.law, size=winner.size)
-            again = self._choose([stay, *rivals], first.before)
+            again = choose([stay, *rivals], first.before, self.floor2, self._samples([stay, *rivals]))
             if again is not None:
                 if again.winner is not stay:
                     self.base = self._polished(again.winner).fitted
@@ -257,14 +248,3 @@ class Search:
                 better = replace(first.choice, winner=again.winner, alike=alike, margin=again.margin)
                 self.passes[-2] = replace(first, choice=better)
         self._timed("look back", began)
-
-    def _attempt(self, simulator: Simulator, values: Mapping[str, Any]) -> Candidate | None:
-        part = self.bench.on(heads(self.bench.recordings))
-        try:
-            fitted = part.fit(simulator, [values], solver=QUICK)
-        except InputError:
-            return None
-        head, tail = judged(self.bench, fitted)
-        element = simulator.elements[-1]
-        size = sum(p.size for p in element.law.parameters().values())
-        return Candidate(element.port, element.law, fitted, head, tail if np.isfinite(tail) else 1e12, size)

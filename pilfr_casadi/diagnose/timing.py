@@ -33,7 +33,7 @@ def nominal_directions(bench: Workbench, fitted: Fitted) -> np.ndarray:
     blocks = []
     for i, r in enumerate(bench.recordings):
         one = run(bench, probe, fitted, i)
-        y = propagate(one, [], n_free, probe.model.substeps, True) / bench.scale[:, None]
+        y = propagate(one, [], n_free, probe.model.substeps) / bench.scale[:, None]
         blocks.append(y[r.skip :].reshape(-1, y.shape[2]))
     return orthonormal(block_diagonal(blocks, n_free))
 

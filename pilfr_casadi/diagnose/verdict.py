@@ -80,11 +80,6 @@ def handicap(candidate: Candidate) -> float:
     return FLEXIBLE.get(candidate.law.id, 1.0) * FORMS.get(candidate.law.form, 1.0)
 
 
-def weighted(candidate: Candidate, n: float) -> float:
-    """Criterion per effective sample, as a logarithm of the error."""
-    return float(np.log(candidate.error) + 0.5 * candidate.size * np.log(n) / n)
-
-
 def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor: float, n: float) -> Choice | None:
     """The winner among candidates; `without` are the errors of the simulator alone, `floor` the noise, all squared."""
     usable = [c for c in candidates if np.isfinite(c.error)]

@@ -121,21 +121,19 @@ class Workbench:
         simulator: Simulator,
         starts: Sequence[Mapping[str, Any]] = ({},),
         *,
-        gain: np.ndarray | None = None,
         anneal: Sequence[float] = (),
         solver: GaussNewton = QUICK,
         model: Model | None = None,
         engine: Engine | None = None,
-        initial: np.ndarray | None = None,
     ) -> Fitted:
-        """Fit from several starts (values by name), each also led through `anneal` where there are injection gains.
+        """Fit from several starts (values by name), each also led through the injection gains `anneal`.
 
         Raises
         ------
         InputError
             If the simulation diverges from every start.
         """
-        model = model or self.model(simulator, gain)
+        model = model or self.model(simulator)
         engine = engine or make_engine(model, self.engine)
         estimated = any(isinstance(r.initial, str) and r.initial == "estimate" for r in self.recordings)
         if not np.any(model.parameters.free) and not (estimated and model.n_x):
@@ -143,7 +141,7 @@ class Workbench:
         best: tuple[float, np.ndarray, Problem] | None = None
         for start in starts:
             for path in ((), tuple(anneal)) if anneal else ((),):
-                found = self._run(model, engine, start, path, solver, initial)
+                found = self._run(model, engine, start, path, solver)
                 if found is not None and (best is None or found[0] < best[0]):
                     best = found
         if best is None:
@@ -172,12 +170,11 @@ class Workbench:
         start: Mapping[str, Any],
         path: tuple[float, ...],
         solver: GaussNewton,
-        initial: np.ndarray | None,
     ) -> tuple[float, np.ndarray, Problem] | None:
         parameters = model.parameters
         known = {k: v for k, v in start.items() if k in parameters}
         vector = np.clip(parameters.pack(known), parameters.lower, parameters.upper)
-        states: np.ndarray | None = initial
+        states: np.ndarray | None = None
         problem: Problem | None = None
         for gamma in (*path, 0.0):
             at = parameters.at(vector)
@@ -186,8 +183,8 @@ class Workbench:
             problem = self.problem(model.with_parameters(at), engine)
             n_free = int(problem.free.sum())
             theta = problem.start.copy()
-            if states is not None and len(states) <= len(theta) - n_free:
-                theta[n_free : n_free + len(states)] = states
+            if states is not None:
+                theta[n_free:] = states
             if not np.isfinite(problem.cost(theta)):
                 if gamma == 0.0 and not path:
                     return None

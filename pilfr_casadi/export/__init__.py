@@ -1,8 +1,8 @@
 """Models on disk, and models as CasADi functions."""
 
-from .files import write_atomically
+from .files import made, write_atomically
 from .functions import to_casadi
 from .loading import load
 from .saving import FORMAT, VERSION, save
 
-__all__ = ["FORMAT", "VERSION", "load", "save", "to_casadi", "write_atomically"]
+__all__ = ["FORMAT", "VERSION", "load", "made", "save", "to_casadi", "write_atomically"]

@@ -49,6 +49,21 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
     return target
 
 
+def made(folder: str | os.PathLike[str]) -> Path:
+    """A folder, made where it does not exist.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"The folder {folder} cannot be made ({error.strerror}); give another one.") from error
+    return Path(folder)
+
+
 def _sync_folder(folder: Path) -> None:
     """Force the new name to disk too, where the system can do that."""
     with contextlib.suppress(OSError):

@@ -4,6 +4,18 @@ from __future__ import annotations
 
 from .base import Law, Local, readable_unit
 from .density import SmoothHysteresis
+from .dynamic import (
+    Attached,
+    Creep,
+    Delay,
+    Drift,
+    Lag,
+    Mode,
+    Relaxation,
+    Resonance,
+    Settling,
+    TwoStageCreep,
+)
 from .friction import (
     AsymmetricFriction,
     CoulombFriction,
@@ -12,6 +24,7 @@ from .friction import (
     QuadraticDrag,
     StribeckFriction,
 )
+from .hysteresis import Backlash, BoucWen, GeneralizedHysteresis, PlayHysteresis, StopHysteresis
 from .limits import (
     AsymmetricDeadZone,
     AsymmetricSaturation,
@@ -20,23 +33,6 @@ from .limits import (
     Saturation,
     SkewSaturation,
     SoftSaturation,
-)
-from .memory import (
-    Attached,
-    Backlash,
-    BoucWen,
-    Creep,
-    Delay,
-    Drift,
-    GeneralizedHysteresis,
-    Lag,
-    Mode,
-    PlayHysteresis,
-    Relaxation,
-    Resonance,
-    Settling,
-    StopHysteresis,
-    TwoStageCreep,
 )
 from .stiffness import (
     Clearance,

@@ -24,7 +24,7 @@ from .canvas import (
     scaled,
     with_unit,
 )
-from .signals import _busiest, amplitude_density
+from .signals import amplitude_density, busiest
 
 DOTS = 2500  # points of a cloud
 
@@ -126,7 +126,7 @@ def compared_traces(
     """Measured output and simulations, a few swings around the largest one, or a stretch where it is `quiet`."""
     ax = axes_or_new(None)
     y = r.y[:, output]
-    begin, end = _busiest(y - np.mean(y), r)
+    begin, end = busiest(y - np.mean(y), r)
     first = round(begin / r.dt)
     part = slice(first, max(round(end / r.dt), first + 2))
     part = _quiet(y, part.stop - part.start, r.skip) if quiet else part

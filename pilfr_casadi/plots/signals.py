@@ -64,7 +64,7 @@ def traces(
 ) -> Axes:
     """Measured and simulated output over a stretch of time in s, by default a few swings around the largest one."""
     ax, y = axes_or_new(ax), _column(recording.y, output, "output")
-    begin, end = between or _busiest(y - np.mean(y), recording)
+    begin, end = between or busiest(y - np.mean(y), recording)
     part = slice(*np.clip(np.round(np.array([begin, end]) / recording.dt).astype(int), 0, len(y)))
     if part.stop - part.start < 2:
         raise InputError(
@@ -83,7 +83,7 @@ def traces(
     return finish(ax, "time [s]", with_unit(recording.outputs[output], unit), recording.name, 3)
 
 
-def _busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
+def busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
     """Start and end of a stretch around the largest excursion with about eight swings; small ripple is not counted."""
     peak = int(np.argmax(np.abs(y)))
     large = np.flatnonzero(np.abs(y) >= 0.2 * np.abs(y[peak]))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..export import write_atomically
+from ..export import made, write_atomically
 from ..recording import InputError, Recording
 from .diagnosis_files import diagnosis_report
 from .page import Code, Page, Picture, Section, Table, Text, write_report
@@ -50,10 +50,6 @@ def fit_report(
     from .fit_page import fit_page
 
     page = fit_page(fit, train, tests, model_file="model.json")
-    target = Path(folder)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {folder} cannot be made ({error.strerror}); give another one.") from error
+    target = made(folder)
     fit.save(target / "model.json")
     return write_atomically(target / "report.html", page.html())

@@ -10,8 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..export import write_atomically
-from ..recording import InputError
+from ..export import made, write_atomically
 from .page import Block, Page, Picture, Section
 
 if TYPE_CHECKING:
@@ -44,11 +43,7 @@ def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pa
     page, figures = _rendered(diagnosis_page(diagnosis))
     html = page.html()
     content = json.dumps(diagnosis.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    target = Path(folder)
-    try:
-        (target / "figures").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {folder} cannot be made ({error.strerror}); give another one.") from error
+    target = made(Path(folder) / "figures").parent
     for name, png in figures.items():
         write_atomically(target / "figures" / name, png)
     write_atomically(target / "diagnosis.json", content)

@@ -14,8 +14,7 @@ import numpy as np
 
 from ..diagnose.linearise import Constant
 from ..diagnose.workbench import Fitted, Workbench
-from ..integration import _Equations, _Values, discretise, signals
-from ..model import Model
+from ..integration import Equations, Instant, discretise, on_grid, signals, states_along
 from ..parameters import ParameterSet
 from ..recording import Recording
 from ..simulator import Simulator
@@ -75,7 +74,7 @@ def hidden_force(
     r, n = bench.recordings[i], fitted.model.substeps
     drive, start = fitted.model.drive(r), np.asarray(fitted.initial[i], dtype=float)
     with np.errstate(all="ignore"):
-        states = _states(fitted.model, drive, fitted.vector, start)
+        states = states_along(fitted.model, drive, fitted.vector, start)
         law = _law_signals(fitted, number, states[::n], r, bench) if number is not None else None
         base, x0 = _without(fitted, number, start, bench.dt / n)
         instant = port.startswith("sensor:") or (port.startswith("actuator:") and bench.hold == "zero")
@@ -92,26 +91,18 @@ def hidden_force(
     return Hidden(port, r.name, r.t[window][:-1], z, dz, force, std, law_z, law_dz, law_force, instant)
 
 
-def _states(model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """States at the start of each step, (K, n_x); p (n_p,), or (n_p, K) where it changes."""
-    columns = p if p.ndim == 2 else np.tile(p[:, None], (1, len(drive)))
-    run = model.closed.mapaccum("run", len(drive))
-    found = np.asarray(run(x, drive.T, columns)[0]).T
-    return np.vstack([x[None], found[:-1]])
-
-
 def _law_signals(
     fitted: Fitted, number: int, states: np.ndarray, r: Recording, bench: Workbench
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Local coordinate, rate and force (M,) of an element along a run."""
-    simulator = _on_grid(fitted.simulator, bench.dt / fitted.model.substeps)
+    simulator = on_grid(fitted.simulator, bench.dt / fitted.model.substeps)
     own = ParameterSet(dict(simulator.parameters))
     vector = ca.SX.sym("p", own.size)
-    equations = _Equations(simulator, vector)
+    equations = Equations(simulator, vector)
     n_s, n_u = sum(equations.n_s), len(simulator.inputs)
     n_x = states.shape[1] - n_s
     x, s, u, v, t = (ca.SX.sym(k, m) for k, m in (("x", n_x), ("s", n_s), ("u", n_u), ("v", n_u), ("t", 1)))
-    found = equations.evaluate(_Values(x, s, u, v, t))[3][number]
+    found = equations.evaluate(Instant(x, s, u, v, t))[3][number]
     function = ca.Function("law", [ca.vertcat(x, s), u, v, t, vector], [ca.vertcat(*map(ca.SX, found))])
     p = np.tile(fitted.vector[:, None], (1, len(r)))
     rows = np.asarray(function(states.T, r.u.T, _slope(bench, r).T, r.t[None], p))
@@ -122,18 +113,13 @@ def _slope(bench: Workbench, r: Recording) -> np.ndarray:
     return np.gradient(r.u, r.dt, axis=0) if bench.hold == "linear" else np.zeros_like(r.u)
 
 
-def _on_grid(simulator: Simulator, h: float) -> Simulator:
-    placed = (replace(e, law=e.law.on_grid(h)) if hasattr(e.law, "on_grid") else e for e in simulator.elements)
-    return replace(simulator, elements=tuple(placed))
-
-
 def _without(fitted: Fitted, number: int | None, start: np.ndarray, h: float) -> tuple[Simulator, np.ndarray]:
     """The simulator without one of its elements, and an initial state without that element's."""
     simulator = fitted.simulator
     if number is None:
         return simulator, start
     own = ParameterSet(dict(simulator.parameters))
-    equations = _Equations(_on_grid(simulator, h), ca.SX.sym("p", own.size))
+    equations = Equations(on_grid(simulator, h), ca.SX.sym("p", own.size))
     at_q = np.cumsum([len(simulator.states), *equations.n_q])
     at_s = np.cumsum([at_q[-1], *equations.n_s])
     dropped = [*range(at_q[number], at_q[number + 1]), *range(at_s[number], at_s[number + 1])]
@@ -180,7 +166,7 @@ def _recover(
     size: tuple[float, float] | None = None
     for _ in range(3):
         p[row] = np.repeat(held, n)
-        states = _states(model, drive, p, x0)
+        states = states_along(model, drive, p, x0)
         cut = slice(window.start * n, window.stop * n)
         simulated, *blocks = (np.asarray(v) for v in step(states[cut].T, drive[cut].T, p[:, cut]))
         error = r.y[window] - simulated.T[::n]
