@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..export import made, write_atomically
-from ..recording import InputError, Recording
+from ..recording import Recording
 from .diagnosis_files import diagnosis_report
 from .page import Code, Page, Picture, Section, Table, Text, write_report
 
