@@ -20,6 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from .arrays import accumulated
 from .model import Model, portless
 from .parameters import ParameterSet
 from .recording import InputError, Recording
@@ -192,10 +193,10 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
 
 
 def states_along(model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """States at the start of each step of a run from x, shape (K, n_x); p (n_p,), or (n_p, K) where it changes."""
-    columns = p if p.ndim == 2 else np.tile(p[:, None], (1, len(drive)))
+    """States at the start of each step of a run from x, shape (K, n_x); p (n_p,), or (K, n_p) where it changes."""
+    rows = p if p.ndim == 2 else np.broadcast_to(p, (len(drive), len(p)))
     with np.errstate(all="ignore"):
-        found = np.asarray(model.closed.mapaccum("run", len(drive))(x, drive.T, columns)[0]).T
+        found = accumulated(model.closed, x, drive, rows)[0]
     return np.vstack([x[None], found[:-1]])
 
 

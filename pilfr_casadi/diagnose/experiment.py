@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..laws import Law
-from .linearise import Probe, run
+from .linearise import linearised
 from .screen import columns_of, folds, held_out
 from .workbench import Fitted, Workbench
 
@@ -88,15 +88,14 @@ def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[floa
 
     The other is the port's own signal half a recording later: alike in every statistic, but unrelated to the residual.
     """
-    probe = Probe.of(bench, fitted)
-    runs = [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
+    probe, runs = linearised(bench, fitted)
     shares = []
     for moved in (False, True):
         shifted = [
             replace(r, z=np.roll(r.z, len(r.z) // 2, axis=0), dz=np.roll(r.dz, len(r.dz) // 2, axis=0)) if moved else r
             for r in runs
         ]
-        tasks, phi, left = columns_of(bench, probe, shifted, [type(law)], None)
+        tasks, phi, left = columns_of(bench, probe, shifted, [type(law)])
         odd, at, best = folds(len(left), len(runs)), 0, 0.0
         for task in tasks:
             width = task.forces.shape[1]

@@ -17,7 +17,7 @@ from ..laws.base import Law, Local
 from ..laws.dynamic import Creep, Relaxation
 from ..laws.hysteresis import PlayHysteresis, StopHysteresis
 from ..parameters import Parameter
-from .linearise import Probe, run
+from .linearise import linearised
 from .screen import columns_of, folds, held_out
 from .workbench import Fitted, Workbench
 
@@ -65,9 +65,8 @@ FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
 
 def explainable(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     """Share of the residual's power that a flexible force explains on blocks it was not fitted to, by port."""
-    probe = Probe.of(bench, fitted)
-    runs = [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
-    tasks, phi, left = columns_of(bench, probe, runs, FLEXIBLE, None)
+    probe, runs = linearised(bench, fitted)
+    tasks, phi, left = columns_of(bench, probe, runs, FLEXIBLE)
     odd = folds(len(left), len(runs))
     out, at = {}, 0
     for task in tasks:

@@ -1,6 +1,6 @@
 """The simulator linearised along its own run: how a small force at a port, a parameter or the start moves the outputs.
 
-With a force held over each step,
+With a force held over each sample,
 
     X⁺ = A_k X + B_k [dθ, w_k],    Y = C_k X + D_k [dθ, w_k],
 
@@ -10,6 +10,7 @@ and along an observer with gain K, whose innovations are then looked at instead 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,12 +19,15 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
+from ..arrays import mapped
 from ..integration import discretise, signals, states_along
 from ..laws.base import Law, Local
 from ..model import Model
 from ..observer import kalman_gain, led
 from ..simulator import Simulator
 from .workbench import Fitted, Workbench
+
+BLOCK = 256  # samples propagated at a time
 
 
 class Constant(Law):
@@ -54,7 +58,7 @@ class Probe:
     Attributes
     ----------
     step : casadi.Function
-        `(x, u, p) -> (x_next, y, A, B, C, D)`; B and D have a column for each free parameter, then each port.
+        `(x, u, p) -> (y, A, B, C, D)`; B and D have a column for each free parameter, then each port.
     local : casadi.Function
         `(x, u, slope, t, p) -> (z, dz)`, a row a port; p without the probes.
     """
@@ -78,7 +82,7 @@ class Probe:
         free = np.flatnonzero(parameters.free)
         picked = p[free.tolist()]
         blocks = [ca.jacobian(e, v) for e, v in ((following, x), (following, picked), (y, x), (y, picked))]
-        step = ca.Function("probe", [x, u, p], [following, y, *map(ca.densify, blocks)])
+        step = ca.Function("probe", [x, u, p], [y, *map(ca.densify, blocks)])
         return cls(model, step, signals(simulator), free, names, len(simulator.states))
 
 
@@ -88,8 +92,10 @@ class Run:
 
     Attributes
     ----------
-    a, b, c, d : array, shapes (K, n_x, n_x), (K, n_x, n_c), (K, n_y, n_x), (K, n_y, n_c)
-        One a step, `substeps` of them a sample.
+    a, b, c, d : array, shapes (M, n_x, n_x), (M, n_x, n_c), (M, n_y, n_x), (M, n_y, n_c)
+        One a sample.
+    mean : tuple of array
+        Mean a, b, c of a sub-step.
     error : array, shape (M, n_y)
         Simulated (or predicted) minus measured output.
     z, dz : array, shape (M, n_ports)
@@ -102,10 +108,10 @@ class Run:
     b: np.ndarray
     c: np.ndarray
     d: np.ndarray
+    mean: tuple[np.ndarray, np.ndarray, np.ndarray]
     error: np.ndarray
     z: np.ndarray
     dz: np.ndarray
-    states: np.ndarray
     sign: np.ndarray
 
 
@@ -120,28 +126,34 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     else:
         seen = led(model, gain)
         states = states_along(seen, seen.drive(r), np.append(p, 1.0), x)
-    m = len(drive)
-    _, y, a, b, c, d = (np.asarray(v) for v in probe.step(states.T, drive.T, np.tile(p[:, None], (1, m))))
-    n_x, n_y, n_c = model.n_x, model.n_y, len(probe.free)
-    blocks = (
-        a.reshape(n_x, m, n_x).transpose(1, 0, 2),
-        b.reshape(n_x, m, n_c).transpose(1, 0, 2),
-        c.reshape(n_y, m, n_x).transpose(1, 0, 2),
-        d.reshape(n_y, m, n_c).transpose(1, 0, 2),
-    )
+    y, a, b, c, d = mapped(probe.step, states, drive, p)
+    mean = a.mean(axis=0), b.mean(axis=0), c.mean(axis=0)
+    if gain is not None:
+        a, b = a - gain @ c, b - gain @ d
     u = r.u
     slope = np.gradient(u, r.dt, axis=0) if bench.hold == "linear" and len(u) > 2 else np.zeros_like(u)
     own = p[: len(p) - len(probe.ports)]
-    inputs = (
-        states[::n, : probe.n_x].T,
-        u.T,
-        slope.T,
-        (np.arange(len(u)) * r.dt)[None],
-        np.tile(own[:, None], (1, len(u))),
-    )
-    z, dz, lift, push = (np.asarray(v).T for v in probe.local(*inputs))
+    at = states[::n, : probe.n_x], u, slope, r.dt * np.arange(len(u))[:, None], own
+    z, dz, lift, push = (v[:, :, 0] for v in mapped(probe.local, *at))
     sign = np.where(np.abs(lift).max(axis=0) > 0, 0.0, -np.sign(np.median(push, axis=0)))
-    return Run(*blocks, error=y.T[::n] - r.y, z=z, dz=dz, states=states, sign=sign)
+    a, b = over_samples(a, b, n)
+    return Run(a, b, c[::n], d[::n], mean, error=y[::n, :, 0] - r.y, z=z, dz=dz, sign=sign)
+
+
+def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """State matrices of the sub-steps, (K, n_x, n_x) and (K, n_x, n_c), put together to those of samples of n each."""
+    total, moved = a[::n], b[::n]
+    for j in range(1, n):
+        moved = a[j::n] @ moved + b[j::n]
+        total = a[j::n] @ total
+    return total, moved
+
+
+@functools.lru_cache(maxsize=2)  # the screen and the flexible force look at the same fit
+def linearised(bench: Workbench, fitted: Fitted) -> tuple[Probe, list[Run]]:
+    """The probe of a fitted simulator, and its run of every recording."""
+    probe = Probe.of(bench, fitted)
+    return probe, [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
 
 
 def along(bench: Workbench, fitted: Fitted, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
@@ -156,9 +168,8 @@ def along(bench: Workbench, fitted: Fitted, count: int = 60) -> tuple[np.ndarray
 
 def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarray:
     """Gain of an observer with process noise at every port, each strong enough to explain the residual alone."""
-    first = runs[0]
-    a, c = first.a.mean(axis=0), first.c.mean(axis=0)
-    ports = first.b.mean(axis=0)[:, len(probe.free) - len(probe.ports) :]
+    a, b, c = runs[0].mean
+    ports = b[:, len(probe.free) - len(probe.ports) :]
     error = np.sqrt(np.mean(np.concatenate([r.error for r in runs]) ** 2, axis=0))
     q = np.zeros_like(a)
     for column in ports.T:
@@ -171,13 +182,7 @@ def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarra
     return kalman_gain(a, c, q, np.diag(np.maximum(noise, 0.05 * error) ** 2))
 
 
-def propagate(
-    r: Run,
-    forces: list[tuple[int, np.ndarray]],
-    n_free: int,
-    substeps: int,
-    gain: np.ndarray | None = None,
-) -> np.ndarray:
+def propagate(r: Run, forces: list[tuple[int, np.ndarray]], n_free: int) -> np.ndarray:
     """Output changes of free parameters, the initial state, and forces at ports.
 
     Parameters
@@ -189,38 +194,35 @@ def propagate(
     -------
     array, shape (M, n_y, n_free + n_x + total n)
     """
-    steps, n_x, _ = r.a.shape
+    m, n_x, _ = r.a.shape
     n_y, first = r.c.shape[1], n_free + n_x
-    widths = [f.shape[1] for _, f in forces]
-    a, b = r.a, r.b
-    if gain is not None:
-        a, b = a - gain @ r.c, b - gain @ r.d
-    edges = first + np.cumsum([0, *widths])
+    edges = first + np.cumsum([0, *(f.shape[1] for _, f in forces)])
     spans = [slice(i, j) for i, j in pairwise(edges)]
     moving = [
         (n_free + port, span, (f + np.vstack([f[1:], f[-1:]])) / 2)
         for (port, f), span in zip(forces, spans, strict=True)
-        if b[:, :, n_free + port].any()
+        if r.b[:, :, n_free + port].any()
     ]
     # columns that reach no state are not carried along
     end = max((span.stop for _, span, _ in moving), default=first)
     x = np.zeros((n_x, end))
     x[:, n_free:first] = np.eye(n_x)
-    carried = np.empty((steps // substeps, n_x, end))
-    for k in range(steps):
-        sample = k // substeps
-        if k % substeps == 0:
-            carried[sample] = x
-        x = a[k] @ x
-        x[:, :n_free] += b[k][:, :n_free]
+    out = np.zeros((m, n_y, int(edges[-1])))
+    for at in range(0, m, BLOCK):
+        now = slice(at, min(at + BLOCK, m))
+        carried = np.empty((now.stop - at + 1, n_x, end))
+        carried[1:] = 0.0
+        carried[0] = x
+        carried[1:, :, :n_free] = r.b[now, :, :n_free]
         for column, span, mean in moving:
-            x[:, span] += b[k][:, column, None] * mean[sample]
-    c, d = r.c[::substeps], r.d[::substeps]
-    out = np.zeros((len(c), n_y, int(edges[-1])))
-    np.matmul(c, carried, out=out[:, :, :end])
-    out[:, :, :n_free] += d[:, :, :n_free]
+            np.multiply(r.b[now, :, column, None], mean[now, None, :], out=carried[1:, :, span])
+        for before, after, a in zip(carried, carried[1:], r.a[now], strict=False):
+            after += a @ before
+        x = carried[-1]
+        np.matmul(r.c[now], carried[:-1], out=out[now, :, :end])
+    out[:, :, :n_free] += r.d[:, :, :n_free]
     for (port, f), span in zip(forces, spans, strict=True):
-        out[:, :, span] += d[:, :, n_free + port, None] * f[:, None, :]
+        out[:, :, span] += r.d[:, :, n_free + port, None] * f[:, None, :]
     return out
 
 

@@ -17,7 +17,7 @@ from ..laws.base import Law
 from ..recording import InputError
 from .floor import effective_size
 from .gates import Gate
-from .linearise import Probe, propagate, run
+from .linearise import linearised, propagate
 from .screen import block_diagonal, orthonormal
 from .workbench import THOROUGH, Fitted, Workbench
 
@@ -43,13 +43,12 @@ class Offset(Law):
 
 def first_order(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
     """Share of the mean square that a constant at each port takes away, to first order."""
-    probe = Probe.of(bench, fitted)
-    n_free, n = len(probe.free) - len(probe.ports), probe.model.substeps
+    probe, runs = linearised(bench, fitted)
+    n_free = len(probe.free) - len(probe.ports)
     blocks, errors = [], []
-    for i, r in enumerate(bench.recordings):
-        one = run(bench, probe, fitted, i)
+    for r, one in zip(bench.recordings, runs, strict=True):
         forces = [(probe.ports.index(name), np.ones((len(r), 1))) for name in ports]
-        y = propagate(one, forces, n_free, n) / bench.scale[:, None]
+        y = propagate(one, forces, n_free) / bench.scale[:, None]
         blocks.append(y[r.skip :].reshape(-1, y.shape[2]))
         errors.append((one.error / bench.scale)[r.skip :].ravel())
     first = blocks[0].shape[1] - len(ports)

@@ -17,7 +17,7 @@ from ..laws import Law
 from ..laws.base import Local
 from ..laws.trace import columns, trace
 from ..simulator import Port
-from .linearise import Probe, Run, locals_of, observer_gain, propagate, run
+from .linearise import Probe, Run, linearised, locals_of, observer_gain, propagate, run
 from .workbench import Fitted, Workbench
 
 MOST = 8000  # samples looked at
@@ -53,14 +53,12 @@ def screen(
     keep : int
         Start values kept of each pair.
     """
-    probe = Probe.of(bench, fitted)
-    n = len(bench.recordings)
-    runs = [run(bench, probe, fitted, i) for i in range(n)]
+    probe, runs = linearised(bench, fitted)
     gain = observer_gain(probe, runs, noise)
-    found = _score(bench, probe, runs, laws, None, keep)
+    found = _score(bench, probe, runs, laws, "simulation", keep)
     if gain.any():
-        led = [run(bench, probe, fitted, i, gain) for i in range(n)]
-        found += _score(bench, probe, led, laws, gain, keep)
+        led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))]
+        found += _score(bench, probe, led, laws, "observer", keep)
     signs = {name: int(s) for name, s in zip(probe.ports, runs[0].sign, strict=True)}
     return sorted(found, key=lambda s: -s.share), signs, gain if gain.any() else None
 
@@ -86,12 +84,11 @@ def _score(
     probe: Probe,
     runs: list[Run],
     laws: Sequence[type[Law]],
-    gain: np.ndarray | None,
+    source: str,
     keep: int,
 ) -> list[Scored]:
-    tasks, phi, left = columns_of(bench, probe, runs, laws, gain)
+    tasks, phi, left = columns_of(bench, probe, runs, laws)
     total, at, out = max(float(left @ left), 1e-300), 0, []
-    source = "simulation" if gain is None else "observer"
     odd = folds(len(left), len(runs))
     for task in tasks:
         own = at
@@ -133,18 +130,16 @@ def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequenc
 
 
 def columns_of(
-    bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], gain: np.ndarray | None
+    bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]]
 ) -> tuple[list[_Task], np.ndarray, np.ndarray]:
     """Each port's laws, the outputs' changes by all their shapes, and the error.
 
     Changes and error are without what the simulator's own parameters and the initial states can follow.
     """
-    n, n_free = probe.model.substeps, len(probe.free) - len(probe.ports)
-    windows = _windows(bench, runs)
-    cuts = [slice(w.start * n, w.stop * n) for w in windows]
+    n_free = len(probe.free) - len(probe.ports)
     short = [
-        replace(r, a=r.a[c], b=r.b[c], c=r.c[c], d=r.d[c], error=r.error[w], z=r.z[w], dz=r.dz[w])
-        for r, c, w in zip(runs, cuts, windows, strict=True)
+        replace(r, **{k: getattr(r, k)[w] for k in ("a", "b", "c", "d", "error", "z", "dz")})
+        for r, w in zip(runs, _windows(bench, runs), strict=True)
     ]
     error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
     tasks = _tasks(bench, probe, laws, locals_of(bench, runs), locals_of(bench, short))
@@ -152,7 +147,7 @@ def columns_of(
     blocks = []
     for i, r in enumerate(short):
         forces = [(t.index, t.forces[edges[i] : edges[i + 1]]) for t in tasks]
-        y = propagate(r, forces, n_free, n, gain) / bench.scale[:, None]
+        y = propagate(r, forces, n_free) / bench.scale[:, None]
         blocks.append(y.reshape(-1, y.shape[2]))
     first = n_free + short[0].a.shape[1]
     base = orthonormal(block_diagonal([b[:, :first] for b in blocks], n_free))

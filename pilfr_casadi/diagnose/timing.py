@@ -15,7 +15,7 @@ import numpy as np
 
 from ..recording import Recording
 from .gates import Change, Gate, changed, refit, shifted
-from .linearise import Probe, propagate, run
+from .linearise import linearised, propagate
 from .screen import block_diagonal, orthonormal
 from .workbench import Fitted, Workbench
 
@@ -28,12 +28,11 @@ DROP = 0.3  # share of the mean square that has to be left at most
 
 def nominal_directions(bench: Workbench, fitted: Fitted) -> np.ndarray:
     """Orthonormal basis of what parameters and initial states can change in the stacked outputs."""
-    probe = Probe.of(bench, fitted)
+    probe, runs = linearised(bench, fitted)
     n_free = len(probe.free) - len(probe.ports)
     blocks = []
-    for i, r in enumerate(bench.recordings):
-        one = run(bench, probe, fitted, i)
-        y = propagate(one, [], n_free, probe.model.substeps) / bench.scale[:, None]
+    for r, one in zip(bench.recordings, runs, strict=True):
+        y = propagate(one, [], n_free) / bench.scale[:, None]
         blocks.append(y[r.skip :].reshape(-1, y.shape[2]))
     return orthonormal(block_diagonal(blocks, n_free))
 

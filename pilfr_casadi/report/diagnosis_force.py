@@ -12,6 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..arrays import mapped
 from ..diagnose.linearise import Constant
 from ..diagnose.workbench import Fitted, Workbench
 from ..integration import Equations, Instant, discretise, on_grid, signals, states_along
@@ -104,9 +105,8 @@ def _law_signals(
     x, s, u, v, t = (ca.SX.sym(k, m) for k, m in (("x", n_x), ("s", n_s), ("u", n_u), ("v", n_u), ("t", 1)))
     found = equations.evaluate(Instant(x, s, u, v, t))[3][number]
     function = ca.Function("law", [ca.vertcat(x, s), u, v, t, vector], [ca.vertcat(*map(ca.SX, found))])
-    p = np.tile(fitted.vector[:, None], (1, len(r)))
-    rows = np.asarray(function(states.T, r.u.T, _slope(bench, r).T, r.t[None], p))
-    return rows[0], rows[1], rows[2]
+    (rows,) = mapped(function, states, r.u, _slope(bench, r), r.t[:, None], fitted.vector)
+    return rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0]
 
 
 def _slope(bench: Workbench, r: Recording) -> np.ndarray:
@@ -156,7 +156,7 @@ def _recover(
     model = discretise(probed, bench.dt, bench.hold, n)
     drive = model.drive(r)
     values = {k: v for k, v in fitted.values.items() if k in base.parameters}
-    p = np.tile(model.parameters.pack(values)[:, None], (1, len(drive)))
+    p = np.tile(model.parameters.pack(values), (len(drive), 1))
     row = model.parameters.position(f"{probed.elements[-1].prefix}w").start
     x, u, q = ca.SX.sym("x", model.n_x), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.parameters.size)
     following, y = model.closed(x, u, q)
@@ -165,11 +165,11 @@ def _recover(
     best: tuple[float, Any] | None = None
     size: tuple[float, float] | None = None
     for _ in range(3):
-        p[row] = np.repeat(held, n)
+        p[:, row] = np.repeat(held, n)
         states = states_along(model, drive, p, x0)
         cut = slice(window.start * n, window.stop * n)
-        simulated, *blocks = (np.asarray(v) for v in step(states[cut].T, drive[cut].T, p[:, cut]))
-        error = r.y[window] - simulated.T[::n]
+        simulated, *blocks = mapped(step, states[cut], drive[cut], p[cut])
+        error = r.y[window] - simulated[::n, :, 0]
         if not np.all(np.isfinite(error)):
             break
         system = UnknownForce.of(blocks, error, noise, held[window], states[cut][::n], n)

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from ..diagnose.linearise import over_samples
+
 LOUDER = (1.0, 3.0, 9.0)  # factors on the noise
 TRIED = np.logspace(-4.0, 0.5, 10)  # random steps of the force, in units of what the residual calls for
 
@@ -45,14 +47,10 @@ class UnknownForce:
     ) -> UnknownForce:
         """Compose the sub-steps of each sample, the force held over it."""
         m, n_x, n_y = len(error), states.shape[1], error.shape[1]
-        a = blocks[0].reshape(n_x, m, n, n_x).transpose(1, 2, 0, 3)
-        b = blocks[1].reshape(n_x, m, n).transpose(1, 2, 0)
-        c = blocks[2].reshape(n_y, m, n, n_x).transpose(1, 2, 0, 3)[:, 0]
-        d = blocks[3].reshape(n_y, m, n).transpose(1, 2, 0)[:, 0]
-        constant = np.allclose(blocks[0].reshape(n_x, m * n, n_x), a[0, 0][:, None], rtol=1e-9, atol=1e-12)
-        f, g = a[:, 0], b[:, 0]
-        for k in range(1, n):
-            f, g = a[:, k] @ f, np.einsum("mij,mj->mi", a[:, k], g) + b[:, k]
+        a, b, c, d = blocks
+        constant = np.allclose(a, a[0], rtol=1e-9, atol=1e-12)
+        f, g = over_samples(a, b, n)
+        g, c, d = g[:, :, 0], c[::n], d[::n, :, 0]
         noise = np.maximum(noise, 1e-6 * np.std(error, axis=0) + 1e-300)
         x, total = np.zeros(n_x), 0.0  # how strongly a lasting unit force shows
         for _ in range(min(m, 500)):
