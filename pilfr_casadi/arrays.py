@@ -1,0 +1,58 @@
+"""CasADi functions called on NumPy arrays through their buffers: no matrix object on the way in or out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+
+BLOCK = 100  # steps a call
+
+
+def mapped(function: ca.Function, *arguments: np.ndarray) -> list[np.ndarray]:
+    """Results of a function at K points, each of shape (K, rows, columns).
+
+    Parameters
+    ----------
+    arguments : arrays, shapes (K, n) or (n,)
+        One a point, or the same at every point.
+    """
+    count = next(len(a) for a in arguments if np.ndim(a) == 2)
+    held = [i for i, a in enumerate(arguments) if np.ndim(a) == 1]
+    given = [np.ascontiguousarray(a, dtype=float) for a in arguments]
+    found = [np.zeros((count, function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]
+    _call(function.map("mapped", "serial", count, held, []), given, found)
+    return [out.transpose(0, 2, 1) for out in found]
+
+
+def accumulated(function: ca.Function, state: np.ndarray, *arguments: np.ndarray) -> list[np.ndarray]:
+    """Results of K steps of a function from a state, its first result being the next step's state, each (K, rows).
+
+    Parameters
+    ----------
+    arguments : arrays, shapes (K, n)
+        After the state, one a step.
+    """
+    count, state = len(arguments[0]), np.array(state, dtype=float)
+    given = [np.ascontiguousarray(a, dtype=float) for a in arguments]
+    found = [np.zeros((count, function.size1_out(i))) for i in range(function.n_out())]
+    at = 0
+    for length, run in ((BLOCK, function.mapaccum("accumulated", BLOCK)), (1, function)):
+        while at + length <= count:
+            now = slice(at, at + length)
+            _call(run, [state, *(a[now] for a in given)], [out[now] for out in found])
+            state = found[0][at + length - 1]
+            at += length
+    return found
+
+
+def _call(function: ca.Function, given: Sequence[np.ndarray], found: Sequence[np.ndarray]) -> None:
+    buffer, evaluate = function.buffer()
+    for i, a in enumerate(given):
+        if a.size:
+            buffer.set_arg(i, a.data)
+    for i, out in enumerate(found):
+        if out.size:
+            buffer.set_res(i, out.data)
+    evaluate()
