@@ -19,10 +19,9 @@ def mapped(function: ca.Function, *arguments: np.ndarray) -> list[np.ndarray]:
         One a point, or the same at every point.
     """
     count = next(len(a) for a in arguments if np.ndim(a) == 2)
-    held = [i for i, a in enumerate(arguments) if np.ndim(a) == 1]
-    given = [np.ascontiguousarray(a, dtype=float) for a in arguments]
+    given = [np.ascontiguousarray(np.broadcast_to(a, (count, np.shape(a)[-1])), dtype=float) for a in arguments]
     found = [np.zeros((count, function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]
-    _call(function.map("mapped", "serial", count, held, []), given, found)
+    _call(function.map(count), given, found)
     return [out.transpose(0, 2, 1) for out in found]
 
 

@@ -129,16 +129,15 @@ class _Pair:
     placed: Simulator
     model: Any
     engine: Any
-    starts: list[dict[str, Any]]
+    starts: list[Mapping[str, Any]]
     candidate: Candidate | None
 
 
 def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: int, gain: np.ndarray | None) -> _Pair:
     """Compile a pair and fit it briefly from its best start."""
-    part = bench.on(heads(bench.recordings))
     first = entries[0]
     placed, _ = closed(without.simulator, first, first.starts[0], sign)
-    model = part.model(placed, gain)
+    model = bench.model(placed, gain)
     engine = make_engine(model, bench.engine)
     nominal = {k: p.value for k, p in without.simulator.parameters.items()}
     starts: list[dict[str, Any]] = []
@@ -148,7 +147,7 @@ def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: 
             starts.append({**without.values, **named})
             if i == 0:
                 starts.append({**nominal, **named})
-    ranked = sorted(starts, key=lambda s: _quick_cost(part, model, engine, s, without))
+    ranked = by_cost(bench, model, engine, starts, without)
     brief = attempt(bench, placed, ranked[:1], solver=BRIEF, model=model, engine=engine)
     return _Pair(placed, model, engine, ranked, brief)
 
@@ -158,7 +157,7 @@ def refine(bench: Workbench, pair: _Pair, led: bool, runs: int = 3) -> Candidate
     starts = pair.starts[:runs]
     if pair.candidate is not None:
         starts = [pair.candidate.fitted.values, *starts[1:]]
-    ways: list[tuple[list[dict[str, Any]], tuple[float, ...]]] = [(starts, ())]
+    ways: list[tuple[list[Mapping[str, Any]], tuple[float, ...]]] = [(starts, ())]
     if led:
         ways.append((pair.starts[:1], (1.0, 0.1)))
     found = [attempt(bench, pair.placed, s, anneal=a, model=pair.model, engine=pair.engine) for s, a in ways]
@@ -183,19 +182,24 @@ def attempt(
     return Candidate(element.port, element.law, fitted, head, tail if np.isfinite(tail) else 1e12, size)
 
 
-def _quick_cost(part: Workbench, model: Any, engine: Any, start: Mapping[str, Any], without: Fitted) -> float:
-    parameters = model.parameters
-    vector = np.clip(
-        parameters.pack({k: v for k, v in start.items() if k in parameters}), parameters.lower, parameters.upper
-    )
-    total = 0.0
-    for r, state in zip(part.recordings, without.initial, strict=True):
-        full = np.zeros(model.n_x)
-        full[: min(len(state), model.n_x)] = state[: model.n_x]
-        with np.errstate(over="ignore", invalid="ignore"):
-            y = engine.simulate(model.drive(r), vector, full)[0]
-            total += float(np.sum(((y - r.y) / part.scale)[r.skip :] ** 2))
-    return total if np.isfinite(total) else np.inf
+def by_cost(
+    bench: Workbench, model: Any, engine: Any, starts: Sequence[Mapping[str, Any]], without: Fitted
+) -> list[Mapping[str, Any]]:
+    """Starts in the order of their error as they stand on the first parts, from the initial states of a fit."""
+    part, parameters = bench.on(heads(bench.recordings)), model.parameters
+
+    def cost(start: Mapping[str, Any]) -> float:
+        known = {k: v for k, v in start.items() if k in parameters}
+        vector, total = np.clip(parameters.pack(known), parameters.lower, parameters.upper), 0.0
+        for r, state in zip(part.recordings, without.initial, strict=True):
+            full = np.zeros(model.n_x)
+            full[: min(len(state), model.n_x)] = state[: model.n_x]
+            with np.errstate(over="ignore", invalid="ignore"):
+                y = engine.simulate(model.drive(r), vector, full)[0]
+                total += float(np.sum(((y - r.y) / part.scale)[r.skip :] ** 2))
+        return total if np.isfinite(total) else np.inf
+
+    return sorted(starts, key=cost)
 
 
 def polish(bench: Workbench, candidate: Candidate) -> Candidate:

@@ -114,7 +114,7 @@ def folds(length: int, recordings: int) -> np.ndarray:
 
 def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float] = (1e-6,)) -> float:
     """Share of `left` that the columns explain on blocks they were not fitted to."""
-    size = np.linalg.norm(phi, axis=0)
+    size = lengths(phi)
     if not np.any(size > 0):
         return 0.0
     phi = phi[:, size > 0] / size[size > 0]
@@ -153,9 +153,9 @@ def columns_of(
     base = orthonormal(block_diagonal([b[:, :first] for b in blocks], n_free))
     left = error - base @ (base.T @ error)
     phi = np.concatenate([b[:, first:] for b in blocks])
-    size = np.linalg.norm(phi, axis=0)
+    size = lengths(phi)
     phi -= base @ (base.T @ phi)
-    phi[:, np.linalg.norm(phi, axis=0) < 1e-6 * size] = 0.0  # what the simulator's own parameters follow entirely
+    phi[:, lengths(phi) < 1e-6 * size] = 0.0  # what the simulator's own parameters follow entirely
     return tasks, phi, left
 
 
@@ -222,9 +222,14 @@ def block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
     return out
 
 
+def lengths(columns: np.ndarray) -> np.ndarray:
+    """Length of each column."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->j", columns, columns)))
+
+
 def orthonormal(columns: np.ndarray) -> np.ndarray:
     """Orthonormal basis of the columns' span."""
-    size = np.linalg.norm(columns, axis=0)
+    size = lengths(columns)
     kept = columns[:, size > 0] / size[size > 0]
     u, s, _ = np.linalg.svd(kept, full_matrices=False)
     return u[:, s > 1e-9 * s.max(initial=1e-300)]

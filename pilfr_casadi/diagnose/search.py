@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..compiled import make_engine
 from ..laws import FINER, Law
-from .explain import Candidate, attempt, explain, heads, judged, polish
+from .explain import Candidate, attempt, by_cost, explain, heads, judged, polish
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .screen import Scored, screen
@@ -174,9 +175,9 @@ class Search:
         found = self.passes[-1]
         assert found.choice is not None
         winner = found.choice.winner
-        still = self._open(self.base).get(winner.port, 0.0)
         closer = [c for c in found.candidates if c.port == winner.port and c.error < 0.95 * winner.error]
-        if still < HINT or not closer:
+        still = self._open(self.base).get(winner.port, 0.0) if closer else 0.0
+        if still < HINT:
             return
         rival = self._polished(min(closer, key=lambda c: c.error))
         if np.isfinite(rival.full) and self._open(rival.fitted).get(winner.port, 0.0) < 0.5 * still:
@@ -198,15 +199,17 @@ class Search:
                 return
             began = time.perf_counter()
             total = float(np.sum(self.base.values[f"{element.prefix}w"]))
-            best = None
-            for shape in kind().shapes(local):
-                law = kind()
-                law = law.at({**shape, **dict.fromkeys(law.strength, total)}, law.bounds(local))
-                tried = attempt(self.bench, bare.with_element(element.port, law), [self.base.values])
-                if tried is not None and (best is None or tried.error < best.error):
-                    best = tried
-            if best is not None and best.error < 0.97 * winner.error:
-                finer = self._polished(best)
+            shapes = [{**shape, **dict.fromkeys(kind.strength, total)} for shape in kind().shapes(local)]
+            law = kind().at(shapes[0], kind().bounds(local))
+            own = [{f"{element.prefix}{k}": v for k, v in shape.items()} for shape in shapes]
+            starts = [{**self.base.values, **values} for values in own]
+            placed = bare.with_element(element.port, law)
+            model = self.bench.model(placed)
+            engine = make_engine(model, self.bench.engine)
+            nearest = by_cost(self.bench, model, engine, starts, self.base)[:1]
+            tried = attempt(self.bench, placed, nearest, model=model, engine=engine)
+            if tried is not None and tried.error < 0.97 * winner.error:
+                finer = self._polished(tried)
                 if finer.full < self.base.cost:
                     self.base = finer.fitted
                     self.passes[-1] = replace(found, choice=replace(found.choice, winner=finer))

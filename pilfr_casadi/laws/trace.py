@@ -10,9 +10,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..arrays import accumulated, mapped
 from .base import Law, Local
-
-BLOCK = 100  # samples unrolled
 
 
 class _Values:
@@ -39,7 +38,7 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
     if not shapes:
         return np.zeros((len(local.z), 0, columns(law)))
     kind: Any = type(law)
-    step, runs = _functions(kind, len(shapes), local.dt if law.shifts else 0.0)
+    step = _step(kind, len(shapes), local.dt if law.shifts else 0.0)
     p = law.at(shapes[0]).parameters()
     names = [name for name in p if name not in law.strength]
     table = [np.ravel(shape.get(n, p[n].value)) for shape in shapes for n in names]
@@ -47,18 +46,20 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
     found, at = [], 0
     for m in local.lengths:
         zs, dzs = local.z[at : at + m], local.dz[at : at + m]
-        rows = np.vstack([zs, dzs, local.dt * np.arange(m), np.append(zs[1:], zs[-1]), np.append(dzs[1:], dzs[-1])])
+        following = (np.append(values[1:], values[-1]) for values in (zs, dzs))
+        rows = np.column_stack([zs, dzs, local.dt * np.arange(m), *following])
         at += m
         if step.size1_in(0):
-            found.append(_accumulate(step, runs, rows, vector))
+            same = np.broadcast_to(vector, (m, len(vector)))
+            found.append(accumulated(step, np.zeros(step.size1_in(0)), rows, same)[1])
         else:
-            found.append(np.asarray(step(np.zeros((0, m)), rows, np.tile(vector[:, None], (1, m)))[1]).T)
+            found.append(mapped(step, np.zeros((m, 0)), rows, vector)[1][:, :, 0])
     return np.vstack(found).reshape(len(local.z), len(shapes), -1)
 
 
 @functools.lru_cache(maxsize=256)
-def _functions(kind: type[Law], lanes: int, grid: float) -> tuple[ca.Function, ca.Function]:
-    """`(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`, and its block."""
+def _step(kind: type[Law], lanes: int, grid: float) -> ca.Function:
+    """`(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`."""
     law = kind()
     law = law.on_grid(grid) if law.shifts else law
     p = law.parameters()
@@ -84,23 +85,7 @@ def _functions(kind: type[Law], lanes: int, grid: float) -> tuple[ca.Function, c
                 end = _advance(law, own, (z, following), (dz, dz_next), t, values, h) if n_q else own
             forces.append(w)
         after.append(end)
-    step = ca.Function("trace", [memory, signals, vector], [ca.vertcat(*after), ca.vertcat(*forces)])
-    return step, step.mapaccum("run", BLOCK) if n_q + n_s else step
-
-
-def _accumulate(step: ca.Function, run: ca.Function, rows: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Outputs of a step from rest, shape (M, n); some samples unrolled at a time."""
-    state, found, m = np.zeros(step.size1_in(0)), [], rows.shape[1]
-    whole = m // BLOCK * BLOCK
-    repeated = np.tile(vector[:, None], (1, BLOCK))
-    for at in range(0, whole, BLOCK):
-        states, out = run(state, rows[:, at : at + BLOCK], repeated)
-        state = states[:, -1]
-        found.append(np.asarray(out))
-    for at in range(whole, m):
-        state, out = step(state, rows[:, at], vector)
-        found.append(np.asarray(out))
-    return np.hstack(found).T
+    return ca.Function("trace", [memory, signals, vector], [ca.vertcat(*after), ca.densify(ca.vertcat(*forces))])
 
 
 def _units(law: Law) -> list[dict[str, Any]]:
