@@ -20,8 +20,14 @@ def mapped(function: ca.Function, *arguments: np.ndarray) -> list[np.ndarray]:
     """
     count = next(len(a) for a in arguments if np.ndim(a) == 2)
     given = [np.ascontiguousarray(np.broadcast_to(a, (count, np.shape(a)[-1])), dtype=float) for a in arguments]
-    found = [np.zeros((count, function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]
-    _call(function.map(count), given, found)
+    found = [np.empty((count, function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]
+    at = 0
+    for length in (BLOCK, count % BLOCK):
+        run = function.map(length) if 0 < length <= count - at else None
+        while run is not None and at + length <= count:
+            now = slice(at, at + length)
+            _call(run, [a[now] for a in given], [out[now] for out in found])
+            at += length
     return [out.transpose(0, 2, 1) for out in found]
 
 
