@@ -157,8 +157,8 @@ def fine_inputs(u: Array, fine: int, hold: str) -> tuple[Array, Array]:
 
 
 def late(a: Array, n: int) -> Array:
-    """A series moved n fine steps later, its first value held."""
-    return a if n <= 0 else np.concatenate([np.repeat(a[:1], n, axis=0), a[:-n]])
+    """A series moved n fine steps later; before it there was rest."""
+    return a if n <= 0 else np.concatenate([np.zeros_like(a[:n]), a[:-n]])
 
 
 def simulate(

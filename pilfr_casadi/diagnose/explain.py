@@ -130,6 +130,7 @@ class _Pair:
     model: Any
     engine: Any
     starts: list[Mapping[str, Any]]
+    states: list[np.ndarray]
     candidate: Candidate | None
 
 
@@ -148,8 +149,8 @@ def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: 
             if i == 0:
                 starts.append({**nominal, **named})
     ranked = by_cost(bench, model, engine, starts, without)
-    brief = attempt(bench, placed, ranked[:1], solver=BRIEF, model=model, engine=engine)
-    return _Pair(placed, model, engine, ranked, brief)
+    brief = attempt(bench, placed, ranked[:1], states=without.begin, solver=BRIEF, model=model, engine=engine)
+    return _Pair(placed, model, engine, ranked, without.begin, brief)
 
 
 def refine(bench: Workbench, pair: _Pair, led: bool, runs: int = 3) -> Candidate | None:
@@ -160,7 +161,10 @@ def refine(bench: Workbench, pair: _Pair, led: bool, runs: int = 3) -> Candidate
     ways: list[tuple[list[Mapping[str, Any]], tuple[float, ...]]] = [(starts, ())]
     if led:
         ways.append((pair.starts[:1], (1.0, 0.1)))
-    found = [attempt(bench, pair.placed, s, anneal=a, model=pair.model, engine=pair.engine) for s, a in ways]
+    found = [
+        attempt(bench, pair.placed, s, states=pair.states, anneal=a, model=pair.model, engine=pair.engine)
+        for s, a in ways
+    ]
     return min((c for c in (pair.candidate, *found) if c is not None), key=lambda c: c.head, default=None)
 
 
@@ -178,8 +182,10 @@ def attempt(
         return None
     head, tail = judged(bench, fitted)
     element = simulator.elements[-1]
-    size = sum(p.size for p in element.law.parameters().values())
-    return Candidate(element.port, element.law, fitted, head, tail if np.isfinite(tail) else 1e12, size)
+    values = {k: fitted.values[f"{element.prefix}{k}"] for k in element.law.parameters()}
+    return Candidate(
+        element.port, element.law, fitted, head, tail if np.isfinite(tail) else 1e12, element.law.size(values)
+    )
 
 
 def by_cost(
@@ -191,9 +197,9 @@ def by_cost(
     def cost(start: Mapping[str, Any]) -> float:
         known = {k: v for k, v in start.items() if k in parameters}
         vector, total = np.clip(parameters.pack(known), parameters.lower, parameters.upper), 0.0
-        for r, state in zip(part.recordings, without.initial, strict=True):
+        for r, state in zip(part.recordings, without.begin, strict=True):
             full = np.zeros(model.n_x)
-            full[: min(len(state), model.n_x)] = state[: model.n_x]
+            full[: len(state)] = state
             with np.errstate(over="ignore", invalid="ignore"):
                 y = engine.simulate(model.drive(r), vector, full)[0]
                 total += float(np.sum(((y - r.y) / part.scale)[r.skip :] ** 2))
@@ -206,7 +212,7 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     """Fit a candidate to everything."""
     placed = candidate.fitted.corrected()  # sub-steps for the law as it was fitted
     try:
-        fitted = bench.fit(placed, [candidate.fitted.values], solver=THOROUGH)
+        fitted = bench.fit(placed, [candidate.fitted.values], states=candidate.fitted.initial, solver=THOROUGH)
     except InputError:
         return replace(candidate, full=np.inf)
     return replace(candidate, fitted=fitted, full=fitted.cost)

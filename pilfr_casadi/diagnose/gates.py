@@ -6,7 +6,7 @@ than the given ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -105,19 +105,25 @@ def refit(
         starts.append(previous.values)
     try:
         model, engine = (same.model, same.engine) if same else (None, None)
-        found = bench.fit(bench.simulator, starts, solver=solver, model=model, engine=engine)
+        states = () if previous is None else previous.begin
+        found = bench.fit(bench.simulator, starts, states=states, solver=solver, model=model, engine=engine)
     except InputError:
         return None
     return found if found.cost < within else None
+
+
+def said_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
+    """What inputs do between samples, where the user, the simulator or a recording says so."""
+    return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
 
 
 def choose_hold(
     simulator: Any, recordings: tuple[Recording, ...], said: str | None, engine: str
 ) -> tuple[str, list[Gate]]:
     """What inputs do between samples: as said, else what fits better."""
-    for hold in (said, simulator.hold, *(r.hold for r in recordings)):
-        if hold is not None:
-            return hold, []
+    known = said_hold(simulator, recordings, said)
+    if known is not None:
+        return known, []
     errors = {}
     for hold in ("zero", "linear"):
         try:
@@ -127,18 +133,20 @@ def choose_hold(
         errors[hold] = np.inf if found is None else found.cost
     best = "linear" if errors["linear"] < errors["zero"] else "zero"
     ratio = np.sqrt(max(errors.values()) / max(min(errors.values()), 1e-300))
-    if ratio < 1.02:
-        return "zero", []
+    return (best, [hold_note(simulator, best, ratio)]) if ratio >= 1.02 else ("zero", [])
+
+
+def hold_note(simulator: Any, hold: str, ratio: float) -> Gate:
+    """That the hold was chosen from the data, the other's error being `ratio` times as large."""
     words = {"zero": "held over each sample", "linear": "interpolated between samples"}
-    gate = Gate(
+    return Gate(
         ", ".join(simulator.inputs),
         "hold",
-        best,
-        f"The recordings do not say what inputs do between samples; {words[best]} fits better "
+        hold,
+        f"The recordings do not say what inputs do between samples; {words[hold]} fits better "
         f"(error {ratio:.3g} times smaller) and is used.",
         True,
     )
-    return best, [gate]
 
 
 def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:

@@ -78,7 +78,7 @@ def offsets(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Ga
         other = replace(bench, simulator=placed)
         with_law = plain.simulator.with_element(port, Offset())
         try:
-            found = other.fit(with_law, [plain.values], solver=THOROUGH)
+            found = other.fit(with_law, [plain.values], states=plain.initial, solver=THOROUGH)
         except InputError:
             break
         n = max(effective_size(found.residual), 30.0)

@@ -10,7 +10,7 @@ import numpy as np
 from ..recording import Recording
 from ..simulator import Simulator
 from .floor import Floor, measured_floor, white_part
-from .gates import Gate, choose_hold, opened, unclip, wrong_scale
+from .gates import Gate, choose_hold, hold_note, opened, said_hold, unclip, wrong_scale
 from .linearise import along
 from .offset import offsets
 from .proof import errors_of
@@ -60,12 +60,24 @@ def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | N
     bench, without, more = unclip(bench, without)
     gates += more
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
-    bench, without, more = timing(bench, without, float(np.mean((floor.deviation / bench.scale) ** 2)))
+    noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
+    given, before = bench, without
+    bench, without, more = timing(given, before, noise2)
+    if more and said_hold(simulator, recordings, hold) is None:  # out of step, what looked better says nothing
+        other = replace(given, hold="linear" if given.hold == "zero" else "zero")
+        found = timing(other, other.fit(other.simulator, [before.values], states=before.initial), noise2)
+        costs = without.cost, found[1].cost
+        if costs[1] < costs[0]:
+            bench, without, more = found
+        ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
+        gates = [g for g in gates if g not in notes] + (
+            [hold_note(simulator, bench.hold, ratio)] if ratio > 1.02 else []
+        )
     gates += more
     bench, without, more = offsets(bench, without)
     gates += more
     if gates:
-        without = bench.fit(bench.simulator, [without.values], solver=THOROUGH)
+        without = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     bench = replace(bench, typical=along(bench, without))
     return Prepared(bench, without, nominal, tuple(gates), floor)

@@ -19,7 +19,7 @@ from .explain import Candidate, attempt, by_cost, explain, heads, judged, polish
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .screen import Scored, screen
-from .verdict import HINT, Choice, choose
+from .verdict import HINT, Choice, choose, imitation
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
@@ -160,7 +160,9 @@ class Search:
     def _judged(self, fitted: Fitted) -> tuple[float, float]:
         """Errors of a simulator fitted to the first part only, on both parts."""
         part = self.bench.on(heads(self.bench.recordings))
-        return judged(self.bench, part.fit(fitted.simulator, [fitted.values, {}], solver=THOROUGH))
+        return judged(
+            self.bench, part.fit(fitted.simulator, [fitted.values, {}], states=fitted.initial, solver=THOROUGH)
+        )
 
     def _lower_floor(self, fits: Sequence[Fitted]) -> None:
         if self.floor.source == "estimated":
@@ -175,7 +177,11 @@ class Search:
         found = self.passes[-1]
         assert found.choice is not None
         winner = found.choice.winner
-        closer = [c for c in found.candidates if c.port == winner.port and c.error < 0.95 * winner.error]
+        closer = [
+            c
+            for c in found.candidates
+            if c.port == winner.port and c.error * max(1 / 0.95, imitation(c, winner)) < winner.error
+        ]
         still = self._open(self.base).get(winner.port, 0.0) if closer else 0.0
         if still < HINT:
             return
@@ -207,7 +213,7 @@ class Search:
             model = self.bench.model(placed)
             engine = make_engine(model, self.bench.engine)
             nearest = by_cost(self.bench, model, engine, starts, self.base)[:1]
-            tried = attempt(self.bench, placed, nearest, model=model, engine=engine)
+            tried = attempt(self.bench, placed, nearest, states=self.base.begin, model=model, engine=engine)
             if tried is not None and tried.error < 0.97 * winner.error:
                 finer = self._polished(tried)
                 if finer.full < self.base.cost:
@@ -223,7 +229,7 @@ class Search:
         assert second.choice is not None
         kept = self.base.simulator.elements[-1]
         bare = self.bench.simulator
-        alone = attempt(self.bench, bare.with_element(kept.port, kept.law), [self.base.values])
+        alone = attempt(self.bench, bare.with_element(kept.port, kept.law), [self.base.values], states=self.base.begin)
         if alone is not None and alone.error < 1.1 * second.choice.winner.error:
             self.base = self._polished(alone).fitted
             self.passes[-2:] = [replace(second, choice=replace(second.choice, winner=alone))]
@@ -237,10 +243,10 @@ class Search:
             own = c.fitted.simulator.elements[-1]
             placed = bare.with_element(own.port, own.law).with_element(kept.port, kept.law)
             values = {**self.base.values, **{k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}}
-            found = attempt(self.bench, placed, [values])
+            found = attempt(self.bench, placed, [values], states=self.base.begin)
             if found is not None:
                 rivals.append(replace(found, port=own.port, law=own.law, size=c.size))
-        own_now = attempt(self.bench, self.base.simulator, [self.base.values])
+        own_now = attempt(self.bench, self.base.simulator, [self.base.values], states=self.base.initial)
         if own_now is not None and rivals:
             stay = replace(own_now, port=winner.port, law=winner.law, size=winner.size)
             again = choose([stay, *rivals], first.before, self.floor2, self._samples([stay, *rivals]))

@@ -19,11 +19,14 @@ from .linearise import linearised, propagate
 from .screen import block_diagonal, orthonormal
 from .workbench import Fitted, Workbench
 
-FARTHEST = 64  # samples
+SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples
 RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 14)[::-1], np.geomspace(1e-4, 0.05, 14)])
 WHOLE = 0.12  # samples within which a shift counts as whole
 LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
+FAR = 0.04  # mean square error of a refit that may have gone astray
 DROP = 0.3  # share of the mean square that has to be left at most
+
+Trial = tuple[float, str, str, float, str, int]  # share left, channel, what, value, "u" or "y", index
 
 
 def nominal_directions(bench: Workbench, fitted: Fitted) -> np.ndarray:
@@ -53,22 +56,11 @@ def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, F
     """Look for a shifted channel or clock; returns the corrected bench where it is a fault of the recording."""
     if plain.cost < 4 * noise2:
         return bench, plain, []
-    basis, dt = nominal_directions(bench, plain), bench.dt
-    channels = [("y", i, name) for i, name in enumerate(bench.simulator.output_names)]
-    if len(bench.simulator.inputs) > 1:
-        channels += [("u", i, name) for i, name in enumerate(bench.simulator.inputs)]
-    straight = _remainder(bench, plain, basis, lambda r: r, False)
-    trials: list[tuple[float, str, str, float, str, int]] = []
-    for kind, i, name in channels:
-        for what, values in (("alignment", dt * np.arange(-FARTHEST, FARTHEST + 1)), ("clock", RATES)):
-            for value in values:
-                make = _maker(kind, i, what)
-                left = _remainder(bench, plain, basis, make(value), kind == "u")
-                trials.append((left, name, what, float(value), kind, i))
+    dt = bench.dt
+    references = [plain] if plain.cost < FAR else [plain, _as_given(bench, plain)]
+    trials = [trial for reference in references for trial in _trials(bench, reference)]
     best: tuple[float, str, str, float, Workbench, Fitted, Change] | None = None
-    for left, name, what, value, kind, i in _best_of_each(trials):
-        if left > 0.7 * straight:
-            continue
+    for _, name, what, value, kind, i in _best_of_each(trials):
         make, cut = _maker(kind, i, what), _maker(kind, i, what, cut=True)
         unit = dt if what == "alignment" else abs(value)
         settled = _settled(bench, plain, make, cut, value, unit)
@@ -87,6 +79,30 @@ def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, F
     relative, name, what, value, other, found, change = best
     gate = _gate(name, what, value, dt, plain.cost, relative, change)
     return (other, found, [gate]) if gate else (bench, plain, [])
+
+
+def _as_given(bench: Workbench, plain: Fitted) -> Fitted:
+    """The simulator at the user's values: a refit to channels out of step may have gone astray."""
+    values = {name: p.value for name, p in bench.simulator.parameters.items()}
+    unknown = [isinstance(r.initial, str) and r.initial == "estimate" for r in bench.recordings]
+    initial = [0 * state if u else state for u, state in zip(unknown, plain.initial, strict=True)]
+    return bench.result(bench.simulator, values, initial, plain.engine, plain.model)
+
+
+def _trials(bench: Workbench, fitted: Fitted) -> list[Trial]:
+    """Shifts and clock rates of every channel that make the remainder clearly smaller, with its share."""
+    channels = [("y", i, name) for i, name in enumerate(bench.simulator.output_names)]
+    if len(bench.simulator.inputs) > 1:
+        channels += [("u", i, name) for i, name in enumerate(bench.simulator.inputs)]
+    basis, out = nominal_directions(bench, fitted), []
+    straight = _remainder(bench, fitted, basis, lambda r: r, False)
+    for kind, i, name in channels:
+        for what, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
+            for value in values:
+                left = _remainder(bench, fitted, basis, _maker(kind, i, what)(value), kind == "u") / straight
+                if left < 0.7:
+                    out.append((left, name, what, float(value), kind, i))
+    return out
 
 
 def _refit_at(
@@ -123,10 +139,10 @@ def _settled(
 
 
 def _best_of_each(
-    trials: list[tuple[float, str, str, float, str, int]],
-) -> list[tuple[float, str, str, float, str, int]]:
+    trials: list[Trial],
+) -> list[Trial]:
     """The best shift and the best clock of each channel, best first, three at most."""
-    best: dict[tuple[str, str], tuple[float, str, str, float, str, int]] = {}
+    best: dict[tuple[str, str], Trial] = {}
     for trial in sorted(trials, key=lambda t: t[0]):
         best.setdefault(trial[1:3], trial)
     return list(best.values())[:3]

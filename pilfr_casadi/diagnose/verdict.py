@@ -46,6 +46,7 @@ FORMS = {
     "power": 1.1,
     "quintic": 1.05,
     "geometric": 1.05,
+    "hertz": 1.05,
     "gradual": 1.05,
     "root": 1.1,
     "polynomial": 1.05,
@@ -80,6 +81,11 @@ def handicap(candidate: Candidate) -> float:
     return FLEXIBLE.get(candidate.law.id, 1.0) * FORMS.get(candidate.law.form, 1.0)
 
 
+def imitation(candidate: Candidate, rival: Candidate) -> float:
+    """Factor by which a law has to be closer than another at its port that it can imitate, or nothing."""
+    return IMITATES.get((candidate.law.id, rival.law.id), 0.0) if candidate.port == rival.port else 0.0
+
+
 def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor: float, n: float) -> Choice | None:
     """The winner among candidates; `without` are the errors of the simulator alone, `floor` the noise, all squared."""
     usable = [c for c in candidates if np.isfinite(c.error)]
@@ -100,11 +106,9 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     if close:  # what does as well with fewer parameters
         winner = min(close, key=lambda c: (c.size, key(c)))
     for rival in ranked[1:]:
-        if rival.port == winner.port and rival.law.id != winner.law.id:
-            needed = IMITATES.get((winner.law.id, rival.law.id), 0.0)
-            if needed and rival.error < needed * winner.error:
-                winner = rival
-                break
+        if rival.error < imitation(winner, rival) * winner.error:
+            winner = rival
+            break
     before = float(np.sqrt(np.sqrt(without[0] * without[1])))
     gain = n * (np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
     alike, margin = [], np.inf

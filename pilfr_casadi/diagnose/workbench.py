@@ -53,6 +53,11 @@ class Fitted:
         """Parameter vector of the model."""
         return self.model.parameters.pack(self.values)
 
+    @property
+    def begin(self) -> list[np.ndarray]:
+        """The simulator's own states at each recording's first sample, without those of laws."""
+        return [state[: len(self.simulator.states)] for state in self.initial]
+
     def corrected(self) -> Simulator:
         """The simulator with the fitted values as start values."""
         own = ParameterSet(dict(self.simulator.parameters))
@@ -110,7 +115,8 @@ class Workbench:
             rates = fastest(simulator, *self.typical, p)
             if np.any(np.isfinite(rates)):
                 wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / REACH)))
-        return int(np.clip(wanted, self.substeps, FINER * self.substeps))
+        least = max(self.substeps, *(getattr(e.law, "substeps", 1) for e in simulator.elements))
+        return int(np.clip(wanted, least, max(FINER * self.substeps, least)))
 
     def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:
         """The simulation-error problem of a model."""
@@ -121,12 +127,15 @@ class Workbench:
         simulator: Simulator,
         starts: Sequence[Mapping[str, Any]] = ({},),
         *,
+        states: Sequence[np.ndarray] = (),
         anneal: Sequence[float] = (),
         solver: GaussNewton = QUICK,
         model: Model | None = None,
         engine: Engine | None = None,
     ) -> Fitted:
         """Fit from several starts (values by name), each also led through the injection gains `anneal`.
+
+        `states` are a first guess of each recording's initial state, without those of new laws at its end.
 
         Raises
         ------
@@ -141,7 +150,7 @@ class Workbench:
         best: tuple[float, np.ndarray, Problem] | None = None
         for start in starts:
             for path in ((), tuple(anneal)) if anneal else ((),):
-                found = self._run(model, engine, start, path, solver)
+                found = self._run(model, engine, start, states, path, solver)
                 if found is not None and (best is None or found[0] < best[0]):
                     best = found
         if best is None:
@@ -168,13 +177,14 @@ class Workbench:
         model: Model,
         engine: Engine,
         start: Mapping[str, Any],
+        guess: Sequence[np.ndarray],
         path: tuple[float, ...],
         solver: GaussNewton,
     ) -> tuple[float, np.ndarray, Problem] | None:
         parameters = model.parameters
         known = {k: v for k, v in start.items() if k in parameters}
         vector = np.clip(parameters.pack(known), parameters.lower, parameters.upper)
-        states: np.ndarray | None = None
+        states = self._unknown(guess, model.n_x + model.n_s) if len(guess) else None
         problem: Problem | None = None
         for gamma in (*path, 0.0):
             at = parameters.at(vector)
@@ -193,8 +203,6 @@ class Workbench:
                 with np.errstate(all="ignore"):
                     solution = solver.solve(problem, theta)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
-                if gamma == 0.0 and states is None:
-                    return None
                 continue
             vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
         if problem is None:
@@ -202,6 +210,15 @@ class Workbench:
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
         cost = problem.cost(theta)
         return (cost, theta, problem) if np.isfinite(cost) else None
+
+    def _unknown(self, states: Sequence[np.ndarray], n: int) -> np.ndarray:
+        """Guesses of the initial states that are estimated, one after the other, n each."""
+        out = [np.zeros(0)]
+        for r, state in zip(self.recordings, states, strict=True):
+            if isinstance(r.initial, str) and r.initial == "estimate":
+                kept = np.asarray(state, dtype=float)[:n]
+                out.append(np.append(kept, np.zeros(n - len(kept))))
+        return np.concatenate(out)
 
     def result(
         self,

@@ -91,6 +91,8 @@ class Law:
         States of its own.
     shifts : bool
         Its memory is a shift register, which takes in the signal at the begin of a step.
+    substeps : int
+        Integration steps a sample that it needs at least.
     """
 
     id: ClassVar[str]
@@ -104,6 +106,7 @@ class Law:
     dissipative: ClassVar[bool] = False
     order: ClassVar[int] = 0
     shifts: ClassVar[bool] = False
+    substeps: ClassVar[int] = 1
 
     values: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
@@ -123,6 +126,10 @@ class Law:
     def applies(self, local: Local) -> str:
         """Why the data cannot speak to this law, or nothing."""
         return ""
+
+    def size(self, values: Mapping[str, Any]) -> int:
+        """Free numbers of the law at fitted values."""
+        return sum(int(np.sum(~p.fixed)) for p in self.parameters().values())
 
     @classmethod
     def reads(cls) -> set[str]:

@@ -23,6 +23,7 @@ class Delay(Law):
     units: ClassVar[Mapping[str, str]] = {"T": "s"}
     places: ClassVar[tuple[str, ...]] = ("series",)
     shifts: ClassVar[bool] = True
+    substeps: ClassVar[int] = 4  # a held input that is late changes inside a sample
     h: float = 0.0  # length of a step, s
 
     def on_grid(self, h: float) -> Delay:

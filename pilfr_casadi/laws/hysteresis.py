@@ -43,6 +43,12 @@ class StopHysteresis(Law):
             "r": Parameter(np.clip(r, r_low, r_high), unit=self.units["r"], bounds=(r_low, r_high)),
         }
 
+    def size(self, values: Mapping[str, Any]) -> int:
+        """Weights that count, and the place and spread of the thresholds; a weight at zero is no parameter."""
+        weights = np.abs(values["w"])
+        scalars = sum(1 for p in self.parameters().values() if p.size == 1)
+        return int(np.sum(weights > 0.01 * np.max(weights))) + 2 + scalars
+
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield {"r": local.half * np.geomspace(0.03, 0.95, self.n)}
         yield {"r": local.half * np.geomspace(0.005, 0.5, self.n)}
