@@ -263,6 +263,8 @@ class Simulator:
         kind = "series" if place.series else "parallel"
         if kind not in allowed:
             raise InputError(f"The law {law.id!r} cannot stand in {kind} at {port!r}; choose another port or law.")
+        if getattr(law, "channels", 1) != 1:
+            raise InputError(f"The element has {law.channels} channels, the port {port!r} has one; give as many.")
         count = sum(e.port == port for e in self.elements)
         prefix = f"{port}." if not count else f"{port}#{count + 1}."
         own = {f"{prefix}{name}": p for name, p in law.parameters().items()}

@@ -89,6 +89,16 @@ def test_an_output_before_its_cause_is_a_fault_of_the_recording():
     assert found.gates[-1].value == pytest.approx(-7 * 2e-3, abs=2e-4)
 
 
+def test_a_shift_is_whole_though_nobody_said_what_inputs_do_between_samples():
+    """Half a sample more or less, and inputs held or interpolated: the one may look like the other."""
+    cut = [(r.u[:-9], r.y[9:]) for r in recordings(hold="linear")]
+    train = [pilfr.Recording(u, y, 2e-3, ("force",), ("x2",), initial="estimate") for u, y in cut]
+    found = pilfr.diagnose(rig(OFF), train)
+    assert (found.verdict, found.hold) == ("recording-fault", "linear")
+    shift = next(g for g in found.gates if g.finding == "alignment")
+    assert shift.value == pytest.approx(-9 * 2e-3, abs=1e-9)
+
+
 def test_a_clipped_output_is_a_fault_of_the_recording():
     records = recordings()
     limit = 0.6 * max(np.abs(r.y).max() for r in records)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, multisine, play
+from pilfr_casadi import InputError, Parameter, Port, PrandtlIshlinskii, Recording, Simulator, Stop, multisine, play
 from pilfr_casadi.compiled import compiler, make_engine
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.integration import MOST, REACH, choose_substeps, discretise
@@ -22,6 +22,7 @@ from pilfr_casadi.laws import (
     Saturation,
     StopHysteresis,
 )
+from pilfr_casadi.model import close_loop
 from pilfr_casadi.parameters import ParameterSet
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.sensitivities import VirtualMachine
@@ -191,6 +192,42 @@ def test_a_delay_is_as_long_as_it_says(record, port, steps):
         late = np.r_[np.zeros(int(steps)), record.u[: -int(steps), 0]]
         expected = run(rig(), record.with_(u=np.column_stack([late, record.u[:, 1]])))[:, 0]
     assert np.max(np.abs(found - expected)[4:]) < 1e-12
+
+
+def test_a_delay_between_samples_is_that_of_a_held_input(record):
+    steps = 1.3
+    law = Delay(values={"T": steps * DT}, limits={"T": (0.0, 0.2)})
+
+    def late(t, s, u):
+        k = int(np.floor(t / DT - steps + 1e-9))
+        return linear_rates(t, s, record.u[k] if k >= 0 else np.zeros(2))
+
+    s, expected = np.zeros(2), []
+    for k in range(M):
+        expected.append(s[0])
+        edges = k * DT, (k + steps % 1) * DT, (k + 1) * DT
+        for a, b in pairwise(edges):
+            now = lambda t, x, at=(a + b) / 2: late(at, x, None)  # noqa: E731
+            s = solve_ivp(now, (a, b), s, rtol=1e-10, atol=1e-12).y[:, -1]
+    closed, size = rig().with_element("actuator:force", law), np.max(np.abs(expected))
+    errors = [np.max(np.abs(run(closed, record, substeps=n)[:, 0] - expected)) / size for n in (1, law.substeps)]
+    assert errors[1] < 2e-4 and errors[0] > 3 * errors[1]
+
+
+def test_one_way_to_close_a_loop(record):
+    """`close_loop` puts a law into a simulator's port, and the layer of the PI-LFR as well."""
+    law = CubicStiffness(values={"k_3": 700.0})
+    assert np.array_equal(run(close_loop(rig(), law, "ground"), record), run(rig().with_element("ground", law), record))
+    w, r = np.full(6, 15.0), np.linspace(0.01, 0.2, 6)
+    layer = PrandtlIshlinskii(Stop, 6)
+    closed = close_loop(rig(), layer, port="ground")
+    own = closed.parameters.change(**{"ground.w": {"value": w[None]}, "ground.r": {"value": r[None]}})
+    found, expected = run(closed.with_parameters(own), record), run(hysteretic(), record)
+    assert np.max(np.abs(found - expected)) < 1e-12 * np.max(np.abs(expected))
+    with pytest.raises(InputError, match="port"):
+        close_loop(rig(), law)
+    with pytest.raises(InputError, match="channels"):
+        close_loop(rig(), PrandtlIshlinskii(Stop, 6, channels=2), port="ground")
 
 
 def hysteretic(law=None):

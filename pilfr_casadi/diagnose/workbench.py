@@ -230,12 +230,12 @@ class Workbench:
     ) -> Fitted:
         """Residuals at given values and initial states."""
         vector = model.parameters.pack(values)
-        residual = []
-        for r, state in zip(self.recordings, initial, strict=True):
-            y = engine.simulate(model.drive(r), vector, state)[0]
-            residual.append(y - r.y)
-        scored = np.concatenate([(e / self.scale)[r.skip :] for e, r in zip(residual, self.recordings, strict=True)])
-        return Fitted(simulator, model, engine, values, initial, residual, float(np.mean(scored**2)))
+        with np.errstate(over="ignore", invalid="ignore"):  # what diverges has an infinite cost
+            runs = zip(self.recordings, initial, strict=True)
+            residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
+            scored = [(e / self.scale)[r.skip :] for e, r in zip(residual, self.recordings, strict=True)]
+            cost = float(np.mean(np.concatenate(scored) ** 2))
+        return Fitted(simulator, model, engine, values, initial, residual, cost)
 
 
 def arranged(simulator: Simulator, recording: Recording) -> Recording:

@@ -1,0 +1,44 @@
+"""Calls through buffers give what CasADi gives, over more points than a block and none."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from pilfr_casadi.arrays import BLOCK, accumulated, mapped
+
+
+@pytest.fixture(scope="module")
+def parts():
+    x, u, p = ca.SX.sym("x", 3), ca.SX.sym("u"), ca.SX.sym("p", 2)
+    blocks = [ca.densify(ca.jacobian(ca.sin(x) * p[0] + u, x)), ca.vertcat(x[0] * p[1], u)]
+    step = ca.Function("step", [x, u, p], [0.5 * ca.sin(x) * p[0] + u, x[1] + u])
+    return ca.Function("blocks", [x, u, p], blocks), step
+
+
+@pytest.mark.parametrize("count", [1, BLOCK - 1, BLOCK, 3 * BLOCK + 7])
+def test_every_point(parts, count):
+    rng = np.random.default_rng(0)
+    x, u, p = rng.normal(size=(count, 3)), rng.normal(size=(count, 1)), np.array([0.7, -2.0])
+    found = mapped(parts[0], x, u, p)
+    assert [a.shape for a in found] == [(count, 3, 3), (count, 2, 1)]
+    for k in (0, count // 2, count - 1):
+        for a, expected in zip(found, parts[0](x[k], u[k], p), strict=True):
+            assert np.array_equal(a[k], np.asarray(expected))
+
+
+@pytest.mark.parametrize("count", [1, BLOCK, 2 * BLOCK + 5])
+def test_every_step(parts, count):
+    rng = np.random.default_rng(1)
+    state, u, p = rng.normal(size=3), rng.normal(size=(count, 1)), np.tile([0.7, -2.0], (count, 1))
+    states, seen = accumulated(parts[1], state, u, p)
+    for k in range(count):
+        state, y = (np.asarray(v).ravel() for v in parts[1](state, u[k], p[k]))
+        assert np.array_equal(states[k], state) and np.array_equal(seen[k], y)
+
+
+def test_without_states():
+    x, u = ca.SX.sym("x", 0), ca.SX.sym("u")
+    step = ca.Function("static", [x, u], [x, 2 * u])
+    u = np.arange(5.0)[:, None]
+    assert np.array_equal(mapped(step, np.zeros((5, 0)), u)[1][:, :, 0], 2 * u)
+    assert np.array_equal(accumulated(step, np.zeros(0), u)[1], 2 * u)
