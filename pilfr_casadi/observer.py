@@ -69,10 +69,13 @@ def kalman_gain(a: np.ndarray, c: np.ndarray, q: np.ndarray, r: np.ndarray) -> n
     n = len(a)
     if not n:
         return np.zeros((0, len(c)))
-    try:
-        p = solve_discrete_are(a.T, c.T, q + 1e-12 * max(np.trace(q) / n, 1e-300) * np.eye(n), r)
-        gain = np.linalg.solve(c @ p @ c.T + r, c @ p @ a.T).T
-        stable = np.max(np.abs(np.linalg.eigvals(a - gain @ c))) < 1
-    except (np.linalg.LinAlgError, ValueError):
-        return np.zeros((n, len(c)))
-    return gain if stable and np.all(np.isfinite(gain)) else np.zeros((n, len(c)))
+    for fading in (1.0, 1 - 1e-4):  # an integrator that no output sees is let fade, which makes it detectable
+        try:
+            p = solve_discrete_are(fading * a.T, c.T, q + 1e-12 * max(np.trace(q) / n, 1e-300) * np.eye(n), r)
+            gain = np.linalg.solve(c @ p @ c.T + r, c @ p @ a.T).T
+            radius = np.max(np.abs(np.linalg.eigvals(a - gain @ c)))
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        if radius < 1 + 1e-6 and np.all(np.isfinite(gain)):
+            return np.asarray(gain)
+    return np.zeros((n, len(c)))

@@ -252,6 +252,15 @@ class Simulator:
             return Port(f"equation:{state}", {state: -1.0}, lambda x: x[state])
         return Port(f"equation:{state}", {state: -1.0}, lambda x: x[held], lambda x: x[state])
 
+    @cached_property
+    def kinematic(self) -> frozenset[str]:
+        """States that are the integral of another state: their equations are definitions, in which nothing can miss."""
+        if self.discrete:
+            return frozenset()
+        x, u, p, t = self._symbols()
+        derivatives = zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True)
+        return frozenset(n for n, d in derivatives if d.is_symbolic() and d.name() in self.states and d.name() != n)
+
     def with_parameters(self, parameters: Mapping[str, Parameter]) -> Simulator:
         """The same equations with other parameters of the same names."""
         return replace(self, parameters=ParameterSet(dict(parameters)))

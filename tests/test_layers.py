@@ -14,6 +14,7 @@ LAYERS = {
         "recording",
         "signals",
         "multisines",
+        "arrays",
         "metrics",
         "parameters",
         "readers",

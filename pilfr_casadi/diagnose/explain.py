@@ -19,11 +19,13 @@ from ..gauss_newton import GaussNewton
 from ..laws import Law
 from ..recording import InputError, Recording
 from ..simulator import Simulator
+from .proof import shown
 from .screen import Scored
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 HEAD = 0.7  # share of each recording that candidates are fitted to
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
+SHOWN = 3.0  # standard errors that a law's strength is from zero at least
 REFINED = 8  # pairs fitted from several starts
 LONG = 12000  # samples that candidates are fitted to
 
@@ -141,14 +143,17 @@ def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: 
     model = bench.model(placed, gain)
     engine = make_engine(model, bench.engine)
     nominal = {k: p.value for k, p in without.simulator.parameters.items()}
-    starts: list[dict[str, Any]] = []
+    starts: list[Mapping[str, Any]] = []
+    led: list[Mapping[str, Any]] = []  # the observer's best: its run may be near the truth where the simulation is not
     for entry in entries:
         for i, own in enumerate(entry.starts):
             _, named = closed(without.simulator, entry, own, sign)
             starts.append({**without.values, **named})
             if i == 0:
+                led += [starts[-1]] if entry.source == "observer" else []
                 starts.append({**nominal, **named})
-    ranked = by_cost(bench, model, engine, starts, without)
+    best, *rest = by_cost(bench, model, engine, starts, without)
+    ranked = [best, *(s for s in led if s is not best), *(s for s in rest if not any(s is o for o in led))]
     brief = attempt(bench, placed, ranked[:1], states=without.begin, solver=BRIEF, model=model, engine=engine)
     return _Pair(placed, model, engine, ranked, without.begin, brief)
 
@@ -209,13 +214,14 @@ def by_cost(
 
 
 def polish(bench: Workbench, candidate: Candidate) -> Candidate:
-    """Fit a candidate to everything."""
+    """Fit a candidate to everything; one whose strength may as well be zero lives off its initial state and is out."""
     placed = candidate.fitted.corrected()  # sub-steps for the law as it was fitted
+    out = replace(candidate, head=np.inf, tail=np.inf, full=np.inf)
     try:
         fitted = bench.fit(placed, [candidate.fitted.values], states=candidate.fitted.initial, solver=THOROUGH)
     except InputError:
-        return replace(candidate, full=np.inf)
-    return replace(candidate, fitted=fitted, full=fitted.cost)
+        return out
+    return out if shown(bench, fitted) < SHOWN else replace(candidate, fitted=fitted, full=fitted.cost)
 
 
 def explain(

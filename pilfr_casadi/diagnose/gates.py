@@ -55,8 +55,8 @@ def scaled(kind: str, index: int, factor: float) -> Change:
     return change
 
 
-def shifted(kind: str, index: int, seconds: float, rate: float = 0.0, cut: bool = True) -> Change:
-    """Read one channel at `t + seconds + rate t`, interpolated.
+def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, cut: bool = True) -> Change:
+    """Read some channels at `t + seconds + rate t`, interpolated.
 
     What lies before the recording is skipped and what lies behind it cut off, unless `cut` is off: then ends are held.
     A periodic recording goes round.
@@ -65,7 +65,8 @@ def shifted(kind: str, index: int, seconds: float, rate: float = 0.0, cut: bool 
     def change(r: Recording) -> Recording:
         values, at = np.array(getattr(r, kind)), r.t * (1 + rate) + seconds
         end = len(r) * r.dt if r.period and len(r) % r.period == 0 and not rate else None
-        values[:, index] = np.interp(at, r.t, values[:, index], period=end)
+        for i in index:
+            values[:, i] = np.interp(at, r.t, values[:, i], period=end)
         other = r.with_(**{kind: values})
         if end is not None or not cut:
             return other
@@ -188,7 +189,7 @@ def unclip(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gat
         held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
         other = replace(bench, simulator=placed.with_parameters(held))
         found = refit(other, plain)
-        if found is None or found.cost > 0.97 * plain.cost:
+        if found is None or found.cost > min(0.97 * plain.cost, 0.3):
             continue
         at = " and ".join(f"{v:.6g}" for v in (low, high) if np.isfinite(v))
         sentence = (
@@ -264,7 +265,13 @@ def clipped(bench: Workbench) -> list[tuple[int, float, float, int]]:
             at = y == extreme
             runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]]))))[::2]
             neighbours = np.mean(np.abs(np.diff(y)) == 0)
-            if at.sum() >= 6 and runs.max(initial=0) >= 3 and at.mean() > 3 * _quantised(y) and neighbours < 0.5:
+            if (
+                at.sum() >= 6
+                and runs.max(initial=0) >= 3
+                and np.sum(runs > 1) > 1
+                and at.mean() > 3 * _quantised(y)
+                and neighbours < 0.5
+            ):
                 limits[j], count = float(extreme), count + int(at.sum())
         if count:
             out.append((i, limits[0], limits[1], count))

@@ -7,17 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..recording import Recording
+from ..recording import InputError, Recording
 from ..simulator import Simulator
 from .floor import Floor, measured_floor, white_part
 from .gates import Gate, choose_hold, hold_note, opened, said_hold, unclip, wrong_scale
-from .linearise import along
+from .linearise import along, linearised, observer_gain
 from .offset import offsets
 from .proof import errors_of
-from .timing import WHOLE, timing
+from .timing import FAR, WHOLE, as_given, timing
 from .workbench import THOROUGH, Fitted, Workbench
 
 SUSPECT, LEAST = 25.0, 4e-4  # times the noise, and mean square error, beyond which signs and units are looked at
+LED = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer in turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | N
     between, notes = choose_hold(simulator, bench.recordings, hold, engine)
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, simulator)
-    without = bench.fit(simulator, solver=THOROUGH)
+    without = refitted(bench)
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     if without.cost > SUSPECT * float(np.mean((first.deviation / bench.scale) ** 2)) and without.cost > LEAST:
         bench, without, more = wrong_scale(bench, without)
@@ -64,7 +65,7 @@ def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | N
     given, before = bench, without
     bench, without, more = timing(given, before, noise2)
     if more and said_hold(simulator, recordings, hold) is None:  # out of step, what looked better says nothing
-        other = replace(given, hold="linear" if given.hold == "zero" else "zero")
+        other = given.otherwise_held()
         found = timing(other, other.fit(other.simulator, [before.values], states=before.initial), noise2)
         costs = _honest(without, more, bench.dt), _honest(found[1], found[2], bench.dt)
         if costs[1] < costs[0]:
@@ -81,6 +82,23 @@ def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | N
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     bench = replace(bench, typical=along(bench, without))
     return Prepared(bench, without, nominal, tuple(gates), floor)
+
+
+def refitted(bench: Workbench) -> Fitted:
+    """The simulator fitted from the user's values; where that stays far off, led there by an observer as well."""
+    plain = bench.fit(bench.simulator, solver=THOROUGH)
+    if plain.cost < FAR:
+        return plain
+    probe, runs = linearised(bench, as_given(bench, plain))
+    gain = observer_gain(probe, runs, white_part(plain.residual))
+    if not gain.any():
+        return plain
+    try:
+        led = bench.fit(bench.simulator, anneal=LED, model=bench.model(bench.simulator, gain))
+        found = bench.fit(bench.simulator, [led.values], states=led.begin, solver=THOROUGH)
+    except (InputError, np.linalg.LinAlgError):
+        return plain
+    return found if found.cost < plain.cost else plain
 
 
 def _honest(fitted: Fitted, gates: Sequence[Gate], dt: float) -> float:

@@ -65,6 +65,20 @@ def test_errors(
 
 def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
     """Standard errors of free parameters, from the residual and its correlation time; nan where held or at a bound."""
+    return _by_name(fitted, *covariance(bench, fitted))
+
+
+def _by_name(fitted: Fitted, where: np.ndarray, matrix: np.ndarray) -> dict[str, np.ndarray]:
+    full = np.full(fitted.model.parameters.size, np.nan)
+    full[where] = np.sqrt(np.maximum(np.diag(matrix), 0))
+    return fitted.model.parameters.unpack(full)
+
+
+def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """Free parameters inside their bounds, as places in the vector (k,), and the covariance of their estimates (k, k).
+
+    Initial states are estimated with them.
+    """
     free = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
     problem = bench.problem(free, fitted.engine)
     n_free = int(problem.free.sum())
@@ -73,17 +87,28 @@ def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
     theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
     _, _, hessian = problem.normal(theta)
     inside = (theta > problem.lower) & (theta < problem.upper)
-    size = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    out = np.full(problem.size, np.nan)
     keep = np.flatnonzero(inside & (np.diag(hessian) > 0))
-    if len(keep):
-        scaled = hessian[np.ix_(keep, keep)] / np.outer(size[keep], size[keep])
-        covariance = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True)
-        n = max(effective_size(fitted.residual), 10.0)
-        out[keep] = np.sqrt(np.maximum(np.diag(covariance), 0) * fitted.cost / n) / size[keep]
-    full = np.full(free.parameters.size, np.nan)
-    full[problem.free] = out[:n_free]
-    return free.parameters.unpack(full)
+    size = np.sqrt(np.maximum(np.diag(hessian)[keep], 1e-300))
+    scaled = hessian[np.ix_(keep, keep)] / np.outer(size, size)
+    matrix = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size, size)
+    n = max(effective_size(fitted.residual), 10.0)
+    own = keep < n_free
+    return np.flatnonzero(problem.free)[keep[own]], matrix[np.ix_(own, own)] * fitted.cost / n
+
+
+def shown(bench: Workbench, fitted: Fitted) -> float:
+    """How many standard errors the strengths of the last element are from zero, together; infinite without any."""
+    element, parameters = fitted.simulator.elements[-1], fitted.model.parameters
+    spans = [parameters.position(f"{element.prefix}{name}") for name in element.law.strength]
+    strengths = [i for span in spans for i in range(span.start, span.stop)]
+    where, matrix = covariance(bench, fitted)
+    own = np.isin(where, strengths)
+    if not np.any(own):
+        return np.inf
+    deviation = np.sqrt(np.maximum(np.diag(matrix)[own], 1e-300))
+    value = fitted.vector[where[own]] / deviation
+    together = np.linalg.pinv(matrix[np.ix_(own, own)] / np.outer(deviation, deviation), rcond=1e-9, hermitian=True)
+    return float(np.sqrt(max(value @ together @ value, 0.0)))
 
 
 def parameter_table(

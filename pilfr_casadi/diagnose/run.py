@@ -15,7 +15,7 @@ from ..recording import InputError, Recording, as_recordings, check_for_identifi
 from ..threads import one_blas_thread
 from .experiment import next_experiment, placebo
 from .explain import Candidate
-from .gates import Gate
+from .gates import Gate, hold_note, said_hold
 from .mismatch import mismatch
 from .prepare import prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
@@ -87,8 +87,14 @@ def diagnose(
     prepared_at = time.perf_counter()
     bench, without = ready.bench, ready.without
     search = Search(bench, without, ready.floor, laws, workers, say).run(effects)
+    gates = ready.gates
+    if said_hold(simulator, recordings, hold) is None and (ratio := search.wrongly_held()) > 1.05:
+        ready = prepare(simulator, recordings, bench.otherwise_held().hold, engine)
+        bench, without = ready.bench, ready.without
+        search = Search(bench, without, ready.floor, laws, workers, say).run(effects)
+        gates = (*ready.gates, hold_note(simulator, bench.hold, ratio))
     accepted = [p for p in search.passes if p.accepted]
-    verdict, sentence = judge(search, ready.gates)
+    verdict, sentence = judge(search, gates)
     if search.interrupted and not accepted:
         sentence = (
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "
@@ -100,9 +106,7 @@ def diagnose(
     searched_at = time.perf_counter()
     errors = {
         "train": {"nominal": ready.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
-        "test": test_errors(bench, tests, ready.gates, simulator, without.corrected(), after.corrected())
-        if tests
-        else None,
+        "test": test_errors(bench, tests, gates, simulator, without.corrected(), after.corrected()) if tests else None,
     }
     effects_found = tuple(_effect(search, p, after, std) for p in accepted) if explained else ()
     experiment = _next(search, accepted) if explained else None
@@ -113,7 +117,7 @@ def diagnose(
         sentence=sentence,
         effects=effects_found,
         candidates=tuple(_row(c, p) for p in search.passes for c in p.candidates),
-        gates=tuple(g for g in ready.gates if _still(g, after, std)),
+        gates=tuple(g for g in gates if _still(g, after, std)),
         mismatch=mismatch(
             bench.recordings,
             without.residual,

@@ -179,7 +179,7 @@ def _tasks(
     out = []
     for j, (name, local, part) in enumerate(zip(probe.ports, places, parts, strict=True)):
         port = by_name[name]
-        if not np.ptp(local.z) > 0:
+        if not np.ptp(local.z) > 0 or name.removeprefix("equation:") in bench.simulator.kinematic:
             continue
         chosen = [law() for law in laws if ("series" if port.series else "parallel") in law.places]
         pairs = [(law, list(law.shapes(local))) for law in chosen if usable(law, local)]

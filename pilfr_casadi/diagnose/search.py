@@ -15,6 +15,7 @@ import numpy as np
 
 from ..compiled import make_engine
 from ..laws import FINER, Law
+from ..recording import InputError
 from .explain import Candidate, attempt, by_cost, explain, heads, judged, polish
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
@@ -24,7 +25,7 @@ from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
 FEWEST = 100.0  # effective samples that a comparison is made on at least
-MORE = 0.06  # share of the excess that has to be left for a second effect to be looked for
+MORE, LOUD = 0.06, 3.0  # share of the excess, or times the noise, that has to be left to look for a second effect
 MOSTLY = 0.5  # share of the rest that a second effect may leave
 UNSEEN = 0.7  # share of the mean square on the unseen part that a second effect may leave
 NOTHING = 0.01  # below this share nothing is explained
@@ -109,9 +110,23 @@ class Search:
                 self._look_back()
             self.open_after = self._open(self.base)
 
+    def wrongly_held(self) -> float:
+        """By how much the error falls, with the effects in place, where inputs do the other thing between samples."""
+        if self.interrupted or not any(p.accepted for p in self.passes):
+            return 1.0
+        try:
+            other = self.bench.otherwise_held().fit(
+                self.base.simulator, [self.base.values], states=self.base.initial, solver=THOROUGH
+            )
+        except InputError:
+            return 1.0
+        return float(np.sqrt(self.base.cost / max(other.cost, 1e-300)))
+
     def _more(self) -> bool:
         excess = (self.base.cost - self.floor2) / max(self.without.cost - self.floor2, 1e-300)
-        return excess > MORE and max(self.open_after.values(), default=0.0) > HINT
+        return (excess > MORE or self.base.cost > LOUD**2 * self.floor2) and max(
+            self.open_after.values(), default=0.0
+        ) > HINT
 
     def _pass(self, number: int) -> Pass:
         began = time.perf_counter()

@@ -26,7 +26,7 @@ LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
 FAR = 0.04  # mean square error of a refit that may have gone astray
 DROP = 0.3  # share of the mean square that has to be left at most
 
-Trial = tuple[float, str, str, float, str, int]  # share left, channel, what, value, "u" or "y", index
+Trial = tuple[float, str, str, float, str, tuple[int, ...]]  # share left, channel, what, value, "u" or "y", columns
 
 
 def nominal_directions(bench: Workbench, fitted: Fitted) -> np.ndarray:
@@ -57,7 +57,7 @@ def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, F
     if plain.cost < 4 * noise2:
         return bench, plain, []
     dt = bench.dt
-    references = [plain] if plain.cost < FAR else [plain, _as_given(bench, plain)]
+    references = [plain] if plain.cost < FAR else [plain, as_given(bench, plain)]
     trials = [trial for reference in references for trial in _trials(bench, reference)]
     best: tuple[float, str, str, float, Workbench, Fitted, Change] | None = None
     for _, name, what, value, kind, i in _best_of_each(trials):
@@ -81,7 +81,7 @@ def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, F
     return (other, found, [gate]) if gate else (bench, plain, [])
 
 
-def _as_given(bench: Workbench, plain: Fitted) -> Fitted:
+def as_given(bench: Workbench, plain: Fitted) -> Fitted:
     """The simulator at the user's values: a refit to channels out of step may have gone astray."""
     values = {name: p.value for name, p in bench.simulator.parameters.items()}
     unknown = [isinstance(r.initial, str) and r.initial == "estimate" for r in bench.recordings]
@@ -91,10 +91,13 @@ def _as_given(bench: Workbench, plain: Fitted) -> Fitted:
 
 def _trials(bench: Workbench, fitted: Fitted) -> list[Trial]:
     """Shifts and clock rates of every channel that make the remainder clearly smaller, with its share."""
-    channels = [("y", i, name) for i, name in enumerate(bench.simulator.output_names)]
+    names = bench.simulator.output_names
+    channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(names)]
+    if len(names) > 1:
+        channels.append(("y", tuple(range(len(names))), ", ".join(names)))
     if len(bench.simulator.inputs) > 1:
-        channels += [("u", i, name) for i, name in enumerate(bench.simulator.inputs)]
-    basis, out = nominal_directions(bench, fitted), []
+        channels += [("u", (i,), name) for i, name in enumerate(bench.simulator.inputs)]
+    basis, out = nominal_directions(bench, fitted), list[Trial]()
     straight = _remainder(bench, fitted, basis, lambda r: r, False)
     for kind, i, name in channels:
         for what, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
@@ -148,7 +151,7 @@ def _best_of_each(
     return list(best.values())[:3]
 
 
-def _maker(kind: str, i: int, what: str, cut: bool = False) -> Callable[[float], Change]:
+def _maker(kind: str, i: tuple[int, ...], what: str, cut: bool = False) -> Callable[[float], Change]:
     if what == "alignment":
         return lambda value: shifted(kind, i, value, 0.0, cut)
     return lambda value: shifted(kind, i, 0.0, value, cut)

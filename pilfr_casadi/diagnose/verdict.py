@@ -164,6 +164,8 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         )
     if (remains > PARTLY and still > STILL) or remains > MOST_OPEN:
         port = accepted[0].winner.port
+        if search.open_before.get(port, 0.0) < 0.5 * search.open_before.get(where, 0.0):
+            port = where
         return "unexplained", (
             f"Something is missing, most likely at {port}, and no law of the catalogue explains it: the nearest, "
             f"{accepted[0].winner.law.id.replace('_', ' ')}, leaves {remains:.0%} of the excess, and a flexible force "

@@ -93,6 +93,10 @@ class Workbench:
         """Sampling interval, s."""
         return self.recordings[0].dt
 
+    def otherwise_held(self) -> Workbench:
+        """The same with inputs that do the other thing between samples."""
+        return replace(self, hold="linear" if self.hold == "zero" else "zero")
+
     def on(self, recordings: Sequence[Recording]) -> Workbench:
         """The same with other recordings, errors still in units of the training outputs' deviation."""
         return replace(self, recordings=tuple(arranged(self.simulator, r) for r in recordings))

@@ -24,7 +24,7 @@ from .friction import (
     QuadraticDrag,
     StribeckFriction,
 )
-from .hysteresis import Backlash, BoucWen, GeneralizedHysteresis, PlayHysteresis, StopHysteresis
+from .hysteresis import Backlash, BoucWen, BoucWenActuator, GeneralizedHysteresis, PlayHysteresis, StopHysteresis
 from .limits import (
     AsymmetricDeadZone,
     AsymmetricSaturation,
@@ -77,6 +77,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     PlayHysteresis,
     GeneralizedHysteresis,
     BoucWen,
+    BoucWenActuator,
     Backlash,
     Saturation,
     AsymmetricSaturation,

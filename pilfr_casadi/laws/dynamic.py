@@ -215,16 +215,15 @@ class Drift(Law):
 
 
 class Settling(Drift):
-    """A warm-up that comes to an end."""
+    """A warm-up or a decay that comes to an end, about a level."""
 
     form = "settling"
-    equation = "w = a (1 - exp(-t / T))"
+    equation = "w = a exp(-t / T) + b"
     source = "Ljung (1999), System Identification, sec. 14.1; Incropera et al. (2007), sec. 5.1"
-    units: ClassVar[Mapping[str, str]] = {"a": "w", "T": "s"}
-    strength: ClassVar[tuple[str, ...]] = ("a",)
+    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "T": "s"}
 
     def force(self, t: Any, p: Any) -> Any:
-        return p.a * (1 - ca.exp(-t / p.T))
+        return p.a * ca.exp(-t / p.T) + p.b
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield from grid(T=local.duration * np.array([0.05, 0.15, 0.4, 1.0]))

@@ -12,6 +12,8 @@ from ..operators import play
 from ..parameters import Parameter
 from .base import Law, Local, grid
 
+PARTS = 4  # of a step of a held signal
+
 
 class StopHysteresis(Law):
     """Rate-independent hysteresis: a Prandtl-Ishlinskii layer of stops (Krikelis et al. 2024, Eq. 16)."""
@@ -131,14 +133,34 @@ class BoucWen(Law):
 
     def flow(self, dz: Any, q: Any, p: Any) -> Any:
         """Equation of the hysteretic displacement q."""
-        size = (ca.fabs(q / p.q_0) + 1e-9) ** p.n
-        return dz * (1 - (1 - p.s) * size) - p.s * ca.fabs(dz) * ca.sign(q) * size
+        size = (ca.fabs(q / p["q_0"]) + 1e-9) ** p["n"]
+        return dz * (1 - (1 - p["s"]) * size) - p["s"] * ca.fabs(dz) * ca.sign(q) * size
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield from grid(q_0=local.half * np.array([0.03, 0.1, 0.3, 0.8]), s=[0.5, 0.8], n=[1.0])
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"q_0": (2e-3 * local.half, 5 * local.half), "s": (0.3, 1.5), "n": (0.5, 4.0)}
+
+
+class BoucWenActuator(BoucWen):
+    """The same of a signal that moves in steps: an actuator's held input, or a sensor."""
+
+    equation = "w = b z + k_h q,  q+ = q + dz (1 - (1 - s + s sign(q dz)) |q/q_0|^n) at each step dz of z"
+    units: ClassVar[Mapping[str, str]] = {"b": "w/z", "k_h": "w/z", "q_0": "z", "s": "", "n": ""}
+    strength: ClassVar[tuple[str, ...]] = ("b", "k_h")
+    places: ClassVar[tuple[str, ...]] = ("series",)
+    dissipative = False
+    order = 0
+    memory = 2  # q and the z it belongs to
+
+    def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
+        """Along the chord from the last z, in parts so small that the equation is followed."""
+        q, part = s[0], (z - s[1]) / PARTS
+        for _ in range(PARTS):
+            middle = q + self.flow(part, q, p) / 2
+            q = q + self.flow(part, middle, p)
+        return p["b"] * z + p["k_h"] * q, ca.vertcat(q, z)
 
 
 class Backlash(Law):
