@@ -235,6 +235,12 @@ def orthonormal(columns: np.ndarray) -> np.ndarray:
     return u[:, s > 1e-9 * s.max(initial=1e-300)]
 
 
+def _signed(law: Law) -> np.ndarray:
+    """Which strengths (one entry a column) need not oppose motion."""
+    p = law.parameters()
+    return np.concatenate([np.full(p[name].size, name in law.signed) for name in law.strength])
+
+
 def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sign: int) -> tuple[float, np.ndarray]:
     """Drop of the sum of squares by the columns of one shape, and their coefficients."""
     gram, right = phi.T @ phi, phi.T @ left
@@ -249,7 +255,11 @@ def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sign: int) -> tuple[float
 
         root = np.linalg.cholesky(ridge).T
         target = np.linalg.solve(root.T, -sign * right / size)
-        coefficients = -sign * nnls(root, target)[0]
+        both = _signed(law)  # these may have either sign: their negatives are columns as well
+        found = nnls(np.hstack([root, -root[:, both]]), target)[0]
+        coefficients = found[:n]
+        coefficients[both] -= found[n:]
+        coefficients = -sign * coefficients
     else:
         coefficients = np.linalg.solve(ridge, right / size)
         if law.dissipative and sign and n == 1 and -sign * coefficients[0] < 0:

@@ -42,6 +42,7 @@ FORMS = {
     "mode": 1.15,
     "off-centre": 1.05,
     "asymmetric": 1.05,
+    "directional": 1.05,
     "soft asymmetric": 1.05,
     "power": 1.1,
     "quintic": 1.05,

@@ -86,7 +86,7 @@ class Law:
     places : tuple of {"parallel", "series"}
         Inside the dynamics, or at an actuator or a sensor.
     dissipative : bool
-        Strengths must oppose motion.
+        Strengths must oppose motion, but for those in `signed`.
     order : int
         States of its own.
     shifts : bool
@@ -104,6 +104,7 @@ class Law:
     strength: ClassVar[tuple[str, ...]] = ()
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     dissipative: ClassVar[bool] = False
+    signed: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[int] = 0
     shifts: ClassVar[bool] = False
     substeps: ClassVar[int] = 1

@@ -41,9 +41,24 @@ class AsymmetricFriction(CoulombFriction):
     equation = "w = F_c tanh(dz/dt / v_0) + F_0"
     units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_0": "w", "v_0": "z/s"}
     strength: ClassVar[tuple[str, ...]] = ("F_c", "F_0")
+    signed: ClassVar[tuple[str, ...]] = ("F_0",)
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.F_c * ca.tanh(dz / p.v_0) + p.F_0
+
+
+class DirectionalFriction(AsymmetricFriction):
+    """Dry and viscous friction that both differ between the two directions."""
+
+    form = "directional"
+    equation = "w = F_c tanh(dz/dt / v_0) + F_0 + c_0 |dz/dt|"
+    sentence = "dry friction, and friction that grows with speed, both different in the two directions"
+    units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_0": "w", "c_0": "w*s/z", "v_0": "z/s"}
+    strength: ClassVar[tuple[str, ...]] = ("F_c", "F_0", "c_0")
+    signed: ClassVar[tuple[str, ...]] = ("F_0", "c_0")
+
+    def force(self, dz: Any, p: Any) -> Any:
+        return p.F_c * ca.tanh(dz / p.v_0) + p.F_0 + p.c_0 * ca.fabs(dz)
 
 
 class PreslidingFriction(Law):
