@@ -25,7 +25,9 @@ from ..laws.base import Law, Local
 from ..model import Model
 from ..observer import kalman_gain, led
 from ..simulator import Simulator
-from .workbench import Fitted, Workbench
+from .workbench import FINER, Fitted, Workbench
+
+WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
 BLOCK = 256  # samples propagated at a time
 
@@ -102,6 +104,8 @@ class Run:
         Local signals.
     sign : array, shape (n_ports,)
         +1 where a positive force opposes the port's motion, -1 where it drives it, 0 where there is no such sense.
+    lift, push : array, shape (n_ports,)
+        Largest effect of a unit force on the local coordinate's first and second derivative.
     """
 
     a: np.ndarray
@@ -113,6 +117,8 @@ class Run:
     z: np.ndarray
     dz: np.ndarray
     sign: np.ndarray
+    lift: np.ndarray
+    push: np.ndarray
 
 
 def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray | None = None) -> Run:
@@ -136,8 +142,9 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     at = states[::n, : probe.n_x], u, slope, r.dt * np.arange(len(u))[:, None], own
     z, dz, lift, push = (v[:, :, 0] for v in mapped(probe.local, *at))
     sign = np.where(np.abs(lift).max(axis=0) > 0, 0.0, -np.sign(np.median(push, axis=0)))
+    felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
     a, b = over_samples(a, b, n)
-    return Run(a, b, c[::n], d[::n], mean, error=y[::n, :, 0] - r.y, z=z, dz=dz, sign=sign)
+    return Run(a, b, c[::n], d[::n], mean, error=y[::n, :, 0] - r.y, z=z, dz=dz, sign=sign, **felt)
 
 
 def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -230,4 +237,7 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     """Local signals of every port over all recordings."""
     lengths = tuple(len(r.z) for r in runs)
     z, dz = np.concatenate([r.z for r in runs]), np.concatenate([r.dz for r in runs])
-    return [Local(z[:, j], dz[:, j], bench.dt, lengths) for j in range(z.shape[1])]
+    rate = WALL * FINER * bench.substeps / bench.dt
+    lift, push = (np.max([getattr(r, name) for r in runs], axis=0) for name in ("lift", "push"))
+    stiffest = [rate / a if a > 0 else rate**2 / b if b > 0 else np.inf for a, b in zip(lift, push, strict=True)]
+    return [Local(z[:, j], dz[:, j], bench.dt, lengths, float(k)) for j, k in enumerate(stiffest)]

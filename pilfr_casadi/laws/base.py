@@ -31,12 +31,15 @@ class Local:
         Sampling interval, s.
     lengths : tuple of int
         Samples of each recording.
+    stiffest : float
+        Largest stiffness (w/z) that the simulation's steps can follow at the port: a harder contact is a wall.
     """
 
     z: np.ndarray
     dz: np.ndarray
     dt: float
     lengths: tuple[int, ...]
+    stiffest: float = np.inf
 
     @cached_property
     def low(self) -> float:

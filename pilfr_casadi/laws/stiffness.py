@@ -11,6 +11,17 @@ import numpy as np
 from .base import Law, Local, grid
 
 
+def one_sided(local: Local) -> str:
+    """Why a law of both signs of z cannot be told, or nothing."""
+    return "" if local.low < -0.05 * local.reach and local.high > 0.05 * local.reach else "one side is never visited"
+
+
+def hardest(local: Local) -> tuple[float, float]:
+    """Limits of Hertz's strength: pressed in by a tenth of the travel, its stiffness is one that is followed."""
+    k = local.stiffest / (1.5 * float(np.sqrt(0.2 * local.half)))
+    return -k, k
+
+
 class CubicStiffness(Law):
     """Hardening (k_3 > 0) or softening spring (Duffing 1918)."""
 
@@ -73,6 +84,10 @@ class QuinticStiffness(CubicStiffness):
     def force(self, z: Any, p: Any) -> Any:
         return p.k_3 * z**3 + p.k_5 * z**5
 
+    def applies(self, local: Local) -> str:
+        # seen from one side the powers are any curve: contacts and weirs look like them
+        return one_sided(local)
+
 
 class QuadraticStiffness(Law):
     """A spring that is stiffer in one direction (Nayfeh & Mook 1979)."""
@@ -106,7 +121,8 @@ class PiecewiseStiffness(Law):
         yield from grid(g=local.low + 2 * local.half * np.array([0.15, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"g": (local.low + 0.04 * local.half, local.high - 0.04 * local.half)}
+        k = local.stiffest
+        return {"g": (local.low + 0.04 * local.half, local.high - 0.04 * local.half), "k_c": (-k, k)}
 
 
 class PiecewiseStiffnessBelow(PiecewiseStiffness):
@@ -131,6 +147,9 @@ class HertzContact(PiecewiseStiffness):
         depth = ca.fmax(z - p.g, 0)
         return p.k_c * depth * ca.sqrt(depth + 1e-300)
 
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {**super().bounds(local), "k_c": hardest(local)}
+
 
 class Clearance(Law):
     """A gap spring: force only beyond the clearance on either side (Shaw & Holmes 1983)."""
@@ -150,12 +169,10 @@ class Clearance(Law):
         yield from grid(g=local.reach * np.array([0.03, 0.08, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"g": (1e-3 * local.reach, 0.97 * local.reach)}
+        return {"g": (1e-3 * local.reach, 0.97 * local.reach), "k_g": (-local.stiffest, local.stiffest)}
 
     def applies(self, local: Local) -> str:
-        return (
-            "" if local.low < -0.05 * local.reach and local.high > 0.05 * local.reach else "one side is never visited"
-        )
+        return one_sided(local)
 
 
 class SoftClearance(Clearance):
@@ -169,6 +186,9 @@ class SoftClearance(Clearance):
     def force(self, z: Any, p: Any) -> Any:
         above, below = ca.fmax(z - p.g, 0), ca.fmax(-z - p.g, 0)
         return p.k_g * (above * ca.sqrt(above + 1e-300) - below * ca.sqrt(below + 1e-300))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {**super().bounds(local), "k_g": hardest(local)}
 
 
 class OffCentreClearance(Clearance):
@@ -186,7 +206,8 @@ class OffCentreClearance(Clearance):
         yield from grid(g=local.half * np.array([0.1, 0.3, 0.6]), m=middle + local.half * np.array([-0.3, 0.0, 0.3]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"g": (1e-3 * local.half, local.half), "m": (local.low, local.high)}
+        k = local.stiffest
+        return {"g": (1e-3 * local.half, local.half), "m": (local.low, local.high), "k_g": (-k, k)}
 
 
 class PeriodicForce(Law):
