@@ -20,7 +20,7 @@ from .explain import Candidate, attempt, by_cost, explain, heads, judged, polish
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .screen import Scored, screen
-from .verdict import HINT, Choice, choose, imitation
+from .verdict import FLEXIBLE, HINT, Choice, choose, imitation
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
@@ -163,9 +163,14 @@ class Search:
         accepted = choice is not None and choice.gain > ROOM
         if accepted and number:  # what is not fitted has to improve as well
             assert choice is not None
-            accepted = choice.remains < MOSTLY and choice.winner.tail < UNSEEN * before[1]
+            accepted = self._mostly(choice) and choice.winner.tail < UNSEEN * before[1]
         self._timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
+
+    def _mostly(self, choice: Choice) -> bool:
+        """Whether most of the excess goes: as judged with the unseen part; for a law that imitates none, or overall."""
+        full = (choice.winner.full - self.floor2) / max(self.base.cost - self.floor2, 1e-300)
+        return choice.remains < MOSTLY or (choice.winner.law.id not in FLEXIBLE and full < MOSTLY)
 
     def _samples(self, candidates: Sequence[Candidate]) -> float:
         """Effective samples of the best candidate's residual."""
