@@ -2,12 +2,12 @@
 
     h_1' = k_4 (u - u_0) - k_1 f(h_1),    h_2' = k_1 f(h_1) - k_3 f(h_2),    y = y_0 + h_2^m,    f(h) = h  or  sqrt(h)
 
-The sensor is not calibrated: its zero y_0 and the bend m of its curve are parameters, and so is the voltage u_0 that the
-pump needs before it delivers. Water may leave a tank in ways the equations do not have (a leak, a spill), and part of
-what leaves the upper tank may fall into the lower one: `share`, a parameter that matters once a law stands in the port.
-Recordings: 1024 samples each, 4 s apart; Schoukens, Mattsson, Wigren & Noel (2016), "Cascaded tanks benchmark combining soft and hard
-nonlinearities"; data not included here. The initial levels are unknown and the same in both recordings, so the test
-starts from those estimated on the training recording.
+The sensor is not calibrated: its zero y_0 and the bend m of its curve are parameters, and so is the voltage u_0 that
+the pump needs before it delivers. Water may leave a tank in ways the equations do not have (a leak, a spill), and part
+of what leaves the upper tank may fall into the lower one: `share`, which matters once a law stands in the port.
+Recordings: 1024 samples each, 4 s apart; Schoukens, Mattsson, Wigren & Noel (2016), "Cascaded tanks benchmark combining
+soft and hard nonlinearities"; data not included here. The initial levels are unknown and the same in both recordings,
+so the test starts from those estimated on the training recording.
 
 Published rms errors of the test simulation in V: grey-box model with overflow 0.18 and 0.19, CT-SUBNET 0.31, TSEM 0.33,
 NLSS2 0.34, PNLSS 0.45, Volterra 0.54, linear 0.75.

@@ -117,9 +117,8 @@ def closed(
     law = entry.law
     limits: dict[str, tuple[Any, Any]] = dict(law.at(start).bounds(entry.local))
     if law.dissipative and sign:
-        limits |= {
-            name: ((0.0, np.inf) if sign > 0 else (-np.inf, 0.0)) for name in law.strength if name not in law.signed
-        }
+        side = (0.0, np.inf) if sign > 0 else (-np.inf, 0.0)
+        limits |= {name: side for name in law.strength if name not in law.signed}
     inside = {k: np.clip(v, *limits[k]) if k in limits else v for k, v in start.items()}
     placed = simulator.with_element(entry.port, law.at(inside, limits))
     prefix = placed.elements[-1].prefix

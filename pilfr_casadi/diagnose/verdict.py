@@ -183,5 +183,5 @@ def confidence(choice: Choice, search: Search) -> float:
     remains, still = left_open(search)
     lead = 1 - np.exp(-8 * np.log(max(min(choice.margin, 10.0), 1.0)))
     still *= min(1.0, remains / 0.03)  # of next to nothing, all may be explainable
-    doubt = (1 - min(4 * remains, 1.0)) / (1 + (still / 0.3) ** 2)
+    doubt = 1 / (1 + (remains / 0.15) ** 2) / (1 + (still / 0.3) ** 2)
     return float(np.clip(lead * doubt / (1 + len(choice.alike)), 0.0, 0.99))
