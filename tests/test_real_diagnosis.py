@@ -22,7 +22,7 @@ def named(diagnosis):
 
 def test_axis_lacks_friction():
     diagnosis, errors = emps.run(folder_of("emps"))
-    port, law = named(diagnosis)[0]
+    ((port, law),) = named(diagnosis)
     assert port == "axis"
     assert law in ("coulomb_friction", "stribeck_friction")
     assert errors["after"]["test"] <= 8.0
@@ -38,11 +38,12 @@ def test_silverbox_lacks_a_cubic_stiffness_and_its_input_is_interpolated():
     assert errors["before"]["arrow"] > 10
 
 
-@pytest.mark.parametrize("root", [False, True])
-def test_tanks_overflow(root):
+# with linear outflow the simulator lacks more than overflow, and cannot follow as far
+@pytest.mark.parametrize(("root", "most"), [(False, 0.35), (True, 0.20)])
+def test_tanks_overflow(root, most):
     diagnosis, errors = tanks.run(folder_of("cascaded_tanks"), root)
-    assert any(law == "piecewise_stiffness" and port.startswith("upper") for port, law in named(diagnosis))
-    assert errors["after"]["test"] <= 0.20
+    assert named(diagnosis)[0] == ("upper-tank", "piecewise_stiffness")
+    assert errors["after"]["test"] <= most
 
 
 def test_piezo_stack_has_hysteresis_at_its_actuator():
