@@ -166,5 +166,8 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
         open_after={"guide": 0.5},
     )
     assert judge(search, [])[0] == verdict
+    search.open_after = {"guide": 0.8}  # what is left is a force at the port: the law is another
+    assert judge(search, [])[0] == "unexplained"
+    search.open_after = {"guide": 0.0}
     search.base.cost = 0.5  # half of the excess is left: no margin carries that
     assert judge(search, [])[0] == "unexplained"

@@ -25,6 +25,7 @@ COLOURED, LOUD = 15.0, 0.015  # times the white part of a residual that coloured
 SOMEWHAT = 4.0  # the same times, for noise of any size
 HINT = 0.1  # share of a residual that a flexible force has to explain to count
 PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name that only comes near
+MAINLY = 0.6  # of it explainable: whatever the rivals, the name is wrong or incomplete
 CLEAR = 1.5  # times the winner's error that every rival's is, for a name that only comes near to be given all the same
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
 LIKE = 0.03  # rivals whose error is within this share cannot be told apart
@@ -164,7 +165,8 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
             f"Something is missing and no law of the catalogue explains it: refitted, the simulator is off by "
             f"{error:.3g} of the outputs' deviation, the noise is about {floor:.3g}{at}."
         )
-    near = remains > PARTLY and still > STILL and min(c.margin for c in accepted) < CLEAR
+    margin = min(c.margin for c in accepted)
+    near = remains > PARTLY and (still > MAINLY or (still > STILL and margin < CLEAR))
     if near or remains > MOST_OPEN:
         port = accepted[0].winner.port
         if search.open_before.get(port, 0.0) < 0.5 * search.open_before.get(where, 0.0):
