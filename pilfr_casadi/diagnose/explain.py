@@ -26,7 +26,9 @@ from .workbench import QUICK, THOROUGH, Fitted, Workbench
 HEAD = 0.7  # share of each recording that candidates are fitted to
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
 SHOWN = 3.0  # standard errors that a law's strength is from zero at least
-REFINED = 8  # pairs fitted from several starts
+REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first
+SAME = 1.02  # times the mean square error of fits that came to the same place
+BEHIND = 3.0  # times the best error of a pair that is not worth more starts
 LONG = 12000  # samples that candidates are fitted to
 
 
@@ -161,17 +163,19 @@ def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: 
 
 def refine(bench: Workbench, pair: _Pair, led: bool, runs: int = 3) -> Candidate | None:
     """Fit a pair from several starts, and `led` by the observer as well."""
+    compiled = {"states": pair.states, "model": pair.model, "engine": pair.engine}
     starts = pair.starts[:runs]
     if pair.candidate is not None:
         starts = [pair.candidate.fitted.values, *starts[1:]]
-    ways: list[tuple[list[Mapping[str, Any]], tuple[float, ...]]] = [(starts, ())]
+    found = [pair.candidate]
     if led:
-        ways.append((pair.starts[:1], (1.0, 0.1)))
-    found = [
-        attempt(bench, pair.placed, s, states=pair.states, anneal=a, model=pair.model, engine=pair.engine)
-        for s, a in ways
-    ]
-    return min((c for c in (pair.candidate, *found) if c is not None), key=lambda c: c.head, default=None)
+        found.append(attempt(bench, pair.placed, pair.starts[:1], anneal=(1.0, 0.1), **compiled))
+    for start in starts:
+        found.append(attempt(bench, pair.placed, [start], **compiled))
+        heads = sorted(c.head for c in found[1:] if c)
+        if len(heads) > 2 and heads[2] < SAME * heads[0]:  # three ways to the same place
+            break
+    return min((c for c in found if c is not None), key=lambda c: c.head, default=None)
 
 
 def attempt(
@@ -232,16 +236,20 @@ def explain(
     signs: Mapping[str, int],
     gain: np.ndarray | None,
     workers: int,
+    enough: float,
     report: Callable[[int, int, float], None],
 ) -> list[Candidate]:
-    """Every survivor fitted, smallest error first."""
-    pairs = survivors(scored)
-    done = 0
+    """Every survivor fitted, smallest error first.
 
-    def step(error: float) -> None:
+    Where one of the first comes below the error `enough`, those that are far behind it are not refined.
+    """
+    pairs = survivors(scored)
+    done, total = 0, len(pairs) + min(len(pairs), REFINED)
+
+    def step(found: Sequence[Candidate | None]) -> None:
         nonlocal done
         done += 1
-        report(done, len(pairs) + min(len(pairs), REFINED), error)
+        report(done, total, min((c.error for c in found if c), default=np.inf))
 
     pool = ThreadPoolExecutor(workers)
     try:
@@ -249,13 +257,19 @@ def explain(
         prepared = []
         for task in tasks:
             prepared.append(task.result())
-            step(min((p.candidate.error for p in prepared if p.candidate), default=np.inf))
+            step([p.candidate for p in prepared])
         prepared.sort(key=lambda p: p.candidate.error if p.candidate else np.inf)
-        again = [pool.submit(refine, bench, pair, gain is not None) for pair in prepared[:REFINED]]
-        found = [p.candidate for p in prepared[REFINED:]]
-        for refined in again:
-            found.append(refined.result())
-            step(min((c.error for c in found if c), default=np.inf))
+        found: list[Candidate | None] = []
+        for group in (prepared[:FIRST], prepared[FIRST:REFINED]):
+            best = min((c.error for c in found if c), default=np.inf)
+            near = [p for p in group if best > enough or (p.candidate and p.candidate.error < BEHIND * best)]
+            again = [pool.submit(refine, bench, pair, gain is not None) for pair in near]
+            found += [p.candidate for p in group if p not in near]
+            for refined in again:
+                found.append(refined.result())
+                step(found)
+        found += [p.candidate for p in prepared[REFINED:]]
+        report(total, total, min((c.error for c in found if c), default=np.inf))
     finally:
         pool.shutdown(cancel_futures=True)
     return sorted((c for c in found if c is not None), key=lambda c: c.error)

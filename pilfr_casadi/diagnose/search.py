@@ -26,6 +26,8 @@ from .workbench import THOROUGH, Fitted, Workbench
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
 FEWEST = 100.0  # effective samples that a comparison is made on at least
 MORE, LOUD = 0.06, 3.0  # share of the excess, or times the noise, that has to be left to look for a second effect
+SEEN = 1e-4  # mean square error below which what is more than noise is not worth a second effect
+NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 MOSTLY = 0.5  # share of the rest that a second effect may leave
 UNSEEN = 0.7  # share of the mean square on the unseen part that a second effect may leave
 NOTHING = 0.01  # below this share nothing is explained
@@ -148,6 +150,7 @@ class Search:
             signs,
             gain,
             self.workers,
+            float(np.sqrt(self.floor2 + NEARLY * max(self.base.cost - self.floor2, 0.0))),
             lambda i, n, e: self.say("fits" if not number else "fits, second effect", i, n, e),
         )
         self._timed("fits", began)

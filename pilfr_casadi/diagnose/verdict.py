@@ -50,6 +50,7 @@ FORMS = {
     "quintic": 1.05,
     "geometric": 1.05,
     "hertz": 1.05,
+    "progressive": 1.05,
     "gradual": 1.05,
     "root": 1.1,
     "polynomial": 1.05,

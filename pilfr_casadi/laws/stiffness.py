@@ -103,6 +103,28 @@ class QuadraticStiffness(Law):
         return p.k_2 * z**2
 
 
+class ProgressiveStiffness(QuadraticStiffness):
+    """The same, ever more: an air spring, a bellows."""
+
+    form = "progressive"
+    equation = "w = k_2 (z^2 + b z^3)"
+    source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 4.2"
+    units: ClassVar[Mapping[str, str]] = {"k_2": "w/z^2", "b": "1/z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k_2 * z**2 * (1 + p.b * z)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(b=np.array([-0.5, 0.5]) / local.reach)
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        # the cubic part never outweighs the quadratic one
+        return {"b": (-1 / local.reach, 1 / local.reach)}
+
+    def applies(self, local: Local) -> str:
+        return one_sided(local)
+
+
 class PiecewiseStiffness(Law):
     """A contact: another spring takes part beyond a point (Shaw & Holmes 1983)."""
 
