@@ -5,9 +5,9 @@ Within a sub-step of length h the inputs are held or follow their chord, and
     k₁ = f(x, u₀), k₂ = f(x + h k₁/2, u_½), k₃ = f(x + h k₂/2, u_½), k₄ = f(x + h k₃, u₁),
     x⁺ = x + h (k₁ + 2 k₂ + 2 k₃ + k₄) / 6.
 
-Laws are evaluated inside every stage; one with memory (`step(z, s, p)`, such as a play) is evaluated from the memory at
-the sub-step's begin and its memory is moved on once, at the sub-step's end (a delay's shift register at its begin). A
-law with differential equations of its own (`flow`) adds states. The model's state is [x; laws' states; laws' memory].
+Laws are evaluated inside every stage; one with memory (`step(z, s, p)`, such as a play) from its memory at the
+sub-step's begin, moved on once by the signal there (moving it again by the same signal must change nothing). A law with
+differential equations of its own (`flow`) adds states. The model's state is [x; laws' states; laws' memory].
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 
 from .arrays import accumulated
-from .model import Model, portless
+from .model import Model, from_expressions
 from .parameters import ParameterSet
 from .recording import InputError, Recording
 from .simulator import Named, Placed, Simulator, call
@@ -118,6 +118,15 @@ class Equations:
                 y[name] = y[name] + apply(i, y[name], rates[self.rows[e.port]])
         return ca.vertcat(f, *flow), ca.vertcat(*y.values()), ca.vertcat(ca.SX(0, 1), *memory), signals
 
+    def memory(self, z: Any, s: Any) -> Any:
+        """Next memory of all laws from the local signal of each of its entries."""
+        _, parts, _ = self._parts(ca.SX(len(self.simulator.states) + sum(self.n_q), 1), s)
+        at, out = 0, [ca.SX(0, 1)]
+        for element, part, n in zip(self.simulator.elements, parts, self.n_s, strict=True):
+            out += [element.law.step(z[at], part, self._own(element))[1]] if n else []
+            at += n
+        return ca.vertcat(*out)
+
 
 def on_grid(simulator: Simulator, h: float) -> Simulator:
     """The simulator with its laws made for steps of length h, s."""
@@ -152,38 +161,46 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     def at(state: Any, memory: Any, u: Any, time: Any) -> tuple[Any, ...]:
         return equations.evaluate(Instant(state, memory, u, slope, time))
 
-    k1, y, begun, _ = at(x, s, u0, t)
-    # a shift register takes in the signal at the step's begin, where it is measured; others move on with the step, from
-    # a memory that has seen its begin (which matters at the first sample)
+    _, _, begun, local = at(x, s, u0, t)
+    # a shift register takes in the signal at the step's begin, where it is measured; others have moved on with it when
+    # the step begins
+    moved = ca.SX.sym("moved", s.numel())
     shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
-    seen = ca.vertcat(ca.SX(0, 1), *(s[i] if shift else begun[i] for i, shift in enumerate(shifts)))
+    seen = ca.vertcat(ca.SX(0, 1), *(s[i] if shift else moved[i] for i, shift in enumerate(shifts)))
+    k1, y, _, _ = at(x, seen, u0, t)
     n_own = len(simulator.states)
     if simulator.discrete:  # laws' own states move with z held over the sample
-        q = x[n_own:] + h * k1[n_own:]
-        x_next, memory_next = ca.vertcat(k1[:n_own], q), begun
+        x_next = ca.vertcat(k1[:n_own], x[n_own:] + h * k1[n_own:])
     else:
         k2 = at(x + h / 2 * k1, seen, middle, t + h / 2)[0]
         k3 = at(x + h / 2 * k2, seen, middle, t + h / 2)[0]
         k4 = at(x + h * k3, seen, end, t + h)[0]
         x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        ended = at(x_next, seen, end, t + h)[2] if s.numel() else s
-        memory_next = ca.vertcat(ca.SX(0, 1), *(begun[i] if shift else ended[i] for i, shift in enumerate(shifts)))
-    state, following = ca.vertcat(x, s), ca.vertcat(x_next, memory_next)
-    everything = ca.vertcat(following, y)
-    reads = ["u"]
-    columns = [u0]
+    reads, columns = ["u"], [u0]
     if hold == "linear":
         reads, columns = [*reads, "next"], [*columns, u1]
-    if ca.depends_on(everything, t):
+    if ca.depends_on(ca.vertcat(x_next, y, begun), t):
         reads, columns = [*reads, "t"], [*columns, t]
-    following, y = ca.cse([following, y])
-    return portless(
+    x_next, y = ca.cse([x_next, y])
+    z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
+    state, following, port = (x, s), (x_next, begun), None
+    if s.numel() and not any(shifts) and not ca.depends_on(z, s):
+        # memory that is moved by a port of its own makes the derivatives sparse
+        channels = ca.SX.sym("z", s.numel())
+        port = z, channels, moved
+        following = x_next, equations.memory(channels, s)
+    else:
+        x_next, y = ca.substitute([x_next, y], [moved], [begun])
+        empty = ca.SX(0, 1)
+        state, following = (ca.vertcat(x, s), empty), (ca.vertcat(x_next, begun), empty)
+    return from_expressions(
         state,
         ca.vertcat(*columns),
         vector,
         following,
         y,
         own,
+        port=port,
         states=simulator.states,
         inputs=simulator.inputs,
         outputs=simulator.output_names,
@@ -283,7 +300,7 @@ def _along_a_run(simulator: Simulator, recording: Recording, p: np.ndarray, rate
     """A high quantile of the rates along a run from rest, if that runs."""
     model = discretise(simulator, recording.dt, "zero", substeps=20)
     short = recording.slice(0, min(len(recording), 400))
-    states = states_along(model, model.drive(short), p, np.zeros(model.n_x))[:: model.substeps]
+    states = states_along(model, model.drive(short), p, np.zeros(model.n_state))[:: model.substeps]
     found = fastest(simulator, states[40::20], short.u[40::20], p)
     found = found[np.isfinite(found)]
     return min(rate, float(np.quantile(found, 0.9))) if len(found) > 5 else rate

@@ -86,7 +86,7 @@ class Model:
 
     @property
     def n_x(self) -> int:
-        """States without the memory of the element in the port; a simulator's own elements count as states."""
+        """States without memory; see `n_state`."""
         return int(self.step.size1_in(0))
 
     @property
@@ -108,6 +108,11 @@ class Model:
     def n_s(self) -> int:
         """Memory states of the element."""
         return int(self.memory.size1_in(1))
+
+    @property
+    def n_state(self) -> int:
+        """Entries of the whole state [x; s]."""
+        return self.n_x + self.n_s
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         """Fresh symbols x, s, u, p of this model's sizes."""
@@ -183,26 +188,40 @@ def open_model(
     )
 
 
-def portless(
-    x: Any,
+def from_expressions(
+    state: tuple[Any, Any],
     u: Any,
     p: Any,
-    x_next: Any,
+    following: tuple[Any, Any],
     y: Any,
     parameters: ParameterSet,
     *,
+    port: tuple[Any, Any, Any] | None = None,
     states: tuple[str, ...],
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
     reads: tuple[str, ...] = ("u",),
     substeps: int = 1,
 ) -> Model:
-    """A model without a port, from expressions of the symbols x, u and p; fields as in `Model`."""
-    w, z, s = ca.SX.sym("w", 0), ca.SX.sym("z", 0), ca.SX.sym("s", 0)
+    """A closed model from expressions of symbols; the other fields are as in `Model`.
+
+    Parameters
+    ----------
+    state, following : (x, s), (x_next, s_next)
+        States and memory (symbols), and those of the next step.
+    u, p, y
+        Inputs and parameters (symbols), and the outputs.
+    port : (z, channels, moved), optional
+        The signals that move the memory (expressions of x, u and p), the symbols by which `s_next` reads them, and
+        those by which `x_next` and `y` read the memory once moved; each as long as s. Without it, s is empty.
+    """
+    (x, s), (x_next, s_next) = state, following
+    z, channels, moved = port or (ca.SX(0, 1),) * 3
+    w = s_next if port else ca.SX(0, 1)
     return Model(
-        step=ca.Function("step", [x, u, w, p], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),
-        port=ca.Function("port", [x, u, p], [ca.SX(0, 1)], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [z, s, p], [w, s], ["z", "s", "p"], ["w", "s_next"]),
+        step=ca.Function("step", [x, u, moved, p], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),
+        port=ca.Function("port", [x, u, p], [z], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [channels, s, p], [w, s_next], ["z", "s", "p"], ["w", "s_next"]),
         parameters=parameters,
         element=None,
         states=states,

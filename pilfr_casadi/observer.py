@@ -8,10 +8,12 @@ the truth are annealed through it.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
-from .model import Model, portless
+from .model import Model
 from .parameters import Parameter
 
 GAMMA = "observer"
@@ -23,7 +25,7 @@ def led(model: Model, gain: np.ndarray) -> Model:
     Parameters
     ----------
     model : Model
-        Closed model without a port of its own (`n_w = 0`).
+        Closed model.
     gain : array, shape (k, n_y)
         Gain of the first k states.
 
@@ -33,24 +35,20 @@ def led(model: Model, gain: np.ndarray) -> Model:
         The same with the parameter `observer` (fixed at 0), reading the measured output as well.
     """
     parameters = model.parameters | {GAMMA: Parameter(0.0, bounds=(0.0, 1.0), fixed=True)}
-    x, u, p = ca.SX.sym("x", model.n_x), ca.SX.sym("u", model.n_u), ca.SX.sym("p", parameters.size)
-    measured, w = ca.SX.sym("y", model.n_y), ca.SX.sym("w", 0)
+    sizes = (("x", model.n_x), ("u", model.n_u), ("w", model.n_w), ("p", parameters.size), ("y", model.n_y))
+    x, u, w, p, measured = (ca.SX.sym(name, n) for name, n in sizes)
+    z, s, read = ca.SX.sym("z", model.n_w), ca.SX.sym("s", model.n_s), ca.vertcat(u, measured)
     following, y = model.step(x, u, w, p[:-1])
     full = np.zeros((model.n_x, model.n_y))
     full[: len(gain)] = gain
     following = following + p[-1] * (ca.DM(full) @ (measured - y))
-    return portless(
-        x,
-        ca.vertcat(u, measured),
-        p,
-        following,
-        y,
-        parameters,
-        states=model.states,
-        inputs=model.inputs,
-        outputs=model.outputs,
+    return replace(
+        model,
+        step=ca.Function("step", [x, read, w, p], [following, y], ["x", "u", "w", "p"], ["x_next", "y"]),
+        port=ca.Function("port", [x, read, p], [model.port(x, u, p[:-1])], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [z, s, p], list(model.memory(z, s, p[:-1])), ["z", "s", "p"], ["w", "s_next"]),
+        parameters=parameters,
         reads=(*model.reads, "y"),
-        substeps=model.substeps,
     )
 
 

@@ -23,7 +23,7 @@ def free_run(simulator: Simulator, recording: Recording, hold: str, first: int =
     held = simulator.with_parameters({k: replace(p, fixed=True) for k, p in simulator.parameters.items()})
     bench = Workbench.of(held, [recording.slice(0, first).with_(skip=0) if first else recording], hold)
     model = bench.model(held)
-    state = np.zeros(model.n_x + model.n_s)
+    state = np.zeros(model.n_state)
     if not isinstance(recording.initial, str):
         state[: len(recording.initial)] = recording.initial
     elif first and len(state):

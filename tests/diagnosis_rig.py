@@ -66,6 +66,6 @@ def recordings(law=None, port="ground-m1", seed=0, count=2, noise=1e-3, hold="ze
         u = (40 * v / np.std(v) * (0.3 + 0.7 * np.sin(np.pi * t / t[-1])))[:, None]
         blank = Recording(u, u, DT, inputs=("force",), outputs=("x2",), initial="zero", hold=hold)
         model = discretise(true, DT, hold, max(4, choose_substeps(true, [blank])))
-        y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_x))[0]
+        y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_state))[0]
         out.append(blank.with_(y=y + noise * np.std(y) * rng.standard_normal(y.shape)))
     return out

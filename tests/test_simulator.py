@@ -60,7 +60,7 @@ def record():
 
 def run(simulator, record, hold="zero", substeps=1, state=None, engine=None):
     model = discretise(simulator, record.dt, hold, substeps)
-    state = np.zeros(model.n_x + model.n_s) if state is None else state
+    state = np.zeros(model.n_state) if state is None else state
     made = VirtualMachine(model) if engine is None else make_engine(model, engine)
     return made.simulate(model.drive(record), model.parameters.start, np.asarray(state, dtype=float))[0]
 

@@ -208,7 +208,7 @@ def by_cost(
         known = {k: v for k, v in start.items() if k in parameters}
         vector, total = np.clip(parameters.pack(known), parameters.lower, parameters.upper), 0.0
         for r, state in zip(part.recordings, without.begin, strict=True):
-            full = np.zeros(model.n_x)
+            full = np.zeros(model.n_state)
             full[: len(state)] = state
             with np.errstate(over="ignore", invalid="ignore"):
                 y = engine.simulate(model.drive(r), vector, full)[0]

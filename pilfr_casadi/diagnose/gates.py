@@ -245,7 +245,7 @@ def _sizes(bench: Workbench) -> np.ndarray:
     """Size of each measured output over that of the output simulated at the user's values; nan where it diverges."""
     model = bench.model(bench.simulator)
     engine = make_engine(model, bench.engine)
-    start, n = model.parameters.start, model.n_x
+    start, n = model.parameters.start, model.n_state
     with np.errstate(all="ignore"):
         y = [engine.simulate(model.drive(r), start, np.zeros(n))[0] for r in bench.recordings]
         return np.asarray(bench.scale / np.std(np.concatenate(y), axis=0))

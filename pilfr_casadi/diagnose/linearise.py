@@ -77,7 +77,7 @@ class Probe:
         """Differentiate the probed simulator."""
         simulator = fitted.simulator
         model = discretise(probed(simulator), bench.dt, bench.hold, fitted.model.substeps)
-        x, _, u, p = model.symbols()
+        x, (u, p) = ca.SX.sym("x", model.n_state), model.symbols()[2:]
         following, y = model.closed(x, u, p)
         parameters = model.parameters
         names = tuple(port.name for port in simulator.all_ports())
@@ -126,7 +126,7 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     r, model = bench.recordings[i], probe.model
     n = model.substeps
     p = model.parameters.pack({k: v for k, v in fitted.values.items() if k in model.parameters})
-    drive, x = model.drive(r), np.asarray(fitted.initial[i], dtype=float)[: model.n_x]
+    drive, x = model.drive(r), np.asarray(fitted.initial[i], dtype=float)[: model.n_state]
     if gain is None:
         states = states_along(model, drive, p, x)
     else:

@@ -126,9 +126,8 @@ class Search:
 
     def _more(self) -> bool:
         excess = (self.base.cost - self.floor2) / max(self.without.cost - self.floor2, 1e-300)
-        return (excess > MORE or self.base.cost > LOUD**2 * self.floor2) and max(
-            self.open_after.values(), default=0.0
-        ) > HINT
+        much = excess > MORE or self.base.cost > max(LOUD**2 * self.floor2, SEEN)
+        return much and max(self.open_after.values(), default=0.0) > HINT
 
     def _pass(self, number: int) -> Pass:
         began = time.perf_counter()

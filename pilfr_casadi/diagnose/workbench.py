@@ -149,7 +149,7 @@ class Workbench:
         model = model or self.model(simulator)
         engine = engine or make_engine(model, self.engine)
         estimated = any(isinstance(r.initial, str) and r.initial == "estimate" for r in self.recordings)
-        if not np.any(model.parameters.free) and not (estimated and model.n_x):
+        if not np.any(model.parameters.free) and not (estimated and model.n_state):
             return self._as_it_is(simulator, model, engine)
         best: tuple[float, np.ndarray, Problem] | None = None
         for start in starts:
@@ -188,7 +188,7 @@ class Workbench:
         parameters = model.parameters
         known = {k: v for k, v in start.items() if k in parameters}
         vector = np.clip(parameters.pack(known), parameters.lower, parameters.upper)
-        states = self._unknown(guess, model.n_x + model.n_s) if len(guess) else None
+        states = self._unknown(guess, model.n_state) if len(guess) else None
         problem: Problem | None = None
         for gamma in (*path, 0.0):
             at = parameters.at(vector)

@@ -19,7 +19,7 @@ import numpy as np
 from ..operators import play
 from .base import Law, Local, grid
 
-NODES = 12
+NODES = 24
 # cells that are equally far from the curve of a = 1, each one stop at its centre of gravity with its weight
 _LOW = -2 * np.log(1 - np.arange(NODES) / NODES)
 _MASS = np.append(-np.diff(np.exp(-_LOW)), np.exp(-_LOW[-1]))

@@ -158,7 +158,7 @@ def _recover(
     values = {k: v for k, v in fitted.values.items() if k in base.parameters}
     p = np.tile(model.parameters.pack(values), (len(drive), 1))
     row = model.parameters.position(f"{probed.elements[-1].prefix}w").start
-    x, u, q = ca.SX.sym("x", model.n_x), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.parameters.size)
+    x, u, q = ca.SX.sym("x", model.n_state), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.parameters.size)
     following, y = model.closed(x, u, q)
     blocks = [ca.densify(ca.jacobian(e, v)) for e, v in ((following, x), (following, q[row]), (y, x), (y, q[row]))]
     step = ca.Function("step", [x, u, q], [y, *blocks])

@@ -236,7 +236,7 @@ def usage(diagnosis: Diagnosis) -> str:
     inputs = f"inputs={list(simulator.inputs)!r}, outputs={list(simulator.output_names)!r}"
     lines += [f'recording = pilfr.read_csv("new.csv", {inputs})']
     lines += [f"model = Workbench.of(corrected, [recording], {diagnosis.hold!r}).model(corrected)"]
-    lines += ["x0 = np.zeros(model.n_x)  # states, then the laws' memory"]
+    lines += ["x0 = np.zeros(model.n_state)  # states, then the laws' memory"]
     lines += ["y = make_engine(model).simulate(model.drive(recording), model.parameters.start, x0)[0]"]
     return "\n".join([*lines, "step = model.closed  # casadi.Function (x, u, p) -> (x_next, y), for controllers"])
 
