@@ -27,7 +27,7 @@ def led(model: Model, gain: np.ndarray) -> Model:
     model : Model
         Closed model.
     gain : array, shape (k, n_y)
-        Gain of the first k states.
+        Gain of the first k states; memory is not led.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def led(model: Model, gain: np.ndarray) -> Model:
     z, s, read = ca.SX.sym("z", model.n_w), ca.SX.sym("s", model.n_s), ca.vertcat(u, measured)
     following, y = model.step(x, u, w, p[:-1])
     full = np.zeros((model.n_x, model.n_y))
-    full[: len(gain)] = gain
+    full[: len(gain)] = gain[: model.n_x]
     following = following + p[-1] * (ca.DM(full) @ (measured - y))
     return replace(
         model,

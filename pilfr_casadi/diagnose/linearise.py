@@ -186,7 +186,9 @@ def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarra
             x = a @ x
         if total > 0 and np.isfinite(total):
             q += np.outer(column, column) / total
-    return kalman_gain(a, c, q, np.diag(np.maximum(noise, 0.05 * error) ** 2))
+    gain = kalman_gain(a, c, q, np.diag(np.maximum(noise, 0.05 * error) ** 2))
+    gain[probe.n_x :] = 0.0  # laws' own states follow
+    return gain
 
 
 def propagate(r: Run, forces: list[tuple[int, np.ndarray]], n_free: int) -> np.ndarray:

@@ -20,7 +20,7 @@ from ..simulator import Port
 from .linearise import Probe, Run, linearised, locals_of, observer_gain, propagate, run
 from .workbench import Fitted, Workbench
 
-MOST = 8000  # samples looked at
+MOST = 6000  # samples looked at
 BLOCKS = 10  # a recording, odd and even ones in turn
 
 

@@ -27,6 +27,7 @@ ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
 FEWEST = 100.0  # effective samples that a comparison is made on at least
 MORE, LOUD = 0.06, 3.0  # share of the excess, or times the noise, that has to be left to look for a second effect
 SEEN = 1e-4  # mean square error below which what is more than noise is not worth a second effect
+FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 MOSTLY = 0.5  # share of the rest that a second effect may leave
 UNSEEN = 0.7  # share of the mean square on the unseen part that a second effect may leave
@@ -235,12 +236,16 @@ class Search:
             model = self.bench.model(placed)
             engine = make_engine(model, self.bench.engine)
             nearest = by_cost(self.bench, model, engine, starts, self.base)[:1]
-            tried = attempt(self.bench, placed, nearest, states=self.base.begin, model=model, engine=engine)
-            if tried is not None and tried.error < 0.97 * winner.error:
-                finer = self._polished(tried)
-                if finer.full < self.base.cost:
-                    self.base = finer.fitted
-                    self.passes[-1] = replace(found, choice=replace(found.choice, winner=finer))
+            try:
+                finer = self.bench.fit(placed, nearest, states=self.base.begin, model=model, engine=engine)
+            except InputError:
+                continue
+            if finer.cost < FINER_BY * self.base.cost:
+                self.base = finer
+                size = law.size({k: finer.values[f"{element.prefix}{k}"] for k in law.parameters()})
+                head, tail = judged(self.bench, finer)
+                better = replace(winner, law=law, fitted=finer, head=head, tail=tail, full=finer.cost, size=size)
+                self.passes[-1] = replace(found, choice=replace(found.choice, winner=better))
             self._timed("finer form", began)
 
     def _look_back(self) -> None:
