@@ -36,6 +36,7 @@ FLEXIBLE: dict[str, float] = {
     "extra_mode": 1.15,
     "stribeck_friction": 1.05,
     "periodic_force": 1.25,
+    "drift": 1.25,
 }
 # a law -> what it has as special cases: it always does as well, and is no rival of theirs
 CONTAINS = {"hysteresis": ("backlash", "coulomb_friction"), "stribeck_friction": ("coulomb_friction",)}

@@ -14,6 +14,7 @@ from .dynamic import (
     Relaxation,
     Resonance,
     Settling,
+    Swing,
     TwoStageCreep,
 )
 from .friction import (
@@ -102,6 +103,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     TwoStageCreep,
     Drift,
     Settling,
+    Swing,
     PeriodicForce,
     Lag,
     Resonance,

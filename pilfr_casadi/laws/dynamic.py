@@ -230,3 +230,22 @@ class Settling(Drift):
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"T": (0.02 * local.duration, 3 * local.duration)}
+
+
+class Swing(Drift):
+    """A slow swing to and fro, as of a room's temperature over a day."""
+
+    form = "swing"
+    equation = "w = a cos(2 pi t / T) + b sin(2 pi t / T) + c"
+    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "c": "w", "T": "s"}
+    strength: ClassVar[tuple[str, ...]] = ("a", "b", "c")
+
+    def force(self, t: Any, p: Any) -> Any:
+        angle = 2 * np.pi * t / p.T
+        return p.a * ca.cos(angle) + p.b * ca.sin(angle) + p.c
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(T=local.duration * np.array([0.4, 0.7, 1.0, 1.5, 2.5]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"T": (0.25 * local.duration, 4 * local.duration)}
