@@ -1,0 +1,135 @@
+"""Every law of the catalogue: its derivatives, both engines, its force along a signal, and what it says of itself."""
+
+import inspect
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+
+import pilfr_casadi.laws as laws
+from pilfr_casadi import Parameter, Port, Recording, Simulator
+from pilfr_casadi.compiled import compiler, make_engine
+from pilfr_casadi.integration import discretise
+from pilfr_casadi.laws import CATALOGUE, FINER, readable_unit
+from pilfr_casadi.laws.base import Local
+from pilfr_casadi.laws.trace import columns, trace
+from pilfr_casadi.sensitivities import VirtualMachine
+
+DT, M = 0.01, 240
+EVERY = (*CATALOGUE, *(finer for kinds in FINER.values() for finer in kinds))
+T = np.arange(M) * DT
+Z = 0.8 * np.sin(2 * np.pi * 1.3 * T) + 0.5 * np.sin(2 * np.pi * 3.1 * T + 1) + 0.05
+LOCAL = Local(Z, np.gradient(Z, DT), DT, (M,), np.inf)
+
+
+def simulator():
+    def dynamics(x, u, p):
+        return {"pos": x.vel, "vel": (u.force - 60 * x.pos - p.d * x.vel) / 1.2}
+
+    port = Port("ground", {"vel": -1 / 1.2}, lambda x: x.pos, lambda x: x.vel, "N", "m")
+    return Simulator(dynamics, lambda x: {"y": x.pos}, ("pos", "vel"), ("force",), {"d": Parameter(1.0)}, ports=(port,))
+
+
+def dose(kind, number=0):
+    """A law with a shape from its own grid and strengths that matter."""
+    law = kind()
+    shapes = list(law.shapes(LOCAL))
+    law = law.at(shapes[min(number, len(shapes) - 1)])
+    law = law.at({k: 1.03 * v for k, v in law.values.items()})  # off the kinks of a law's own grid
+    law = law.at({}, law.bounds(LOCAL))
+    strengths = {}
+    for name in law.strength:
+        value = np.asarray(law.parameters()[name].value)
+        strengths[name] = 0.3 * np.ones(value.shape) if value.ndim else 0.3
+    return law.at(strengths)
+
+
+@pytest.fixture(scope="module")
+def record():
+    rng = np.random.default_rng(3)
+    u = 20 * np.interp(T, T[::6], rng.standard_normal(len(T[::6])))
+    return Recording(u, np.zeros(M), DT, ("force",), ("y",), initial="zero")
+
+
+def model_of(kind, hold):
+    port = "ground" if "parallel" in kind.places else "sensor:y"
+    return discretise(simulator().with_element(port, dose(kind)), DT, hold, 2)
+
+
+@pytest.mark.parametrize("kind", EVERY, ids=lambda kind: kind.__name__)
+def test_derivatives_and_engines(kind, record):
+    model = model_of(kind, "linear")
+    vm, drive, p = VirtualMachine(model), model.drive(record), model.parameters.start
+    state = np.zeros(model.n_state)
+    seed, place = np.zeros((model.n_state, len(p))), np.arange(len(p))
+    y, jac, *_ = vm.sensitivity(drive, p, state, seed, place)
+    assert np.all(np.isfinite(y)) and np.all(np.isfinite(jac))
+    assert np.array_equal(y, vm.simulate(drive, p, state)[0])
+    if compiler():
+        c = make_engine(model, "c")
+        np.testing.assert_allclose(c.simulate(drive, p, state)[0], y, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(c.sensitivity(drive, p, state, seed, place)[1], jac, rtol=1e-7, atol=1e-9)
+    weight = np.random.default_rng(0).standard_normal(M)
+
+    def projected(values):
+        return float(weight @ vm.simulate(drive, values, state)[0][:, 0])
+
+    step = 1e-6 * np.maximum(np.abs(p), 1e-3)
+    slopes = np.array([approx_fprime(p, projected, np.where(place == i, step, 0.0) + 1e-300)[i] for i in place])
+    exact = np.einsum("k,kp->p", weight, jac[:, 0])
+    np.testing.assert_allclose(exact, slopes, rtol=2e-3, atol=2e-3 * np.max(np.abs(slopes)))
+
+
+@pytest.mark.parametrize("kind", EVERY, ids=lambda kind: kind.__name__)
+def test_the_force_is_linear_in_the_strengths(kind):
+    law = dose(kind)
+    shapes = list(law.shapes(LOCAL))
+    found = trace(law, LOCAL, shapes)
+    assert found.shape == (M, len(shapes), columns(law))
+    assert np.all(np.isfinite(found))
+    assert np.all(np.ptp(found, axis=0).max(axis=1) > 0), "a shape on the grid gives no force that changes"
+    same = np.isclose(found, np.roll(found, 1, axis=1)).all(axis=(0, 2))
+    assert len(shapes) == 1 or not np.any(same), "two shapes of the grid are the same"
+
+
+@pytest.mark.parametrize("kind", EVERY, ids=lambda kind: kind.__name__)
+def test_a_law_speaks_of_itself(kind):
+    law = dose(kind)
+    own = law.parameters()
+    assert set(own) == set(law.units) or set(own) <= set(law.units)
+    assert set(law.strength) <= set(own)
+    assert len(law.sentence.split()) > 3 and "=" in law.equation
+    assert any(letter.isdigit() for letter in law.source), "no citation"
+    assert inspect.getdoc(kind)
+    assert all("[" not in readable_unit(unit, "N", "m") for unit in law.units.values())
+    assert set(law.places) <= {"parallel", "series"} and law.places
+    for name, (low, high) in law.bounds(LOCAL).items():
+        assert name in own
+        assert np.all(np.asarray(low) <= np.asarray(high))
+    reach, inside = 1e-3 * LOCAL.reach, []
+    for shape in kind().shapes(LOCAL):
+        limits = kind().at(shape).bounds(LOCAL)
+        pairs = [(np.asarray(v), *limits.get(k, (-np.inf, np.inf))) for k, v in shape.items()]
+        inside.append(all(np.all((v >= low - reach) & (v <= high + reach)) for v, low, high in pairs))
+    assert any(inside), "no shape of the grid lies inside the bounds"
+
+
+def test_what_moves_memory_twice_by_the_same_signal_changes_nothing():
+    """The integration moves memory on at the begin of a step and reads it again at the same signal."""
+    for kind in EVERY:
+        law = dose(kind)
+        if not hasattr(law, "step") or law.shifts:
+            continue
+        p = {name: ca.DM(q.value) for name, q in law.parameters().items()}
+        rng = np.random.default_rng(1)
+        for z in (-0.7, 0.0, 0.4):
+            first = law.step(ca.DM(z), ca.DM(0.3 * rng.standard_normal(law.memory)), p)
+            again = law.step(ca.DM(z), first[1], p)
+            np.testing.assert_allclose(np.asarray(again[1]), np.asarray(first[1]), rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(float(again[0]), float(first[0]), rtol=1e-9, atol=1e-12)
+
+
+def test_the_catalogue_has_no_law_twice():
+    assert len({(kind.id, kind.form, kind.places) for kind in CATALOGUE}) == len(CATALOGUE)
+    assert set(laws.__all__) >= {"CATALOGUE", "Law"}
