@@ -259,13 +259,18 @@ def hysteresis(rng: np.random.Generator, c: Scale) -> Draft:
 
 
 def creep(rng: np.random.Generator, c: Scale) -> Draft:
-    """Slow relaxation in parallel: one or three Maxwell elements."""
-    n = int(rng.choice([1, 3]))
+    """Slow relaxation in parallel: one or three Maxwell elements, or six as a spring-pot (fractional damping)."""
+    n = int(rng.choice([1, 3, 6]))
     tau = np.geomspace(1, 8, n) * c.duration * rng.uniform(0.01, 0.04)
+    share = np.ones(n) / n
+    if n == 6:
+        tau = np.geomspace(0.02, 3.0, n) / c.frequency
+        share = (tau[0] / tau) ** 0.5
 
     def law(s: Any, a: float) -> tuple[Any, Any]:
         pull = [s.z - s.q[i] for i in range(n)]
-        return a * c.force / c.z / n * sum(pull), ca.vertcat(*[pull[i] / tau[i] for i in range(n)])
+        force = sum(w * e for w, e in zip(share, pull, strict=True))
+        return a * c.force / c.z * force, ca.vertcat(*[pull[i] / tau[i] for i in range(n)])
 
     return Draft(f"maxwell-{n}", flowing(n, law))
 

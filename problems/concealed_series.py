@@ -204,19 +204,11 @@ def outside(rng: np.random.Generator, c: Scale, series: bool, other: str | None)
             },
         )
         return Draft(variant, make, 0.2, 0.9)
-    tau = np.geomspace(0.02, 3.0, 6) / c.frequency
     options = {
         "position-damping": memoryless(lambda s, a: a * c.force * (s.z / c.z) ** 2 * s.dz / c.dz),
         "parametric-stiffness": memoryless(lambda s, a: a * c.force * ca.cos(w * s.t) * s.z / c.z),
         "disturbance": lambda a: {"fn": lambda s: (a * c.force * s.noise, NONE, NONE)},
         "switching-friction": memoryless(lambda s, a: a * c.force * on(s) * ca.tanh(s.dz / (0.02 * c.dz))),
-        "fractional-damping": flowing(
-            6,
-            lambda s, a: (
-                a * c.force / c.z * sum((s.z - s.q[i]) * (tau[0] / tau[i]) ** 0.5 for i in range(6)),
-                ca.vertcat(*[(s.z - s.q[i]) / tau[i] for i in range(6)]),
-            ),
-        ),
     }
     if other is not None:
         options["state-product"] = memoryless(lambda s, a: a * c.force * s.z / c.z * getattr(s.x, other) / c.dz)

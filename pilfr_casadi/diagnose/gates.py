@@ -67,7 +67,7 @@ def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, 
         values, at = np.array(getattr(r, kind)), r.t * (1 + rate) + seconds
         end = len(r) * r.dt if r.period and len(r) % r.period == 0 and not rate else None
         for i in index:
-            values[:, i] = np.interp(at, r.t, values[:, i], period=end)
+            values[:, i] = _read(r.t, values[:, i], at, end, smooth=kind == "y")
         other = r.with_(**{kind: values})
         if end is not None or not cut:
             return other
@@ -77,6 +77,17 @@ def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, 
         return other.slice(0, max(len(r) - late, other.skip + 2)) if late else other
 
     return change
+
+
+def _read(t: np.ndarray, v: np.ndarray, at: np.ndarray, end: float | None, smooth: bool) -> np.ndarray:
+    """A signal between its samples: an output along a cubic spline, an input along its chords; ends are held."""
+    if not smooth:
+        return np.interp(at, t, v, period=end)
+    from scipy.interpolate import CubicSpline
+
+    if end is None:
+        return np.asarray(CubicSpline(t, v)(np.clip(at, t[0], t[-1])))
+    return np.asarray(CubicSpline(np.append(t, end), np.append(v, v[0]), bc_type="periodic")(at))
 
 
 def slower_by(factor: float) -> Change:
@@ -206,13 +217,13 @@ def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, lis
     """Sign and unit slips of each channel, and of the time."""
     best, found = plain, None
     trials: list[tuple[str, str, float, Change]] = []
-    sizes = _sizes(bench)
+    sizes, lost = _sizes(bench), plain.cost > 1  # a size says nothing where a simulator has left its working range
     for i, name in enumerate(bench.simulator.output_names):
         trials.append((name, "sign", -1.0, scaled("y", i, -1.0)))
-        trials += [(name, "unit", f, scaled("y", i, f)) for f in FACTORS if _near(f * sizes[i])]
+        trials += [(name, "unit", f, scaled("y", i, f)) for f in FACTORS if lost or _near(f * sizes[i])]
     for i, name in enumerate(bench.simulator.inputs):
         trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
-        trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if np.any([_near(v / f) for v in sizes])]
+        trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if lost or any(_near(v / f) for v in sizes)]
     for factor in (1e-3, 1e3, 60.0, 1 / 60) if plain.cost > HOPELESS else ():
         trials.append(("time", "time-unit", factor, slower_by(factor)))
     for name, finding, value, change in trials:

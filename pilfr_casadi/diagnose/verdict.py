@@ -25,8 +25,10 @@ COLOURED, LOUD = 15.0, 0.015  # times the white part of a residual that coloured
 SOMEWHAT = 4.0  # the same times, for noise of any size
 HINT = 0.1  # share of a residual that a flexible force has to explain to count
 PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name that only comes near
+LITTLE = 0.02  # of the excess left, with rivals near and a force that explains most of it
 MAINLY = 0.6  # of it explainable: whatever the rivals, the name is wrong or incomplete
 CLEAR = 1.5  # times the winner's error that every rival's is, for a name that only comes near to be given all the same
+PURE = 0.05  # share of model error in a residual that is taken for noise
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
 LIKE = 0.03  # rivals whose error is within this share cannot be told apart
 # a law that can imitate others -> factor by which its error must be smaller
@@ -50,6 +52,7 @@ FORMS = {
     "power": 1.1,
     "quintic": 1.05,
     "geometric": 1.05,
+    "two-stage": 1.05,
     "hertz": 1.05,
     "progressive": 1.05,
     "gradual": 1.05,
@@ -91,6 +94,10 @@ def imitation(candidate: Candidate, rival: Candidate) -> float:
     return IMITATES.get((candidate.law.id, rival.law.id), 0.0) if candidate.port == rival.port else 0.0
 
 
+def _near(candidate: Candidate, winner: Candidate) -> bool:
+    return candidate.error < (1 + LIKE) * winner.error
+
+
 def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor: float, n: float) -> Choice | None:
     """The winner among candidates; `without` are the errors of the simulator alone, `floor` the noise, all squared."""
     usable = [c for c in candidates if np.isfinite(c.error)]
@@ -116,19 +123,14 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
             break
     before = float(np.sqrt(np.sqrt(without[0] * without[1])))
     gain = n * (np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
-    alike, margin = [], np.inf
-    seen = {winner.name}
-    for c in ranked:
-        if c.name in seen:
-            continue
-        seen.add(c.name)
+    first = {c.name: c for c in reversed(ranked) if c.name != winner.name}  # the best of each name
+    alike = [c for c in ranked if c is first.get(c.name) and _near(c, winner) and c.size <= winner.size]
+    ports, margin = {winner.port, *(c.port for c in alike)}, np.inf
+    for c in first.values():
         ratio = c.error / winner.error
-        if ratio < 1 + LIKE and c.size <= winner.size:
-            alike.append(c)
-        elif c.port == winner.port and (
-            ratio < 1 + LIKE or (winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > 1 - LIKE)
-        ):
-            continue  # a refinement of the winner is no rival
+        contains = winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > 1 - LIKE
+        if c in alike or (c.port in ports and (_near(c, winner) or contains)):
+            continue  # a refinement of the winner, or of what cannot be told from it, is no rival
         else:
             margin = min(margin, max(ratio, excess(c) / excess(winner)))
     remains = (winner.error**2 - floor) / max(before**2 - floor, 1e-300)
@@ -168,7 +170,8 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
             f"{error:.3g} of the outputs' deviation, the noise is about {floor:.3g}{at}."
         )
     margin = min(c.margin for c in accepted)
-    near = remains > PARTLY and (still > MAINLY or (still > STILL and margin < CLEAR))
+    most = PARTLY if margin > CLEAR else LITTLE
+    near = (still > MAINLY and remains > most) or (still > STILL and remains > PARTLY and margin < CLEAR)
     if near or remains > MOST_OPEN:
         port = accepted[0].winner.port
         if search.open_before.get(port, 0.0) < 0.5 * search.open_before.get(where, 0.0):
@@ -183,9 +186,16 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
 
 
 def confidence(choice: Choice, search: Search) -> float:
-    """How sure the name is: from the margin over true rivals, lowered by what stays unexplained."""
+    """How sure the law's name is: from the margin over true rivals, lowered by what stays unexplained.
+
+    At the noise floor a small margin over thousands of samples says more than the same margin where model error rules.
+    A tie between ports does not lower it, a tie between laws does.
+    """
     remains, still = left_open(search)
-    lead = 1 - np.exp(-8 * np.log(max(min(choice.margin, 10.0), 1.0)))
+    error2 = max(choice.winner.error**2, 1e-300)
+    above = float(np.clip(1 - search.floor2 / error2, PURE, 1.0))
+    lead = 1 - np.exp(-8 / above * np.log(max(min(choice.margin, 10.0), 1.0)))
     still *= min(1.0, remains / 0.03)  # of next to nothing, all may be explainable
     doubt = 1 / (1 + (remains / 0.15) ** 2) / (1 + (still / 0.3) ** 2)
-    return float(np.clip(lead * doubt / (1 + len(choice.alike)), 0.0, 0.99))
+    others = len({c.law.id for c in choice.alike} - {choice.winner.law.id})
+    return float(np.clip(lead * doubt / (1 + others), 0.0, 0.99))

@@ -16,6 +16,7 @@ from .dynamic import (
     Settling,
     Swing,
     TwoStageCreep,
+    TwoStageRelaxation,
 )
 from .friction import (
     AsymmetricFriction,
@@ -99,6 +100,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     Root,
     Delay,
     Relaxation,
+    TwoStageRelaxation,
     Creep,
     TwoStageCreep,
     Drift,

@@ -76,6 +76,36 @@ class Relaxation(Law):
         return {"T": (5 * local.dt, 2 * local.duration)}
 
 
+class TwoStageRelaxation(Relaxation):
+    """Creep with a fast and a slow part."""
+
+    form = "two-stage"
+    equation = "w = k_1 (z - q_1) + k_2 (z - q_2),  dq_i/dt = (z - q_i) / T_i"
+    units: ClassVar[Mapping[str, str]] = {"k_1": "w/z", "k_2": "w/z", "T_1": "s", "T_2": "s"}
+    strength: ClassVar[tuple[str, ...]] = ("k_1", "k_2")
+    order = 2
+
+    def force(self, z: Any, q: Any, p: Any) -> Any:
+        return p.k_1 * (z - q[0]) + p.k_2 * (z - q[1])
+
+    def flow(self, z: Any, q: Any, p: Any) -> Any:
+        """Both dampers."""
+        return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from _two_times(local)
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {name: (5 * local.dt, 2 * local.duration) for name in ("T_1", "T_2")}
+
+
+def _two_times(local: Local) -> Iterator[dict[str, Any]]:
+    times = np.geomspace(20 * local.dt, local.duration / 2, 5)
+    for i, fast in enumerate(times):
+        for slow in times[i + 1 :]:
+            yield {"T_1": float(fast), "T_2": float(slow)}
+
+
 class Creep(Relaxation):
     """Creep of an actuator or a sensor: a slow part follows the signal (Kelvin-Voigt element)."""
 
@@ -108,13 +138,12 @@ class TwoStageCreep(Creep):
         return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        times = np.geomspace(20 * local.dt, local.duration / 2, 5)
-        for i, fast in enumerate(times):
-            for slow in times[i + 1 :]:
-                yield {"T_1": float(fast), "T_2": float(slow)}
+        yield from _two_times(local)
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {name: (5 * local.dt, 2 * local.duration) for name in ("T_1", "T_2")}
+        # parts of opposite signs would be a filter, not something that goes on in the same direction
+        times = {name: (5 * local.dt, 2 * local.duration) for name in ("T_1", "T_2")}
+        return times | {name: (0.0, np.inf) for name in self.strength}
 
 
 class Lag(Law):
