@@ -20,7 +20,7 @@ from .explain import Candidate, attempt, by_cost, explain, heads, judged, polish
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .screen import Scored, screen
-from .verdict import FLEXIBLE, HINT, Choice, choose, imitation
+from .verdict import FLEXIBLE, HINT, Choice, choose, imitates
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
@@ -200,11 +200,8 @@ class Search:
         found = self.passes[-1]
         assert found.choice is not None
         winner = found.choice.winner
-        closer = [
-            c
-            for c in found.candidates
-            if c.port == winner.port and c.error * max(1 / 0.95, imitation(c, winner)) < winner.error
-        ]
+        nearer = [c for c in found.candidates if c.port == winner.port and c.error < 0.95 * winner.error]
+        closer = [c for c in nearer if not imitates(c, winner, self.floor2)]
         still = self._open(self.base).get(winner.port, 0.0) if closer else 0.0
         if still < HINT:
             return

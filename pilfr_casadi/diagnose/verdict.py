@@ -89,9 +89,11 @@ def handicap(candidate: Candidate) -> float:
     return FLEXIBLE.get(candidate.law.id, 1.0) * FORMS.get(candidate.law.form, 1.0)
 
 
-def imitation(candidate: Candidate, rival: Candidate) -> float:
-    """Factor by which a law has to be closer than another at its port that it can imitate, or nothing."""
-    return IMITATES.get((candidate.law.id, rival.law.id), 0.0) if candidate.port == rival.port else 0.0
+def imitates(candidate: Candidate, rival: Candidate, floor: float) -> bool:
+    """Whether a law comes so little nearer than another at its port, above the floor, that it may just imitate it."""
+    needed = IMITATES.get((candidate.law.id, rival.law.id), 0.0) if candidate.port == rival.port else 0.0
+    own, other = (max(c.error**2 - floor, 0.05 * floor) for c in (candidate, rival))
+    return other < needed**2 * own
 
 
 def _near(candidate: Candidate, winner: Candidate) -> bool:
@@ -118,7 +120,7 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     if close:  # what does as well with fewer parameters
         winner = min(close, key=lambda c: (c.size, key(c)))
     for rival in ranked[1:]:
-        if rival.error < imitation(winner, rival) * winner.error:
+        if imitates(winner, rival, floor):
             winner = rival
             break
     before = float(np.sqrt(np.sqrt(without[0] * without[1])))
