@@ -155,11 +155,12 @@ def test_a_fit_goes_on_from_given_states():
 
 @pytest.mark.parametrize(("margin", "verdict"), [(2.0, "missing-physics"), (1.2, "unexplained")])
 def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
-    winner = SimpleNamespace(port="guide", law=SimpleNamespace(id="coulomb_friction"))
-    found = SimpleNamespace(accepted=True, choice=SimpleNamespace(winner=winner, margin=margin))
+    winner = SimpleNamespace(port="guide", law=SimpleNamespace(id="coulomb_friction"), error=0.4)
+    found = SimpleNamespace(accepted=True, choice=SimpleNamespace(winner=winner, margin=margin, alike=()))
     search = SimpleNamespace(
         passes=[found],
-        floor2=0.0,
+        floor2=1e-6,
+        floor=SimpleNamespace(source="estimated"),
         base=SimpleNamespace(cost=0.2),
         without=SimpleNamespace(cost=1.0),
         open_before={"guide": 0.9},

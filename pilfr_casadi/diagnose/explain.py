@@ -92,7 +92,8 @@ def judged(bench: Workbench, fitted: Fitted) -> tuple[float, float]:
         cut = len(first)
         head.append(e[r.skip : cut])
         tail.append(e[cut:] if len(r) - cut > 5 else e[r.skip :])
-    means = [float(np.mean(np.concatenate(part))) for part in (head, tail)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        means = [float(np.mean(np.concatenate(part))) for part in (head, tail)]
     return means[0], means[1] if np.isfinite(means[1]) else np.inf
 
 

@@ -14,6 +14,8 @@ import numpy as np
 
 from ..recording import Recording
 
+ALIKE, CHANCE = 0.5, 1e-4  # rank correlation, and its chance in noise, of a residual that swells with a signal
+
 
 @dataclass(frozen=True, eq=False)
 class Floor:
@@ -69,3 +71,29 @@ def effective_size(residuals: Sequence[np.ndarray], most: int = 400) -> float:
             rho = rho / rho[0] if rho[0] > 0 else np.zeros(1)
             total += n / (1 + 2 * float(np.sum(rho[1:] ** 2)))
     return total
+
+
+def swells_with(residuals: Sequence[np.ndarray], signals: Sequence[np.ndarray]) -> bool:
+    """Whether a residual swells and fades with any column of signals of the same length: noise does not.
+
+    Rank correlation (Spearman 1904) of their powers over blocks longer than the residual remembers.
+    """
+    from scipy.stats import spearmanr
+
+    def powers(v: np.ndarray, block: int) -> np.ndarray:
+        count = len(v) // block
+        return np.asarray(np.mean(v[: count * block].reshape(count, block) ** 2, axis=1))
+
+    for k in range(residuals[0].shape[1]):
+        own = [e[:, [k]] for e in residuals]
+        memory = sum(map(len, own)) / max(effective_size(own), 1.0)
+        blocks = [int(np.clip(4 * memory, 10, max(len(e) // 12, 10))) for e in own]
+        loud = np.concatenate([powers(e[:, 0], b) for e, b in zip(own, blocks, strict=True)])
+        for j in range(signals[0].shape[1]):
+            other = np.concatenate([powers(v[:, j] - v[:, j].mean(), b) for v, b in zip(signals, blocks, strict=True)])
+            if len(loud) < 8 or not np.ptp(other) > 0:
+                continue
+            rank, chance = spearmanr(loud, other)
+            if rank > ALIKE and chance < CHANCE:
+                return True
+    return False

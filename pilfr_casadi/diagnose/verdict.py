@@ -15,19 +15,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .explain import Candidate
+from .floor import swells_with
 from .gates import Gate
 
 if TYPE_CHECKING:
     from .search import Search
 
-AT_FLOOR = 1.15  # times a measured floor that counts as being at it
-COLOURED, LOUD = 15.0, 0.015  # times the white part of a residual that coloured noise may have, and its size then
-SOMEWHAT = 4.0  # the same times, for noise of any size
+AT_FLOOR = 1.15  # times the floor that counts as being at it
+QUANTISED, SOMEWHAT, COLOURED = 2.0, 4.0, 9.0  # times a measured floor, and an estimated one, that noise may be
+LOUD, SILENT = 0.05, 0.01  # largest coloured noise, and what a force may explain of it
 HINT = 0.1  # share of a residual that a flexible force has to explain to count
 PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name that only comes near
 LITTLE = 0.02  # of the excess left, with rivals near and a force that explains most of it
 MAINLY = 0.6  # of it explainable: whatever the rivals, the name is wrong or incomplete
 CLEAR = 1.5  # times the winner's error that every rival's is, for a name that only comes near to be given all the same
+UNSURE = 0.5  # confidence below which a name is called likely
 PURE = 0.05  # share of model error in a residual that is taken for noise
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
 LIKE = 0.03  # rivals whose error is within this share cannot be told apart
@@ -146,45 +148,67 @@ def left_open(search: Search) -> tuple[float, float]:
     return float(np.clip(share, 0, 1)), max(search.open_after.values(), default=0.0)
 
 
+def _like_noise(search: Search, times: float) -> bool:
+    """Whether a residual so many times the floor can be noise: coloured, or repeated as quantisation is."""
+    unexplained = max(search.open_before.values(), default=0.0) < SILENT
+    if search.floor.source != "estimated":
+        return times < QUANTISED and unexplained
+    return times < SOMEWHAT or (times < COLOURED and unexplained and search.without.cost < LOUD**2)
+
+
+def _swells(search: Search) -> bool:
+    """Whether the residual swells with the inputs, the outputs or their rates."""
+    records = search.bench.recordings
+    signals = [np.column_stack([r.u, r.y, np.gradient(r.y, axis=0)])[r.skip :] for r in records]
+    return swells_with([e[r.skip :] for e, r in zip(search.without.residual, records, strict=True)], signals)
+
+
 def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     """Verdict and its sentence."""
-    faults = [g for g in gates if g.fault]
     accepted = [p.choice for p in search.passes if p.accepted and p.choice is not None]
     remains, still = left_open(search)
+    if accepted and _explains(accepted, remains, still):
+        words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
+        sure = min(confidence(c, search) for c in accepted) > UNSURE
+        return "missing-physics", (
+            f"The simulator leaves out {words}."
+            if sure
+            else f"The simulator most likely leaves out {words}; the name is not certain."
+        )
+    faults = [g for g in gates if g.fault]
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
+    open_now = max(search.open_before.values(), default=0.0)
+    bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and not _swells(search))
+    if faults and (bare or (open_now < HINT and not accepted)):
+        return "recording-fault", faults[0].sentence
+    if bare and open_now < HINT:
+        return "complete", (
+            f"Nothing is missing: refitted, the simulator follows the recordings to {error:.3g} of the outputs' "
+            f"deviation, and no force at any port explains any of the rest."
+        )
     if not accepted:
-        open_now = max(search.open_before.values(), default=0.0)
-        if search.floor.source != "estimated":
-            bare = error < AT_FLOOR * floor
-        else:
-            bare = error < SOMEWHAT * floor or (error < COLOURED * floor and error < LOUD)
-        if faults and (bare or open_now < HINT):
-            return "recording-fault", faults[0].sentence
-        if bare and open_now < HINT:
-            return "complete", (
-                f"Nothing is missing: refitted, the simulator follows the recordings to {error:.3g} of the outputs' "
-                f"deviation, and no force at any port explains any of the rest."
-            )
         at = f"; a force at {where} could explain {open_now:.0%} of the rest" if open_now > HINT else ""
         return "unexplained", (
             f"Something is missing and no law of the catalogue explains it: refitted, the simulator is off by "
             f"{error:.3g} of the outputs' deviation, the noise is about {floor:.3g}{at}."
         )
+    port = accepted[0].winner.port
+    if search.open_before.get(port, 0.0) < 0.5 * search.open_before.get(where, 0.0):
+        port = where
+    return "unexplained", (
+        f"Something is missing, most likely at {port}, and no law of the catalogue explains it: the nearest, "
+        f"{accepted[0].winner.law.id.replace('_', ' ')}, leaves {remains:.0%} of the excess, and a flexible force "
+        f"explains {still:.0%} of what it leaves."
+    )
+
+
+def _explains(accepted: Sequence[Choice], remains: float, still: float) -> bool:
+    """Whether what is named leaves little, or nothing that a force explains."""
     margin = min(c.margin for c in accepted)
     most = PARTLY if margin > CLEAR else LITTLE
     near = (still > MAINLY and remains > most) or (still > STILL and remains > PARTLY and margin < CLEAR)
-    if near or remains > MOST_OPEN:
-        port = accepted[0].winner.port
-        if search.open_before.get(port, 0.0) < 0.5 * search.open_before.get(where, 0.0):
-            port = where
-        return "unexplained", (
-            f"Something is missing, most likely at {port}, and no law of the catalogue explains it: the nearest, "
-            f"{accepted[0].winner.law.id.replace('_', ' ')}, leaves {remains:.0%} of the excess, and a flexible force "
-            f"explains {still:.0%} of what it leaves."
-        )
-    words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
-    return "missing-physics", f"The simulator leaves out {words}."
+    return not near and remains <= MOST_OPEN
 
 
 def confidence(choice: Choice, search: Search) -> float:
