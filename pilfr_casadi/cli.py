@@ -114,6 +114,13 @@ def _parser() -> argparse.ArgumentParser:
         "--test", action="append", default=[], metavar="FILE", help="recording to judge on, never fitted (repeatable)"
     )
     _data_options(diagnose, named=False, which="with --simulated")
+    diagnose.add_argument(
+        "--limit",
+        action="append",
+        default=[],
+        metavar="INPUT=AMPLITUDE",
+        help="largest amplitude of an input in the experiment that is proposed next (repeatable; default: as recorded)",
+    )
     diagnose.add_argument("--workers", type=int, help="fits side by side (default: one a processor, at most four)")
     diagnose.add_argument(
         "--out",

@@ -62,12 +62,24 @@ def run_diagnosis(options: argparse.Namespace) -> int:
                 recordings,
                 test=tests or None,
                 hold=options.hold,
+                limits=amplitudes(options.limit),
                 workers=options.workers,
                 progress=progress,
             )
     except KeyboardInterrupt:
         return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
     return write(diagnosis, folder)
+
+
+def amplitudes(given: Sequence[str]) -> dict[str, float]:
+    """Amplitudes by name from "name=number"."""
+    out = {}
+    for name, value in pairs(given, "--limit").items():
+        try:
+            out[name] = float(value)
+        except ValueError:
+            raise InputError(f"--limit {name}={value} is not a number; give, for example, --limit {name}=10.") from None
+    return out
 
 
 def write(diagnosis: Any, folder: Path) -> int:

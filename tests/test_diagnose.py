@@ -7,7 +7,9 @@ import pytest
 from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
+from pilfr_casadi import InputError
 from pilfr_casadi.laws import CATALOGUE
+from pilfr_casadi.laws.dynamic import Delay
 from pilfr_casadi.laws.friction import CoulombFriction
 from pilfr_casadi.laws.hysteresis import Backlash
 from pilfr_casadi.laws.stiffness import CubicStiffness
@@ -105,6 +107,25 @@ def test_a_clipped_output_is_a_fault_of_the_recording():
     found = pilfr.diagnose(rig(OFF), [r.with_(y=np.clip(r.y, -limit, limit)) for r in records])
     assert found.verdict == "recording-fault"
     assert [g.finding for g in found.gates] == ["clipping"]
+
+
+def test_the_next_experiment_stays_within_the_users_limits():
+    """A delay before or behind a linear rig is the same; only what the rig does not do linearly can tell them apart."""
+    law = Delay(values={"T": 3.3e-3}, limits={"T": (0.0, 0.02)})
+    train = [r.with_(initial="estimate") for r in recordings(law, "sensor:x2")]
+    found = pilfr.diagnose(rig(OFF), train, limits={"force": 7.0})
+    assert [(e.law, e.indistinguishable) for e in found.effects] in (
+        [("delay", (("actuator:force", "delay"),))],
+        [("delay", (("sensor:x2", "delay"),))],
+    )
+    assert found.effects[0].confidence > 0.8  # the law is sure, the place is not
+    assert (
+        found.next_experiment["between"]
+        == [["sensor:x2", "delay"], ["actuator:force", "delay"]][:: 1 if found.effects[0].port == "sensor:x2" else -1]
+    )
+    assert found.next_experiment.get("amplitude", 0.0) <= 7.0
+    with pytest.raises(InputError, match="limit"):
+        pilfr.diagnose(rig(OFF), train, limits={"voltage": 1.0})
 
 
 def test_test_data_that_was_trained_on_is_refused():

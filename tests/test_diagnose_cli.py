@@ -189,6 +189,15 @@ def test_files_that_are_missing_or_in_the_wrong_place(capsys, files):
     refused(capsys, *arguments(files)[:-4], "--out", files / "file" / "below", says="--out")
 
 
+@pytest.mark.parametrize(
+    ("limit", "words"), [("force=much", "number"), ("force", "NAME=VALUE"), ("torque=3", "torque")]
+)
+def test_limits_that_are_none(capsys, files, limit, words):
+    status = main(["diagnose", *files[:2], "--out", str(files[0]) + "-out", "--limit", limit])
+    said = capsys.readouterr().err
+    assert status == 2 and words in said and said.count("\n") == 1
+
+
 def test_recordings_that_do_not_fit_each_other(capsys, files, truth):
     write_csv(files / "test.csv", *truth["test"], t=np.arange(800) * 0.01)
     refused(capsys, *arguments(files), says=("test.csv", "0.01 s", "0.02 s"))

@@ -128,7 +128,8 @@ class Diagnosis:
         lines += [f"note: {g.sentence}" for g in self.gates]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
-        lines.append(f"{self.seconds:.1f} s")
+        stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in self.times.items())
+        lines.append(f"{self.seconds:.1f} s{f': {stages}' if stages else ''}")
         return "\n".join(lines)
 
     __repr__ = __str__

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ def diagnose(
     hold: str | None = None,
     laws: Sequence[type[Law]] = CATALOGUE,
     effects: int = 2,
+    limits: Mapping[str, float] | None = None,
     workers: int | None = None,
     engine: str = "auto",
     progress: Progress | None = None,
@@ -56,6 +57,8 @@ def diagnose(
         The catalogue.
     effects : int
         Most effects looked for.
+    limits : mapping, optional
+        Largest amplitude of each input that a next experiment may have; by default what was recorded.
     workers : int, optional
         Fits run side by side, by default one a processor, at most four.
     progress : callable
@@ -81,6 +84,12 @@ def diagnose(
         if abs(r.dt / recordings[0].dt - 1) > 1e-4:
             raise InputError(
                 f"The test recording's step is {r.dt:g} s, the training's {recordings[0].dt:g} s; resample it."
+            )
+    for name, most in (limits or {}).items():
+        if name not in simulator.inputs or not most > 0:
+            raise InputError(
+                f"The limit {name}={most!r} is no amplitude of an input; give a positive number for any of "
+                f"{', '.join(simulator.inputs)}."
             )
     say("refit", 0, 1, np.inf)
     ready = prepare(simulator, recordings, hold, engine)
@@ -109,7 +118,7 @@ def diagnose(
         "test": test_errors(bench, tests, gates, simulator, without.corrected(), after.corrected()) if tests else None,
     }
     effects_found = tuple(_effect(search, p, after, std) for p in accepted) if explained else ()
-    experiment = _next(search, accepted) if explained else None
+    experiment = _next(search, accepted, limits) if explained else None
     now = time.perf_counter()
     times = {"gates and refit": prepared_at - began, **search.times, "proof": now - searched_at}
     return Diagnosis(
@@ -178,17 +187,17 @@ def _still(gate: Gate, after: Fitted, std: dict[str, np.ndarray]) -> bool:
     return abs(value) > 3 * error and abs(value) > 0.1 * abs(gate.value)
 
 
-def _next(search: Search, accepted: Sequence[Pass]) -> dict[str, Any] | None:
+def _next(search: Search, accepted: Sequence[Pass], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
     """The experiment that would separate the first tie, where there is one."""
     for found in accepted:
         choice = found.choice
         if choice is not None and choice.alike:
             one, other = choice.winner, choice.alike[0]
-            best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation)
+            best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits)
             names = [[c.port, c.law.id] for c in (one, other)]
             if best is not None:
                 return {"between": names, **best}
-            sentence = "No sine or triangle within the recorded amplitude separates them beyond the noise."
+            sentence = "No sine or triangle within the allowed amplitude separates them beyond the noise."
             return {"between": names, "sentence": sentence}
     return None
 
