@@ -12,6 +12,7 @@ differential equations of its own (`flow`) adds states. The model's state is [x;
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -81,7 +82,8 @@ class Equations:
             e, now = simulator.elements[i], Named("input", u)
             have = {"z": z, "dz": dz, "q": q[i], "p": self._own(e), "t": t, "x": x, "u": now}
             if hasattr(e.law, "step"):
-                w, memory[i] = e.law.step(z, s[i], self._own(e))
+                rate = {"dz": dz} if "dz" in inspect.signature(e.law.step).parameters else {}
+                w, memory[i] = e.law.step(z, s[i], self._own(e), **rate)
             else:
                 w = call(e.law.force, f"law {e.law.id!r}", **have)
                 if self.n_q[i]:

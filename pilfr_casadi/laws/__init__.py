@@ -24,6 +24,7 @@ from .friction import (
     CubicDamping,
     DirectionalFriction,
     PreslidingFriction,
+    PreslidingStribeckFriction,
     QuadraticDrag,
     StribeckFriction,
 )
@@ -77,6 +78,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     DirectionalFriction,
     PreslidingFriction,
     StribeckFriction,
+    PreslidingStribeckFriction,
     QuadraticDrag,
     CubicDamping,
     StopHysteresis,

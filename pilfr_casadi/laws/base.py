@@ -139,7 +139,7 @@ class Law:
     def reads(cls) -> set[str]:
         """Names of the signals that the force (and the flow) use."""
         if hasattr(cls, "step"):
-            return {"z"}
+            return set(inspect.signature(cls.step).parameters) & {"z", "dz"}
         named = set(inspect.signature(cls.force).parameters)
         if cls.order:
             named |= set(inspect.signature(cls.flow).parameters)  # type: ignore[attr-defined]

@@ -109,6 +109,30 @@ class StribeckFriction(Law):
         return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (2e-3 * local.speed, 0.3 * local.speed)}
 
 
+class PreslidingStribeckFriction(PreslidingFriction):
+    """The same where the contact springs back before it slides: an elasto-plastic element of falling strength."""
+
+    id = "stribeck_friction"
+    equation = "w = (k_t + k_e exp(-(dz/dt / v_s)^2)) stop_r[z],  F_c = k_t r"
+    source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7); Jenkins (1962)"
+    sentence = "dry friction that is larger at rest than in motion, and whose contact springs back before it slides"
+    units: ClassVar[Mapping[str, str]] = {"k_t": "w/z", "k_e": "w/z", "r": "z", "v_s": "z/s"}
+    strength: ClassVar[tuple[str, ...]] = ("k_t", "k_e")
+
+    def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0) -> tuple[Any, Any]:
+        """One stop."""
+        following = play(z, s, p["r"])
+        return (p["k_t"] + p["k_e"] * ca.exp(-((dz / p["v_s"]) ** 2))) * (z - following), following
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(
+            r=local.half * np.array([0.003, 0.01, 0.03, 0.1]), v_s=local.speed * np.array([0.05, 0.15, 0.4])
+        )
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {**super().bounds(local), "v_s": (4e-3 * local.speed, 0.8 * local.speed)}
+
+
 class QuadraticDrag(Law):
     """Drag of turbulent flow (White 2011)."""
 

@@ -79,7 +79,8 @@ def _step(kind: type[Law], lanes: int, grid: float) -> ca.Function:
         for strength in _units(law):
             values = _Values({**shape, **strength})
             if n_s:
-                w, end = law.step(z, own, values)  # type: ignore[attr-defined]
+                rate = {"dz": dz} if "dz" in law.reads() else {}
+                w, end = law.step(z, own, values, **rate)  # type: ignore[attr-defined]
             else:
                 w = _call(law.force, z=z, dz=dz, q=own, t=t, p=values)
                 end = _advance(law, own, (z, following), (dz, dz_next), t, values, h) if n_q else own
