@@ -80,7 +80,7 @@ class _Draw(Draw):
             if any(e.law in ("drift", "creep", "outside") for e in effects) and self.start == "periodic":
                 raise Unsuited
         if self.kind == "fault":
-            fault = dull.draw_fault(rng, rig.inputs, rig.outputs, rig.linear_plant)
+            fault = dull.draw_fault(rng, rig.inputs, rig.outputs, rig.linear_plant, bool(rig.states))
             fault_tags = {f"fault:{fault.kind}"}
         plant = Plant(self.module, self.names, effects)
         motions = [self.run(plant, item) for item in items]

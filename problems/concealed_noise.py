@@ -72,10 +72,15 @@ def noise(rng: np.random.Generator, kind: str, y: Array, level: Array) -> Array:
 
 
 def draw_fault(
-    rng: np.random.Generator, inputs: tuple[str, ...], outputs: tuple[str, ...], linear: bool, kind: str = ""
+    rng: np.random.Generator,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    linear: bool,
+    dynamic: bool,
+    kind: str = "",
 ) -> Fault:
-    """Draw a fault."""
-    kind = kind or str(rng.choice(FAULTS))
+    """Draw a fault; a wrong unit of time only where something moves in time."""
+    kind = kind or str(rng.choice([f for f in FAULTS if dynamic or f != "time-unit"]))
     single = len(inputs) == len(outputs) == 1
     is_input = kind in ("sign", "unit", "clipped") and rng.random() < 0.4
     names = inputs if is_input else outputs

@@ -195,7 +195,7 @@ class Resonance(Law):
         yield from grid(W=np.geomspace(0.015, 1.2, 16) / local.dt, D=[0.05])
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"W": (8 / local.duration, 1.6 / local.dt), "D": (1e-3, 2.0)}
+        return {"W": (8 / local.duration, 1.6 / local.dt), "D": (1e-3, 1.0)}
 
 
 class Mode(Resonance):
