@@ -14,10 +14,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from .expressions import Named
 from .model import Model
 from .parameters import Parameter
 from .recording import InputError, Recording
-from .simulator import Named, Simulator
+from .simulator import Simulator
 
 FACTOR = 2.0
 GAIN = (0.7, 1.3)

@@ -22,10 +22,11 @@ import casadi as ca
 import numpy as np
 
 from .arrays import accumulated
+from .expressions import Named, call
 from .model import Model, from_expressions
 from .parameters import ParameterSet
 from .recording import InputError, Recording
-from .simulator import Named, Placed, Simulator, call
+from .simulator import Placed, Simulator
 
 REACH = 0.25  # largest |λ| h: phase error (λh)⁴/120 = 3e-5 of a cycle's angle
 MOST = 200  # sub-steps a sample

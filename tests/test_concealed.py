@@ -88,7 +88,7 @@ def test_refit_by_the_package_leaves_the_effect_visible(cases):
 
 @pytest.mark.parametrize("kind", FAULTS)
 def test_every_fault_can_be_drawn(kind):
-    fault = draw_fault(np.random.default_rng(1), ("u",), ("a", "b"), True, kind)
+    fault = draw_fault(np.random.default_rng(1), ("u",), ("a", "b"), True, True, kind)
     assert fault.kind == kind and fault.channels
 
 

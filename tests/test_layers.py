@@ -15,6 +15,7 @@ LAYERS = {
         "signals",
         "multisines",
         "arrays",
+        "expressions",
         "metrics",
         "parameters",
         "readers",

@@ -17,12 +17,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..expressions import Named
 from ..fit import fit
 from ..lfr import PILFR
 from ..metrics import nrmse
 from ..parameters import Parameter
 from ..recording import InputError, Recording, as_recordings, check_for_identification
-from ..simulator import Named, Port, Simulator
+from ..simulator import Port, Simulator
 from .modes import Mode, modes, to_continuous
 
 POOR = 0.02  # NRMSE above which the simulation is not linear enough for a surrogate to stand for it

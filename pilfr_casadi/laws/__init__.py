@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .base import Law, Local, readable_unit
+from .curves import Cubic, Magnitude, Polynomial, Power, Quadratic, Root
 from .density import SmoothHysteresis
 from .dynamic import (
     Attached,
@@ -40,23 +41,17 @@ from .limits import (
 )
 from .stiffness import (
     Clearance,
-    Cubic,
     CubicStiffness,
     GeometricStiffness,
     HertzContact,
-    Magnitude,
     OffCentreClearance,
     PeriodicForce,
     PiecewiseStiffness,
     PiecewiseStiffnessBelow,
-    Polynomial,
-    Power,
     PowerStiffness,
     ProgressiveStiffness,
-    Quadratic,
     QuadraticStiffness,
     QuinticStiffness,
-    Root,
     SoftClearance,
 )
 

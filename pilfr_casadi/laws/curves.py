@@ -1,0 +1,96 @@
+"""Memoryless curves of an actuator or a sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
+
+import casadi as ca
+
+from .base import Law, Local, grid
+
+
+class Polynomial(Law):
+    """A memoryless curve: quadratic and cubic terms."""
+
+    id = "static_curve"
+    form = "polynomial"
+    equation = "w = a_2 z^2 + a_3 z^3"
+    source = "Billings & Fakhouri (1982), Automatica 18(1)"
+    sentence = "a memoryless curve: the signal is bent by its own square and cube"
+    units: ClassVar[Mapping[str, str]] = {"a_2": "w/z^2", "a_3": "w/z^3"}
+    strength: ClassVar[tuple[str, ...]] = ("a_2", "a_3")
+    places: ClassVar[tuple[str, ...]] = ("series",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a_2 * z**2 + p.a_3 * z**3
+
+
+class Quadratic(Polynomial):
+    """A memoryless curve: the square alone."""
+
+    form = "quadratic"
+    equation = "w = a_2 z^2"
+    units: ClassVar[Mapping[str, str]] = {"a_2": "w/z^2"}
+    strength: ClassVar[tuple[str, ...]] = ("a_2",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a_2 * z**2
+
+
+class Cubic(Polynomial):
+    """A memoryless curve: the cube alone."""
+
+    form = "cubic"
+    equation = "w = a_3 z^3"
+    units: ClassVar[Mapping[str, str]] = {"a_3": "w/z^3"}
+    strength: ClassVar[tuple[str, ...]] = ("a_3",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a_3 * z**3
+
+
+class Magnitude(Polynomial):
+    """A gain that differs between the two signs."""
+
+    form = "magnitude"
+    equation = "w = a |z|"
+    units: ClassVar[Mapping[str, str]] = {"a": "w/z"}
+    strength: ClassVar[tuple[str, ...]] = ("a",)
+    sentence = "a memoryless curve: the gain differs between the two signs"
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a * ca.fabs(z)
+
+
+class Power(Polynomial):
+    """A signed power, such as the square root of a flow under its own head (Torricelli)."""
+
+    form = "power"
+    equation = "w = a sign(z) |z|^n"
+    source = "White (2011), Fluid Mechanics, sec. 3.5"
+    sentence = "a memoryless curve: a power of the local signal, as in flow through an orifice"
+    units: ClassVar[Mapping[str, str]] = {"a": "w/z^n", "n": ""}
+    strength: ClassVar[tuple[str, ...]] = ("a",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a * ca.sign(z) * (ca.fabs(z) + 1e-12) ** p.n
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(n=[0.4, 0.5, 0.65, 1.5, 2.5])
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"n": (0.3, 5.0)}
+
+
+class Root(Power):
+    """A power below one inside the dynamics, such as flow through an orifice under its own head."""
+
+    form = "root"
+    places: ClassVar[tuple[str, ...]] = ("parallel",)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(n=[0.4, 0.5, 0.65])
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"n": (0.3, 0.9)}
