@@ -1,5 +1,6 @@
 """Physics lost on one side or in one direction: friction that depends on it, a tank that spills; and the verdict."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import casadi as ca
@@ -8,13 +9,14 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
+from pilfr_casadi.diagnose.explain import Candidate, simpler
 from pilfr_casadi.diagnose.linearise import Probe, locals_of, run
 from pilfr_casadi.diagnose.screen import _gain
 from pilfr_casadi.diagnose.verdict import judge
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.laws.base import Local
-from pilfr_casadi.laws.friction import DirectionalFriction
+from pilfr_casadi.laws.friction import DirectionalFriction, PreslidingFriction, PreslidingStribeckFriction
 from pilfr_casadi.laws.stiffness import CubicStiffness, HertzContact, PiecewiseStiffness, QuinticStiffness
 
 SHARE = 0.6
@@ -172,3 +174,17 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
     search.open_after = {"guide": 0.0}
     search.base.cost = 0.5  # half of the excess is left: no margin carries that
     assert judge(search, [])[0] == "unexplained"
+
+
+def test_a_refinement_that_comes_out_as_zero_is_the_law_that_it_refines():
+    """Stribeck's curve without its rise is plain dry friction."""
+    bench = Workbench.of(axis(), [moved(0)], "zero")
+    law = PreslidingStribeckFriction().at({"k_t": 800.0, "k_e": 0.0, "r": 1e-3, "v_s": 0.1}, {"k_e": (0.0, np.inf)})
+    placed = bench.simulator.with_element("guide", law.at({}, {"k_t": (0.0, np.inf), "r": (1e-5, 0.1)}))
+    own = bench.fit(placed, solver=GaussNewton(max_iterations=1))
+    held = {k: v if "k_e" not in k else 0 * v for k, v in own.values.items()}
+    candidate = Candidate("guide", law, replace(own, values=held), 1.0, 1.0, 4)
+    found = simpler(bench, candidate)
+    assert type(found.law) is PreslidingFriction
+    assert found.size == 2
+    assert found.fitted.cost < own.cost

@@ -223,6 +223,7 @@ def by_cost(
 
 def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     """Fit a candidate to everything; one whose strength may as well be zero lives off its initial state and is out."""
+    candidate = simpler(bench, candidate)
     placed = candidate.fitted.corrected()  # sub-steps for the law as it was fitted
     out = replace(candidate, head=np.inf, tail=np.inf, full=np.inf)
     try:
@@ -230,6 +231,24 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     except InputError:
         return out
     return out if shown(bench, fitted) < SHOWN else replace(candidate, fitted=fitted, full=fitted.cost)
+
+
+def simpler(bench: Workbench, candidate: Candidate) -> Candidate:
+    """A law one of whose strengths came out as zero is the law that it refines, started where it stands."""
+    element = candidate.fitted.simulator.elements[-1]
+    plain: Any = type(candidate.law).__base__
+    own = {
+        k.removeprefix(element.prefix): v for k, v in candidate.fitted.values.items() if k.startswith(element.prefix)
+    }
+    idle = [name for name in candidate.law.strength if not np.any(own[name])]
+    if not idle or not getattr(plain, "units", {}) or not set(plain.units) <= set(own) - set(idle):
+        return candidate
+    law = plain().at(
+        {k: own[k] for k in plain.units}, {k: v for k, v in candidate.law.limits.items() if k in plain.units}
+    )
+    placed = candidate.fitted.simulator.without_last_element().with_element(element.port, law)
+    found = attempt(bench, placed, [candidate.fitted.values], states=candidate.fitted.begin)
+    return found if found is not None and found.error < 1.01 * candidate.error else candidate
 
 
 def explain(
