@@ -11,11 +11,11 @@ from pilfr_casadi.integration import choose_substeps, discretise
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.readers import read_csv
 from pilfr_casadi.recording import Recording
-from problems.concealed import KINDS, case, export, score
+from problems.concealed import KINDS, case, export, run_one, score
 from problems.concealed_case import _Draw
 from problems.concealed_noise import FAULTS, LOUDEST, QUIETEST, draw_fault
 from problems.concealed_rigs_more import RIGS, places
-from problems.concealed_score import summary
+from problems.concealed_score import line, summary
 
 LAWS = {
     "cubic_stiffness", "quadratic_stiffness", "piecewise_stiffness", "clearance", "coulomb_friction",
@@ -134,3 +134,13 @@ def test_exported_files_are_read_back(tmp_path, cases):
     assert np.allclose(r.y, c.train[0].y, rtol=1e-9, atol=1e-9) and r.dt == pytest.approx(c.train[0].dt)
     assert json.loads((tmp_path / "truth.json").read_text())["verdict"] == c.verdict
     compile((tmp_path / "simulator.py").read_text(), "simulator.py", "exec")
+
+
+@pytest.mark.parametrize("first", range(600, 620, 5))
+def test_concealed_cases_are_diagnosed(first):
+    """Twenty cases, five at a time: four of five entirely right, and no confident wrong name."""
+    scores = [run_one(seed) for seed in range(first, first + 5)]
+    assert not any(s.crash for s in scores), [s.crash for s in scores]
+    right = [s.verdict_right and s.law is not False and s.channel is not False and not s.spurious for s in scores]
+    assert sum(right) >= 4, [line(s) for s in scores]
+    assert not [line(s) for s in scores if (s.confidence or 0) > 0.9 and not s.right]

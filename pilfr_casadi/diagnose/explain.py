@@ -236,6 +236,8 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
 def simpler(bench: Workbench, candidate: Candidate) -> Candidate:
     """A law one of whose strengths came out as zero is the law that it refines, started where it stands."""
     element = candidate.fitted.simulator.elements[-1]
+    if element.port != candidate.port or type(element.law) is not type(candidate.law):  # another was put in after it
+        return candidate
     plain: Any = type(candidate.law).__base__
     own = {
         k.removeprefix(element.prefix): v for k, v in candidate.fitted.values.items() if k.startswith(element.prefix)

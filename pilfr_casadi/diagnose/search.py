@@ -106,7 +106,12 @@ class Search:
             if not found.accepted:
                 break
             assert found.choice is not None
-            self.base = self._polished(found.choice.winner).fitted
+            winner = self._polished(found.choice.winner)
+            if winner is None:
+                self.passes[-1] = replace(found, accepted=False)
+                break
+            self.base = winner.fitted
+            self.passes[-1] = replace(found, choice=replace(found.choice, winner=winner))
             self._prefer_what_leaves_nothing()
             self._put_more_finely()
             if number:
@@ -161,6 +166,8 @@ class Search:
             polish(self.bench, c) if i < 4 and c.error < 1.5 * candidates[0].error else c
             for i, c in enumerate(candidates)
         ]
+        # a law may have become the one that it refines
+        kept = list({(c.port, type(c.law)): c for c in sorted(kept, key=lambda c: -c.error)}.values())[::-1]
         samples = self._samples(kept)
         choice = choose(kept, before, self.floor2, samples)
         accepted = choice is not None and choice.gain > ROOM
@@ -192,8 +199,10 @@ class Search:
             found = [self.floor.deviation, *(white_part(f.residual) for f in fits)]
             self.floor = Floor(np.min(found, axis=0), "estimated")
 
-    def _polished(self, candidate: Candidate) -> Candidate:
-        return candidate if np.isfinite(candidate.full) else polish(self.bench, candidate)
+    def _polished(self, candidate: Candidate) -> Candidate | None:
+        """A candidate fitted to everything; None where it does not hold there."""
+        done = candidate if np.isfinite(candidate.full) else polish(self.bench, candidate)
+        return done if np.isfinite(done.full) else None
 
     def _prefer_what_leaves_nothing(self) -> None:
         """Where the winner leaves what a flexible force explains, and a closer law at its port does not: take that."""
@@ -206,7 +215,7 @@ class Search:
         if still < HINT:
             return
         rival = self._polished(min(closer, key=lambda c: c.error))
-        if np.isfinite(rival.full) and self._open(rival.fitted).get(winner.port, 0.0) < 0.5 * still:
+        if rival is not None and self._open(rival.fitted).get(winner.port, 0.0) < 0.5 * still:
             self.base = rival.fitted
             margin = winner.error / rival.error
             choice = replace(found.choice, winner=rival, margin=min(margin, found.choice.margin), alike=())
@@ -254,8 +263,10 @@ class Search:
         kept = self.base.simulator.elements[-1]
         bare = self.bench.simulator
         alone = attempt(self.bench, bare.with_element(kept.port, kept.law), [self.base.values], states=self.base.begin)
-        if alone is not None and alone.error < 1.1 * second.choice.winner.error:
-            self.base = self._polished(alone).fitted
+        near = alone is not None and alone.error < 1.1 * second.choice.winner.error
+        alone = self._polished(alone) if alone is not None and near else None
+        if alone is not None:
+            self.base = alone.fitted
             self.passes[-2:] = [replace(second, choice=replace(second.choice, winner=alone))]
             self._timed("look back", began)
             return
@@ -274,9 +285,9 @@ class Search:
         if own_now is not None and rivals:
             stay = replace(own_now, port=winner.port, law=winner.law, size=winner.size)
             again = choose([stay, *rivals], first.before, self.floor2, self._samples([stay, *rivals]))
-            if again is not None:
-                if again.winner is not stay:
-                    self.base = self._polished(again.winner).fitted
+            other = None if again is None or again.winner is stay else self._polished(again.winner)
+            if again is not None and (again.winner is stay or other is not None):
+                self.base = self.base if other is None else other.fitted
                 alike = tuple(c for c in again.alike if c.port == winner.port)
                 better = replace(first.choice, winner=again.winner, alike=alike, margin=again.margin)
                 self.passes[-2] = replace(first, choice=better)
