@@ -186,9 +186,11 @@ def attempt(
 
     `options` are those of `Workbench.fit`; None where every start diverges.
     """
-    law = simulator.elements[-1].law
-    # a trend in time cannot be judged on a time that it has not seen
-    part = bench if getattr(law, "id", "") == "drift" else bench.on(heads(bench.recordings))
+    alone = len(simulator.elements) == len(bench.simulator.elements) + 1
+    # a trend in time cannot be judged on a time that it has not seen; beside another effect it has to stand that all
+    # the same, for what an integrator makes of that effect's error looks like a trend
+    trend = alone and getattr(simulator.elements[-1].law, "id", "") == "drift"
+    part = bench if trend else bench.on(heads(bench.recordings))
     try:
         fitted = part.fit(simulator, starts, **{"solver": QUICK, **options})
     except InputError:

@@ -241,5 +241,6 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     z, dz = np.concatenate([r.z for r in runs]), np.concatenate([r.dz for r in runs])
     rate = WALL * FINER * bench.substeps / bench.dt
     lift, push = (np.max([getattr(r, name) for r in runs], axis=0) for name in ("lift", "push"))
-    stiffest = [rate / a if a > 0 else rate**2 / b if b > 0 else np.inf for a, b in zip(lift, push, strict=True)]
+    with np.errstate(divide="ignore", over="ignore"):  # a force that does not move the port has no limit
+        stiffest = np.where(lift > 0, rate / lift, rate**2 / push)
     return [Local(z[:, j], dz[:, j], bench.dt, lengths, float(k)) for j, k in enumerate(stiffest)]

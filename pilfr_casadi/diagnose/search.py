@@ -19,6 +19,7 @@ from ..recording import InputError
 from .explain import Candidate, attempt, by_cost, explain, heads, judged, polish
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
+from .linearise import linearised
 from .screen import Scored, screen
 from .verdict import FLEXIBLE, HINT, Choice, choose, imitates
 from .workbench import THOROUGH, Fitted, Workbench
@@ -173,9 +174,18 @@ class Search:
         accepted = choice is not None and choice.gain > ROOM
         if accepted and number:  # what is not fitted has to improve as well
             assert choice is not None
-            accepted = self._mostly(choice) and choice.winner.tail < UNSEEN * before[1]
+            accepted = (
+                self._mostly(choice) and choice.winner.tail < UNSEEN * before[1] and not self._only_drifts(choice)
+            )
         self._timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
+
+    def _only_drifts(self, choice: Choice) -> bool:
+        """Whether a law that imitates others stands at a sensor behind a free integrator, whose drift it can follow."""
+        if choice.winner.law.id not in FLEXIBLE or not choice.winner.port.startswith("sensor:"):
+            return False
+        a = linearised(self.bench, self.without)[1][0].mean[0]
+        return bool(np.any(np.abs(np.linalg.eigvals(a) - 1) < 1e-6))
 
     def _mostly(self, choice: Choice) -> bool:
         """Whether most of the excess goes: as judged with the unseen part; for a law that imitates none, or overall."""
