@@ -208,7 +208,8 @@ class Workbench:
                     solution = solver.solve(problem, theta)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 continue
-            vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
+            if np.all(np.isfinite(solution.theta)):
+                vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
         if problem is None:
             return None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
