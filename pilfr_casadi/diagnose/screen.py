@@ -21,6 +21,7 @@ from .linearise import Probe, Run, linearised, locals_of, observer_gain, propaga
 from .workbench import Fitted, Workbench
 
 MOST = 6000  # samples looked at
+HUGE = 1e60  # times an output's deviation
 BLOCKS = 10  # a recording, odd and even ones in turn
 
 
@@ -147,8 +148,10 @@ def columns_of(
     blocks = []
     for i, r in enumerate(short):
         forces = [(t.index, t.forces[edges[i] : edges[i + 1]]) for t in tasks]
-        y = propagate(r, forces, n_free) / bench.scale[:, None]
-        blocks.append(y.reshape(-1, y.shape[2]))
+        with np.errstate(over="ignore", invalid="ignore"):
+            y = propagate(r, forces, n_free) / bench.scale[:, None]
+            y = y.reshape(-1, y.shape[2])
+        blocks.append(np.where(np.all(np.abs(y) < HUGE, axis=0), y, 0.0))  # what grows without end says nothing
     first = n_free + short[0].a.shape[1]
     base = orthonormal(block_diagonal([b[:, :first] for b in blocks], n_free))
     left = error - base @ (base.T @ error)
