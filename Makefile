@@ -12,7 +12,7 @@ demo: $(STAMP)
 	.venv/bin/pilfr demo
 
 test: lint
-	$(ONE_THREAD) $(PYTHON) -m pytest -q -n $(WORKERS)
+	$(ONE_THREAD) $(PYTHON) -m pytest -q -n $(WORKERS) --dist worksteal
 
 lint: $(STAMP)
 	$(PYTHON) -m ruff check .
@@ -20,7 +20,7 @@ lint: $(STAMP)
 	$(PYTHON) -m mypy
 
 slow: $(STAMP)
-	$(ONE_THREAD) $(PYTHON) -m pytest -q -n $(WORKERS) -m slow
+	$(ONE_THREAD) $(PYTHON) -m pytest -q -n $(WORKERS) --dist worksteal -m slow
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
