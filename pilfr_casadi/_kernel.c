@@ -1,7 +1,7 @@
 /* Time loops around the generated step: simulation, and the matrix-form sensitivity recursion.
  *
- * The generated part above defines pilfr_step(), pilfr_computed(), the sizes N_X N_S N_Z N_Y N_U N_P N_TERMS, and
- * where the values of one sample begin in their stack: AT_CONSTANT AT_P AT_U AT_X AT_S AT_Z AT_W AT_COMPUTED, N_VALUES.
+ * The generated part above defines pilfr_fixed(), pilfr_step(), pilfr_computed(), the sizes N_X N_S N_Z N_Y N_U N_P N_TERMS, and
+ * where the values of one sample begin in their stack: AT_CONSTANT AT_P AT_FIXED AT_U AT_X AT_S AT_Z AT_W AT_COMPUTED, N_VALUES.
  * Of STRIDE steps the first one's outputs are kept; `length` counts the steps.
  * A row of slopes is a sum of terms. TERM_<t>[ROW_<t>[i]] .. TERM_<t>[ROW_<t>[i+1]] are those of row i of target t, each
  * {source, index, value}: the row `index` of source 0 x, 1 s, 2 z, 3 w, times a value of the stack; DIRECT_<t> likewise
@@ -80,14 +80,16 @@ static void rows(double *out, long ld, int n_rows, const int *row, const term_t 
 
 /* state (N_X + N_S) is advanced in place; z and w may be null. */
 int pilfr_simulate(long length, const double *u, const double *p, double *state, double *y, double *z, double *w) {
-    double *work = malloc(sizeof(double) * (SZ_W + N_X + N_S + 2 * N_Z + N_Y + 1));
+    double *work = malloc(sizeof(double) * (SZ_W + N_X + N_S + 2 * N_Z + N_Y + N_FIXED + 1));
     if (!work) return 1;
-    double *next = work + SZ_W, *z_k = next + N_X + N_S, *w_k = z_k + N_Z, *y_k = w_k + N_Z;
+    double *next = work + SZ_W, *z_k = next + N_X + N_S, *w_k = z_k + N_Z, *y_k = w_k + N_Z, *fixed = y_k + N_Y;
     casadi_int iw[SZ_IW];
     const double *arg[SZ_ARG];
     double *res[SZ_RES];
+    arg[0] = p; res[0] = fixed;
+    pilfr_fixed(arg, res, iw, work, 0);
     for (long k = 0; k < length; ++k) {
-        arg[0] = state; arg[1] = state + N_X; arg[2] = u + k * N_U; arg[3] = p;
+        arg[0] = state; arg[1] = state + N_X; arg[2] = u + k * N_U; arg[3] = p; arg[4] = fixed;
         const int kept = k % STRIDE == 0;
         const long i = k / STRIDE;
         res[0] = next; res[1] = next + N_X; res[2] = kept ? y + i * N_Y : y_k;
@@ -122,17 +124,19 @@ int pilfr_sensitivity(long length, const double *u, const double *p, double *sta
     memcpy(value + AT_CONSTANT, CONSTANTS, sizeof(double) * (AT_P - AT_CONSTANT));
     memcpy(value + AT_P, p, sizeof(double) * N_P);
     memcpy(value + AT_X, state, sizeof(double) * N);
+    arg[0] = value + AT_P; res[0] = value + AT_FIXED;
+    pilfr_fixed(arg, res, iw, work, 0);
 #define ROWS_OF(t, out, n, keep) \
     rows(out, ld, n, ROW_##t, TERM_##t, DIRECT_ROW_##t, DIRECT_##t, value, source, column, keep, active, span)
     for (long k = 0; k < length; ++k) {
         memcpy(value + AT_U, u + k * N_U, sizeof(double) * N_U);
-        arg[0] = value + AT_X; arg[1] = value + AT_S; arg[2] = value + AT_U; arg[3] = value + AT_P;
+        arg[0] = value + AT_X; arg[1] = value + AT_S; arg[2] = value + AT_U; arg[3] = value + AT_P; arg[4] = value + AT_FIXED;
         const int kept = k % STRIDE == 0;
         const long sample = k / STRIDE;
         res[0] = next; res[1] = next + N_X; res[2] = kept ? y + sample * N_Y : next + N; res[3] = value + AT_Z; res[4] = value + AT_W;
         pilfr_step(arg, res, iw, work, 0);
         arg[0] = value + AT_X; arg[1] = value + AT_S; arg[2] = value + AT_Z; arg[3] = value + AT_W;
-        arg[4] = value + AT_U; arg[5] = value + AT_P;
+        arg[4] = value + AT_U; arg[5] = value + AT_P; arg[6] = value + AT_FIXED;
         res[0] = value + AT_COMPUTED;
         pilfr_computed(arg, res, iw, work, 0);
         source[0] = x; source[1] = s; source[2] = z; source[3] = w;

@@ -6,7 +6,7 @@ others can write to is not used. Without a working C compiler `make_engine` fall
 `sensitivities`, which gives the same numbers.
 
 Most partial derivatives of a state-space model are parameters, signals or constants themselves. The kernel looks these
-up; only the others are written out as code.
+up; only the others are written out as code. What depends on parameters alone is evaluated once a run.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import stat
 import subprocess
 import tempfile
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +32,18 @@ import numpy as np
 from .model import Model
 from .recording import InputError
 from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
+from .threads import one_at_a_time
 
 # without contraction the generated step gives the very numbers of the virtual machine: what slips, slips in both
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 FLAGS = (("-O2", "-march=native", *COMMON), ("-O2", *COMMON))  # the second where the first is not understood
-LONG = 120_000  # characters of source that are optimised less
+# long straight lines take seconds to optimise and gain nothing from it, unlike the loops; clang has no such pragma
+PLAIN = '#if defined(__GNUC__) && !defined(__clang__)\n#pragma GCC push_options\n#pragma GCC optimize("O1")\n#endif'
+AGAIN = "#if defined(__GNUC__) && !defined(__clang__)\n#pragma GCC pop_options\n#endif"
 PATIENCE = 600.0  # seconds for one compilation
 _failures: dict[str, str] = {}  # what did not compile is not tried again by this process
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
-_VALUES = ("constant", "p", "u", "x", "s", "z", "w", "computed")
+_VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "computed")
 
 
 @functools.cache
@@ -97,52 +101,83 @@ def cache_directory() -> Path:
     return Path(temporary)
 
 
-def _values(linear: Linearization) -> tuple[list[float], ca.Function, dict[str, int], dict[tuple[str, str], list[int]]]:
-    """Where the kernel finds the nonzeros of each block.
+@dataclass(frozen=True, eq=False)
+class _Code:
+    """What is written out in C, and where the kernel finds the nonzeros of each block.
 
-    Returns the constants; the Function of those that have to be computed, each once; where each of `_VALUES` begins in
-    their stack; and the place in the stack of each nonzero, in the order of the block's pattern.
+    Attributes
+    ----------
+    functions : dict
+        `fixed` (p -> f), what depends on parameters alone, evaluated once a run; `step`; and `computed`, the nonzeros
+        that are neither constants nor parameters nor signals, each once.
+    at : dict
+        Where each of `_VALUES` begins in the stack of values, and its `end`.
+    entries : dict
+        The place in the stack of each nonzero, in the order of the block's pattern.
     """
-    symbol = linear.symbols()
-    blocks = linear.blocks(symbol)
-    known = {e.element_hash(): (k, i) for k, v in symbol.items() for i, e in enumerate(v.elements())}
-    constants: dict[float, int] = {}
-    computed: dict[int, tuple[int, Any]] = {}
 
-    def place(e: Any) -> tuple[str, int]:
-        if e.is_constant():
-            return "constant", constants.setdefault(float(e), len(constants))
-        if e.element_hash() in known:
-            return known[e.element_hash()]
-        return "computed", computed.setdefault(e.element_hash(), (len(computed), e))[0]
+    functions: dict[str, ca.Function]
+    constants: list[float]
+    at: dict[str, int]
+    entries: dict[tuple[str, str], list[int]]
 
-    places = {key: [place(e) for e in block.nonzeros()] for key, block in blocks.items()}
-    rest = ca.vertcat(*(e for _, e in computed.values())) if computed else ca.SX(0, 1)
-    function = ca.Function("pilfr_computed", [symbol[k] for k in linear.partial.name_in()], [rest])
-    lengths = {**linear.sizes, "constant": len(constants), "computed": len(computed)}
-    at, end = {}, 0
-    for k in _VALUES:
-        at[k] = end
-        end += lengths[k]
-    entries = {key: [at[k] + i for k, i in found] for key, found in places.items()}
-    return list(constants), function, {**at, "end": end}, entries
+    @classmethod
+    def of(cls, linear: Linearization) -> _Code:
+        """Sort the nonzeros by where they come from."""
+        symbol = linear.symbols()
+        stepped = linear.step(*(symbol[k] for k in linear.step.name_in()))
+        blocks = linear.blocks(symbol)
+        (*found,), names, fixed = ca.extract_parametric([*stepped, *blocks.values()], symbol["p"], {})
+        stepped, blocks = found[: len(stepped)], dict(zip(blocks, found[len(stepped) :], strict=True))
+        symbol["fixed"] = ca.vertcat(ca.SX(0, 1), *names)
+        known = {e.element_hash(): (k, i) for k, v in symbol.items() for i, e in enumerate(v.elements())}
+        constants: dict[float, int] = {}
+        computed: dict[int, tuple[int, Any]] = {}
+
+        def place(e: Any) -> tuple[str, int]:
+            if e.is_constant():
+                return "constant", constants.setdefault(float(e), len(constants))
+            if e.element_hash() in known:
+                return known[e.element_hash()]
+            return "computed", computed.setdefault(e.element_hash(), (len(computed), e))[0]
+
+        def given(function: ca.Function) -> list[Any]:
+            return [symbol[k] for k in (*function.name_in(), "fixed")]
+
+        places = {key: [place(e) for e in block.nonzeros()] for key, block in blocks.items()}
+        rest = ca.vertcat(ca.SX(0, 1), *(e for _, e in computed.values()))
+        functions = {
+            "fixed": ca.Function("pilfr_fixed", [symbol["p"]], [ca.vertcat(ca.SX(0, 1), *fixed)]),
+            "step": ca.Function("pilfr_step", given(linear.step), ca.cse(stepped)),
+            "computed": ca.Function("pilfr_computed", given(linear.partial), [rest]),
+        }
+        sizes = {"fixed": len(names), "constant": len(constants), "computed": len(computed)}
+        at, end = {}, 0
+        for k in _VALUES:
+            at[k] = end
+            end += {**linear.sizes, **sizes}[k]
+        entries = {key: [at[k] + i for k, i in each] for key, each in places.items()}
+        return cls(functions, list(constants), {**at, "end": end}, entries)
 
 
+@one_at_a_time
 def source_code(linear: Linearization) -> str:
     """The whole C source for one structure: CasADi's code for the step, the term tables, and the time loops."""
-    constants, computed, at, entries = _values(linear)
+    code = _Code.of(linear)
+    functions, at = code.functions.values(), code.at
     options = {"with_header": False, "main": False, "indent": 0, "casadi_int": "long long"}
     generator = ca.CodeGenerator("generated", options)
     lines = ["typedef struct { int source, index, value; } term_t;"]
     lines += ["typedef struct { int parameter, value; } direct_t;"]
-    for function in (linear.step, computed):
+    for function in functions:
         generator.add(function)
     for key in ("iw", "w", "arg", "res"):
-        size = max(getattr(f, f"sz_{key}")() for f in (linear.step, computed))
+        size = max(getattr(f, f"sz_{key}")() for f in functions)
         lines.append(f"#define SZ_{key.upper()} {size + 1}")
     lines += [f"#define N_{key.upper()} {linear.sizes[key]}" for key in ("x", "s", "z", "y", "u", "p")]
+    lines.append(f"#define N_FIXED {at['u'] - at['fixed']}")
     lines += [f"#define AT_{key.upper()} {at[key]}" for key in _VALUES]
-    lines.append(f"static const double CONSTANTS[] = {{{', '.join(map(repr, constants)) or '0'}}};")
+    lines.append(f"static const double CONSTANTS[] = {{{', '.join(map(repr, code.constants)) or '0'}}};")
     most = 0
     for target in TARGETS:
         n = linear.sizes[target]
@@ -150,7 +185,7 @@ def source_code(linear: Linearization) -> str:
         direct: list[list[str]] = [[] for _ in range(n)]
         for source in TARGETS[target]:
             pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
-            for i, j, value in zip(*pattern.get_triplet(), entries[target, source], strict=True):
+            for i, j, value in zip(*pattern.get_triplet(), code.entries[target, source], strict=True):
                 if source == "p":
                     direct[i].append(f"{{{j},{value}}}")
                 else:
@@ -163,7 +198,7 @@ def source_code(linear: Linearization) -> str:
     lines.append(f"#define STRIDE {linear.substeps}")
     lines += [f"#define N_VALUES {at['end']}", f"#define N_TERMS {most}", f"#define KEEPS {int(diagonal)}"]
     kernel = Path(__file__).with_name("_kernel.c").read_text(encoding="utf-8")
-    return "\n".join([generator.dump(), *lines, kernel])
+    return "\n".join([PLAIN, generator.dump(), AGAIN, *lines, kernel])
 
 
 def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[str, str]:
@@ -183,10 +218,7 @@ def _compile(cc: str, source: str, key: str) -> Path:
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
         c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
         c_file.write_text(source, encoding="utf-8")
-        options: tuple[tuple[str, ...], ...] = FLAGS
-        for flags in options:
-            if len(source) > LONG:  # what takes seconds to compile gains little from it
-                flags = tuple("-O1" if flag == "-O2" else flag for flag in flags)
+        for flags in FLAGS:
             command = [cc, *flags, str(c_file), "-o", str(partial), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
             if not done.returncode and partial.exists():

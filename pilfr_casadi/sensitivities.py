@@ -21,6 +21,7 @@ import casadi as ca
 import numpy as np
 
 from .model import Model
+from .threads import one_at_a_time
 
 TARGETS = {"z": ("x", "p"), "w": ("z", "s", "p"), "s": ("z", "s", "p"), "x": ("x", "w", "p"), "y": ("x", "w", "p")}
 BLOCKS = tuple((target, source) for target, sources in TARGETS.items() for source in sources)
@@ -57,6 +58,7 @@ class Linearization:
         return dict(zip(BLOCKS, found, strict=True))
 
 
+@one_at_a_time
 def linearize(model: Model) -> Linearization:
     """Differentiate one step of a closed model symbolically."""
     x, s, u, p = model.symbols()

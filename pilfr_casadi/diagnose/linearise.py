@@ -25,6 +25,7 @@ from ..laws.base import Law, Local
 from ..model import Model
 from ..observer import kalman_gain, led
 from ..simulator import Simulator
+from ..threads import one_at_a_time
 from .workbench import FINER, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
@@ -55,24 +56,28 @@ def probed(simulator: Simulator) -> Simulator:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """One step of the probed simulator with its derivatives, and the local signals of its ports.
+    """One step of the probed simulator at fitted values, with its derivatives, and the local signals of its ports.
 
     Attributes
     ----------
     step : casadi.Function
-        `(x, u, p) -> (y, A, B, C, D)`; B and D have a column for each free parameter, then each port.
+        `(x, u) -> (y, A, B, C, D)`; B and D have a column for each free parameter, then each port.
     local : casadi.Function
         `(x, u, slope, t, p) -> (z, dz)`, a row a port; p without the probes.
+    values : array
+        Parameter vector of the probed model.
     """
 
     model: Model
     step: ca.Function
     local: ca.Function
+    values: np.ndarray
     free: np.ndarray
     ports: tuple[str, ...]
     n_x: int
 
     @classmethod
+    @one_at_a_time
     def of(cls, bench: Workbench, fitted: Fitted) -> Probe:
         """Differentiate the probed simulator."""
         simulator = fitted.simulator
@@ -80,12 +85,14 @@ class Probe:
         x, (u, p) = ca.SX.sym("x", model.n_state), model.symbols()[2:]
         following, y = model.closed(x, u, p)
         parameters = model.parameters
+        values = parameters.pack({k: v for k, v in fitted.values.items() if k in parameters})
         names = tuple(port.name for port in simulator.all_ports())
         free = np.flatnonzero(parameters.free)
         picked = p[free.tolist()]
         blocks = [ca.jacobian(e, v) for e, v in ((following, x), (following, picked), (y, x), (y, picked))]
-        step = ca.Function("probe", [x, u, p], [y, *map(ca.densify, blocks)])
-        return cls(model, step, signals(simulator), free, names, len(simulator.states))
+        at = ca.substitute([y, *map(ca.densify, blocks)], [p], [ca.SX(values)])  # constants are folded
+        step = ca.Function("probe", [x, u], ca.cse(at))
+        return cls(model, step, signals(simulator), values, free, names, len(simulator.states))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,18 +128,22 @@ class Run:
     push: np.ndarray
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray | None = None) -> Run:
-    """Run recording i at fitted values from its fitted state, led by an observer where a gain is given."""
+    """Run recording i at fitted values from its fitted state, led by an observer where a gain is given.
+
+    An observer may lead a simulator out of its range: then the run is not finite.
+    """
     r, model = bench.recordings[i], probe.model
     n = model.substeps
-    p = model.parameters.pack({k: v for k, v in fitted.values.items() if k in model.parameters})
+    p = probe.values
     drive, x = model.drive(r), np.asarray(fitted.initial[i], dtype=float)[: model.n_state]
     if gain is None:
         states = states_along(model, drive, p, x)
     else:
         seen = led(model, gain)
         states = states_along(seen, seen.drive(r), np.append(p, 1.0), x)
-    y, a, b, c, d = mapped(probe.step, states, drive, p)
+    y, a, b, c, d = mapped(probe.step, states, drive)
     mean = a.mean(axis=0), b.mean(axis=0), c.mean(axis=0)
     if gain is not None:
         a, b = a - gain @ c, b - gain @ d

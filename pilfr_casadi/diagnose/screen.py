@@ -8,6 +8,7 @@ observer with process noise at every port, on its innovations.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -56,12 +57,18 @@ def screen(
     """
     probe, runs = linearised(bench, fitted)
     gain = observer_gain(probe, runs, noise)
-    found = _score(bench, probe, runs, laws, "simulation", keep)
-    if gain.any():
-        led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))]
-        found += _score(bench, probe, led, laws, "observer", keep)
     signs = {name: int(s) for name, s in zip(probe.ports, runs[0].sign, strict=True)}
-    return sorted(found, key=lambda s: -s.share), signs, gain if gain.any() else None
+
+    def along_observer() -> list[Scored]:
+        led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
+        seen = all(np.all(np.isfinite(values)) for r in led for values in (r.a, r.b, r.z, r.dz, r.error))
+        return _score(bench, probe, led, laws, "observer", keep) if led and seen else []
+
+    with ThreadPoolExecutor(1) as other:
+        observed = other.submit(along_observer)
+        found = _score(bench, probe, runs, laws, "simulation", keep) + observed.result()
+    led = any(s.source == "observer" for s in found)
+    return sorted(found, key=lambda s: -s.share), signs, gain if led else None
 
 
 def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
@@ -149,9 +156,11 @@ def columns_of(
     for i, r in enumerate(short):
         forces = [(t.index, t.forces[edges[i] : edges[i + 1]]) for t in tasks]
         with np.errstate(over="ignore", invalid="ignore"):
-            y = propagate(r, forces, n_free) / bench.scale[:, None]
-            y = y.reshape(-1, y.shape[2])
-        blocks.append(np.where(np.all(np.abs(y) < HUGE, axis=0), y, 0.0))  # what grows without end says nothing
+            y = propagate(r, forces, n_free)
+            y /= bench.scale[:, None]
+        y = y.reshape(-1, y.shape[2])
+        y[:, ~((y.max(axis=0) < HUGE) & (y.min(axis=0) > -HUGE))] = 0.0  # what grows without end says nothing
+        blocks.append(y)
     first = n_free + short[0].a.shape[1]
     base = orthonormal(block_diagonal([b[:, :first] for b in blocks], n_free))
     left = error - base @ (base.T @ error)

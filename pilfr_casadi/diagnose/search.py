@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -34,6 +35,7 @@ MOSTLY = 0.5  # share of the rest that a second effect may leave
 UNSEEN = 0.7  # share of the mean square on the unseen part that a second effect may leave
 NOTHING = 0.01  # below this share nothing is explained
 
+Seen = tuple[list[Scored], dict[str, int], np.ndarray | None]
 Say = Callable[[str, int, int, float], None]
 
 
@@ -98,11 +100,15 @@ class Search:
         return self
 
     def _run(self, effects: int) -> None:
-        self.open_before = self.open_after = self._open(self.without)
+        linearised(self.bench, self.without)  # what both of the next look at
+        with ThreadPoolExecutor(1) as other:
+            looked = other.submit(self._screen)
+            self.open_before = self.open_after = self._open(self.without)
+            seen = looked.result()
         for number in range(effects):
             if number and not self._more():
                 break
-            found = self._pass(number)
+            found = self._pass(number, seen if not number else self._screen())
             self.passes.append(found)
             if not found.accepted:
                 break
@@ -136,11 +142,15 @@ class Search:
         much = excess > MORE or self.base.cost > max(LOUD**2 * self.floor2, SEEN)
         return much and max(self.open_after.values(), default=0.0) > HINT
 
-    def _pass(self, number: int) -> Pass:
+    def _screen(self) -> Seen:
         began = time.perf_counter()
         self.say("screen", 0, 1, self.base.cost**0.5)
-        scored, signs, gain = screen(self.bench, self.base, self.laws, self.floor.deviation)
+        seen = screen(self.bench, self.base, self.laws, self.floor.deviation)
         self._timed("screen", began)
+        return seen
+
+    def _pass(self, number: int, seen: Seen) -> Pass:
+        scored, signs, gain = seen
         taken = {e.port for e in self.base.simulator.elements[len(self.bench.simulator.elements) :]}
         scored = [s for s in scored if s.port not in taken]
         most = max((s.share for s in scored), default=0.0)

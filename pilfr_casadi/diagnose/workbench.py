@@ -18,6 +18,7 @@ from ..problem import Problem
 from ..recording import InputError, Recording
 from ..sensitivities import Engine
 from ..simulator import Simulator
+from ..threads import one_at_a_time
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 FINER = 4  # times as many sub-steps for a law at most
@@ -101,6 +102,7 @@ class Workbench:
         """The same with other recordings, errors still in units of the training outputs' deviation."""
         return replace(self, recordings=tuple(arranged(self.simulator, r) for r in recordings))
 
+    @one_at_a_time
     def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
         """The simulator as a model, with output injection where a gain is given."""
         model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
@@ -137,7 +139,7 @@ class Workbench:
         model: Model | None = None,
         engine: Engine | None = None,
     ) -> Fitted:
-        """Fit from several starts (values by name), each also led through the injection gains `anneal`.
+        """Fit from several starts (values by name), each led through the injection gains `anneal`.
 
         `states` are a first guess of each recording's initial state, without those of new laws at its end.
 
@@ -153,10 +155,9 @@ class Workbench:
             return self._as_it_is(simulator, model, engine)
         best: tuple[float, np.ndarray, Problem] | None = None
         for start in starts:
-            for path in ((), tuple(anneal)) if anneal else ((),):
-                found = self._run(model, engine, start, states, path, solver)
-                if found is not None and (best is None or found[0] < best[0]):
-                    best = found
+            found = self._run(model, engine, start, states, tuple(anneal), solver)
+            if found is not None and (best is None or found[0] < best[0]):
+                best = found
         if best is None:
             raise InputError(
                 "The simulation diverges at the start values; check the parameters' values and units, and the hold."

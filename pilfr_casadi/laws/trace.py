@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ..arrays import accumulated, mapped
+from ..threads import one_at_a_time
 from .base import Law, Local
 
 
@@ -57,6 +58,7 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
     return np.vstack(found).reshape(len(local.z), len(shapes), -1)
 
 
+@one_at_a_time
 @functools.lru_cache(maxsize=256)
 def _step(kind: type[Law], lanes: int, grid: float) -> ca.Function:
     """`(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`."""
