@@ -22,12 +22,12 @@ from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .linearise import linearised
 from .screen import Scored, screen
-from .verdict import FLEXIBLE, HINT, Choice, choose, imitates
+from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, imitates
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
 FEWEST = 100.0  # effective samples that a comparison is made on at least
-MORE, LOUD = 0.06, 3.0  # share of the excess, or times the noise, that has to be left to look for a second effect
+MORE, LOUD = 0.03, 2.5  # share of the excess, or times the noise, that has to be left to look for a second effect
 SEEN = 1e-4  # mean square error below which what is more than noise is not worth a second effect
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
@@ -140,7 +140,8 @@ class Search:
     def _more(self) -> bool:
         excess = (self.base.cost - self.floor2) / max(self.without.cost - self.floor2, 1e-300)
         much = excess > MORE or self.base.cost > max(LOUD**2 * self.floor2, SEEN)
-        return much and max(self.open_after.values(), default=0.0) > HINT
+        still = max(self.open_after.values(), default=0.0)
+        return (much and still > HINT) or (excess > LITTLE and still > MAINLY)
 
     def _screen(self) -> Seen:
         began = time.perf_counter()

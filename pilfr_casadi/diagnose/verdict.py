@@ -52,6 +52,7 @@ FORMS = {
     "directional": 1.05,
     "soft asymmetric": 1.05,
     "power": 1.1,
+    "power with gain": 1.15,
     "quintic": 1.05,
     "geometric": 1.05,
     "two-stage": 1.05,

@@ -55,6 +55,12 @@ class Fitted:
         return self.model.parameters.pack(self.values)
 
     @property
+    def at_bound(self) -> bool:
+        """Whether a free parameter came out at a bound."""
+        p, at = self.model.parameters, self.vector
+        return bool(np.any(p.free & ((at <= p.lower) | (at >= p.upper))))
+
+    @property
     def begin(self) -> list[np.ndarray]:
         """The simulator's own states at each recording's first sample, without those of laws."""
         return [state[: len(self.simulator.states)] for state in self.initial]

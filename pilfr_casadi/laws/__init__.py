@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .base import Law, Local, readable_unit
-from .curves import Cubic, Magnitude, Polynomial, Power, Quadratic, Root
+from .curves import Cubic, Magnitude, Polynomial, Power, PowerWithGain, Quadratic, Root
 from .density import SmoothHysteresis
 from .dynamic import (
     Attached,
@@ -94,6 +94,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     Polynomial,
     Magnitude,
     Power,
+    PowerWithGain,
     Root,
     Delay,
     Relaxation,

@@ -83,6 +83,18 @@ class Power(Polynomial):
         return {"n": (0.3, 5.0)}
 
 
+class PowerWithGain(Power):
+    """A signed power beside an error of the gain, which the simulator has no parameter for."""
+
+    form = "power with gain"
+    equation = "w = a sign(z) |z|^n + b z"
+    units: ClassVar[Mapping[str, str]] = {**Power.units, "b": "w/z"}
+    strength: ClassVar[tuple[str, ...]] = ("a", "b")
+
+    def force(self, z: Any, p: Any) -> Any:
+        return super().force(z, p) + p.b * z
+
+
 class Root(Power):
     """A power below one inside the dynamics, such as flow through an orifice under its own head."""
 
