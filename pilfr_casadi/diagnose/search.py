@@ -22,13 +22,13 @@ from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .linearise import linearised
 from .screen import Scored, screen
-from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, imitates
+from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, imitates, left_open
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
 FEWEST = 100.0  # effective samples that a comparison is made on at least
 MORE, LOUD = 0.03, 2.5  # share of the excess, or times the noise, that has to be left to look for a second effect
-SEEN = 1e-4  # mean square error below which what is more than noise is not worth a second effect
+SEEN = 2.5e-5  # mean square error below which what is more than noise is not worth a second effect
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 MOSTLY = 0.5  # share of the rest that a second effect may leave
@@ -106,9 +106,13 @@ class Search:
             self.open_before = self.open_after = self._open(self.without)
             seen = looked.result()
         for number in range(effects):
-            if number and not self._more():
-                break
-            found = self._pass(number, seen if not number else self._screen())
+            if number:
+                if not self._much():
+                    break
+                seen = self._screen()
+                if max([*self.open_after.values(), *(s.share for s in seen[0])], default=0.0) < HINT:
+                    break
+            found = self._pass(number, seen)
             self.passes.append(found)
             if not found.accepted:
                 break
@@ -137,11 +141,11 @@ class Search:
             return 1.0
         return float(np.sqrt(self.base.cost / max(other.cost, 1e-300)))
 
-    def _more(self) -> bool:
-        excess = (self.base.cost - self.floor2) / max(self.without.cost - self.floor2, 1e-300)
+    def _much(self) -> bool:
+        """Whether enough is left to look for a second effect."""
+        excess, still = left_open(self)
         much = excess > MORE or self.base.cost > max(LOUD**2 * self.floor2, SEEN)
-        still = max(self.open_after.values(), default=0.0)
-        return (much and still > HINT) or (excess > LITTLE and still > MAINLY)
+        return much or (excess > LITTLE and still > MAINLY)
 
     def _screen(self) -> Seen:
         began = time.perf_counter()
