@@ -58,6 +58,7 @@ FORMS = {
     "two-stage": 1.05,
     "hertz": 1.05,
     "progressive": 1.05,
+    "harmonics": 1.05,
     "gradual": 1.05,
     "root": 1.1,
     "polynomial": 1.05,

@@ -251,3 +251,16 @@ class PeriodicForce(Law):
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"L": (2 * local.half / 60, 2 * local.half / 1.5)}
+
+
+class HarmonicForce(PeriodicForce):
+    """A force that repeats with position, its second harmonic included."""
+
+    form = "harmonics"
+    equation = "w = a sin(q) + b cos(q) + a_2 sin(2 q) + b_2 cos(2 q),  q = 2 pi z / L"
+    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "a_2": "w", "b_2": "w", "L": "z"}
+    strength: ClassVar[tuple[str, ...]] = ("a", "b", "a_2", "b_2")
+
+    def force(self, z: Any, p: Any) -> Any:
+        twice = 4 * np.pi * z / p.L
+        return super().force(z, p) + p.a_2 * ca.sin(twice) + p.b_2 * ca.cos(twice)
