@@ -32,7 +32,7 @@ SEEN = 2.5e-5  # mean square error below which what is more than noise is not wo
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 MOSTLY = 0.5  # share of the rest that a second effect may leave
-UNSEEN = 0.7  # share of the mean square on the unseen part that a second effect may leave
+UNSEEN, NO_WORSE = 0.7, 1.1  # shares of the mean square on the unseen part that a second effect may leave
 NOTHING = 0.01  # below this share nothing is explained
 
 Seen = tuple[list[Scored], dict[str, int], np.ndarray | None]
@@ -189,9 +189,7 @@ class Search:
         accepted = choice is not None and choice.gain > ROOM
         if accepted and number:  # what is not fitted has to improve as well
             assert choice is not None
-            accepted = (
-                self._mostly(choice) and choice.winner.tail < UNSEEN * before[1] and not self._only_drifts(choice)
-            )
+            accepted = self._stands(choice, before[1]) and not self._only_drifts(choice)
         self._timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
@@ -202,10 +200,16 @@ class Search:
         a = linearised(self.bench, self.without)[1][0].mean[0]
         return bool(np.any(np.abs(np.linalg.eigvals(a) - 1) < 1e-6))
 
-    def _mostly(self, choice: Choice) -> bool:
-        """Whether most of the excess goes: as judged with the unseen part; for a law that imitates none, or overall."""
-        full = (choice.winner.full - self.floor2) / max(self.base.cost - self.floor2, 1e-300)
-        return choice.remains < MOSTLY or (choice.winner.law.id not in FLEXIBLE and full < MOSTLY)
+    def _stands(self, choice: Choice, unseen: float) -> bool:
+        """Whether a second effect is believed: most of what is left goes, and what is not fitted improves.
+
+        A law that imitates none and takes most away overall need only not do worse there, which may see little of it.
+        `unseen` is the mean square error before on what is not fitted.
+        """
+        left = (choice.winner.full - self.floor2) / max(self.base.cost - self.floor2, 1e-300)
+        sure = choice.winner.law.id not in FLEXIBLE and left < MOSTLY
+        clear = choice.remains < MOSTLY and choice.winner.tail < UNSEEN * unseen
+        return clear or (sure and choice.winner.tail < NO_WORSE * unseen)
 
     def _samples(self, candidates: Sequence[Candidate]) -> float:
         """Effective samples of the best candidate's residual."""
