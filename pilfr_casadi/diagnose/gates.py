@@ -1,4 +1,4 @@
-"""The dull causes, looked at first: sign, unit, time unit, alignment, clock, clipping, offset, hold.
+"""The dull causes, looked at first: sign, unit, time unit, alignment, clock, offset, hold.
 
 Each is a change of the recordings; it counts when the simulator, refitted, follows the changed recordings far better
 than the given ones.
@@ -14,7 +14,6 @@ import numpy as np
 
 from ..compiled import make_engine
 from ..gauss_newton import GaussNewton
-from ..laws.limits import AsymmetricSaturation
 from ..recording import InputError, Recording
 from .workbench import QUICK, Fitted, Workbench
 
@@ -38,6 +37,7 @@ class Gate:
     fault: bool = False
     change: Change | None = None
     parameter: str = ""
+    left: float = 1.0  # share of the mean square error that is left once it is put right
 
     def to_dict(self) -> dict[str, Any]:
         """As in diagnosis.json."""
@@ -190,29 +190,6 @@ def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine:
         raise error
 
 
-def unclip(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Outputs that the recorder clipped: the simulator's are clipped alike, and what else they say is kept."""
-    gates = []
-    for i, low, high, count in clipped(bench):
-        name = bench.simulator.output_names[i]
-        law = AsymmetricSaturation().at({"low": max(low, -1e300), "high": min(high, 1e300)})
-        placed = bench.simulator.with_element(f"sensor:{name}", law)
-        prefix = placed.elements[-1].prefix
-        held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
-        other = replace(bench, simulator=placed.with_parameters(held))
-        found = refit(other, plain)
-        if found is None or found.cost > min(0.97 * plain.cost, 0.3):
-            continue
-        at = " and ".join(f"{v:.6g}" for v in (low, high) if np.isfinite(v))
-        sentence = (
-            f"{name} is clipped at {at} ({count} samples at the limit); with the simulator's output clipped alike the "
-            f"refitted error falls from {plain.cost**0.5:.3g} to {found.cost**0.5:.3g} of the outputs' deviation."
-        )
-        gates.append(Gate(name, "clipping", [v for v in (low, high) if np.isfinite(v)], sentence, True, fault=True))
-        bench, plain = other, found
-    return bench, plain, gates
-
-
 def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
     """Sign and unit slips of each channel, and of the time."""
     best, found = plain, None
@@ -250,7 +227,8 @@ def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, lis
         f"In the recordings {words}: with it corrected the refitted simulator's error falls from "
         f"{np.sqrt(plain.cost):.3g} to {np.sqrt(best.cost):.3g} of the outputs' deviation."
     )
-    return other, best, [Gate(name, finding, value, sentence, True, True, change)]
+    left = best.cost / plain.cost
+    return other, best, [Gate(name, finding, value, sentence, True, True, change, left=left)]
 
 
 def _sizes(bench: Workbench) -> np.ndarray:
@@ -265,34 +243,3 @@ def _sizes(bench: Workbench) -> np.ndarray:
 
 def _near(ratio: float) -> bool:
     return not np.isfinite(ratio) or ratio == 0 or 1 / NEAR < ratio < NEAR
-
-
-def clipped(bench: Workbench) -> list[tuple[int, float, float, int]]:
-    """Outputs whose extremes are repeated exactly over several samples: (output, low, high, samples at the limits)."""
-    out = []
-    for i in range(len(bench.scale)):
-        y = np.concatenate([r.y[:, i] for r in bench.recordings])
-        limits, count = [-np.inf, np.inf], 0
-        for j, extreme in enumerate((y.min(), y.max())):
-            at = y == extreme
-            runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]]))))[::2]
-            neighbours = np.mean(np.abs(np.diff(y)) == 0)
-            if (
-                at.sum() >= 6
-                and runs.max(initial=0) >= 3
-                and np.sum(runs > 1) > 1
-                and at.mean() > 3 * _quantised(y)
-                and neighbours < 0.5
-            ):
-                limits[j], count = float(extreme), count + int(at.sum())
-        if count:
-            out.append((i, limits[0], limits[1], count))
-    return out
-
-
-def _quantised(y: np.ndarray) -> float:
-    """Share of samples at a typical level of a quantised signal near its extremes; 0 for a continuous one."""
-    values, counts = np.unique(y, return_counts=True)
-    if len(values) > 0.5 * len(y):
-        return 0.0
-    return float(np.median(np.concatenate([counts[1:6], counts[-6:-1]])) / len(y))

@@ -9,8 +9,9 @@ import numpy as np
 
 from ..recording import InputError, Recording
 from ..simulator import Simulator
+from .clipping import unclip
 from .floor import Floor, measured_floor, white_part
-from .gates import Gate, choose_hold, hold_note, opened, said_hold, unclip, wrong_scale
+from .gates import Gate, choose_hold, hold_note, opened, said_hold, wrong_scale
 from .linearise import along, linearised, observer_gain
 from .offset import offsets
 from .proof import errors_of

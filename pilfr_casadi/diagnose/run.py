@@ -13,6 +13,7 @@ from ..accepted import as_simulator
 from ..laws import CATALOGUE, Law, readable_unit
 from ..recording import InputError, Recording, as_recordings, check_for_identification
 from ..threads import one_blas_thread
+from .clipping import clipped_input
 from .experiment import next_experiment, placebo
 from .explain import Candidate
 from .gates import Gate, hold_note, said_hold
@@ -104,6 +105,9 @@ def diagnose(
         gates = (*ready.gates, hold_note(simulator, bench.hold, ratio))
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
+    where = max(search.open_before, key=lambda k: search.open_before[k], default="")
+    if verdict == "unexplained" and (lost := clipped_input(bench, where)) is not None:
+        verdict, sentence, gates = "recording-fault", lost.sentence, (*gates, lost)
     if search.interrupted and not accepted:
         sentence = (
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "

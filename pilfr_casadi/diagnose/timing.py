@@ -183,7 +183,7 @@ def _gate(name: str, what: str, value: float, dt: float, before: float, after: f
     fall = f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
     if what == "clock":
         sentence = f"The clock of {name} runs {value * 100:+.3g} % off the others'; with it corrected {fall}."
-        return Gate(name, "clock", value, sentence, True, True, change)
+        return Gate(name, "clock", value, sentence, True, True, change, left=after / before)
     samples = value / dt
     whole = abs(samples - round(samples)) < WHOLE and abs(samples) > LONG
     if samples > -0.3 and not whole:
@@ -192,4 +192,4 @@ def _gate(name: str, what: str, value: float, dt: float, before: float, after: f
     sentence = (
         f"{name} is recorded {abs(samples):.3g} samples ({abs(value):.3g} s) too {word}; with it corrected {fall}."
     )
-    return Gate(name, "alignment", value, sentence, True, True, change)
+    return Gate(name, "alignment", value, sentence, True, True, change, left=after / before)

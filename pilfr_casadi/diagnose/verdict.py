@@ -30,6 +30,7 @@ LITTLE = 0.02  # of the excess left, with rivals near and a force that explains 
 MAINLY = 0.6  # of it explainable: whatever the rivals, the name is wrong or incomplete
 CLEAR = 1.5  # times the winner's error that every rival's is, for a name that only comes near to be given all the same
 UNSURE = 0.5  # confidence below which a name is called likely
+CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 PURE = 0.05  # share of model error in a residual that is taken for noise
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
 LIKE = 0.03  # rivals whose error is within this share cannot be told apart
@@ -182,7 +183,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     error, floor = search.without.cost**0.5, search.floor2**0.5
     open_now = max(search.open_before.values(), default=0.0)
     bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and not _swells(search))
-    if faults and (bare or (open_now < HINT and not accepted)):
+    if faults and (bare or (open_now < HINT and not accepted) or min(g.left for g in faults) < CURES):
         return "recording-fault", faults[0].sentence
     if bare and open_now < HINT:
         return "complete", (

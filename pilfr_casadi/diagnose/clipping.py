@@ -1,0 +1,89 @@
+"""Channels that the recorder clipped: an output's simulation can be clipped alike, an input is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..laws.limits import AsymmetricSaturation
+from ..recording import Recording
+from .gates import Gate, refit
+from .workbench import Fitted, Workbench
+
+
+def unclip(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Outputs that the recorder clipped: the simulator's are clipped alike, and what else they say is kept."""
+    gates = []
+    for i, low, high, count in clipped(bench.recordings, "y"):
+        name = bench.simulator.output_names[i]
+        law = AsymmetricSaturation().at({"low": max(low, -1e300), "high": min(high, 1e300)})
+        placed = bench.simulator.with_element(f"sensor:{name}", law)
+        prefix = placed.elements[-1].prefix
+        held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
+        other = replace(bench, simulator=placed.with_parameters(held))
+        found = refit(other, plain)
+        if found is None or found.cost > min(0.97 * plain.cost, 0.3):
+            continue
+        at = " and ".join(f"{v:.6g}" for v in _said(low, high))
+        sentence = (
+            f"{name} is clipped at {at} ({count} samples at the limit); with the simulator's output clipped alike the "
+            f"refitted error falls from {plain.cost**0.5:.3g} to {found.cost**0.5:.3g} of the outputs' deviation."
+        )
+        gates.append(Gate(name, "clipping", _said(low, high), sentence, True, fault=True, left=found.cost / plain.cost))
+        bench, plain = other, found
+    return bench, plain, gates
+
+
+def clipped_input(bench: Workbench, where: str) -> Gate | None:
+    """The clipped input at whose actuator the mismatch is: what went into the machine is not in the recording."""
+    for i, low, high, count in clipped(bench.recordings, "u"):
+        name = bench.simulator.inputs[i]
+        if where == f"actuator:{name}":
+            at = " and ".join(f"{v:.6g}" for v in _said(low, high))
+            sentence = (
+                f"{name} is clipped at {at} ({count} samples at the limit), and the mismatch looks like a signal added "
+                "to it: what went into the machine there is not in the recording. Record it with a larger range."
+            )
+            return Gate(name, "clipping", _said(low, high), sentence, False, fault=True)
+    return None
+
+
+def _said(low: float, high: float) -> list[float]:
+    """The limits that there are."""
+    return [v for v in (low, high) if np.isfinite(v)]
+
+
+def clipped(recordings: Sequence[Recording], kind: str) -> list[tuple[int, float, float, int]]:
+    """Channels whose extremes are repeated exactly over several samples: (column, low, high, samples at the limits).
+
+    `kind` is "u" for the inputs, "y" for the outputs.
+    """
+    out = []
+    for i in range(getattr(recordings[0], kind).shape[1]):
+        y = np.concatenate([getattr(r, kind)[:, i] for r in recordings])
+        limits, count = [-np.inf, np.inf], 0
+        for j, extreme in enumerate((y.min(), y.max())):
+            at = y == extreme
+            runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]]))))[::2]
+            neighbours = np.mean(np.abs(np.diff(y)) == 0)
+            if (
+                at.sum() >= 6
+                and runs.max(initial=0) >= 3
+                and np.sum(runs > 1) > 1
+                and at.mean() > 3 * _quantised(y)
+                and neighbours < 0.5
+            ):
+                limits[j], count = float(extreme), count + int(at.sum())
+        if count:
+            out.append((i, limits[0], limits[1], count))
+    return out
+
+
+def _quantised(y: np.ndarray) -> float:
+    """Share of samples at a typical level of a quantised signal near its extremes; 0 for a continuous one."""
+    values, counts = np.unique(y, return_counts=True)
+    if len(values) > 0.5 * len(y):
+        return 0.0
+    return float(np.median(np.concatenate([counts[1:6], counts[-6:-1]])) / len(y))
