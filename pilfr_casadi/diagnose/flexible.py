@@ -60,13 +60,13 @@ class Surface(Law):
         }
 
 
-MOST, LEAST = 150_000, 2500  # samples times states looked at, and samples at least
+MOST, LEAST = 600_000, 2500  # samples times states squared looked at, and samples at least
 FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
 
 
 def explainable(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     """Share of the residual's power that a flexible force explains on blocks it was not fitted to, by port."""
-    most = max(MOST // max(fitted.model.n_state, 1), LEAST) // len(bench.recordings)
+    most = max(MOST // max(fitted.model.n_state, 1) ** 2, LEAST) // len(bench.recordings)
     if any(len(r) > most for r in bench.recordings):
         bench = bench.on([r.slice(0, max(most, r.skip + LEAST // 10)) for r in bench.recordings])
     probe, runs = linearised(bench, fitted)

@@ -20,7 +20,8 @@ from .workbench import QUICK, Fitted, Workbench
 Change = Callable[[Recording], Recording]
 FACTORS = (1e3, 1e-3, 1e6, 1e-6, 180 / np.pi, np.pi / 180, 1e2, 1e-2, 9.80665, 1 / 9.80665)
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
-HOPELESS, STRAINED = 0.1, 0.01  # mean square error that a wrong unit of time leaves at least, and at a bound
+# mean square error that a wrong unit of time leaves at least, and where it has driven parameters to their bounds
+HOPELESS, STRAINED = 0.1, 0.01
 CURED = 0.12  # share of the mean square that a sign or a unit put right leaves at most
 NEAR = 6.0  # a factor is tried where it brings the simulated and the measured size this near
 
@@ -201,7 +202,7 @@ def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, lis
     for i, name in enumerate(bench.simulator.inputs):
         trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
         trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if lost or any(_near(v / f) for v in sizes)]
-    for factor in (1e-3, 1e3, 60.0, 1 / 60) if plain.cost > (STRAINED if plain.at_bound else HOPELESS) else ():
+    for factor in (1e-3, 1e3, 60.0, 1 / 60) if plain.cost > (STRAINED if plain.at_bounds > 0.3 else HOPELESS) else ():
         trials.append(("time", "time-unit", factor, slower_by(factor)))
     for name, finding, value, change in trials:
         other: Workbench = changed(bench, change)

@@ -55,10 +55,10 @@ class Fitted:
         return self.model.parameters.pack(self.values)
 
     @property
-    def at_bound(self) -> bool:
-        """Whether a free parameter came out at a bound."""
+    def at_bounds(self) -> float:
+        """Share of the free parameters that came out at a bound."""
         p, at = self.model.parameters, self.vector
-        return bool(np.any(p.free & ((at <= p.lower) | (at >= p.upper))))
+        return float(np.mean(((at <= p.lower) | (at >= p.upper))[p.free])) if np.any(p.free) else 0.0
 
     @property
     def begin(self) -> list[np.ndarray]:
