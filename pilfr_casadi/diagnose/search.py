@@ -27,10 +27,11 @@ from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
 FEWEST = 100.0  # effective samples that a comparison is made on at least
-MORE, LOUD = 0.03, 2.5  # share of the excess, or times the noise, that has to be left to look for a second effect
+MORE, LOUD = 0.03, 3.0  # share of the excess, or times the noise, that has to be left to look for a second effect
 SEEN = 2.5e-5  # mean square error below which what is more than noise is not worth a second effect
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
+POLISHED = 4  # candidates fitted to everything before one is chosen
 MOSTLY = 0.5  # share of the rest that a second effect may leave
 UNSEEN, NO_WORSE = 0.7, 1.1  # shares of the mean square on the unseen part that a second effect may leave
 NOTHING = 0.01  # below this share nothing is explained
@@ -178,10 +179,9 @@ class Search:
         began = time.perf_counter()
         before = self._judged(self.base)
         self._lower_floor([c.fitted for c in candidates[:5]])
-        kept = [
-            polish(self.bench, c) if i < 4 and c.error < 1.5 * candidates[0].error else c
-            for i, c in enumerate(candidates)
-        ]
+        near = [c for c in candidates[:POLISHED] if c.error < 1.5 * candidates[0].error]
+        with ThreadPoolExecutor(self.workers) as pool:
+            kept = [*pool.map(lambda c: polish(self.bench, c), near), *(c for c in candidates if c not in near)]
         # a law may have become the one that it refines
         kept = list({(c.port, type(c.law)): c for c in sorted(kept, key=lambda c: -c.error)}.values())[::-1]
         samples = self._samples(kept)
