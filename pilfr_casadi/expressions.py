@@ -56,4 +56,9 @@ def call(function: Expression, what: str, **available: Any) -> Any:
     except InputError as error:
         raise InputError(f"In the {what}: {error}") from None
     except Exception as error:
+        if "truth value" in str(error):
+            raise InputError(
+                f"The {what} decides by the value of a symbol (if, and, or, min, max), which has none yet; "
+                "use casadi.if_else, casadi.fmin and casadi.fmax."
+            ) from error
         raise InputError(f"The {what} fails: {type(error).__name__}: {error}.") from error

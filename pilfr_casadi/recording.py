@@ -231,8 +231,9 @@ def check_for_identification(data: Recording | Iterable[Recording], n_min: int =
             "record longer or choose a smaller model."
         )
     if not any(_varies(r.u[:, i]) for r in recordings for i in range(r.n_u)):
+        still = "s {} never change" if first.n_u > 1 else " {} never changes"
         raise InputError(
-            f"the input {listed(first.inputs)} never changes in {listed([r.label for r in recordings])}; "
+            f"the input{still.format(listed(first.inputs))} in {listed([r.label for r in recordings])}; "
             "nothing can be identified without excitation."
         )
     for i, name in enumerate(first.outputs):

@@ -139,7 +139,12 @@ BAD_SIMULATORS = {
     "port into an unknown state": (("dict(vel=-1", "dict(speed=-1"), ("'ground-mass'", "'speed'")),
     "recording lacks an input": (('("force",)', '("force", "heat")'), ("'heat'", "--column heat=COLUMN")),
     "recording lacks an output": (("dict(position=x.pos)", "dict(place=x.pos)"), ("'place'", "--column place=COLUMN")),
-    "diverging simulator": (("- p.d * x.vel", "+ 1e3 * x.vel"), ("diverges",)),
+    "diverging simulator": (
+        ("- p.d * x.vel", "+ 1e3 * x.vel"),
+        ("diverges", "position is out", "s into"),
+    ),
+    "decides by a symbol": (("p.k * x.pos", "p.k * max(x.pos, 0)"), ("casadi.if_else", "casadi.fmax")),
+    "math's functions": (("p.k * x.pos", "p.k * __import__('math').sin(x.pos)"), ("equation of 'vel'", "ca.sin")),
     "diverging at once": (("- p.d * x.vel", "+ 1e6 * x.vel**3"), ("diverges",)),
     "far too fast": (("p.k * x.pos", "1e16 * x.pos"), ("fast",)),
 }

@@ -190,7 +190,7 @@ def test_a_recording_may_lack_outputs_but_cannot_be_fitted():
 
 def test_nothing_to_identify():
     r = recording(n_u=2, n_y=2)
-    with pytest.raises(InputError, match="u1, u2 never changes"):
+    with pytest.raises(InputError, match="inputs u1, u2 never change in"):
         check_for_identification(r.with_(u=np.full((20, 2), [1.0, 0.1])))
     with pytest.raises(InputError, match="output 'y2' never changes"):
         check_for_identification(r.with_(y=r.y * [1.0, 0.0]))

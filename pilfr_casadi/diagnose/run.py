@@ -161,10 +161,14 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
     own, unrelated = placebo(bench, search.without, winner.port, winner.law)
     element = next(e for e in fitted.simulator.elements if e.port == winner.port and type(e.law) is type(winner.law))
     port = bench.simulator.port(winner.port)
+    w_unit, z_unit = port.unit, port.across_unit
+    if port.series:  # what it is in series with
+        channel = port.name.partition(":")[2]
+        w_unit = z_unit = bench.recordings[0].units.get(channel) or f"[{channel}]"
     values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
     shown: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
-        unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], port.unit, port.across_unit)
+        unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit)
         flat = np.ravel(value)
         for i, v in enumerate(flat):
             label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")

@@ -21,6 +21,7 @@ from ..simulator import Simulator
 from ..threads import one_at_a_time
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
+HUGE = 1e6  # times the largest measured value
 FINER = 4  # times as many sub-steps for a law at most
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
 
@@ -165,13 +166,31 @@ class Workbench:
             if found is not None and (best is None or found[0] < best[0]):
                 best = found
         if best is None:
+            at = self._lost(model, engine, starts[0])
             raise InputError(
-                "The simulation diverges at the start values; check the parameters' values and units, and the hold."
+                f"The simulation diverges at the start values{at}; "
+                "check the parameters' values and units, and the hold."
             )
         _, theta, problem = best
         values = model.parameters.unpack(problem.parameters(theta))
         values.pop(GAMMA, None)
         return self.result(simulator, values, problem.first_states(theta), engine, model)
+
+    def _lost(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
+        """Where a run from rest leaves every bound, in words."""
+        parameters = model.parameters
+        vector = np.clip(
+            parameters.pack({k: v for k, v in start.items() if k in parameters}), parameters.lower, parameters.upper
+        )
+        for r in self.recordings:
+            with np.errstate(all="ignore"):
+                y = engine.simulate(model.drive(r), vector, np.zeros(model.n_state))[0]
+                off = ~(np.abs(y) < HUGE * np.max(np.abs(r.y), axis=0))
+            if np.any(off):
+                k = int(np.argmax(np.any(off, axis=1)))
+                name = self.simulator.output_names[int(np.argmax(off[k]))]
+                return f" ({name} is out of all bounds {k * r.dt:.3g} s into {r.label})"
+        return ""
 
     def _as_it_is(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
         """Nothing to estimate: the simulator as it stands."""
