@@ -1,11 +1,7 @@
-/* Time loops around the generated step: simulation, and the matrix-form sensitivity recursion.
+/* Time loops around a generated step: simulation, and the matrix-form sensitivity recursion.
  *
- * The generated part above defines pilfr_fixed(), pilfr_step(), pilfr_computed(), the sizes N_X N_S N_Z N_Y N_U N_P N_TERMS, and
- * where the values of one sample begin in their stack: AT_CONSTANT AT_P AT_FIXED AT_U AT_X AT_S AT_Z AT_W AT_COMPUTED, N_VALUES.
- * Of STRIDE steps the first one's outputs are kept; `length` counts the steps.
- * A row of slopes is a sum of terms. TERM_<t>[ROW_<t>[i]] .. TERM_<t>[ROW_<t>[i+1]] are those of row i of target t, each
- * {source, index, value}: the row `index` of source 0 x, 1 s, 2 z, 3 w, times a value of the stack; DIRECT_<t> likewise
- * {parameter, value}: the value goes to the parameter's column.
+ * They are compiled once a machine. A model's own library holds its generated code and a `model_t` (_kernel.h) that says
+ * where everything is. Of `stride` steps the first one's outputs are kept; `length` counts the steps.
  *
  * Terms whose value is zero are dropped at run time, and a memory row that only keeps itself is not touched: a play's slope
  * changes only while it slips. This is what makes the recursion cheap with many operators.
@@ -14,6 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#define SLOTS 16 /* more than the arguments, results and whole numbers of a generated function */
 #define LANE 8  /* columns are padded to a multiple of this */
 #define TILE 64 /* columns worked on at a time, so that the rows read again and again stay in the nearest cache */
 
@@ -50,9 +47,11 @@ static void combine(double *out, const active_t *terms, int n, long from, long t
 
 /* All rows of one target. `active` and `span` are scratch for its terms and rows; with `keep`, row i of the target is row i
  * of source 1 and stays as it is where that is its only term. */
-static void rows(double *out, long ld, int n_rows, const int *row, const term_t *terms, const int *direct_row,
-                 const direct_t *direct, const double *value, const double *const *source, const long *column, int keep,
-                 active_t *active, span_t *span) {
+static void rows(double *out, long ld, int n_rows, const table_t *table, const double *value,
+                 const double *const *source, const long *column, int keep, active_t *active, span_t *span) {
+    const int *row = table->row, *direct_row = table->direct_row;
+    const term_t *terms = table->term;
+    const direct_t *direct = table->direct;
     int n = 0, m = 0;
     for (int i = 0; i < n_rows; ++i) {
         const int first = n;
@@ -78,80 +77,84 @@ static void rows(double *out, long ld, int n_rows, const int *row, const term_t 
         }
 }
 
-/* state (N_X + N_S) is advanced in place; z and w may be null. */
-int pilfr_simulate(long length, const double *u, const double *p, double *state, double *y, double *z, double *w) {
-    double *work = malloc(sizeof(double) * (SZ_W + N_X + N_S + 2 * N_Z + N_Y + N_FIXED + 1));
+/* state (n_x + n_s) is advanced in place; z and w may be null. */
+int pilfr_simulate(const model_t *m, long length, const double *u, const double *p, double *state, double *y, double *z,
+                   double *w) {
+    const int n = m->n_x + m->n_s;
+    double *work = malloc(sizeof(double) * (m->sz_w + n + 2 * m->n_z + m->n_y + m->n_fixed + 1));
     if (!work) return 1;
-    double *next = work + SZ_W, *z_k = next + N_X + N_S, *w_k = z_k + N_Z, *y_k = w_k + N_Z, *fixed = y_k + N_Y;
-    casadi_int iw[SZ_IW];
-    const double *arg[SZ_ARG];
-    double *res[SZ_RES];
+    double *next = work + m->sz_w, *z_k = next + n, *w_k = z_k + m->n_z, *y_k = w_k + m->n_z, *fixed = y_k + m->n_y;
+    const double *arg[SLOTS];
+    double *res[SLOTS];
+    long long iw[SLOTS];
     arg[0] = p; res[0] = fixed;
-    pilfr_fixed(arg, res, iw, work, 0);
+    m->fixed(arg, res, iw, work, 0);
     for (long k = 0; k < length; ++k) {
-        arg[0] = state; arg[1] = state + N_X; arg[2] = u + k * N_U; arg[3] = p; arg[4] = fixed;
-        const int kept = k % STRIDE == 0;
-        const long i = k / STRIDE;
-        res[0] = next; res[1] = next + N_X; res[2] = kept ? y + i * N_Y : y_k;
-        res[3] = z && kept ? z + i * N_Z : z_k; res[4] = w && kept ? w + i * N_Z : w_k;
-        pilfr_step(arg, res, iw, work, 0);
-        memcpy(state, next, sizeof(double) * (N_X + N_S));
+        arg[0] = state; arg[1] = state + m->n_x; arg[2] = u + k * m->n_u; arg[3] = p; arg[4] = fixed;
+        const int kept = k % m->stride == 0;
+        const long i = k / m->stride;
+        res[0] = next; res[1] = next + m->n_x; res[2] = kept ? y + i * m->n_y : y_k;
+        res[3] = z && kept ? z + i * m->n_z : z_k; res[4] = w && kept ? w + i * m->n_z : w_k;
+        m->step(arg, res, iw, work, 0);
+        memcpy(state, next, sizeof(double) * n);
     }
     free(work);
     return 0;
 }
 
-/* Derivatives with respect to n_c columns: slope ((N_X + N_S) x n_c, row by row) is advanced in place with the state, jac is
- * (length / STRIDE * N_Y) x n_c; column[i] is the column of parameter i, or -1. */
-int pilfr_sensitivity(long length, const double *u, const double *p, double *state, double *slope, const long *column,
-                      long n_c, double *y, double *jac) {
-    enum { N = N_X + N_S, ROWS = N + N_X + 2 * N_Z + N_Y + (KEEPS ? 0 : N_S), LINE = 64 };
+/* Derivatives with respect to n_c columns: slope ((n_x + n_s) x n_c, row by row) is advanced in place with the state, jac is
+ * (length / stride * n_y) x n_c; column[i] is the column of parameter i, or -1. */
+int pilfr_sensitivity(const model_t *m, long length, const double *u, const double *p, double *state, double *slope,
+                      const long *column, long n_c, double *y, double *jac) {
+    enum { LINE = 64 };
+    const int n_x = m->n_x, n_s = m->n_s, n_z = m->n_z, n_y = m->n_y, n_u = m->n_u, n = n_x + n_s;
+    const int n_rows = n + n_x + 2 * n_z + n_y + (m->keeps ? 0 : n_s);
     const long ld = (n_c + LANE - 1) / LANE * LANE;
-    const size_t doubles = (size_t)ROWS * ld + N_VALUES + N + N_Y + SZ_W, terms = N_TERMS + 1, spans = N + N_Z + N_Y + 1;
+    const size_t doubles = (size_t)n_rows * ld + m->n_values + n + n_y + m->sz_w, terms = m->n_terms + 1, spans = n + n_z + n_y + 1;
     char *memory = malloc(LINE + sizeof(double) * doubles + sizeof(active_t) * terms + sizeof(span_t) * spans);
     if (!memory) return 1;
-    double *x = (double *)(((uintptr_t)memory + LINE - 1) / LINE * LINE), *s = x + N_X * ld, *x_next = s + N_S * ld;
-    double *z = x_next + N_X * ld, *w = z + N_Z * ld, *y_k = w + N_Z * ld, *s_next = KEEPS ? s : y_k + N_Y * ld;
-    double *value = x + ROWS * ld, *next = value + N_VALUES, *work = next + N + N_Y;
-    active_t *active = (active_t *)(work + SZ_W);
+    double *x = (double *)(((uintptr_t)memory + LINE - 1) / LINE * LINE), *s = x + n_x * ld, *x_next = s + n_s * ld;
+    double *z = x_next + n_x * ld, *w = z + n_z * ld, *y_k = w + n_z * ld, *s_next = m->keeps ? s : y_k + n_y * ld;
+    double *value = x + n_rows * ld, *next = value + m->n_values, *work = next + n + n_y;
+    active_t *active = (active_t *)(work + m->sz_w);
     span_t *span = (span_t *)(active + terms);
-    casadi_int iw[SZ_IW];
-    const double *arg[SZ_ARG], *source[4];
-    double *res[SZ_RES];
+    double *at_p = value + m->at_p, *at_fixed = value + m->at_fixed, *at_u = value + m->at_u, *at_x = value + m->at_x;
+    double *at_s = value + m->at_s, *at_z = value + m->at_z, *at_w = value + m->at_w;
+    const double *arg[SLOTS], *source[4];
+    double *res[SLOTS];
+    long long iw[SLOTS];
 
-    memset(x, 0, sizeof(double) * ROWS * ld);
-    for (int i = 0; i < N; ++i) memcpy(x + i * ld, slope + i * n_c, sizeof(double) * n_c);
-    memcpy(value + AT_CONSTANT, CONSTANTS, sizeof(double) * (AT_P - AT_CONSTANT));
-    memcpy(value + AT_P, p, sizeof(double) * N_P);
-    memcpy(value + AT_X, state, sizeof(double) * N);
-    arg[0] = value + AT_P; res[0] = value + AT_FIXED;
-    pilfr_fixed(arg, res, iw, work, 0);
-#define ROWS_OF(t, out, n, keep) \
-    rows(out, ld, n, ROW_##t, TERM_##t, DIRECT_ROW_##t, DIRECT_##t, value, source, column, keep, active, span)
+    memset(x, 0, sizeof(double) * n_rows * ld);
+    for (int i = 0; i < n; ++i) memcpy(x + i * ld, slope + i * n_c, sizeof(double) * n_c);
+    memcpy(value, m->constants, sizeof(double) * m->at_p);
+    memcpy(at_p, p, sizeof(double) * m->n_p);
+    memcpy(at_x, state, sizeof(double) * n);
+    arg[0] = at_p; res[0] = at_fixed;
+    m->fixed(arg, res, iw, work, 0);
+#define ROWS_OF(t, out, count, keep) rows(out, ld, count, &m->t, value, source, column, keep, active, span)
     for (long k = 0; k < length; ++k) {
-        memcpy(value + AT_U, u + k * N_U, sizeof(double) * N_U);
-        arg[0] = value + AT_X; arg[1] = value + AT_S; arg[2] = value + AT_U; arg[3] = value + AT_P; arg[4] = value + AT_FIXED;
-        const int kept = k % STRIDE == 0;
-        const long sample = k / STRIDE;
-        res[0] = next; res[1] = next + N_X; res[2] = kept ? y + sample * N_Y : next + N; res[3] = value + AT_Z; res[4] = value + AT_W;
-        pilfr_step(arg, res, iw, work, 0);
-        arg[0] = value + AT_X; arg[1] = value + AT_S; arg[2] = value + AT_Z; arg[3] = value + AT_W;
-        arg[4] = value + AT_U; arg[5] = value + AT_P; arg[6] = value + AT_FIXED;
-        res[0] = value + AT_COMPUTED;
-        pilfr_computed(arg, res, iw, work, 0);
+        memcpy(at_u, u + k * n_u, sizeof(double) * n_u);
+        arg[0] = at_x; arg[1] = at_s; arg[2] = at_u; arg[3] = at_p; arg[4] = at_fixed;
+        const int kept = k % m->stride == 0;
+        const long sample = k / m->stride;
+        res[0] = next; res[1] = next + n_x; res[2] = kept ? y + sample * n_y : next + n; res[3] = at_z; res[4] = at_w;
+        m->step(arg, res, iw, work, 0);
+        arg[0] = at_x; arg[1] = at_s; arg[2] = at_z; arg[3] = at_w; arg[4] = at_u; arg[5] = at_p; arg[6] = at_fixed;
+        res[0] = value + m->at_computed;
+        m->computed(arg, res, iw, work, 0);
         source[0] = x; source[1] = s; source[2] = z; source[3] = w;
-        ROWS_OF(z, z, N_Z, 0);
-        ROWS_OF(w, w, N_Z, 0);
-        ROWS_OF(s, s_next, N_S, KEEPS);
-        if (kept) ROWS_OF(y, y_k, N_Y, 0);
-        ROWS_OF(x, x_next, N_X, 0);
-        for (int i = 0; kept && i < N_Y; ++i) memcpy(jac + (sample * N_Y + i) * n_c, y_k + i * ld, sizeof(double) * n_c);
+        ROWS_OF(of_z, z, n_z, 0);
+        ROWS_OF(of_w, w, n_z, 0);
+        ROWS_OF(of_s, s_next, n_s, m->keeps);
+        if (kept) ROWS_OF(of_y, y_k, n_y, 0);
+        ROWS_OF(of_x, x_next, n_x, 0);
+        for (int i = 0; kept && i < n_y; ++i) memcpy(jac + (sample * n_y + i) * n_c, y_k + i * ld, sizeof(double) * n_c);
         double *swap = x; x = x_next; x_next = swap;
-        if (!KEEPS) { swap = s; s = s_next; s_next = swap; }
-        memcpy(value + AT_X, next, sizeof(double) * N);
+        if (!m->keeps) { swap = s; s = s_next; s_next = swap; }
+        memcpy(at_x, next, sizeof(double) * n);
     }
-    for (int i = 0; i < N; ++i) memcpy(slope + i * n_c, (i < N_X ? x + i * ld : s + (i - N_X) * ld), sizeof(double) * n_c);
-    memcpy(state, value + AT_X, sizeof(double) * N);
+    for (int i = 0; i < n; ++i) memcpy(slope + i * n_c, (i < n_x ? x + i * ld : s + (i - n_x) * ld), sizeof(double) * n_c);
+    memcpy(state, at_x, sizeof(double) * n);
     free(memory);
     return 0;
 }

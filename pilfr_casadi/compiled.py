@@ -1,12 +1,9 @@
-"""The engine that runs generated C: the symbolic step, written out by CasADi, inside the time loops of `_kernel.c`.
+"""The engine that runs generated C: a model's step, called from the time loops of `_kernel.c`.
 
-A library is built once a structure and kept in a private per-user cache, keyed by source, compiler, processor and
-CasADi version; its file name holds a digest of its content, so that a damaged one is built anew. A cache directory that
-others can write to is not used. Without a working C compiler `make_engine` falls back to the virtual machine of
-`sensitivities`, which gives the same numbers.
-
-Most partial derivatives of a state-space model are parameters, signals or constants themselves. The kernel looks these
-up; only the others are written out as code. What depends on parameters alone is evaluated once a run.
+The loops are built once; a model's library is built once a structure. Both are kept in a private per-user cache, keyed
+by source, compiler, processor and CasADi version; a file name holds a digest of its content, so that a damaged library
+is built anew. A cache directory that others can write to is not used. Without a working C compiler `make_engine` falls
+back to the virtual machine of `sensitivities`, which gives the same numbers.
 """
 
 from __future__ import annotations
@@ -22,28 +19,23 @@ import stat
 import subprocess
 import tempfile
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from .generated import loops_code, source_code
 from .model import Model
 from .recording import InputError
-from .sensitivities import BLOCKS, TARGETS, Engine, Linearization, VirtualMachine, linearize
-from .threads import one_at_a_time
+from .sensitivities import Engine, VirtualMachine, linearize
 
 # without contraction the generated step gives the very numbers of the virtual machine: what slips, slips in both
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
-FLAGS = (("-O2", "-march=native", *COMMON), ("-O2", *COMMON))  # the second where the first is not understood
-# long straight lines take seconds to optimise and gain nothing from it, unlike the loops; clang has no such pragma
-PLAIN = '#if defined(__GNUC__) && !defined(__clang__)\n#pragma GCC push_options\n#pragma GCC optimize("O1")\n#endif'
-AGAIN = "#if defined(__GNUC__) && !defined(__clang__)\n#pragma GCC pop_options\n#endif"
+FLAGS = (("-march=native", *COMMON), COMMON)  # the second where the first is not understood
+PLAIN, LOOPS = "-O1", "-O2"  # long straight lines take seconds to optimise and gain nothing from it, unlike the loops
 PATIENCE = 600.0  # seconds for one compilation
 _failures: dict[str, str] = {}  # what did not compile is not tried again by this process
-_SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
-_VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "computed")
 
 
 @functools.cache
@@ -101,125 +93,17 @@ def cache_directory() -> Path:
     return Path(temporary)
 
 
-@dataclass(frozen=True, eq=False)
-class _Code:
-    """What is written out in C, and where the kernel finds the nonzeros of each block.
-
-    Attributes
-    ----------
-    functions : dict
-        `fixed` (p -> f), what depends on parameters alone, evaluated once a run; `step`; and `computed`, the nonzeros
-        that are neither constants nor parameters nor signals, each once.
-    at : dict
-        Where each of `_VALUES` begins in the stack of values, and its `end`.
-    entries : dict
-        The place in the stack of each nonzero, in the order of the block's pattern.
-    """
-
-    functions: dict[str, ca.Function]
-    constants: list[float]
-    at: dict[str, int]
-    entries: dict[tuple[str, str], list[int]]
-
-    @classmethod
-    def of(cls, linear: Linearization) -> _Code:
-        """Sort the nonzeros by where they come from."""
-        symbol = linear.symbols()
-        stepped = linear.step(*(symbol[k] for k in linear.step.name_in()))
-        blocks = linear.blocks(symbol)
-        (*found,), names, fixed = ca.extract_parametric([*stepped, *blocks.values()], symbol["p"], {})
-        stepped, blocks = found[: len(stepped)], dict(zip(blocks, found[len(stepped) :], strict=True))
-        symbol["fixed"] = ca.vertcat(ca.SX(0, 1), *names)
-        known = {e.element_hash(): (k, i) for k, v in symbol.items() for i, e in enumerate(v.elements())}
-        constants: dict[float, int] = {}
-        computed: dict[int, tuple[int, Any]] = {}
-
-        def place(e: Any) -> tuple[str, int]:
-            if e.is_constant():
-                return "constant", constants.setdefault(float(e), len(constants))
-            if e.element_hash() in known:
-                return known[e.element_hash()]
-            return "computed", computed.setdefault(e.element_hash(), (len(computed), e))[0]
-
-        def given(function: ca.Function) -> list[Any]:
-            return [symbol[k] for k in (*function.name_in(), "fixed")]
-
-        places = {key: [place(e) for e in block.nonzeros()] for key, block in blocks.items()}
-        rest = ca.vertcat(ca.SX(0, 1), *(e for _, e in computed.values()))
-        functions = {
-            "fixed": ca.Function("pilfr_fixed", [symbol["p"]], [ca.vertcat(ca.SX(0, 1), *fixed)]),
-            "step": ca.Function("pilfr_step", given(linear.step), ca.cse(stepped)),
-            "computed": ca.Function("pilfr_computed", given(linear.partial), [rest]),
-        }
-        sizes = {"fixed": len(names), "constant": len(constants), "computed": len(computed)}
-        at, end = {}, 0
-        for k in _VALUES:
-            at[k] = end
-            end += {**linear.sizes, **sizes}[k]
-        entries = {key: [at[k] + i for k, i in each] for key, each in places.items()}
-        return cls(functions, list(constants), {**at, "end": end}, entries)
-
-
-@one_at_a_time
-def source_code(linear: Linearization) -> str:
-    """The whole C source for one structure: CasADi's code for the step, the term tables, and the time loops."""
-    code = _Code.of(linear)
-    functions, at = code.functions.values(), code.at
-    options = {"with_header": False, "main": False, "indent": 0, "casadi_int": "long long"}
-    generator = ca.CodeGenerator("generated", options)
-    lines = ["typedef struct { int source, index, value; } term_t;"]
-    lines += ["typedef struct { int parameter, value; } direct_t;"]
-    for function in functions:
-        generator.add(function)
-    for key in ("iw", "w", "arg", "res"):
-        size = max(getattr(f, f"sz_{key}")() for f in functions)
-        lines.append(f"#define SZ_{key.upper()} {size + 1}")
-    lines += [f"#define N_{key.upper()} {linear.sizes[key]}" for key in ("x", "s", "z", "y", "u", "p")]
-    lines.append(f"#define N_FIXED {at['u'] - at['fixed']}")
-    lines += [f"#define AT_{key.upper()} {at[key]}" for key in _VALUES]
-    lines.append(f"static const double CONSTANTS[] = {{{', '.join(map(repr, code.constants)) or '0'}}};")
-    most = 0
-    for target in TARGETS:
-        n = linear.sizes[target]
-        terms: list[list[str]] = [[] for _ in range(n)]
-        direct: list[list[str]] = [[] for _ in range(n)]
-        for source in TARGETS[target]:
-            pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
-            for i, j, value in zip(*pattern.get_triplet(), code.entries[target, source], strict=True):
-                if source == "p":
-                    direct[i].append(f"{{{j},{value}}}")
-                else:
-                    terms[i].append(f"{{{_SOURCES[source]},{j},{value}}}")
-        lines += [*_table(f"TERM_{target}", "term_t", f"ROW_{target}", terms)]
-        lines += [*_table(f"DIRECT_{target}", "direct_t", f"DIRECT_ROW_{target}", direct)]
-        most = max(most, sum(map(len, terms)))
-    # a diagonal s_s lets the memory's slopes be advanced in place
-    diagonal = linear.partial.sparsity_out(BLOCKS.index(("s", "s"))).is_diag()
-    lines.append(f"#define STRIDE {linear.substeps}")
-    lines += [f"#define N_VALUES {at['end']}", f"#define N_TERMS {most}", f"#define KEEPS {int(diagonal)}"]
-    kernel = Path(__file__).with_name("_kernel.c").read_text(encoding="utf-8")
-    return "\n".join([PLAIN, generator.dump(), AGAIN, *lines, kernel])
-
-
-def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[str, str]:
-    """C tables of the entries of all rows, one after the other, and of where each row begins."""
-    first = np.cumsum([0, *map(len, rows)]).tolist()
-    flat = ",".join(entry for row in rows for entry in row) or "{0}"
-    begins = ",".join(map(str, first))
-    return f"static const {kind} {name}[] = {{{flat}}};", f"static const int {starts}[] = {{{begins}}};"
-
-
 def _digest(library: Path) -> str:
     return hashlib.sha256(library.read_bytes()).hexdigest()[:16]
 
 
-def _compile(cc: str, source: str, key: str) -> Path:
+def _compile(cc: str, source: str, key: str, level: str) -> Path:
     """Compile under another name first, so that a library is never half there."""
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
         c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
         c_file.write_text(source, encoding="utf-8")
         for flags in FLAGS:
-            command = [cc, *flags, str(c_file), "-o", str(partial), "-lm"]
+            command = [cc, level, *flags, str(c_file), "-o", str(partial), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
             if not done.returncode and partial.exists():
                 library = cache_directory() / f"{key}-{_digest(partial)}.so"
@@ -228,7 +112,7 @@ def _compile(cc: str, source: str, key: str) -> Path:
     raise OSError((done.stderr.strip().splitlines() or ["it wrote no library"])[0][:300])
 
 
-def build(source: str) -> Path:
+def build(source: str, level: str = PLAIN) -> Path:
     """The library of a source, from the cache or compiled.
 
     Raises
@@ -239,14 +123,14 @@ def build(source: str) -> Path:
     cc = compiler()
     if cc is None:
         raise InputError("No C compiler was found; install one (cc, gcc or clang) or use engine='vm'.")
-    key = hashlib.sha256("\n".join((source, _machine(cc))).encode()).hexdigest()[:32]
+    key = hashlib.sha256("\n".join((source, level, _machine(cc))).encode()).hexdigest()[:32]
     for library in cache_directory().glob(f"{key}-*.so"):
         if library.stem == f"{key}-{_digest(library)}":
             return library
         library.unlink(missing_ok=True)
     if key not in _failures:
         try:
-            return _compile(cc, source, key)
+            return _compile(cc, source, key, level)
         except (OSError, subprocess.TimeoutExpired) as error:
             _failures[key] = str(error)
     raise InputError(
@@ -259,19 +143,30 @@ def _pointer(array: np.ndarray | None) -> ctypes.c_void_p:
     return ctypes.c_void_p() if array is None else ctypes.c_void_p(array.ctypes.data)
 
 
+def _loaded(library: Path) -> ctypes.CDLL:
+    try:
+        return ctypes.CDLL(str(library))
+    except OSError as error:
+        raise InputError(f"The compiled model cannot be loaded ({error}); use engine='vm'.") from error
+
+
+@functools.cache
+def _loops(_cache: Path) -> ctypes.CDLL:
+    """The time loops, once a cache."""
+    return _loaded(build(loops_code(), LOOPS))
+
+
 class Compiled:
     """Generated C behind the `Engine` protocol; it keeps nothing between calls, so threads may share it."""
 
     def __init__(self, model: Model) -> None:
         self.linear = linearize(model)
-        library = build(source_code(self.linear))
-        try:
-            self.library = ctypes.CDLL(str(library))
-        except OSError as error:
-            raise InputError(f"The compiled model cannot be loaded ({error}); use engine='vm'.") from error
+        self.loops = _loops(cache_directory())
+        self.library = _loaded(build(source_code(self.linear)))
+        self.model = ctypes.byref(ctypes.c_char.in_dll(self.library, "pilfr_model"))
 
     def _call(self, name: str, *arguments: Any) -> None:
-        if getattr(self.library, name)(*arguments):
+        if getattr(self.loops, name)(self.model, *arguments):
             raise MemoryError("the compiled model found no memory for its slopes")
 
     def _arguments(self, u: np.ndarray, p: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -33,6 +33,7 @@ LAYERS = {
         "simulate",
         "sensitivities",
         "observer",
+        "generated",
         "compiled",
         "bla",
         "local_polynomial",

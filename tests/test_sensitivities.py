@@ -245,7 +245,7 @@ def test_another_structure_is_another_library():
     for changes, libraries in (({}, 1), ({}, 1), ({"operator": Stop}, 2)):
         Compiled(case(libraries, nx=1, n=1, **changes)[0])
         kept = list(cache_directory().iterdir())
-        assert [path.suffix for path in kept] == [".so"] * libraries  # and nothing half done beside them
+        assert [path.suffix for path in kept] == [".so"] * (1 + libraries)  # the loops, and nothing half done
 
 
 @needs_compiler
