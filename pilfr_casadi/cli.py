@@ -200,3 +200,7 @@ def _data_options(parser: argparse.ArgumentParser, named: bool = True, which: st
         metavar="STEPS",
         help="how far samples may lie off a uniform grid (default: 1e-4 steps, beyond rounding)",
     )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

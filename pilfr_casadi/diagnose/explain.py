@@ -19,12 +19,13 @@ from ..gauss_newton import GaussNewton
 from ..laws import Law
 from ..recording import InputError, Recording
 from ..simulator import Simulator
-from .proof import shown
+from .proof import deviations, shown
 from .screen import Scored
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 HEAD = 0.7  # share of each recording that candidates are fitted to
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
+WEAK, NO_WORSE = 2.0, 1.03  # standard errors within which a part of a law is idle, and error without it
 SHOWN = 3.0  # standard errors that a law's strength is from zero at least
 REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first
 SAME = 1.02  # times the mean square error of fits that came to the same place
@@ -232,11 +233,18 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
         fitted = bench.fit(placed, [candidate.fitted.values], states=candidate.fitted.initial, solver=THOROUGH)
     except InputError:
         return out
-    return out if shown(bench, fitted) < SHOWN else replace(candidate, fitted=fitted, full=fitted.cost)
+    if shown(bench, fitted) < SHOWN:
+        return out
+    done = replace(candidate, fitted=fitted, full=fitted.cost)
+    plain = simpler(bench, done, deviations(bench, fitted))
+    return done if plain is done else polish(bench, plain)
 
 
-def simpler(bench: Workbench, candidate: Candidate) -> Candidate:
-    """A law one of whose strengths came out as zero is the law that it refines, started where it stands."""
+def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray] | None = None) -> Candidate:
+    """A law one of whose strengths is zero is the law that it refines, started where it stands.
+
+    With standard errors, what may as well be zero counts as zero.
+    """
     element = candidate.fitted.simulator.elements[-1]
     if element.port != candidate.port or type(element.law) is not type(candidate.law):  # another was put in after it
         return candidate
@@ -244,15 +252,18 @@ def simpler(bench: Workbench, candidate: Candidate) -> Candidate:
     own = {
         k.removeprefix(element.prefix): v for k, v in candidate.fitted.values.items() if k.startswith(element.prefix)
     }
-    idle = [name for name in candidate.law.strength if not np.any(own[name])]
+    doubt = {name: WEAK * std[f"{element.prefix}{name}"] if std else 0.0 for name in candidate.law.strength}
+    idle = [name for name, most in doubt.items() if np.all(np.abs(own[name]) <= most)]
     if not idle or not getattr(plain, "units", {}) or not set(plain.units) <= set(own) - set(idle):
+        return candidate
+    if not set(candidate.law.places) <= set(plain.places):
         return candidate
     law = plain().at(
         {k: own[k] for k in plain.units}, {k: v for k, v in candidate.law.limits.items() if k in plain.units}
     )
     placed = candidate.fitted.simulator.without_last_element().with_element(element.port, law)
     found = attempt(bench, placed, [candidate.fitted.values], states=candidate.fitted.begin)
-    return found if found is not None and found.error < 1.01 * candidate.error else candidate
+    return found if found is not None and found.error < (NO_WORSE if std else 1.01) * candidate.error else candidate
 
 
 def explain(

@@ -18,7 +18,9 @@ from ..recording import InputError, Recording
 from .workbench import QUICK, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]
-FACTORS = (1e3, 1e-3, 1e6, 1e-6, 180 / np.pi, np.pi / 180, 1e2, 1e-2, 9.80665, 1 / 9.80665)
+# metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches, psi
+UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 6894.757)
+FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 # mean square error that a wrong unit of time leaves at least, and where it has driven parameters to their bounds
 HOPELESS, STRAINED = 0.1, 0.01
@@ -70,6 +72,8 @@ def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, 
         for i in index:
             values[:, i] = _read(r.t, values[:, i], at, end, smooth=kind == "y")
         other = r.with_(**{kind: values})
+        if kind == "y" and isinstance(r.initial, str) and r.initial == "zero":  # at rest when it was said to be
+            other = other.with_(initial="estimate")
         if end is not None or not cut:
             return other
         early, late = int(np.sum(at < 0)), int(np.sum(at > r.t[-1] + 1e-9 * r.dt))

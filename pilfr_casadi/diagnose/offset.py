@@ -22,6 +22,7 @@ from .screen import block_diagonal, orthonormal
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats that an offset has to gain
+IDLE = 1.02  # times the mean square error that an offset which was none may take away
 LEAST = 0.01  # share of the mean square that it has to take away
 
 
@@ -95,3 +96,21 @@ def offsets(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Ga
         bench, plain = other, found
         ports.remove(port)
     return bench, plain, gates
+
+
+def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
+    """A simulator with effects, its offsets held at zero where it does as well: an effect may have looked like one."""
+    for element in fitted.simulator.elements[: len(bench.simulator.elements)]:
+        if not isinstance(element.law, Offset) or len(fitted.simulator.elements) == len(bench.simulator.elements):
+            continue
+        name = f"{element.prefix}w_0"
+        held = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
+        simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: held})
+        start = {k: v for k, v in fitted.values.items() if k != name}
+        try:
+            found = bench.fit(simulator, [start], states=fitted.initial, solver=THOROUGH)
+        except InputError:
+            continue
+        if found.cost < IDLE * fitted.cost:
+            fitted = found
+    return fitted

@@ -18,11 +18,12 @@ from .experiment import next_experiment, placebo
 from .explain import Candidate
 from .gates import Gate, hold_note, said_hold
 from .mismatch import mismatch
+from .offset import without_idle_offsets
 from .prepare import prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import Pass, Search
-from .verdict import confidence, judge
+from .verdict import UNSURE, confidence, judge
 from .workbench import Fitted, arranged
 
 Progress = Callable[[str, int, int, float], None]
@@ -103,10 +104,14 @@ def diagnose(
         bench, without = ready.bench, ready.without
         search = Search(bench, without, ready.floor, laws, workers, say).run(effects)
         gates = (*ready.gates, hold_note(simulator, bench.hold, ratio))
+    search.base = without_idle_offsets(bench, search.base)
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
-    if verdict == "unexplained" and (lost := clipped_input(bench, where)) is not None:
+    if accepted and verdict == "missing-physics":
+        where = accepted[0].choice.winner.port if accepted[0].choice else where
+    sure = verdict != "unexplained" and min((confidence(p.choice, search) for p in accepted if p.choice), default=1.0)
+    if sure < UNSURE and (lost := clipped_input(bench, where)) is not None:
         verdict, sentence, gates = "recording-fault", lost.sentence, (*gates, lost)
     if search.interrupted and not accepted:
         sentence = (

@@ -31,6 +31,7 @@ MAINLY = 0.6  # of it explainable: whatever the rivals, the name is wrong or inc
 CLEAR = 1.5  # times the winner's error that every rival's is, for a name that only comes near to be given all the same
 UNSURE = 0.5  # confidence below which a name is called likely
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
+HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
 PURE = 0.05  # share of model error in a residual that is taken for noise
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
 LIKE = 0.03  # rivals whose error is within this share cannot be told apart
@@ -170,6 +171,10 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     """Verdict and its sentence."""
     accepted = [p.choice for p in search.passes if p.accepted and p.choice is not None]
     remains, still = left_open(search)
+    faults = [g for g in gates if g.fault]
+    cured = min((g.left for g in faults), default=1.0) < CURES
+    if cured and search.without.cost < HALVED**2 * search.base.cost:  # next to the fault an effect is nothing
+        return "recording-fault", faults[0].sentence
     if accepted and _explains(accepted, remains, still):
         words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
         sure = min(confidence(c, search) for c in accepted) > UNSURE
@@ -178,12 +183,11 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
             if sure
             else f"The simulator most likely leaves out {words}; the name is not certain."
         )
-    faults = [g for g in gates if g.fault]
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
     open_now = max(search.open_before.values(), default=0.0)
     bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and not _swells(search))
-    if faults and (bare or (open_now < HINT and not accepted) or min(g.left for g in faults) < CURES):
+    if faults and (bare or (open_now < HINT and not accepted) or cured):
         return "recording-fault", faults[0].sentence
     if bare and open_now < HINT:
         return "complete", (
@@ -196,12 +200,13 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
             f"Something is missing and no law of the catalogue explains it: refitted, the simulator is off by "
             f"{error:.3g} of the outputs' deviation, the noise is about {floor:.3g}{at}."
         )
-    port = accepted[0].winner.port
+    near = accepted[0].winner
+    port = near.port
     if search.open_before.get(port, 0.0) < 0.5 * search.open_before.get(where, 0.0):
         port = where
     return "unexplained", (
         f"Something is missing, most likely at {port}, and no law of the catalogue explains it: the nearest, "
-        f"{accepted[0].winner.law.id.replace('_', ' ')}, leaves {remains:.0%} of the excess, and a flexible force "
+        f"{near.law.id.replace('_', ' ')} at {near.port}, leaves {remains:.0%} of the excess, and a flexible force "
         f"explains {still:.0%} of what it leaves."
     )
 

@@ -21,7 +21,7 @@ from ..simulator import Simulator
 from ..threads import one_at_a_time
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
-HUGE = 1e6  # times the largest measured value
+HUGE, ENDLESS = 1e6, 1e20  # times the largest measured value, and mean square error, of what grows without end
 FINER = 4  # times as many sub-steps for a law at most
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
 
@@ -240,7 +240,7 @@ class Workbench:
             return None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
         cost = problem.cost(theta)
-        return (cost, theta, problem) if np.isfinite(cost) else None
+        return (cost, theta, problem) if cost < ENDLESS else None
 
     def _unknown(self, states: Sequence[np.ndarray], n: int) -> np.ndarray:
         """Guesses of the initial states that are estimated, one after the other, n each."""

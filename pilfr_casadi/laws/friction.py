@@ -86,16 +86,15 @@ class PreslidingFriction(Law):
         return {"r": (5e-4 * local.half, 0.6 * local.half)}
 
 
-class StribeckFriction(Law):
+class StribeckFriction(CoulombFriction):
     """Dry friction that falls as motion sets in (Stribeck 1902; Armstrong-Hélouvry et al. 1994)."""
 
     id = "stribeck_friction"
+    form = ""
     equation = "w = (F_c + F_e exp(-(dz/dt / v_s)^2)) tanh(dz/dt / v_0)"
-    source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7)"
     sentence = "dry friction that is larger at rest than in motion"
     units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_e": "w", "v_s": "z/s", "v_0": "z/s"}
     strength: ClassVar[tuple[str, ...]] = ("F_c", "F_e")
-    dissipative = True
 
     def force(self, dz: Any, p: Any) -> Any:
         return (p.F_c + p.F_e * ca.exp(-((dz / p.v_s) ** 2))) * ca.tanh(dz / p.v_0)

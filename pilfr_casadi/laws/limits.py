@@ -125,7 +125,7 @@ class DeadZone(Law):
         return {"g": (1e-3 * local.reach, 0.8 * local.reach)}
 
     def applies(self, local: Local) -> str:
-        return "" if local.low < 0 < local.high else "one side is never visited"
+        return "" if np.min(np.abs(local.z)) < 0.1 * local.reach else "the signal is never small"
 
 
 class AsymmetricDeadZone(DeadZone):
@@ -144,3 +144,6 @@ class AsymmetricDeadZone(DeadZone):
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"g_1": (0.0, 0.8 * local.reach), "g_2": (0.0, 0.8 * local.reach)}
+
+    def applies(self, local: Local) -> str:
+        return "" if local.low < 0 < local.high else "one side is never visited"

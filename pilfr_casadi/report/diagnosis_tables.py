@@ -107,7 +107,7 @@ def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
     if wider:
         out.append(Text(f"As good, but with more freedom than needed: {wider}."))
     elif not e.indistinguishable:
-        out.append(Text("No other port and law does as well on these recordings."))
+        out.append(Text("No law of another name does as well on these recordings."))
     return out
 
 
