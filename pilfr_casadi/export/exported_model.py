@@ -165,7 +165,7 @@ class Exported:
             lambda t, x, u, params: np.asarray(both(x, u)[1]).ravel(),
             inputs=named(self.inputs),
             outputs=named(self.outputs),
-            states=named(self.states) if self.states else 0,
+            states=named(self.states) if self.states else None,
             dt=self.dt,
             name=self.name,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,12 +17,9 @@ from .exported_model import Exported
 from .sampled import Sampled, right_hand_side, sampled
 from .smoothing import smoothed
 
-if TYPE_CHECKING:
-    from ..diagnose import Diagnosis
-
 
 def exported(
-    model: Fit | Simulator | Model | Diagnosis,
+    model: Any,
     *,
     dt: float | None = None,
     hold: str | None = None,
@@ -108,7 +105,7 @@ def exported(
     )
 
 
-def to_casadi(model: Fit | Simulator | Model | Diagnosis, name: str = "model", **options: Any) -> ca.Function:
+def to_casadi(model: Any, name: str = "model", **options: Any) -> ca.Function:
     """One step of a model as `casadi.Function (x, u) -> (x_next, y)`, in engineering units.
 
     Parameters
