@@ -132,6 +132,12 @@ def everything():
     for name, make in CASES.items():
         fitted, data = from_zoo(make)
         out[f"zoo {name}"] = fitted, {}, data, replace(fitted, engine="vm").simulate(data)
+    grey = mass_on_spring().with_element("ground", dose(StopHysteresis))  # a fit of a simulator's model
+    fitted = replace(
+        some_fit(), model=discretise(grey, 0.02, "linear", 3), structure=None, initial={}, units={}, dt=0.02
+    )
+    data = wave(grey, 0.02, 3.0)
+    out["fit with sub-steps"] = fitted, {}, data, replace(fitted, engine="vm").simulate(data)
     for name, (simulator, dt, hold, substeps) in simulators().items():
         data = wave(simulator, dt, 3.0 if name.startswith("law") else 1.0)
         given = {"dt": dt, "hold": hold, "substeps": substeps}

@@ -81,7 +81,7 @@ def _header(exported: Exported) -> str:
 
 def _source(exported: Exported) -> str:
     name, big, step = exported.name, exported.name.upper(), exported.step
-    inner = f"{name}_casadi"
+    inner = f"{name.rstrip('_')}_casadi"
     x, u = (ca.MX.sym(key, step.size1_in(key)) for key in ("x", "u"))
     # long ones hold a loop and stay as they are, called from a function of the right name
     renamed = step.expand(inner) if step.is_a("SXFunction") else ca.Function(inner, [x, u], step.call([x, u]))

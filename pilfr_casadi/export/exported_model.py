@@ -73,7 +73,8 @@ class Exported:
     def bound(self, x: Any, u: Any) -> tuple[np.ndarray, np.ndarray]:
         """How far one smoothed step from x and u can be from the exact one: arrays (n_x,) and (n_y,).
 
-        For a PI-LFR model it does not depend on x and u; see `smoothing` for what it is.
+        In a PI-LFR model with plays or stops it is never more than `|D_yw| Σ_j w_j eps/2` for y, and for the linear
+        states the same with `|B_w|`; a play's memory is off by at most eps/2. See `smoothing`.
 
         Raises
         ------

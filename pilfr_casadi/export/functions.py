@@ -165,6 +165,8 @@ def _start(model: Any, closed: Model, step: Sampled, start: Any) -> np.ndarray:
             if abs(start.dt / step.dt - 1) > 1e-4:
                 raise InputError(f"The recording's step is {start.dt:g} s, that of the export {step.dt:g} s; use one.")
             state = first_state(closed, make_engine(closed), start)
+        if not np.all(np.isfinite(state)):
+            raise InputError("The state at the recording's first sample is not finite; give another start.")
         return np.append(state, np.zeros(size - n))
     try:
         given = np.asarray(start, dtype=float).ravel()

@@ -7,9 +7,9 @@ Every max, min and |·| of a step is rounded,
 each off by at most eps/2, max and |·| upwards, min downwards; sign(a), the slope of |a|, by its slope. A play `max(z -
 r, min(z + r, q))` and a stop are thus off by at most eps/2 a step, since the two signs do not add; a generalized play,
 whose upper curve is a max itself, by at most eps. In a PI-LFR model (Krikelis et al. 2024, Eq. 15-16) with plays or
-stops an output is off by `|D_yw| Σ_j w_j eps/2`, a state by `|B_w| Σ_j w_j eps/2`. What is off in general follows by
-interval arithmetic: each value of the step is enclosed together with its rounded twin, and each rounding widens the
-interval by eps/2 (Moore, Kearfott & Cloud 2009, ch. 2).
+stops an output is off by at most `|D_yw| Σ_j w_j eps/2`, a state by `|B_w| Σ_j w_j eps/2`. What is off in general
+follows by interval arithmetic: each value of the step is enclosed together with its rounded twin, and each rounding
+widens the interval by eps/2 (Moore, Kearfott & Cloud 2009, ch. 2).
 
 The bound is one step's, from the same x and u. Over many steps a rounded play creeps towards its signal, by about
 eps²/4d a sample at the distance d from its edges, and so forgets; this is for the horizon of a controller, not for a
@@ -186,7 +186,7 @@ def _unary(op: str, a: Interval, eps: float) -> Interval:
     if op == "INV":
         return _binary("DIV", (1.0, 1.0), a, eps)
     if op == "NOT":
-        return float(low == high == 1), float(low == 0)
+        return float(low == high == 0), float(low == 0)
     raise InputError(f"Nothing is known of the error behind the operation {op.lower()!r}; leave it out.")
 
 
