@@ -1,10 +1,13 @@
 """What comes with an exported step: names, start state, files that need no package, continuous time, plain refusals."""
 
+import ast
 import ctypes
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -16,9 +19,14 @@ from test_exported_models import lfr, mass_on_spring, wave
 
 from pilfr_casadi import InputError, Parameter, Play, PrandtlIshlinskii, Recording, Simulator, exported, to_casadi
 from pilfr_casadi.compiled import compiler
+from pilfr_casadi.diagnose import diagnose
 from pilfr_casadi.diagnose.result import Diagnosis
-from pilfr_casadi.laws import Backlash, Drift, Relaxation, StopHysteresis
+from pilfr_casadi.export import load
+from pilfr_casadi.laws import Backlash, Drift, PreslidingFriction, Relaxation, StopHysteresis
 from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.load_simulator import load_simulator
+from pilfr_casadi.metrics import nrmse
+from pilfr_casadi.readers import read_csv
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -104,6 +112,23 @@ def test_a_diagnosis_exports_what_it_fitted():
     with pytest.raises(InputError, match="leave dt, hold and substeps out") as error:
         exported(diagnosis, dt=0.02)
     one_sentence(error)
+
+
+def test_a_real_diagnosis_exports_what_it_judged():
+    simulator = load_simulator("pilfr_casadi/demo_data/rig.py")
+    known = {"inputs": "force", "outputs": "x2", "initial": "zero", "hold": "zero"}
+    train, test = (read_csv(f"pilfr_casadi/demo_data/rig_{name}.csv", **known) for name in ("train", "test"))
+    diagnosis = diagnose(simulator, train, test=test, laws=(PreslidingFriction,))
+    found = diagnosis.export(name="rig")
+    assert found.sampled.substeps == diagnosis.substeps > 1 and "ground-m2.memory1" in found.states
+    assert found.units["x2"] == "m"
+    for kind, recording in (("train", train), ("test", test)):
+        x, rows = found.x0(), []
+        for u in recording.u:
+            x, y = found.step(x, u)
+            rows.append(np.asarray(y).ravel())
+        error = nrmse(recording.y, np.array(rows))
+        assert error == pytest.approx(diagnosis.errors[kind]["after"], rel=1e-9 if kind == "test" else 0.05)
 
 
 READER = """
@@ -244,6 +269,56 @@ def test_refused_in_one_sentence(case):
     with pytest.raises(InputError, match=words) as error:
         action()
     one_sentence(error)
+
+
+HOSTILE = (
+    "__import__('os').system('touch evil')",
+    "{0.__class__}",
+    "%s%n",
+    '"); system("touch evil"); //',
+    "$(touch evil)",
+)
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_no_code_is_run_from_a_model_file(tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    some_fit().save("model.json")
+    content = json.loads((tmp_path / "model.json").read_text())
+    signals, training = content["model"], content["training"]
+    signals["inputs"][0] |= {"name": text, "unit": text}
+    signals["outputs"][0]["unit"] = training["message"] = content["written_by"]["casadi"] = text
+    signals["states"] = [text] * len(signals["states"])
+    training["active"] = [text]
+    (tmp_path / "model.json").write_text(json.dumps(content))
+    fitted = load("model.json")
+    found = exported(fitted, name="rig")
+    assert text in str(fitted) and text in str(found)
+    found.serialize("rig.casadi")
+    source, header = found.to_c("c")
+    found.to_control()
+    code = [re.sub(r"/\*.*?\*/", "", p.read_text(encoding="utf-8"), flags=re.S) for p in (source, header)]
+    assert not any(word in part for part in code for word in ("evil", "system", text))  # but as RIG_U_SYSTEM_TOUCH_EVIL
+    for key in ("operator", "kind"):
+        content["structure"]["element"][key] = text
+        (tmp_path / "model.json").write_text(json.dumps(content))
+        with pytest.raises(InputError) as error:
+            load("model.json")
+        one_sentence(error)
+    assert not list(tmp_path.rglob("evil"))
+
+
+def test_the_package_runs_no_text_but_the_users_own_program():
+    """`eval`, `exec`, unpickling: nowhere but where a simulator's file is run, which is a program and called one."""
+    package = Path(exported.__code__.co_filename).parents[1]
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id not in ("eval", "exec", "compile", "__import__") or path.name == "load_simulator.py"
+            if isinstance(node, ast.Attribute):
+                assert node.attr not in ("loads", "Unpickler", "external") or ast.unparse(node) == "json.loads", path
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "np.load":
+                assert any(k.arg == "allow_pickle" and k.value.value is False for k in node.keywords), path
 
 
 def test_an_open_port_is_refused():

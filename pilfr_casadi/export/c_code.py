@@ -31,6 +31,7 @@ def write_c(exported: Exported, folder: str | os.PathLike[str]) -> tuple[Path, P
 
 def _header(exported: Exported) -> str:
     name, big = exported.name, exported.name.upper()
+    between = "next" in exported.sampled.reads
     sizes = {"NX": len(exported.states), "NU": len(exported.inputs), "NY": len(exported.outputs)}
     lines = [
         f"/* {name}: one step of an identified model, every {exported.dt:.10g} s; {_accuracy(exported)}.",
@@ -39,6 +40,7 @@ def _header(exported: Exported) -> str:
         f" *   {name}_x0(x);                 once, at the start",
         f" *   {name}_step(x, u, x, y);      every sample: y now, and x for the next one",
         " *",
+        *([" * Inputs are interpolated: behind those of this sample, u holds those of the next one.", " *"] * between),
         " * Nothing is allocated and nothing is kept between calls; several threads may call it at once.",
         " */",
         f"#ifndef {big}_H",
