@@ -235,6 +235,16 @@ def test_continuous_time_where_there_is_one():
     assert exported(discrete, dt=1.0).rhs is None
 
 
+def test_a_simulator_without_inputs_and_one_without_states(tmp_path):
+    ringing = Simulator(lambda x: dict(a=x.b, b=-800 * x.a), lambda x: dict(y=x.a), ("a", "b"))
+    found = exported(ringing, dt=0.1)
+    assert (found.inputs, found.sampled.substeps) == ((), 12)
+    assert float(found.step([1.0, 0.0], [])[0][0]) == pytest.approx(np.cos(np.sqrt(8.0)), abs=1e-4)
+    device = exported(Simulator({}.get, lambda u: dict(y=2 * u.v), (), ("v",)), dt=0.1, name="device")
+    assert (device.states, device.x0().size, float(device.step([], 3.0)[1])) == ({}, 0, 6.0)
+    assert "#define DEVICE_NX 0" in device.to_c(tmp_path)[1].read_text()
+
+
 REFUSED = {
     "what": (lambda: exported(3), "a int was given; give a Fit"),
     "class": (lambda: exported(Simulator, dt=0.1), "a class was given"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -143,10 +144,11 @@ def _substeps(simulator: Simulator, dt: float) -> int:
     """Sub-steps a sample, from the fastest eigenvalue at rest, and what the laws need at least."""
     if simulator.discrete:
         return 1
-    n_u = len(simulator.inputs)
-    at_rest = Recording(np.zeros((400, max(n_u, 1))), np.zeros((400, len(simulator.output_names))), dt)
+    # without inputs, one that nothing reads stands for them
+    driven = simulator if simulator.inputs else replace(simulator, inputs=("none",))
+    at_rest = Recording(np.zeros((400, len(driven.inputs))), np.zeros((400, len(driven.output_names))), dt)
     least = max((getattr(e.law, "substeps", 1) for e in simulator.elements), default=1)
-    return max(choose_substeps(simulator, [at_rest]) if n_u else 1, least)
+    return max(choose_substeps(driven, [at_rest]), least)
 
 
 def _start(model: Any, closed: Model, step: Sampled, start: Any) -> np.ndarray:
