@@ -141,10 +141,17 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     export = commands.add_parser(
-        "export", help="write a saved model as a serialized CasADi function", allow_abbrev=False
+        "export", help="write a model's step as a serialized CasADi function or as C", allow_abbrev=False
     )
-    export.add_argument("model", help="model.json")
-    export.add_argument("--out", required=True, metavar="FILE", help="file for casadi.Function.load")
+    export.add_argument("model", help="model.json, or a Python file that sets `simulator`")
+    form = export.add_mutually_exclusive_group()
+    form.add_argument("--casadi", action="store_true", help="a file for casadi.Function.load, and its names (default)")
+    form.add_argument("--c", action="store_true", help="C source and header that need no library")
+    export.add_argument("--out", required=True, metavar="FILE", help="the file; with --c the folder for both files")
+    export.add_argument("--name", default="model", help="name of the function (default: model)")
+    export.add_argument("--smooth", type=float, default=0.0, metavar="EPS", help="round min and max (default: exact)")
+    export.add_argument("--dt", type=float, metavar="SECONDS", help="step of a simulator, which has none")
+    export.add_argument("--hold", choices=("zero", "linear"), help="what a simulator's inputs do between samples")
 
     demo = commands.add_parser(
         "demo", help="identify a rig, and diagnose a simulator, from recordings that come along", allow_abbrev=False

@@ -166,15 +166,10 @@ def simulate(options: argparse.Namespace) -> int:
 
 
 def export(options: argparse.Namespace) -> int:
-    """Write a saved model as a serialized CasADi function."""
-    function, out = load(options.model).to_casadi(), Path(options.out)
-    if out.is_dir() or not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
-        raise InputError(f"--out {options.out} cannot be written; give a file in a folder that exists.")
-    if out.resolve() == Path(options.model).resolve():
-        raise InputError(f"--out {options.out} would overwrite the model; give another file.")
-    function.save(str(out))
-    print(f"casadi function: {options.out}")
-    return DONE
+    """Write a model's step as a serialized CasADi function with its names, or as C."""
+    from .export_command import run_export
+
+    return run_export(options)
 
 
 def diagnose(options: argparse.Namespace) -> int:

@@ -186,11 +186,15 @@ class Fit:
 
         save(self, path)
 
-    def to_casadi(self, name: str = "model") -> Any:
+    def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
         """`casadi.Function (x, u) -> (x_next, y)`, operator memory inside x; see `export.to_casadi`."""
-        from .export import to_casadi
+        return self.export(name=name, smooth=smooth).step
 
-        return to_casadi(self, name)
+    def export(self, **options: Any) -> Any:
+        """The step with start state, names and units, for CasADi, C and python-control; see `export.exported`."""
+        from .export import exported
+
+        return exported(self, **options)
 
     def __str__(self) -> str:
         errors = ", ".join(f"{e:.4f}" for e in self.train_nrmse)

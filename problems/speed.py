@@ -1,4 +1,4 @@
-"""Speed: what a residual with its Jacobian, a start, a whole identification, and a growing record cost.
+"""Speed: what a residual with its Jacobian, a start, a whole identification, a growing record, an exported step cost.
 
     python -m problems.speed            all tables, some minutes
     python -m problems.speed --quick    a small version, less than half a minute
@@ -153,6 +153,16 @@ def table_of_beginnings(folder: Path) -> Figures:
     return figures
 
 
+def table_of_export(folder: Path) -> Figures:
+    """Print and return what one step of the exported model costs a controller."""
+    print("\none step of the exported model                        time")
+    figures = run(folder, "exported_step")
+    for key, name in (("seconds", "its C, in a C program (-O2)"), ("function", "its CasADi function, from Python")):
+        if key in figures:
+            print(f"  {name:<46}{1e6 * figures[key]:8.2f} us", flush=True)
+    return figures
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -171,6 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             table_of_starts(folder)
             table_of_growth(folder)
             table_of_solvers(folder)
+        table_of_export(folder)
         table_of_beginnings(folder)
 
 

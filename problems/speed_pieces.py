@@ -184,7 +184,51 @@ def building(folder: Path) -> Figures:
     return {"seconds": time.perf_counter() - began}
 
 
-PIECES = {f.__name__: f for f in (derivatives, growth, one_start, pipeline, least_squares, imports, building)}
+MAIN = """#include <stdio.h>
+#include <time.h>
+#include "rig.h"
+int main(void) {
+  double x[RIG_NX], y[RIG_NY], u[RIG_NU], sum = 0;
+  struct timespec a, b;
+  int k;
+  rig_x0(x);
+  clock_gettime(CLOCK_MONOTONIC, &a);
+  for (k = 0; k < 2000000; k++) {
+    u[0] = (k / 64 % 2 ? -1.0 : 1.0) * (k % 64 - 32) / 16;
+    rig_step(x, u, x, y);
+    sum += y[0];
+  }
+  clock_gettime(CLOCK_MONOTONIC, &b);
+  printf("%.6e %.17g\\n", ((b.tv_sec - a.tv_sec) + 1e-9 * (b.tv_nsec - a.tv_nsec)) / 2e6, sum);
+  return 0;
+}
+"""
+
+
+def exported_step(folder: Path, optimisation: str = "-O2") -> Figures:
+    """One step of the exported model in a C program, and of its CasADi function called from Python."""
+    import subprocess
+
+    from pilfr_casadi.compiled import compiler
+    from pilfr_casadi.export import exported
+
+    step = exported(load(folder, "vm", 200, "way").model, dt=1 / 120, name="rig")
+    x, u = step.x0(), np.ones(1)
+    figures = {"function": clock(lambda: [step.step(x, u) for _ in range(1000)]) / 1000}
+    if (cc := compiler()) is not None:
+        step.to_c(folder)
+        (folder / "main.c").write_text(MAIN)
+        command = [cc, "-D_POSIX_C_SOURCE=199309L", "-std=c99", optimisation, "main.c", "rig.c", "-lm", "-o", "rig"]
+        subprocess.run(command, cwd=folder, check=True)
+        runs = [subprocess.run([folder / "rig"], capture_output=True, text=True, check=True).stdout for _ in range(5)]
+        assert all(np.isfinite(float(run.split()[1])) for run in runs)
+        figures["seconds"] = float(np.median([float(run.split()[0]) for run in runs]))
+    return figures
+
+
+PIECES = {
+    f.__name__: f for f in (derivatives, growth, one_start, pipeline, least_squares, imports, building, exported_step)
+}
 
 
 def main(call: str) -> None:

@@ -73,7 +73,7 @@ LAYERS = {
         "load_simulator",
     ),
     7: ("diagnose", "report"),  # a diagnosis writes its own report
-    8: ("cli", "commands", "diagnose_command", "option_values", "demo"),
+    8: ("cli", "commands", "diagnose_command", "export_command", "option_values", "demo"),
 }
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py" and p.parent.name != "demo_data")

@@ -62,10 +62,17 @@ def test_long_record_takes_memory_and_time_in_proportion(case):
     assert long["memory"] < 300
 
 
+@needs_compiler
+def test_a_step_in_c_takes_less_than_a_microsecond(case):
+    """Five states and 20 plays; a busy machine gets another try."""
+    assert min(speed.run(case, "exported_step")["seconds"] for _ in range(AGAIN)) <= 1e-6
+
+
 def test_quick_tables(capsys):
     speed.main(["--quick"])
     out = capsys.readouterr().out
-    for title in ("residual and Jacobian", "one start to the end", "normal equations", "GaussNewton", "import"):
+    titles = ("residual and Jacobian", "one start to the end", "normal equations", "GaussNewton", "import")
+    for title in (*titles, "one step of the exported model"):
         assert title in out
 
 

@@ -62,6 +62,8 @@ class Diagnosis:
         `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs.
     floor : dict
         `nrmse` and `source`.
+    substeps : int
+        Integration steps a sample with which the corrected simulator was fitted.
     """
 
     verdict: str
@@ -83,6 +85,7 @@ class Diagnosis:
     times: Mapping[str, float] = field(default_factory=dict)
     interrupted: bool = False
     evidence: Mapping[str, Any] = field(default_factory=dict)
+    substeps: int = 1
 
     def to_dict(self) -> dict[str, Any]:
         """The content of diagnosis.json; numbers that are not finite are None."""
@@ -100,6 +103,16 @@ class Diagnosis:
         }
         clean: dict[str, Any] = plain(raw)
         return clean
+
+    def export(self, **options: Any) -> Any:
+        """The corrected simulator as a step over a sample, in steps and sub-steps as fitted; see `export.exported`."""
+        from ..export import exported
+
+        return exported(self.corrected, dt=self.train[0].dt, hold=self.hold, substeps=self.substeps, **options)
+
+    def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
+        """The corrected simulator as `casadi.Function (x, u) -> (x_next, y)`; see `export.to_casadi`."""
+        return self.export(name=name, smooth=smooth).step
 
     def report(self, folder: str | os.PathLike[str]) -> None:
         """Write report.html, diagnosis.json and figures into a folder."""

@@ -156,6 +156,7 @@ def diagnose(
         times=times,
         interrupted=search.interrupted,
         evidence={"search": search, "without": without, "after": after},
+        substeps=after.model.substeps,
     )
 
 

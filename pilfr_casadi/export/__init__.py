@@ -1,8 +1,20 @@
 """Models on disk, and models as CasADi functions."""
 
+from .exported_model import NAMES, Exported
 from .files import made, write_atomically
-from .functions import to_casadi
+from .functions import exported, to_casadi
 from .loading import load
 from .saving import FORMAT, VERSION, save
 
-__all__ = ["FORMAT", "VERSION", "load", "made", "save", "to_casadi", "write_atomically"]
+__all__ = [
+    "FORMAT",
+    "NAMES",
+    "VERSION",
+    "Exported",
+    "exported",
+    "load",
+    "made",
+    "save",
+    "to_casadi",
+    "write_atomically",
+]

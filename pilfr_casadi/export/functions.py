@@ -1,26 +1,122 @@
-"""A fitted model as a CasADi function, for controllers and simulations elsewhere."""
+"""Models as CasADi functions, for controllers and simulations elsewhere."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import Any
 
 import casadi as ca
+import numpy as np
 
-from ..recording import InputError
+from ..compiled import make_engine
+from ..fitted import Fit, first_state
+from ..integration import choose_substeps, discretise
+from ..model import Model
+from ..recording import InputError, Recording
+from ..simulator import Simulator
+from .exported_model import Exported
+from .sampled import Sampled, right_hand_side, sampled
+from .smoothing import smoothed
 
-if TYPE_CHECKING:
-    from ..fit import Fit
 
-
-def to_casadi(fit: Fit, name: str = "model") -> ca.Function:
-    """One step of the fitted model as `casadi.Function (x, u) -> (x_next, y)`, in engineering units.
+def exported(
+    model: Any,
+    *,
+    dt: float | None = None,
+    hold: str | None = None,
+    substeps: int | None = None,
+    start: Any = None,
+    smooth: float = 0.0,
+    name: str = "model",
+) -> Exported:
+    """A model as one step `(x, u) -> (x_next, y)`, with start state, names and units.
 
     Parameters
     ----------
-    fit : Fit
-        The model; its fitted values become constants of the function.
+    model : Fit, Simulator, Model or Diagnosis
+        A simulator is taken with the laws in its ports, at its parameters' values; of a diagnosis, the corrected one.
+    dt : float
+        Duration of a step, s: needed for a simulator and a model; a fit and a diagnosis have theirs.
+    hold : {"zero", "linear"}, optional
+        What inputs do between samples, for a simulator; default: what it says itself, else "zero".
+    substeps : int, optional
+        Runge-Kutta steps a sample, for a simulator; chosen from its fastest eigenvalue where left out.
+    start : Recording or array, optional
+        Where `x0()` is: at a recording's first sample, as its `initial` says, or given, with or without memory.
+    smooth : float
+        eps > 0 rounds min, max, |.| and sign (`smoothing`), for solvers that need derivatives everywhere; the error is
+        `Exported.bound`.
     name : str
         Name of the function: letters, digits and single underscores, beginning with a letter.
+
+    Returns
+    -------
+    Exported
+
+    Raises
+    ------
+    InputError
+        If something is missing or does not fit; one sentence says what.
+    """
+    if not ca.Function.check_name(name):
+        raise InputError(f"The function name {name!r} cannot be used; give letters, digits and single underscores.")
+    if not isinstance(smooth, int | float) or not 0 <= smooth < np.inf:
+        raise InputError(f"smooth = {smooth!r} was given; give a number, zero or more, in units of the signals.")
+    units: dict[str, str] = {}
+    rhs = None
+    if isinstance(model, Fit | Model):
+        if hold is not None or substeps is not None:
+            raise InputError("The model has its own steps; `hold` and `substeps` are for simulators, leave them out.")
+        if isinstance(model, Fit) and dt is not None and dt != model.dt:
+            raise InputError(f"dt = {dt!r} was given, but the fit's step is {model.dt:g} s; leave dt out.")
+        closed = model.model if isinstance(model, Fit) else model
+        units = dict(model.units) if isinstance(model, Fit) else {}
+        step = sampled(closed, model.dt if isinstance(model, Fit) else _duration(dt))
+    elif isinstance(model, Simulator):
+        dt, hold = _duration(dt), hold or model.hold or "zero"
+        if hold not in ("zero", "linear"):
+            raise InputError(f"hold = {hold!r} was given; use 'zero' or 'linear'.")
+        if substeps is not None and (substeps != int(substeps) or substeps < 1):
+            raise InputError(f"substeps = {substeps!r} was given; give a whole number, 1 or more.")
+        closed = discretise(model, dt, hold, int(substeps or _substeps(model, dt)))
+        units, step = dict(model.units), sampled(closed, dt, model)
+        rhs = right_hand_side(model, f"{name}_rhs")
+    elif callable(getattr(model, "export", None)):
+        given = {"dt": dt, "hold": hold, "substeps": substeps}
+        if any(v is not None for v in given.values()):
+            raise InputError("A diagnosis has its own step and hold; leave dt, hold and substeps out.")
+        found: Exported = model.export(name=name, smooth=smooth, start=start)
+        return found
+    else:
+        what = "a class" if isinstance(model, type) else f"a {type(model).__name__}"
+        raise InputError(f"{what} was given; give a Fit, a Simulator, a Model or a Diagnosis.")
+    one = smoothed(step.one, smooth) if smooth else None
+    return Exported(
+        step=step.function(name, one),
+        start=_start(model, closed, step, start),
+        states={n: i for i, n in enumerate(step.states)},
+        thresholds=step.thresholds,
+        inputs=step.inputs,
+        outputs=step.outputs,
+        units={k: v for k, v in units.items() if v},
+        dt=step.dt,
+        smooth=float(smooth),
+        rhs=smoothed(rhs, smooth) if rhs is not None and smooth else rhs,
+        sampled=step,
+    )
+
+
+def to_casadi(model: Any, name: str = "model", **options: Any) -> ca.Function:
+    """One step of a model as `casadi.Function (x, u) -> (x_next, y)`, in engineering units.
+
+    Parameters
+    ----------
+    model : Fit, Simulator, Model or Diagnosis
+        The model; its values become constants of the function.
+    name : str
+        Name of the function: letters, digits and single underscores, beginning with a letter.
+    **options
+        Those of `exported`: for a simulator `dt`, `hold`, `substeps`; `smooth`.
 
     Returns
     -------
@@ -28,15 +124,58 @@ def to_casadi(fit: Fit, name: str = "model") -> ca.Function:
         `x` (n_x + n_s,) holds the linear states in the order of `fit.model.states`, then the operators' memory: channel
         by channel, and inside a channel in the order of the thresholds `r[i, :]` (the play state, for stops too). `u`
         is (n_u,), `x_next` like `x`, `y` (n_y,). A step takes `fit.dt` s; `fit.initial_state(recording)` is an `x`.
+        `exported` gives the same with a map of the states' names, start state and units.
 
     Raises
     ------
     InputError
-        If CasADi does not take the name.
+        If CasADi does not take the name, or an option does not fit the model.
     """
-    if not ca.Function.check_name(name):
-        raise InputError(f"The function name {name!r} cannot be used; give letters, digits and single underscores.")
-    model = fit.model
-    x, u = ca.SX.sym("x", model.n_x + model.n_s), ca.SX.sym("u", model.n_u)
-    x_next, y = model.closed(x, u, ca.DM(model.parameters.start))
-    return ca.Function(name, [x, u], [x_next, y], ["x", "u"], ["x_next", "y"])
+    return exported(model, name=name, **options).step
+
+
+def _duration(dt: float | None) -> float:
+    if not isinstance(dt, int | float) or isinstance(dt, bool) or not 0 < dt < np.inf:
+        raise InputError(f"dt = {dt!r} was given; give the duration of a step in s, above zero.")
+    return float(dt)
+
+
+def _substeps(simulator: Simulator, dt: float) -> int:
+    """Sub-steps a sample, from the fastest eigenvalue at rest, and what the laws need at least."""
+    if simulator.discrete:
+        return 1
+    # without inputs, one that nothing reads stands for them
+    driven = simulator if simulator.inputs else replace(simulator, inputs=("none",))
+    at_rest = Recording(np.zeros((400, len(driven.inputs))), np.zeros((400, len(driven.output_names))), dt)
+    least = max((getattr(e.law, "substeps", 1) for e in simulator.elements), default=1)
+    return max(choose_substeps(driven, [at_rest]), least)
+
+
+def _start(model: Any, closed: Model, step: Sampled, start: Any) -> np.ndarray:
+    n, size = closed.n_state, len(step.states)
+    if start is None:
+        return np.zeros(size)
+    if isinstance(start, Recording):
+        if isinstance(model, Fit):
+            state = model.initial_state(start)
+        else:
+            if (start.inputs, start.outputs) != (closed.inputs, closed.outputs):
+                raise InputError(
+                    f"The recording has {', '.join((*start.inputs, *start.outputs))}, the model "
+                    f"{', '.join((*closed.inputs, *closed.outputs))}; they must be the same, in this order."
+                )
+            if abs(start.dt / step.dt - 1) > 1e-4:
+                raise InputError(f"The recording's step is {start.dt:g} s, that of the export {step.dt:g} s; use one.")
+            state = first_state(closed, make_engine(closed), start)
+        if not np.all(np.isfinite(state)):
+            raise InputError("The state at the recording's first sample is not finite; give another start.")
+        return np.append(state, np.zeros(size - n))
+    try:
+        given = np.asarray(start, dtype=float).ravel()
+    except (TypeError, ValueError):
+        given = np.full(1, np.nan)
+    if given.size not in (len(closed.states), n, size) or not np.all(np.isfinite(given)):
+        raise InputError(
+            f"The start state has {given.size} numbers; give {len(closed.states)} (memory zero) or {size}, all finite."
+        )
+    return np.append(given, np.zeros(size - given.size))

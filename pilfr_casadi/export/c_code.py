@@ -1,0 +1,147 @@
+"""A step as C: the code that CasADi generates, behind two plain functions and a header that says what is where.
+
+    rig_x0(x);                          the state to start from
+    rig_step(x, u, x_next, y);          arrays of RIG_NX, RIG_NU, RIG_NX, RIG_NY doubles; x_next may be x itself
+
+Names and units of signals come from files and are written into comments and constants only after everything that could
+end a comment, or is no letter, digit or underscore, has been taken out.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import casadi as ca
+
+from .files import made, write_atomically
+
+if TYPE_CHECKING:
+    from .exported_model import Exported
+
+
+def write_c(exported: Exported, folder: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """Write source and header of an exported model; see `Exported.to_c`."""
+    target, name = made(folder), exported.name
+    header = write_atomically(target / f"{name}.h", _header(exported))
+    return write_atomically(target / f"{name}.c", _source(exported)), header
+
+
+def _header(exported: Exported) -> str:
+    name, big = exported.name, exported.name.upper()
+    between = "next" in exported.sampled.reads
+    sizes = {"NX": len(exported.states), "NU": len(exported.inputs), "NY": len(exported.outputs)}
+    lines = [
+        f"/* {name}: one step of an identified model, every {exported.dt:.10g} s; {_accuracy(exported)}.",
+        " *",
+        f" *   double x[{big}_NX], u[{big}_NU], y[{big}_NY];",
+        f" *   {name}_x0(x);                 once, at the start",
+        f" *   {name}_step(x, u, x, y);      every sample: y now, and x for the next one",
+        " *",
+        *([" * Inputs are interpolated: behind those of this sample, u holds those of the next one.", " *"] * between),
+        " * Nothing is allocated and nothing is kept between calls; several threads may call it at once.",
+        " */",
+        f"#ifndef {big}_H",
+        f"#define {big}_H",
+        "",
+        *(f"#define {big}_{key} {size}" for key, size in sizes.items()),
+        f"#define {big}_DT {exported.dt!r} /* s */",
+    ]
+    for letter, title, names in (
+        ("X", "entries of x", list(exported.states)),
+        ("U", "entries of u", exported.inputs),
+        ("Y", "entries of y", exported.outputs),
+    ):
+        constants = _constants(f"{big}_{letter}_", names)
+        rows = [
+            f"#define {constant} {i} /* {_comment(_labelled(exported, n))} */"
+            for i, (constant, n) in enumerate(zip(constants, names, strict=True))
+        ]
+        lines += ["", f"/* {title} */", *rows]
+    lines += [
+        "",
+        "#ifdef __cplusplus",
+        'extern "C" {',
+        "#endif",
+        "",
+        "/* State to start from. */",
+        f"void {name}_x0(double *x);",
+        "",
+        "/* Output at this sample and state at the next one; x_next may be x. */",
+        f"void {name}_step(const double *x, const double *u, double *x_next, double *y);",
+        "",
+        "#ifdef __cplusplus",
+        "}",
+        "#endif",
+        "",
+        "#endif",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _source(exported: Exported) -> str:
+    name, big, step = exported.name, exported.name.upper(), exported.step
+    inner = f"{name.rstrip('_')}_casadi"
+    x, u = (ca.MX.sym(key, step.size1_in(key)) for key in ("x", "u"))
+    # long ones hold a loop and stay as they are, called from a function of the right name
+    renamed = step.expand(inner) if step.is_a("SXFunction") else ca.Function(inner, [x, u], step.call([x, u]))
+    generator = ca.CodeGenerator(inner)
+    generator.add(renamed)
+    sizes = {"arg": renamed.sz_arg(), "res": renamed.sz_res(), "iw": renamed.sz_iw(), "w": renamed.sz_w()}
+    start = [f"  x[{i}] = {float(v)!r};" for i, v in enumerate(exported.start)] or ["  (void)x;"]
+    lines = [
+        f'#include "{name}.h"',
+        "",
+        generator.dump(),
+        f"void {name}_x0(double *x) {{",
+        *start,
+        "}",
+        "",
+        f"void {name}_step(const double *x, const double *u, double *x_next, double *y) {{",
+        *(f"  {kind}[{max(1, sizes[key])}];" for key, kind in _WORK.items()),
+        f"  double now[{max(1, len(exported.states))}]; /* x_next may be x */",
+        "  int i;",
+        f"  for (i = 0; i < {big}_NX; i++) now[i] = x[i];" if exported.states else "  (void)x; i = 0; now[i] = 0;",
+        "  arg[0] = now;",
+        "  arg[1] = u;",
+        "  res[0] = x_next;",
+        "  res[1] = y;",
+        f"  {inner}(arg, res, iw, w, 0);",
+        "}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+_WORK = {"arg": "const casadi_real *arg", "res": "casadi_real *res", "iw": "casadi_int iw", "w": "casadi_real w"}
+
+
+def _accuracy(exported: Exported) -> str:
+    return f"min and max rounded, eps = {exported.smooth:g}" if exported.smooth else "min and max exact"
+
+
+def _labelled(exported: Exported, name: str) -> str:
+    unit = exported.units.get(name)
+    text = f"{name} [{unit}]" if unit else name
+    return f"{text}, r = {exported.thresholds[name]:.6g}" if name in exported.thresholds else text
+
+
+def _comment(text: str) -> str:
+    """Text that cannot end, open or bend a comment."""
+    kept = "".join(c if c.isprintable() and c not in "\\?" else "_" for c in text[:200])
+    while "*/" in kept or "/*" in kept:
+        kept = kept.replace("*/", "* ").replace("/*", " *")
+    return kept.strip("/")
+
+
+def _constants(prefix: str, names: Sequence[str]) -> list[str]:
+    """A constant for each name: letters, digits and underscores, all different."""
+    out: list[str] = []
+    for name in names:
+        plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name.upper()[:60]).strip("_")
+        while "__" in plain:
+            plain = plain.replace("__", "_")
+        options = (prefix + (plain or "_") + ("" if k == 1 else f"_{k}") for k in range(1, len(names) + 2))
+        out.append(next(c for c in options if c not in out))
+    return out

@@ -1,0 +1,222 @@
+"""One step, four ways: the exported function, generated C, python-control and the simulation agree on every model."""
+
+import ctypes
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_export import some_fit
+from test_laws import EVERY, dose
+from test_laws import simulator as mass_on_spring
+
+from pilfr_casadi import GeneralizedPlay, Play, PrandtlIshlinskii, Recording, Stop, close_loop, exported
+from pilfr_casadi.compiled import compiler
+from pilfr_casadi.integration import discretise, fastest
+from pilfr_casadi.laws import CubicStiffness, StopHysteresis
+from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.load_simulator import load_simulator
+from pilfr_casadi.parameters import ParameterSet
+from pilfr_casadi.sensitivities import VirtualMachine
+from problems import emps, masing_diagnosis, piezo_diagnosis, silverbox, tanks
+from problems.concealed_rigs_more import RIGS
+from problems.zoo import CASES
+
+M = 150
+LIBRARY_FLAGS = ("-std=c99", "-Wall", "-Werror", "-O1", "-ffp-contract=off", "-fPIC", "-shared")
+
+
+def linear(n_u, n_y, nx, seed=0):
+    """Blocks of a stable linear part with everything in it."""
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(nx, nx))
+    a *= 0.9 / max(1e-9, np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
+    return {"A": a, "B_u": rng.normal(size=(nx, n_u)), "C_y": rng.normal(size=(n_y, nx)), "y_0": rng.normal(size=n_y)}
+
+
+def lfr(operator, nx, n, channels=1, n_u=1, n_y=1, seed=0):
+    """A fit of a PI-LFR with such a linear part and an element that counts."""
+    structure = PILFR(nx, PrandtlIshlinskii(operator, n, channels))
+    rng, base = np.random.default_rng(seed + 1), structure.model(n_u, n_y)
+    values = linear(n_u, n_y, nx, seed) | {
+        "B_w": 0.1 * rng.normal(size=(nx, channels)),
+        "D_yw": rng.normal(size=(n_y, channels)),
+        "C_z": rng.normal(size=(channels, nx)),
+        "D_zu": rng.normal(size=(channels, n_u)),
+        "w": rng.uniform(0.1, 1.0, size=(channels, n)),
+        "r": np.sort(rng.uniform(0.05, 2.0, size=(channels, n)), axis=1),
+    }
+    model = structure.model(n_u, n_y, values, inputs=base.inputs, outputs=base.outputs)
+    return replace(some_fit(), model=model, structure=structure, initial={}, units={}, dt=0.01)
+
+
+def from_zoo(make):
+    """A case of the zoo as a fit at its start, from rest."""
+    case = make()
+    p = case.model.parameters
+    if "B_w" in p:  # shut at the start
+        rng = np.random.default_rng(0)
+        p = p.change(**{k: {"value": 0.05 * rng.normal(size=p[k].shape)} for k in ("B_w",) if not np.all(p[k].fixed)})
+    model = case.model.with_parameters(p)
+    fitted = replace(some_fit(), model=model, structure=None, initial={}, units={}, dt=case.recordings[0].dt)
+    r = case.recordings[0]
+    return fitted, r.slice(0, min(len(r), 2 * M)).with_(initial="zero", skip=0)
+
+
+def from_rig(rig):
+    """A base rig of the concealed cases in the middle of its parameters' ranges."""
+    texts = {n: f"Parameter({float(np.sqrt(low * high))!r})" for n, (low, high, _, _) in rig.parameters.items()}
+    return rig.module(rig.source(texts))["simulator"]
+
+
+def wave(simulator, dt, amplitude=1.0):
+    """Held steps of seeded inputs, at rest first."""
+    rng = np.random.default_rng(3)
+    n_u, n_y = len(simulator.inputs), len(simulator.output_names)
+    steps = np.cumsum(rng.standard_normal((M // 6, n_u)), axis=0) * amplitude
+    u = np.repeat(steps, 6, axis=0)[:M]
+    return Recording(u, np.zeros((M, n_y)), dt, simulator.inputs, simulator.output_names, initial="zero")
+
+
+def pace(simulator):
+    """A step that suits a simulator's fastest mode."""
+    p = ParameterSet(dict(simulator.parameters)).start
+    rate = fastest(simulator, np.full((1, len(simulator.states)), 0.1), np.zeros((1, len(simulator.inputs))), p)[0]
+    return 0.3 / rate if np.isfinite(rate) and rate > 0 else 0.01
+
+
+def with_law(kind):
+    return mass_on_spring().with_element("ground" if "parallel" in kind.places else "sensor:y", dose(kind))
+
+
+def simulators():
+    """Name -> simulator, step, what inputs do, sub-steps (None: chosen)."""
+    out = {f"law {kind.__name__}": (with_law(kind), 0.02, "zero", 2) for kind in EVERY}
+    named = {
+        "masing": masing_diagnosis.simulator(),
+        "silverbox": silverbox.simulator(),
+        "emps": emps.simulator(),
+        "tanks": tanks.simulator(False),
+        "root tanks": tanks.simulator(True),
+        "piezo": piezo_diagnosis.simulator(),
+        "demo": load_simulator("pilfr_casadi/demo_data/rig.py"),
+        **{f"rig {name}": from_rig(rig) for name, rig in RIGS.items()},
+    }
+    out |= {name: (s, pace(s), "zero", None) for name, s in named.items()}
+    spring = named["masing"].with_element("ground-m1", dose(StopHysteresis))
+    out["masing, corrected"] = spring.with_element("ground-m2", dose(CubicStiffness)), 1 / 120, "zero", None
+    out["interpolated"] = mass_on_spring().with_element("ground", dose(StopHysteresis)), 0.02, "linear", 3
+    out["many sub-steps"] = mass_on_spring().with_element("ground", dose(StopHysteresis)), 0.05, "linear", 9
+    element = PrandtlIshlinskii(Stop, 3)
+    out["stops in a port"] = close_loop(mass_on_spring(), element, "ground"), 0.02, "zero", None
+    return out
+
+
+def everything():
+    """Name -> (exported, recording, simulated outputs)."""
+    out = {}
+    fits = {
+        "5 states, 20 plays": lfr(Play, 5, 20),
+        "static stack": lfr(Play, 0, 20),
+        "stops, two channels": lfr(Stop, 2, 4, 2, 2, 3),
+        "generalized plays": lfr(GeneralizedPlay(2), 2, 3, 2, 1, 2),
+    }
+    for name, fitted in fits.items():
+        rng = np.random.default_rng(2)
+        u = np.cumsum(rng.normal(size=(M, fitted.model.n_u)), axis=0) / 3
+        x0 = rng.normal(size=fitted.model.n_x + fitted.model.n_s)
+        data = Recording(
+            u, np.zeros((M, fitted.model.n_y)), 0.01, fitted.model.inputs, fitted.model.outputs, initial=x0
+        )
+        out[name] = fitted, {"start": data}, data, replace(fitted, engine="vm").simulate(data)
+    for name, make in CASES.items():
+        fitted, data = from_zoo(make)
+        out[f"zoo {name}"] = fitted, {}, data, replace(fitted, engine="vm").simulate(data)
+    grey = mass_on_spring().with_element("ground", dose(StopHysteresis))  # a fit of a simulator's model
+    fitted = replace(
+        some_fit(), model=discretise(grey, 0.02, "linear", 3), structure=None, initial={}, units={}, dt=0.02
+    )
+    data = wave(grey, 0.02, 3.0)
+    out["fit with sub-steps"] = fitted, {}, data, replace(fitted, engine="vm").simulate(data)
+    for name, (simulator, dt, hold, substeps) in simulators().items():
+        data = wave(simulator, dt, 3.0 if name.startswith("law") else 1.0)
+        given = {"dt": dt, "hold": hold, "substeps": substeps}
+        used = exported(simulator, **given).sampled.substeps
+        model = discretise(simulator, dt, hold, used)
+        run = VirtualMachine(model).simulate(model.drive(data), model.parameters.start, np.zeros(model.n_state))
+        out[name] = simulator, given, data, run[0]
+    named = {key: f"case{i}" for i, key in enumerate(out)}
+    return {k: (exported(m, name=named[k], **given), r, y) for k, (m, given, r, y) in out.items()}
+
+
+@pytest.fixture(scope="module")
+def models():
+    return everything()
+
+
+@pytest.fixture(scope="module")
+def library(models, tmp_path_factory):
+    """The C of all models in one library, compiled with every warning an error."""
+    if compiler() is None:
+        pytest.skip("no C compiler")
+    folder = tmp_path_factory.mktemp("c")
+    sources = [str(e.to_c(folder)[0]) for e, _, _ in models.values()]
+    path = folder / "all.so"
+    subprocess.run([compiler(), *LIBRARY_FLAGS, "-o", path, *sources, "-lm"], check=True, capture_output=True)
+    return ctypes.CDLL(str(path))
+
+
+def inputs_of(model, data):
+    """Rows of u as the exported step wants them: with those of the next sample where it interpolates."""
+    after = np.vstack([data.u[1:], data.u[-1:]])
+    return np.hstack([data.u, after]) if len(model.inputs) == 2 * data.n_u else data.u
+
+
+def agree(found, expected):
+    assert np.all(np.isfinite(expected)) and np.ptp(expected) > 0
+    size = np.max(np.abs(expected), axis=0)
+    np.testing.assert_array_less(np.max(np.abs(found - expected), axis=0), 1e-10 * size + 1e-300)
+
+
+def test_there_are_all_models(models):
+    assert len([name for name in models if name.startswith("law")]) == len(EVERY)
+    assert len([name for name in models if name.startswith("zoo")]) == len(CASES)
+    assert len([name for name in models if name.startswith("rig")]) == len(RIGS) > 5
+    for name, (model, _, _) in models.items():
+        assert list(model.states.values()) == list(range(model.step.size1_in("x"))), name
+        assert model.step.size1_in("u") == len(model.inputs) and model.step.size1_out("y") == len(model.outputs)
+
+
+def test_the_function_agrees_with_the_simulation(models):
+    for model, data, expected in models.values():
+        x, rows = model.x0(), []
+        for u in inputs_of(model, data):
+            x, y = model.step(x, u)
+            rows.append(np.asarray(y).ravel())
+        agree(np.array(rows), expected)
+
+
+def test_c_agrees_with_the_simulation(models, library):
+    vector = np.ctypeslib.ndpointer(dtype=np.float64, flags="C")
+    for model, data, expected in models.values():
+        step, begin = (getattr(library, f"{model.name}_{what}") for what in ("step", "x0"))
+        step.argtypes, begin.argtypes = [vector] * 4, [vector]
+        step.restype = begin.restype = None
+        x, y, rows = np.full(max(1, len(model.states)), np.nan), np.zeros(len(model.outputs)), []
+        begin(x)
+        assert np.array_equal(x[: len(model.states)], model.x0())
+        for u in inputs_of(model, data):
+            step(x, np.ascontiguousarray(u), x, y)
+            rows.append(y.copy())
+        agree(np.array(rows), expected)
+
+
+def test_control_agrees_with_the_simulation(models):
+    import control
+
+    for model, data, expected in models.values():
+        system, u = model.to_control(), inputs_of(model, data)
+        assert (system.dt, system.ninputs, system.noutputs) == (model.dt, len(model.inputs), len(model.outputs))
+        assert system.nstates == len(model.states)
+        found = control.input_output_response(system, np.arange(len(u)) * model.dt, u.T, X0=model.x0())
+        agree(found.outputs.reshape(len(model.outputs), -1).T, expected)
