@@ -8,7 +8,7 @@ With `F(x, u) = (f, h)`, `C = ∂h/∂x` at the prediction and `A = ∂f/∂x` a
 The Jacobian of min and max is that of the active branch, so the filter switches with the operators: a play that sticks
 keeps the variance of its memory, one that slips takes over that of the signal that drives it. Memory has process noise,
 without which a filter that has become sure of it would not correct it any more. Anderson & Moore (1979), Optimal
-Filtering, Sec. 8.2. An unscented filter was tried too: its points straddle the kinks, and it did no better for three
+Filtering, Sec. 8.2. An unscented filter was tried too: its points straddle the kinks, and it did no better for four
 times the work (`python -m problems.observer`).
 """
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..fit import Fit
 
 Array = np.ndarray
-SHARES = 10.0 ** np.arange(-4.5, -0.9, 0.5)  # process noise a step, as shares of the states' spread
+SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # process noise a step, as shares of the states' spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +35,9 @@ class KalmanFilter:
 
     Attributes
     ----------
+    function : casadi.Function
+        The model `(x, u) -> (x_next, y)` that is observed: the fit's, with the disturbances of the outputs behind its
+        state where they were asked for.
     step : casadi.Function
         `(x, P, u, y) -> (x_next, P_next, y_pred)`: x and y_pred are predicted from the samples before the present one,
         whose u and y they have not seen.
@@ -46,6 +49,7 @@ class KalmanFilter:
         Root mean square of each state over the recording that the levels come from.
     """
 
+    function: ca.Function
     step: ca.Function
     x0: Array
     P0: Array
@@ -75,7 +79,7 @@ class KalmanFilter:
         return np.vstack([x, xs.T]), predicted.T, ps[:, -n:]
 
 
-def kalman_filter(fit: Fit, recording: Recording, *, share: float | None = None) -> KalmanFilter:
+def kalman_filter(fit: Fit, recording: Recording, *, disturbance: bool = False, share: float | None = None) -> KalmanFilter:
     """An extended Kalman filter of a fit, with noise levels from what the fit leaves of a recording.
 
     The measurement noise has the variance of the residual of the free simulation. The process noise of each state and
@@ -88,6 +92,9 @@ def kalman_filter(fit: Fit, recording: Recording, *, share: float | None = None)
         The model.
     recording : Recording
         Usually the training recording.
+    disturbance : bool
+        Observe a slow disturbance of each output as well, `y = h(x, u) + d, d⁺ = d`: what the model leaves out is then
+        followed, and control is free of offset.
     share : float, optional
         Standard deviation of the process noise a step over the root mean square of the state.
 
@@ -109,6 +116,9 @@ def kalman_filter(fit: Fit, recording: Recording, *, share: float | None = None)
     spread = np.sqrt(np.mean(states**2, axis=1))
     spread = np.maximum(spread, 1e-6 * np.max(spread, initial=1e-300))
     level = np.mean(residual**2, axis=0)
+    if disturbance:
+        function = disturbed(function)
+        start, spread = np.concatenate([start, np.zeros(len(level))]), np.concatenate([spread, np.sqrt(level) + 1e-300])
     noise = np.diag(np.maximum(level, 1e-16 * np.mean(recording.y**2, axis=0) + 1e-300))
     made = [_filter(function, spread, noise, s) for s in (SHARES if share is None else [share])]
     return min(made, key=lambda f: _surprise(f, recording, start)) if len(made) > 1 else made[0]
@@ -117,7 +127,16 @@ def kalman_filter(fit: Fit, recording: Recording, *, share: float | None = None)
 def _filter(function: ca.Function, spread: Array, noise: Array, share: float) -> KalmanFilter:
     process = np.diag((share * spread) ** 2)
     step = ekf_step(function, process, noise)
-    return KalmanFilter(step, np.zeros(len(spread)), np.diag(spread**2), process, noise, spread)
+    return KalmanFilter(function, step, np.zeros(len(spread)), np.diag(spread**2), process, noise, spread)
+
+
+def disturbed(function: ca.Function) -> ca.Function:
+    """`F(x, u)` with a constant disturbance of each output, which stands behind the state."""
+    n, n_u, n_y = function.size1_in(0), function.size1_in(1), function.size1_out(1)
+    x, d, u = (ca.SX.sym(k, m) for k, m in (("x", n), ("d", n_y), ("u", n_u)))
+    following, y = function(x, u)
+    names = ["x", "u"], ["x_next", "y"]
+    return ca.Function("disturbed", [ca.vertcat(x, d), u], [ca.vertcat(following, d), y + d], *names)
 
 
 def ekf_step(function: ca.Function, Q: Array, R: Array) -> ca.Function:

@@ -66,7 +66,7 @@ def visibility(fit: Fit, observer: KalmanFilter, x: Array, u: Array) -> Visibili
     observer : KalmanFilter
         Its filter, of which the noise and the usual spread are taken.
     x : array, shape (n,)
-        State with memory at the window's beginning.
+        State of the observer at the window's beginning.
     u : array, shape (samples, n_u)
         Inputs of the window.
 
@@ -80,7 +80,7 @@ def visibility(fit: Fit, observer: KalmanFilter, x: Array, u: Array) -> Visibili
     InputError
         If x or u do not fit the model.
     """
-    model, function, n = fit.model, fit.to_casadi(), fit.model.n_state
+    model, function, n = fit.model, observer.function, len(observer.x0)
     x, u = np.asarray(x, dtype=float).ravel(), np.asarray(u, dtype=float)
     u = u[:, None] if u.ndim == 1 else u
     if len(x) != n or u.ndim != 2 or u.shape[1] != model.n_u or not len(u):
@@ -104,7 +104,7 @@ def visibility(fit: Fit, observer: KalmanFilter, x: Array, u: Array) -> Visibili
     traces = np.vstack(rows) * observer.spread
     information = np.linalg.eigvalsh(traces.T @ traces)
     left = np.sqrt(np.clip(np.diag(np.linalg.inv(np.eye(n) + traces.T @ traces)), 0, 1))
-    unseen = [j for j in range(model.n_x, n) if left[j] > UNSEEN]
+    unseen = [j for j in range(model.n_x, model.n_state) if left[j] > UNSEEN]
     sentences = _reasons(fit, unseen, np.linalg.norm(traces, axis=0), slip, len(u))
     return Visibility(left, tuple(unseen), tuple(sentences), int(np.sum(information > 1)))
 
