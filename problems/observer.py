@@ -16,10 +16,13 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-import pilfr_casadi as pilfr
 from pilfr_casadi.demo import demo_recordings
+from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.feedback import kalman_filter
 from pilfr_casadi.feedback.kalman import ekf_step
+from pilfr_casadi.fit import fit
+from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.operators import Play
 
 Array = np.ndarray
 WINDOW = 400  # samples that are judged
@@ -65,9 +68,9 @@ def excursions(y: Array, n: int) -> int:
 def ratios(seeds: int = 10, start: int = 500) -> dict[str, tuple[Array, float]]:
     """Filter -> (wrong over known prediction error after 0, 1, 2 excursions (seeds, 3), ms a step)."""
     records = demo_recordings()
-    fit = pilfr.fit(pilfr.PILFR(5, pilfr.PrandtlIshlinskii(pilfr.Play, 10)), records["train"], starts=3)
-    test, function, made = records["multisine"], fit.to_casadi(), kalman_filter(fit, records["train"])
-    n_x, n = fit.model.n_x, len(made.x0)
+    rig = fit(PILFR(5, PrandtlIshlinskii(Play, 10)), records["train"], starts=3)
+    test, function, made = records["multisine"], rig.to_casadi(), kalman_filter(rig, records["train"])
+    n_x, n = rig.model.n_x, len(made.x0)
     known = np.asarray(function.mapaccum("states", start)(np.zeros(n), test.u[:start].T)[0])[:, -1]
     u, y = test.u[start:], test.y[start:]
     at = [excursions(y[:, 0], k) for k in range(3)]

@@ -94,4 +94,6 @@ def record(u: np.ndarray, rng: np.random.Generator) -> Recording:
         y[k] = stage.y
         stage.advance(value)
     y += NOISE * rng.standard_normal(len(u))
-    return Recording(u, y, 1 / FS, ("voltage",), ("displacement",), {"voltage": "V", "displacement": "µm"}, initial="zero")
+    return Recording(
+        u, y, 1 / FS, ("voltage",), ("displacement",), {"voltage": "V", "displacement": "µm"}, initial="zero"
+    )

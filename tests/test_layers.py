@@ -67,6 +67,7 @@ LAYERS = {
         "penalty",
         "multistart",
         "export",
+        "feedback",
         "plots",
         "accepted",
         "load_simulator",

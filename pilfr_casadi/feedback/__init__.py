@@ -1,7 +1,8 @@
 """From a fitted model to a running controller: observer, hysteresis compensation, predictive control."""
 
-from .feedforward import Feedforward, feedforward
-from .inverse import Inverse, inverse
+from .compensation import Feedforward, feedforward
+from .dompc import do_mpc_controller, do_mpc_model
+from .inverse import Inverse, inverse_element
 from .kalman import KalmanFilter, kalman_filter
 from .mpc import Plan, PredictiveController
 from .unseen import Visibility, visibility
@@ -13,8 +14,10 @@ __all__ = [
     "Plan",
     "PredictiveController",
     "Visibility",
+    "do_mpc_controller",
+    "do_mpc_model",
     "feedforward",
-    "inverse",
+    "inverse_element",
     "kalman_filter",
     "visibility",
 ]

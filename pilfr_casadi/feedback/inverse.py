@@ -8,8 +8,9 @@ Kuhnen (2001), IEE Proc. Control Theory Appl. 148, give the inverse in closed fo
     q'_i = Σ_{j≤i} w_j q_i + Σ_{j>i} w_j q_j.
 
 r' are the values of the virgin loading curve at the kinks, and w' the changes of slope of its inverse function; q' are
-the memories, which follow from those of the plays at the moment when play i slipped last. Stops are turned into plays by `S_r[z] = z - P_r[z]`: `Σ w_j S_rj = (Σ w_j) z - Σ w_j P_rj`. A sum of stops alone saturates and
-has no inverse; one with a spring of stiffness `gain` beside it has.
+the memories, which follow from those of the plays at the moment when play i slipped last. Stops are turned into plays
+by `S_r[z] = z - P_r[z]`: `Σ w_j S_rj = (Σ w_j) z - Σ w_j P_rj`. A sum of stops alone saturates and has no inverse; one
+with a spring of stiffness `gain` beside it has.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Inverse:
         return np.asarray(own)
 
 
-def inverse(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, name: str = "inverse") -> Inverse:
+def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, name: str = "inverse") -> Inverse:
     """Invert one channel of a Prandtl-Ishlinskii element, `v = gain z + Σ w_j H_rj[z]`.
 
     Parameters

@@ -22,7 +22,7 @@ from ..quadratic_program import unconstrained
 from ..recording import InputError
 
 Array = np.ndarray
-PENALTY = 1e3  # of a violated output limit, per y_scale
+PENALTY = 30.0  # of a violated output limit, per y_scale
 CLOSE = 1e-5  # of u_scale: a smaller step ends the search
 ENORMOUS = 1e20
 
@@ -66,7 +66,7 @@ class PredictiveController:
     solver : {"sqp", "ipopt"}
         See above.
     iterations : int
-        Most Gauss-Newton steps a call.
+        Most Gauss-Newton steps a call; the first call, which starts from a held input, may take ten times as many.
 
     Raises
     ------
@@ -104,8 +104,7 @@ class PredictiveController:
         self._differences = np.eye(horizon * n_u) - np.eye(horizon * n_u, k=-n_u)
         self._weighted = np.sqrt(move) * self._differences / self.u_scale[:, None]
         self._plan: Array | None = None
-        self._build = {"sqp": self._build_sqp, "ipopt": self._build_ipopt}[solver]
-        self._build()
+        {"sqp": self._build_sqp, "ipopt": self._build_ipopt}[solver]()
 
     def __call__(self, x: Array, reference: Array, u_previous: Array) -> Plan:
         """Plan from the state x, towards the reference (N, n_y) from the present sample on.
@@ -158,12 +157,13 @@ class PredictiveController:
         size, rows = len(self.low), 2 * len(self.low_y) * self.limited + len(self.low) * np.isfinite(self.rate).all()
         m = size + self.limited
         structure = {"h": ca.Sparsity.dense(m, m), "a": ca.Sparsity.dense(rows, m)}
+        unconstrained(np.eye(1), np.zeros(1))  # what it imports is not paid for by the first plan
         self._qp = ca.conic("qp", "daqp", structure, {"error_on_fail": False})
 
     def _solve_sqp(self, x: Array, wanted: Array, before: Array, u: Array) -> tuple[Array, Array, float, bool]:
         u = np.clip(u, self.low, self.high)
         moved, converged, best, y = self._moved(before), False, np.inf, np.zeros(0)
-        for _ in range(self.iterations):
+        for _ in range(self.iterations if self._plan is not None else 10 * self.iterations):
             out, jac = self._slopes(x, u)
             y, jac = out.full().ravel(), jac.full()
             best = self._cost(u, y, wanted, before)
@@ -183,7 +183,7 @@ class PredictiveController:
             else:
                 converged = True  # at a kink: no shorter step is better
                 break
-            converged = share == 1.0 and value - expected < 1e-4 * value or best - value < 1e-6 * value
+            converged = (share == 1.0 and value - expected < 1e-4 * value) or best - value < 1e-6 * value
             u, y = trial, output
             if converged:  # no kink in between, or next to nothing gained
                 break

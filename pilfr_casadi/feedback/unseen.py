@@ -124,7 +124,7 @@ def _reasons(fit: Fit, unseen: list[int], size: Array, slip: Array, samples: int
         out.append(f"The outputs of {samples} samples see all {n_memory} memories.")
     if wiped:
         out.append(
-            f"{_named(fit, wiped)}: wiped out before a trace of it reaches an output; nothing needs to be known about it."
+            f"{_named(fit, wiped)}: wiped out before a trace of it reaches an output; nothing needs to be known of it."
         )
     if idle:
         out.append(f"{_named(fit, idle)}: no output depends on it, as its weight is zero.")

@@ -4,10 +4,11 @@ With `F(x, u) = (f, h)` and a look-ahead of d samples, the input u of a sample s
 
     y_{k+d}(x_k, u_{k+i} = u + i (u - u_{k-1})) = wanted_{k+d},
 
-the input going on as it went since the sample before: a scalar equation that is piecewise linear and increasing for plays (decreasing where the gain is negative); it is
-solved by Newton steps inside a bracket that each step narrows, for a fixed number of steps. Where d is the relative
-degree this is the exact inverse. Sampled machines often have zeros outside the unit circle (Åström, Hagander & Sternby
-1984, Automatica 20); then the exact inverse is unstable, and a longer look-ahead is taken, under which
+the input going on as it went since the sample before: a scalar equation that is piecewise linear and increasing for
+plays (decreasing where the gain is negative). It is solved by Newton steps inside a bracket that each step narrows, for
+a fixed number of steps. Where d is the relative degree this is the exact inverse. Sampled machines often
+have zeros outside the unit circle (Åström, Hagander & Sternby 1984, Automatica 20); then the exact inverse is unstable,
+and a longer look-ahead is taken, under which
 
     x⁺ = A x + B u,   u = -(g_x x + g_before u_before) / g_u,   g = ∂y_{k+d},
 
@@ -23,6 +24,7 @@ import casadi as ca
 import numpy as np
 
 from ..recording import InputError, Recording
+from .kalman import function_of
 
 if TYPE_CHECKING:
     from ..fit import Fit
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 Array = np.ndarray
 FARTHEST = 12  # samples of look-ahead that are tried
 POINTS = 60  # states along the recording at which the inverse has to be stable
-STABLE = 0.98  # spectral radius of the inverse that is accepted
+STABLE = 0.999  # spectral radius of the inverse that is accepted
 FAINT = 0.02  # of the largest gain over the look-aheads, below which a gain is not used
 STEPS = 40  # of Newton or bisection
 
@@ -114,7 +116,7 @@ def feedforward(
     low, high = (np.min(recording.u), np.max(recording.u)) if limits is None else limits
     if not low < high:
         raise InputError(f"Limits of the input of {limits!r} were given; give (low, high) with low below high.")
-    function = fit.to_casadi()
+    function = function_of(fit)
     found = _look_ahead(fit, function, recording, ahead)
     step = inverse_step(function if observer is None else observer.function, found, (float(low), float(high)))
     return Feedforward(step, found, (float(low), float(high)))
@@ -168,7 +170,9 @@ def _look_ahead(fit: Fit, function: ca.Function, recording: Recording, asked: in
     for d in tried:
         reached, radius, smallest = _reached(function, d), 0.0, np.inf
         for k, (a, b) in zip(at, linear, strict=True):
-            _, g_x, g_before, g_u = (np.asarray(v) for v in reached(states[:, k - 1], recording.u[k - 1], recording.u[k]))
+            _, g_x, g_before, g_u = (
+                np.asarray(v) for v in reached(states[:, k - 1], recording.u[k - 1], recording.u[k])
+            )
             gain = float(g_u.item())
             smallest = min(smallest, abs(gain))
             if gain:
@@ -185,7 +189,8 @@ def _look_ahead(fit: Fit, function: ca.Function, recording: Recording, asked: in
     for d, gain, radius in zip(tried, gains, radii, strict=True):
         if gain > FAINT * max(gains) and radius < STABLE:
             return int(d)
+    which = f"{asked}" if asked is not None else f"0 to {FARTHEST}"
     raise InputError(
-        f"The model has no stable inverse with a look-ahead of {' to '.join(map(str, dict.fromkeys((tried[0], tried[-1]))))}"
-        f" samples (non-minimum phase: its inverse has a pole of magnitude {min(radii):.3f}); use predictive control."
+        f"The model has no stable inverse with a look-ahead of {which} samples (non-minimum phase: its "
+        f"inverse has a pole of magnitude {min(radii):.3f}); use predictive control."
     )
