@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ..fit import Fit
 
 Array = np.ndarray
+TENTH = 0.1
 SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # process noise a step, as shares of the states' spread
 
 
@@ -96,7 +97,8 @@ def kalman_filter(
         Usually the training recording.
     disturbance : bool
         Observe a slow disturbance of each output as well, `y = h(x, u) + d, d⁺ = d`: what the model leaves out is then
-        followed, and control is free of offset.
+        followed, and control is free of offset. Its usual size is that of the residual, or a tenth of the output's
+        standard deviation.
     share : float, optional
         Standard deviation of the process noise a step over the root mean square of the state.
 
@@ -122,7 +124,8 @@ def kalman_filter(
     level = np.mean(residual**2, axis=0)
     if disturbance:
         function = disturbed(function)
-        start, spread = np.concatenate([start, np.zeros(len(level))]), np.concatenate([spread, np.sqrt(level) + 1e-300])
+        size = np.maximum(np.sqrt(level), TENTH * np.std(recording.y, axis=0))
+        start, spread = np.concatenate([start, np.zeros(len(level))]), np.concatenate([spread, size])
     noise = np.diag(np.maximum(level, 1e-16 * np.mean(recording.y**2, axis=0) + 1e-300))
     made = [_filter(function, spread, noise, s) for s in (SHARES if share is None else [share])]
     return min(made, key=lambda f: _surprise(f, recording, start)) if len(made) > 1 else made[0]

@@ -205,7 +205,11 @@ class PredictiveController:
                 return np.asarray(free * self.u_scale)
         a, lba, uba = [], [], []
         if np.all(np.isfinite(self.rate)):
-            a, lba, uba = [np.hstack([changes, np.zeros((len(u), self.limited))])], [gap - self.rate], [gap + self.rate]
+            a, lba, uba = (
+                [np.hstack([changes, np.zeros((len(u), int(self.limited)))])],
+                [gap - self.rate],
+                [gap + self.rate],
+            )
         if self.limited:
             h, g = np.pad(h, (0, 1)), np.append(g, PENALTY)
             h[-1, -1] = 1e-6 * PENALTY
