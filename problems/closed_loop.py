@@ -1,134 +1,33 @@
 """Controllers on a true simulator: what `mpc_piezo` and `mpc_masing` share.
 
-A plant is anything with `y` (the output before the next input acts) and `advance(u)`. At each sample the sensor is read
-with noise, and the input that was computed in the sample before is applied: a controller that plans has one sample of
-time for it.
+At each sample the input that was computed in the sample before is applied, and the sensor is read with noise: a
+controller that plans has one sample of time for it. The reference touches the limits that the controllers are told,
+which stay a margin inside those of the machine.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.feedback import Feedforward, KalmanFilter, PredictiveController, feedforward, kalman_filter
+from pilfr_casadi.feedback import (
+    PredictiveController,
+    do_mpc_controller,
+    feedforward,
+    kalman_filter,
+)
 from pilfr_casadi.fit import Fit
 from pilfr_casadi.recording import Recording
+
+from .controllers import ByDoMpc, Compensated, Given, Plant, Predictive, ProportionalIntegral
 
 Array = np.ndarray
 LINEAR = "MPC, linear model"
 MOVE = 1e-4  # weight of moves
-
-
-class Plant(Protocol):
-    """A true simulator."""
-
-    @property
-    def y(self) -> float:
-        """Output before the next input acts."""
-
-    def advance(self, u: float) -> None:
-        """Hold an input for one sample."""
-
-
-class Controller(Protocol):
-    """Gives the input of sample k and then hears what was measured in it."""
-
-    def decide(self, k: int) -> float:
-        """Input of sample k."""
-
-    def hear(self, u: float, y: float) -> None:
-        """Take notice of sample k."""
-
-
-@dataclass
-class Predictive:
-    """Predictive control on the state of an observer."""
-
-    planner: PredictiveController
-    observer: KalmanFilter
-    reference: Array
-    seconds: list[float] = field(default_factory=list)
-    before: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.x, self.p = self.observer.x0, self.observer.Q
-
-    def decide(self, k: int) -> float:
-        """First input of the plan."""
-        ahead = np.minimum(k + np.arange(self.planner.horizon), len(self.reference) - 1)
-        plan = self.planner(self.x, self.reference[ahead], np.array([self.before]))
-        self.seconds.append(plan.seconds)
-        return float(plan.u[0])
-
-    def hear(self, u: float, y: float) -> None:
-        """Filter."""
-        x, self.p, _ = self.observer.step(self.x, self.p, u, y)
-        self.x, self.before = np.asarray(x).ravel(), u
-
-
-@dataclass
-class Compensated:
-    """The inverse of the model on the state of an observer."""
-
-    inverse: Feedforward
-    observer: KalmanFilter
-    reference: Array
-
-    def __post_init__(self) -> None:
-        self.x, self.p, self.before = self.observer.x0, self.observer.Q, 0.0
-
-    def decide(self, k: int) -> float:
-        """The input for what is wanted `ahead` samples later."""
-        wanted = self.reference[min(k + self.inverse.ahead, len(self.reference) - 1)]
-        return float(self.inverse.step(self.x, self.before, wanted)[1])
-
-    def hear(self, u: float, y: float) -> None:
-        """Filter."""
-        x, self.p, _ = self.observer.step(self.x, self.p, u, y)
-        self.x, self.before = np.asarray(x).ravel(), u
-
-
-@dataclass
-class Given:
-    """A path of inputs computed beforehand, without feedback."""
-
-    inputs: Array
-
-    def decide(self, k: int) -> float:
-        """Input of sample k."""
-        return float(self.inputs[k])
-
-    def hear(self, u: float, y: float) -> None:
-        """Nothing is heard."""
-
-
-@dataclass
-class ProportionalIntegral:
-    """PI control with the static feed-forward `u = r / gain`; the integral rests while the input is at a limit."""
-
-    reference: Array
-    gain: float
-    proportional: float
-    integral: float
-    limits: tuple[float, float]
-    total: float = 0.0
-    error: float = 0.0
-
-    def decide(self, k: int) -> float:
-        """Input from the error that was heard last."""
-        u = self.reference[k] / self.gain + self.proportional * self.error + self.integral * self.total
-        self._k = k
-        return float(np.clip(u, *self.limits))
-
-    def hear(self, u: float, y: float) -> None:
-        """Integrate."""
-        self.error = float(self.reference[self._k]) - y
-        if self.limits[0] < u < self.limits[1]:
-            self.total += self.error
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,16 +116,21 @@ class Task:
         """The loop with a controller."""
         return run(name, self.plant(), controller, self.reference, self.noise, outputs=self.outputs, skip=self.skip)
 
-    def planner(self, function: Any, move: float, solver: str = "sqp") -> PredictiveController:
-        """Predictive control with a model."""
+    def planner(self, function: Any, move: float, solver: str = "sqp") -> Any:
+        """Predictive control with a model, by a solver of `PredictiveController` or by "do-mpc"."""
         limits = self.outputs[0] + self.margin, self.outputs[1] - self.margin
         scales: dict[str, Any] = {"y_scale": self.y_scale, "u_scale": self.u_scale}
+        if solver == "do-mpc":
+            common: dict[str, Any] = {"inputs": self.inputs, "outputs": limits, "move": move}
+            return do_mpc_controller(function, self.horizon, self.reference, **common, **scales)
         return PredictiveController(
             function, self.horizon, inputs=self.inputs, outputs=limits, move=move, solver=solver, **scales
         )
 
 
-def compare(task: Task, linear: Fit, hysteresis: Fit, train: Recording, *, quick: bool, ipopt: bool) -> list[Outcome]:
+def compare(
+    task: Task, linear: Fit, hysteresis: Fit, train: Recording, *, quick: bool, solvers: Sequence[str]
+) -> list[Outcome]:
     """All controllers on one task.
 
     PI and linear predictive control are tuned on the task itself, over their gains and over the observer's noise,
@@ -251,9 +155,13 @@ def compare(task: Task, linear: Fit, hysteresis: Fit, train: Recording, *, quick
                 loops.append(task.close(LINEAR, Predictive(planner, observer, task.reference)))
     out.append(min(loops, key=lambda o: o.error))
     observer = kalman_filter(hysteresis, train)
-    for solver, name in (("sqp", "MPC, hysteresis model"), ("ipopt", "MPC, hysteresis model, IPOPT"))[: 1 + ipopt]:
-        planner = task.planner(observer.function, MOVE, solver)
-        out.append(task.close(name, Predictive(planner, observer, task.reference)))
+    for solver in ("sqp", *solvers):
+        planner, name = task.planner(observer.function, MOVE, solver), "MPC, hysteresis model"
+        if solver == "do-mpc":
+            out.append(task.close(f"{name}, do-mpc", ByDoMpc(planner, observer)))
+        else:
+            name += f", {solver}" if solver != "sqp" else ""
+            out.append(task.close(name, Predictive(planner, observer, task.reference)))
     inverse = feedforward(hysteresis, train, limits=task.inputs)
     out.append(task.close("inverse on the observer's state", Compensated(inverse, observer, task.reference)))
     out.append(task.close("inverse, no sensor", Given(inverse.inputs(task.reference)[:, 0])))
@@ -271,7 +179,7 @@ def draw(outcomes: list[Outcome], task: Task, dt: float, units: tuple[str, str],
     top, middle, low = figure.subplots(3, 1, sharex=True)
     for value in task.outputs:
         top.axhline(value / scale, color=GREY, linewidth=1, linestyle=":")
-    drawn = [o for o in outcomes if "IPOPT" not in o.name and "no sensor" not in o.name]
+    drawn = [o for o in outcomes if o.name.count(",") < 2 and "no sensor" not in o.name]
     for o, colour in zip(drawn, [ORANGE, VERMILLION, BLUE, GREEN], strict=True):
         top.plot(t, o.y / scale, color=colour, linewidth=1.2, label=o.name)
         middle.plot(t, (o.y - task.reference) / scale, color=colour, linewidth=1.0)

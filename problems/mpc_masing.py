@@ -53,10 +53,10 @@ def reference(samples: int) -> np.ndarray:
     t = np.arange(samples) / FS
     sines = zip((0.5, 0.45, 0.15), (0.7, 1.9, 4.3), (0.0, 1.0, 0.0), strict=True)
     path = sum(a * np.sin(2 * np.pi * f * t + phase) for a, f, phase in sines)
-    return np.asarray(np.clip(1e-3 * np.minimum(1, t / 0.5) * path, 3 * MARGIN - LIMIT, LIMIT - 3 * MARGIN))
+    return np.asarray(np.clip(1e-3 * np.minimum(1, t / 0.5) * path, MARGIN - LIMIT, LIMIT - MARGIN))
 
 
-def outcomes(samples: int = 600, *, quick: bool = False, ipopt: bool = False) -> tuple[list[Outcome], Task]:
+def outcomes(samples: int = 600, *, quick: bool = False, solvers: Sequence[str] = ()) -> tuple[list[Outcome], Task]:
     """Fit both models, close all loops."""
     train = records(100)["train"]
     linear = fit(PILFR(5), train)
@@ -64,7 +64,7 @@ def outcomes(samples: int = 600, *, quick: bool = False, ipopt: bool = False) ->
     task = Task(
         RigInMotion, reference(samples), (-FORCE, FORCE), (-LIMIT, LIMIT), MARGIN, noise=1e-6, y_scale=1e-4, u_scale=1.0
     )
-    return compare(task, linear, hysteresis, train, quick=quick, ipopt=ipopt), task
+    return compare(task, linear, hysteresis, train, quick=quick, solvers=solvers), task
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -72,8 +72,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/mpc_masing"), help="folder for the picture")
     parser.add_argument("--ipopt", action="store_true", help="plan by IPOPT and multiple shooting as well")
+    parser.add_argument("--do-mpc", action="store_true", help="plan by do-mpc as well, which has to be installed")
     options = parser.parse_args(arguments)
-    results, task = outcomes(ipopt=options.ipopt)
+    solvers = ("ipopt",) * options.ipopt + ("do-mpc",) * options.do_mpc
+    results, task = outcomes(solvers=solvers)
     print(table(results, "m", 1 / FS, TOLERANCE))
     picture = options.out / "tracking.png"
     draw(results, task, 1 / FS, ("m", "N"), picture)

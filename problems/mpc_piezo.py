@@ -28,16 +28,16 @@ def reference(samples: int) -> np.ndarray:
     t = np.arange(samples) / FS
     amplitude = 3 * np.minimum(1, 0.3 + 1.2 * np.abs(np.sin(2 * np.pi * 1.3 * t)))
     path = 5 + amplitude * np.sin(2 * np.pi * 22 * t) + 0.8 * np.sin(2 * np.pi * 57 * t)
-    return np.asarray(np.clip(np.minimum(1, t / 0.05) * path, LIMITS[0], LIMITS[1] - 3 * MARGIN))
+    return np.asarray(np.clip(np.minimum(1, t / 0.05) * path, LIMITS[0], LIMITS[1] - MARGIN))
 
 
-def outcomes(samples: int = 600, *, quick: bool = False, ipopt: bool = False) -> tuple[list[Outcome], Task]:
+def outcomes(samples: int = 600, *, quick: bool = False, solvers: Sequence[str] = ()) -> tuple[list[Outcome], Task]:
     """Fit both models, close all loops."""
     train = training()
     linear = fit(PILFR(3), train)
     hysteresis = fit(PILFR(3, PrandtlIshlinskii(Play, 12)), train, starts=3)
     task = Task(PiezoStage, reference(samples), RANGE, LIMITS, MARGIN, noise=NOISE, y_scale=1.0, u_scale=10.0)
-    return compare(task, linear, hysteresis, train, quick=quick, ipopt=ipopt), task
+    return compare(task, linear, hysteresis, train, quick=quick, solvers=solvers), task
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -45,8 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/mpc_piezo"), help="folder for the picture")
     parser.add_argument("--ipopt", action="store_true", help="plan by IPOPT and multiple shooting as well")
+    parser.add_argument("--do-mpc", action="store_true", help="plan by do-mpc as well, which has to be installed")
     options = parser.parse_args(arguments)
-    results, task = outcomes(ipopt=options.ipopt)
+    solvers = ("ipopt",) * options.ipopt + ("do-mpc",) * options.do_mpc
+    results, task = outcomes(solvers=solvers)
     print(table(results, "µm", 1 / FS, TOLERANCE))
     picture = options.out / "tracking.png"
     draw(results, task, 1 / FS, ("µm", "V"), picture)
