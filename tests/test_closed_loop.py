@@ -52,25 +52,45 @@ def small_model():
     return ca.Function("F", [x, u], model.closed(x, u, ca.DM(model.parameters.start)))
 
 
+OPTIONS = {"inputs": (-1.0, 1.0), "outputs": (-3.0, 3.5), "move": 1e-2}
+
+
+def inputs_of_both(theirs, horizon=8, samples=25):
+    """Inputs of our solver in closed loop, and those that `theirs(x, reference, u_before)` gives at the same states."""
+    function, path = small_model(), path_of(samples)
+    ours, x, u, both = pilfr.PredictiveController(function, horizon, **OPTIONS), np.zeros(4), np.zeros(1), []
+    for k in range(samples):
+        ahead = path[np.minimum(k + np.arange(horizon), samples - 1)]
+        other = theirs(x, ahead, u)
+        u = ours(x, ahead, u).u
+        both.append((u.item(), other))
+        x = np.asarray(function(x, u)[0]).ravel()
+    return np.array(both).T
+
+
+def path_of(samples):
+    return 4 * np.sin(np.arange(samples) / 4)
+
+
+def test_multiple_shooting_by_ipopt_closes_the_same_loop():
+    planner = pilfr.PredictiveController(small_model(), 8, solver="ipopt", **OPTIONS)
+    ours, theirs = inputs_of_both(lambda x, ahead, u: planner(x, ahead, u).u.item())
+    np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_do_mpc_closes_the_same_loop():
     pytest.importorskip("do_mpc", reason="do-mpc, an optional extra, is not installed")
-    function, horizon, samples = small_model(), 8, 25
-    path = 4 * np.sin(np.arange(samples) / 4)
-    options = {"inputs": (-1.0, 1.0), "outputs": (-3.0, 3.5), "move": 1e-2}
-    theirs = pilfr.do_mpc_controller(function, horizon, path, **options)
-    theirs.x0, theirs.u0 = np.zeros((4, 1)), np.zeros((1, 1))
-    theirs.set_initial_guess()
-    ours = pilfr.PredictiveController(function, horizon, **options)
-    x, u, both = np.zeros(4), np.zeros(1), []
-    for k in range(samples):
-        ahead = path[np.minimum(k + np.arange(horizon), samples - 1)]
-        u = ours(x, ahead, u).u
-        both.append((u.item(), np.asarray(theirs.make_step(x[:, None])).item()))
-        theirs.u0 = u[:, None]
-        x = np.asarray(function(x, u)[0]).ravel()
-    both = np.array(both)
-    np.testing.assert_allclose(both[:, 0], both[:, 1], atol=2e-3)
+    planner = pilfr.do_mpc_controller(small_model(), 8, path_of(25), **OPTIONS)
+    planner.x0, planner.u0 = np.zeros((4, 1)), np.zeros((1, 1))
+    planner.set_initial_guess()
+
+    def theirs(x, ahead, u):
+        planner.u0 = u[:, None]
+        return np.asarray(planner.make_step(x[:, None])).item()
+
+    ours, others = inputs_of_both(theirs)
+    np.testing.assert_allclose(ours, others, atol=1e-6)
 
 
 def test_without_do_mpc_one_sentence_says_what_to_install(monkeypatch):

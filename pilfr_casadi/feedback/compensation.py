@@ -34,7 +34,7 @@ Array = np.ndarray
 FARTHEST = 12  # samples of look-ahead that are tried
 POINTS = 60  # states along the recording at which the inverse has to be stable
 STABLE = 0.999  # spectral radius of the inverse that is accepted
-FAINT = 0.02  # of the largest gain over the look-aheads, below which a gain is not used
+FAINT = 0.02  # of the largest gain over the look-aheads and along the recording, below which a gain is not used
 STEPS = 40  # of Newton or bisection
 
 
@@ -166,28 +166,30 @@ def _look_ahead(fit: Fit, function: ca.Function, recording: Recording, asked: in
     following = function(x, u)[0]
     moves: Any = ca.Function("moves", [x, u], [ca.jacobian(following, x), ca.jacobian(following, u)])
     linear = [[np.asarray(v) for v in moves(states[:, k - 1], recording.u[k])] for k in at]
-    gains, radii = [], []
+    gains, held, radii = [], [], []
     for d in tried:
-        reached, radius, smallest = _reached(function, d), 0.0, np.inf
+        reached, poles, constant = _reached(function, d), [], []
         for k, (a, b) in zip(at, linear, strict=True):
-            _, g_x, g_before, g_u = (
-                np.asarray(v) for v in reached(states[:, k - 1], recording.u[k - 1], recording.u[k])
-            )
+            slopes = reached(states[:, k - 1], recording.u[k - 1], recording.u[k])
+            _, g_x, g_before, g_u = (np.asarray(v) for v in slopes)
             gain = float(g_u.item())
-            smallest = min(smallest, abs(gain))
+            constant.append(abs(gain + float(g_before.item())))
             if gain:
                 feedback = -np.hstack([g_x[:, :n], g_before]) / gain
                 inverse = np.vstack([np.hstack([a[:n, :n], np.zeros((n, 1))]) + b[:n] @ feedback, feedback])
-                radius = max(radius, float(np.max(np.abs(np.linalg.eigvals(inverse)))))
-        gains.append(smallest)
-        radii.append(radius)
+                poles.append((abs(gain), float(np.max(np.abs(np.linalg.eigvals(inverse))))))
+        # where a play sticks the gain may vanish, as in a dead zone; there the input jumps and stays in its bracket
+        usual = float(np.median([g for g, _ in poles] + [0.0] * (len(at) - len(poles))))
+        gains.append(usual)
+        held.append(float(np.median(constant)))  # that of an input that does not go on, which does not grow with d
+        radii.append(max((radius for g, radius in poles if g > FAINT * usual), default=0.0))
     if max(gains) <= 1e-12 * np.ptp(recording.y) / np.ptp(recording.u):
         raise InputError(
             f"The input reaches the output nowhere within {tried[-1]} samples (no direct feedthrough, no path through "
-            "the states that holds everywhere along the recording), so there is nothing to invert; give a longer ahead."
+            "the states that holds along the recording), so there is nothing to invert; give a longer ahead."
         )
     for d, gain, radius in zip(tried, gains, radii, strict=True):
-        if gain > FAINT * max(gains) and radius < STABLE:
+        if gain > FAINT * max(held) and radius < STABLE:
             return int(d)
     which = f"{asked}" if asked is not None else f"0 to {FARTHEST}"
     raise InputError(
