@@ -61,6 +61,8 @@ class KalmanFilter:
     def run(self, u: Array, y: Array, x0: Array | None = None, P0: Array | None = None) -> tuple[Array, Array, Array]:
         """Filter a whole recording: states (M + 1, n) before each sample and after the last, predictions (M, n_y), P.
 
+        A start that is known is told by `P0=filter.Q`; by default it is not.
+
         Raises
         ------
         InputError

@@ -124,10 +124,10 @@ def _reasons(fit: Fit, unseen: list[int], size: Array, slip: Array, samples: int
         out.append(f"The outputs of {samples} samples see all {n_memory} memories.")
     if wiped:
         out.append(
-            f"{_named(fit, wiped)}: wiped out before a trace of it reaches an output; nothing needs to be known of it."
+            f"{_named(fit, wiped)}: wiped out before a trace reaches an output; nothing needs to be known of it."
         )
     if idle:
-        out.append(f"{_named(fit, idle)}: no output depends on it, as its weight is zero.")
+        out.append(f"{_named(fit, idle)}: no output depends on what has the weight zero.")
     if len(joint) > 1:
         out.append(
             f"{_named(fit, joint)}: stick over all {samples} samples, so that the outputs see the weighted sum of what "
@@ -139,9 +139,10 @@ def _reasons(fit: Fit, unseen: list[int], size: Array, slip: Array, samples: int
             "or looks like that of others; an excursion that makes it slip settles it."
         )
     if faint:
+        verb = "slip" if len(faint) > 1 else "slips"
         out.append(
-            f"{_named(fit, faint)}: slips within the window, and the trace that it leaves before drowns in noise or "
-            "looks like that of others; from then on it is known from what drives it."
+            f"{_named(fit, faint)}: {verb} within the window, and the trace left before drowns in noise or looks like "
+            "that of others; from then on the signal that drives the operator tells its memory."
         )
     return out
 
