@@ -68,6 +68,7 @@ LAYERS = {
         "penalty",
         "multistart",
         "export",
+        "feedback",
         "plots",
         "accepted",
         "load_simulator",

@@ -1,0 +1,119 @@
+"""A fitted model in do-mpc (Fiedler et al. 2023, Control Engineering Practice 140), which is an optional extra.
+
+The same problem as `PredictiveController`, states in, multiple shooting by IPOPT; where no output limit has to be given
+up the optimum is the same.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ..recording import InputError
+from .mpc import PENALTY
+
+Array = np.ndarray
+MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
+
+
+def imported() -> Any:
+    """The package do_mpc.
+
+    Raises
+    ------
+    InputError
+        If it is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it warns about each of its own optional parts
+            import do_mpc
+    except ImportError:
+        raise InputError(MISSING) from None
+    return do_mpc
+
+
+def do_mpc_model(function: ca.Function) -> Any:
+    """A discrete `do_mpc.model.Model` of `F(x, u) -> (x_next, y)`: state x, input u, expression y, reference r.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        For example `fit.to_casadi()`.
+
+    Returns
+    -------
+    do_mpc.model.Model
+        Set up; r is a time-varying parameter of as many entries as y.
+
+    Raises
+    ------
+    InputError
+        If do-mpc is not installed.
+    """
+    model = imported().model.Model("discrete", "SX")
+    x = model.set_variable("_x", "x", (function.size1_in(0), 1))
+    u = model.set_variable("_u", "u", (function.size1_in(1), 1))
+    model.set_variable("_tvp", "r", (function.size1_out(1), 1))
+    following, y = function(x, u)
+    model.set_rhs("x", following)
+    model.set_expression("y", y)
+    model.setup()
+    return model
+
+
+def do_mpc_controller(
+    function: ca.Function,
+    horizon: int,
+    reference: Array,
+    *,
+    inputs: tuple[Any, Any],
+    outputs: tuple[Any, Any] | None = None,
+    move: float = 1e-3,
+    y_scale: float = 1.0,
+    u_scale: float = 1.0,
+) -> Any:
+    """A `do_mpc.controller.MPC` that follows a reference; the arguments are those of `PredictiveController`.
+
+    Parameters
+    ----------
+    reference : array, shape (M, n_y)
+        The whole path, a row a sample; behind its end the last row is wanted.
+
+    Returns
+    -------
+    do_mpc.controller.MPC
+        Set up; set `x0` and `u0`, call `set_initial_guess()`, then `make_step(x)` at each sample. The sample number is
+        do-mpc's own time.
+
+    Raises
+    ------
+    InputError
+        If do-mpc is not installed.
+    """
+    do_mpc, path = imported(), np.asarray(reference, dtype=float).reshape(len(reference), -1)
+    model = do_mpc_model(function)
+    mpc = do_mpc.controller.MPC(model)
+    quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.tol": 1e-9}
+    mpc.set_param(n_horizon=horizon, t_step=1.0, store_full_solution=False, nlpsol_opts=quiet)
+    error = (model.aux["y"] - model.tvp["r"]) / y_scale
+    mpc.set_objective(lterm=ca.sumsqr(error), mterm=ca.SX(0))
+    mpc.set_rterm(u=move / u_scale**2)
+    mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = inputs
+    if outputs is not None:
+        soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": PENALTY}
+        mpc.set_nl_cons("above", (model.aux["y"] - outputs[1]) / y_scale, **soft)
+        mpc.set_nl_cons("below", (outputs[0] - model.aux["y"]) / y_scale, **soft)
+    template = mpc.get_tvp_template()
+
+    def wanted(now: float) -> Any:
+        for k in range(horizon + 1):
+            template["_tvp", k, "r"] = path[min(round(np.asarray(now).item()) + k, len(path) - 1)]
+        return template
+
+    mpc.set_tvp_fun(wanted)
+    mpc.setup()
+    return mpc

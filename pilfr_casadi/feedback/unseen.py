@@ -1,0 +1,163 @@
+"""Which memory the outputs cannot tell: the limits of observability along a window of inputs, in words.
+
+The outputs of the window depend on the state at its beginning as `δY = O δx`. What they say about it, with independent
+noise of variance R and a state known beforehand to within its usual spread S, is the covariance
+
+    P = (S⁻² + O' R⁻¹ O)⁻¹,
+
+and a memory whose standard deviation `sqrt(P_jj)` stays near `S_j` is not seen. Why, the columns of O tell: a column of
+zeros belongs to a memory that is wiped out before it leaves a trace, or that no output depends on; several that stick
+throughout act as one, by their weighted sum alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from ..elements import PrandtlIshlinskii
+from ..recording import InputError
+
+if TYPE_CHECKING:
+    from ..fit import Fit
+    from .kalman import KalmanFilter
+
+Array = np.ndarray
+UNSEEN = 0.5  # left of the spread, from which on a memory counts as not seen
+TRACE = 1e-9  # of the largest column, below which a column leaves no trace
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """What the outputs of a window say about the state at its beginning.
+
+    Attributes
+    ----------
+    left : array, shape (n,)
+        Standard deviation of each state and memory that is left once the outputs are known, over its usual spread; 0 is
+        seen exactly, 1 not at all.
+    unseen : tuple of int
+        Entries of the state, counted from 0, that are memory and left with half their spread or more.
+    sentences : tuple of str
+        What that means, a sentence for each kind of reason.
+    rank : int
+        Directions of the state that the outputs see better than it was known.
+    """
+
+    left: Array
+    unseen: tuple[int, ...]
+    sentences: tuple[str, ...]
+    rank: int
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences)
+
+
+def visibility(fit: Fit, observer: KalmanFilter, x: Array, u: Array) -> Visibility:
+    """Which memory the outputs see when the inputs u are applied from the state x on.
+
+    Parameters
+    ----------
+    fit : Fit
+        The model.
+    observer : KalmanFilter
+        Its filter, of which the noise and the usual spread are taken.
+    x : array, shape (n,)
+        State of the observer at the window's beginning.
+    u : array, shape (samples, n_u)
+        Inputs of the window.
+
+    Returns
+    -------
+    Visibility
+        `print` it for the sentences.
+
+    Raises
+    ------
+    InputError
+        If x or u do not fit the model.
+    """
+    model, function, n = fit.model, observer.function, len(observer.x0)
+    x, u = np.asarray(x, dtype=float).ravel(), np.asarray(u, dtype=float)
+    u = u[:, None] if u.ndim == 1 else u
+    if len(x) != n or u.ndim != 2 or u.shape[1] != model.n_u or not len(u):
+        raise InputError(
+            f"A state of {len(x)} numbers and inputs {u.shape} were given; give {n} numbers and (samples, {model.n_u})."
+        )
+    state, drive = ca.SX.sym("x", n), ca.SX.sym("u", model.n_u)
+    following, output = function(state, drive)
+    slopes = ca.Function(
+        "slopes", [state, drive], [following, ca.jacobian(following, state), ca.jacobian(output, state)]
+    )
+    root = 1 / np.sqrt(np.diag(observer.R))
+    carried, rows, slip = np.eye(n), [], np.full(n, -1)
+    for k, value in enumerate(u):
+        out: Any = slopes(x, value)
+        x, a, c = np.asarray(out[0]).ravel(), np.asarray(out[1]), np.asarray(out[2])
+        rows.append(root[:, None] * (c @ carried))
+        carried = a @ carried
+        slips = np.flatnonzero((slip < 0) & (np.diag(a) == 0))
+        slip[slips] = k
+    traces = np.vstack(rows) * observer.spread
+    information = np.linalg.eigvalsh(traces.T @ traces)
+    left = np.sqrt(np.clip(np.diag(np.linalg.inv(np.eye(n) + traces.T @ traces)), 0, 1))
+    unseen = [j for j in range(model.n_x, model.n_state) if left[j] > UNSEEN]
+    sentences = _reasons(fit, unseen, np.linalg.norm(traces, axis=0), slip, len(u))
+    return Visibility(left, tuple(unseen), tuple(sentences), int(np.sum(information > 1)))
+
+
+def _reasons(fit: Fit, unseen: list[int], size: Array, slip: Array, samples: int) -> list[str]:
+    """A sentence for each kind of reason."""
+    model = fit.model
+    n_memory, tiny = model.n_s, TRACE * np.max(size, initial=0.0)
+    if not n_memory:
+        return ["The model has no memory to see."]
+    wiped = [j for j in unseen if size[j] <= tiny and slip[j] >= 0]
+    idle = [j for j in unseen if size[j] <= tiny and slip[j] < 0]
+    rest = [j for j in unseen if size[j] > tiny]
+    joint, faint = ([j for j in rest if slip[j] < 0], [j for j in rest if slip[j] >= 0])
+    out = []
+    if not unseen:
+        out.append(f"The outputs of {samples} samples see all {n_memory} memories.")
+    if wiped:
+        out.append(
+            f"{_named(fit, wiped)}: wiped out before a trace reaches an output; nothing needs to be known of it."
+        )
+    if idle:
+        out.append(f"{_named(fit, idle)}: no output depends on what has the weight zero.")
+    if len(joint) > 1:
+        out.append(
+            f"{_named(fit, joint)}: stick over all {samples} samples, so that the outputs see the weighted sum of what "
+            "sticks and not each one; an excursion that makes them slip one after the other tells them apart."
+        )
+    elif joint:
+        out.append(
+            f"{_named(fit, joint)}: sticks over all {samples} samples, and what it adds to the outputs drowns in noise "
+            "or looks like that of others; an excursion that makes it slip settles it."
+        )
+    if faint:
+        verb = "slip" if len(faint) > 1 else "slips"
+        out.append(
+            f"{_named(fit, faint)}: {verb} within the window, and the trace left before drowns in noise or looks like "
+            "that of others; from then on the signal that drives the operator tells its memory."
+        )
+    return out
+
+
+def _named(fit: Fit, entries: list[int]) -> str:
+    """Memories by their operator and threshold where the element has them."""
+    model = fit.model
+    element = model.element
+    if not isinstance(element, PrandtlIshlinskii):
+        return "Memory " + ", ".join(str(j - model.n_x + 1) for j in entries)
+    r = fit.parameters["r"]
+    names = []
+    for j in entries:
+        channel, i = divmod(j - model.n_x, element.n)
+        where = f" of channel {channel + 1}" if element.channels > 1 else ""
+        names.append(f"{i + 1}{where} (r = {r[channel, i]:.3g})")
+    kind = element.operator.name.replace("_", " ")
+    return f"{kind[0].upper()}{kind[1:]} " + ", ".join(names)

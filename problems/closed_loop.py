@@ -1,0 +1,194 @@
+"""Controllers on a true simulator: what `mpc_piezo` and `mpc_masing` share.
+
+At each sample the input that was computed in the sample before is applied, and the sensor is read with noise: a
+controller that plans has one sample of time for it. The reference touches the limits that the controllers are told,
+which stay a margin inside those of the machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pilfr_casadi.feedback import (
+    PredictiveController,
+    do_mpc_controller,
+    feedforward,
+    kalman_filter,
+)
+from pilfr_casadi.fit import Fit
+from pilfr_casadi.recording import Recording
+
+from .controllers import ByDoMpc, Compensated, Given, Plant, Predictive, ProportionalIntegral
+
+Array = np.ndarray
+LINEAR = "MPC, linear model"
+MOVE = 1e-4  # weight of moves
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A closed loop: true output, inputs, and figures over the samples from `skip` on."""
+
+    name: str
+    y: Array
+    u: Array
+    error: float
+    violation: float
+    median: float
+    slowest: float
+
+
+def run(
+    name: str,
+    plant: Plant,
+    controller: Any,
+    reference: Array,
+    noise: float,
+    *,
+    outputs: tuple[float, float],
+    skip: int = 0,
+    seed: int = 0,
+) -> Outcome:
+    """Close the loop; the error is the rms of the true output's deviation, the violation the worst beyond `outputs`."""
+    rng, m = np.random.default_rng(seed), len(reference)
+    y, u = np.zeros(m), np.zeros(m)
+    for k in range(m):
+        y[k] = plant.y
+        u[k] = controller.decide(k)
+        controller.hear(u[k], y[k] + noise * rng.standard_normal())
+        plant.advance(u[k])
+    error = float(np.sqrt(np.mean((y - reference)[skip:] ** 2)))
+    over = float(max(0.0, np.max(y) - outputs[1], outputs[0] - np.min(y)))
+    seconds = np.array(getattr(controller, "seconds", []) or [0.0])
+    return Outcome(name, y, u, error, over, float(np.median(seconds)), float(np.max(seconds)))
+
+
+def table(outcomes: list[Outcome], unit: str, sample_time: float, tolerance: float) -> str:
+    """Table of outcomes; errors also as shares of that of linear predictive control."""
+    base = next(o.error for o in outcomes if o.name == LINEAR)
+    lines = [
+        f"{'controller':<36}{'rms error':>11}{'/ linear MPC':>14}{'violation':>12}{'solve time, median / max':>26}",
+        f"{'':<36}{unit:>11}{'':>14}{f'/ {tolerance:.2g} {unit}':>12}{f'ms, of {1e3 * sample_time:.3g} ms':>26}",
+    ]
+    for o in outcomes:
+        spent = f"{1e3 * o.median:.2f} / {1e3 * o.slowest:.2f}" if o.slowest else "-"
+        lines.append(f"{o.name:<36}{o.error:>11.3g}{o.error / base:>14.3f}{o.violation / tolerance:>12.2f}{spent:>26}")
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What has to be tracked, and on what.
+
+    Attributes
+    ----------
+    plant : callable
+        Gives a fresh plant at rest.
+    reference : array, (M,)
+        Wanted output.
+    inputs, outputs : (low, high)
+        Limits; the controllers are told those of the output less `margin`.
+    noise : float
+        Standard deviation of the sensor.
+    y_scale, u_scale : float
+        See `PredictiveController`.
+    skip : int
+        Samples at the beginning that are not scored.
+    """
+
+    plant: Callable[[], Plant]
+    reference: Array
+    inputs: tuple[float, float]
+    outputs: tuple[float, float]
+    margin: float
+    noise: float
+    y_scale: float
+    u_scale: float
+    skip: int = 50
+    horizon: int = 20
+
+    def close(self, name: str, controller: Any) -> Outcome:
+        """The loop with a controller."""
+        return run(name, self.plant(), controller, self.reference, self.noise, outputs=self.outputs, skip=self.skip)
+
+    def planner(self, function: Any, move: float, solver: str = "sqp") -> Any:
+        """Predictive control with a model, by a solver of `PredictiveController` or by "do-mpc"."""
+        limits = self.outputs[0] + self.margin, self.outputs[1] - self.margin
+        scales: dict[str, Any] = {"y_scale": self.y_scale, "u_scale": self.u_scale}
+        if solver == "do-mpc":
+            common: dict[str, Any] = {"inputs": self.inputs, "outputs": limits, "move": move}
+            return do_mpc_controller(function, self.horizon, self.reference, **common, **scales)
+        return PredictiveController(
+            function, self.horizon, inputs=self.inputs, outputs=limits, move=move, solver=solver, **scales
+        )
+
+
+def compare(
+    task: Task, linear: Fit, hysteresis: Fit, train: Recording, *, quick: bool, solvers: Sequence[str]
+) -> list[Outcome]:
+    """All controllers on one task.
+
+    PI and linear predictive control are tuned on the task itself, over their gains and over the observer's noise,
+    disturbance model and weight of moves; those with the hysteresis model take their defaults.
+    """
+    p = {k: v.value for k, v in linear.model.parameters.items()}
+    gain = (p["C_y"] @ np.linalg.solve(np.eye(len(p["A"])) - p["A"], p["B_u"]) + p["D_yu"]).item()
+    proportional = (0.0,) if quick else (0.0, 0.1, 0.3, 1.0)
+    integral = (0.05,) if quick else (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
+    loops = [
+        task.close("PI control", ProportionalIntegral(task.reference, gain, a / gain, b / gain, task.inputs))
+        for a in proportional
+        for b in integral
+    ]
+    out = [min(loops, key=lambda o: o.error if np.isfinite(o.error) else np.inf)]
+    loops = []
+    for share in (0.3,) if quick else (0.03, 0.1, 0.3, 1.0):
+        for disturbance in (True,) if quick else (False, True):
+            observer = kalman_filter(linear, train, disturbance=disturbance, share=share)
+            for move in (MOVE,) if quick else (0.1 * MOVE, MOVE, 10 * MOVE):
+                planner = task.planner(observer.function, move)
+                loops.append(task.close(LINEAR, Predictive(planner, observer, task.reference)))
+    out.append(min(loops, key=lambda o: o.error))
+    observer = kalman_filter(hysteresis, train)
+    for solver in ("sqp", *solvers):
+        planner, name = task.planner(observer.function, MOVE, solver), "MPC, hysteresis model"
+        if solver == "do-mpc":
+            out.append(task.close(f"{name}, do-mpc", ByDoMpc(planner, observer)))
+        else:
+            name += f", {solver}" if solver != "sqp" else ""
+            out.append(task.close(name, Predictive(planner, observer, task.reference)))
+    inverse = feedforward(hysteresis, train, limits=task.inputs)
+    out.append(task.close("inverse on the observer's state", Compensated(inverse, observer, task.reference)))
+    out.append(task.close("inverse, no sensor", Given(inverse.inputs(task.reference)[:, 0])))
+    return out
+
+
+def draw(outcomes: list[Outcome], task: Task, dt: float, units: tuple[str, str], path: Path) -> None:
+    """Reference and outputs above, errors in the middle, inputs (units: output, input) below."""
+    from pilfr_casadi import plots
+    from pilfr_casadi.plots.canvas import BLUE, GREEN, GREY, INK, ORANGE, VERMILLION, finish, scaled
+
+    t = dt * np.arange(len(task.reference))
+    scale, unit = scaled(task.reference, units[0])
+    figure = plots.new_figure(8.0, 8.0)
+    top, middle, low = figure.subplots(3, 1, sharex=True)
+    for value in task.outputs:
+        top.axhline(value / scale, color=GREY, linewidth=1, linestyle=":")
+    drawn = [o for o in outcomes if o.name.count(",") < 2 and "no sensor" not in o.name]
+    for o, colour in zip(drawn, [ORANGE, VERMILLION, BLUE, GREEN], strict=True):
+        top.plot(t, o.y / scale, color=colour, linewidth=1.2, label=o.name)
+        middle.plot(t, (o.y - task.reference) / scale, color=colour, linewidth=1.0)
+        low.step(t, o.u, color=colour, linewidth=0.8, where="post")
+    top.plot(t, task.reference / scale, color=INK, linewidth=0.8, linestyle="--", label="reference")
+    worst = max(float(np.max(np.abs(o.y - task.reference)[task.skip :])) for o in drawn if o.name == LINEAR) / scale
+    middle.set_ylim(-1.3 * worst, 1.3 * worst)
+    finish(top, "", f"output [{unit}]", columns=3)
+    finish(middle, "", f"error [{unit}]", legend=False)
+    finish(low, "time [s]", f"input [{units[1]}]", legend=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
