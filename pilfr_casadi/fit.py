@@ -78,7 +78,8 @@ def fit(
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
         solved and re-gridded.
     stable : bool or float
-        Bound on the spectral radius of a PI-LFR's linear part, 1 by default; False for none.
+        Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope. A number holds
+        exactly, by the eigenvalues of the result; True, the default, is 1 up to 1e-4; False is none.
     constraints
         See `Problem`.
     noise : float, optional
@@ -148,7 +149,7 @@ def _fit(
     executor: Executor | None,
 ) -> Fit:
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
-    limits = stability(structure, 1.0 if stable is True else float(stable)) if structure and stable else ()
+    limits = _stability(structure, stable) if structure and stable else ()
     job = replace(job, limits=(*limits, *job.limits))
     if not isinstance(model, PILFR):
         given = model.model if isinstance(model, Fit) else model
@@ -279,6 +280,11 @@ def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any
             raise InputError(f"{name} = {value!r} was given; give a whole number, {least} or more.")
     if progress is not None and not isinstance(progress, bool) and not callable(progress):
         raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
+
+
+def _stability(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
+    """The limits that `stable` stands for: a number exactly, True up to a slack that lets an integrator be one."""
+    return stability(structure) if bound is True else stability(structure, float(bound), exact=True)
 
 
 def _leave_interrupts() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .constraints import Constraint
+from .exactness import exactly
 from .fitted import Fit, Progress
 from .gauss_newton import GaussNewton
 from .interrupts import deferred_interrupt
@@ -68,6 +69,7 @@ class Job:
         given = {"engine": self.engine, **more}
         try:
             with deferred_interrupt():
+                solution = exactly(problem, solution)
                 found.append(outcome(model, structure, problem, solution, self.began, self.recordings, **given))
             if self.progress:
                 self.progress("standard errors", 1, 1, np.nan)

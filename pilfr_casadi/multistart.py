@@ -94,14 +94,14 @@ class Candidate:
     note: str = ""
 
 
-def stability(structure: PILFR, radius: float = 1.0) -> tuple[Constraint, ...]:
+def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tuple[Constraint, ...]:
     """Bounds on the spectral radius of A, and of A + B_w diag(Σw) C_z: no operator slips, or all (stops: sticks)."""
     if structure.nx == 0:
         return ()
-    limits: tuple[Constraint, ...] = (stable(radius),)
+    limits: tuple[Constraint, ...] = (stable(radius, exact=exact),)
     element = structure.element
     if isinstance(element, PrandtlIshlinskii):
-        limits += (stable(radius, _with_element, "spectral radius with the element's full slope"),)
+        limits += (stable(radius, _with_element, "spectral radius with the element's full slope", exact=exact),)
     return limits
 
 
@@ -228,6 +228,11 @@ def run_tasks(
     return results, False
 
 
+def _merit(candidate: Candidate) -> tuple[bool, float]:
+    """What candidates are compared by: whether the constraints hold comes first."""
+    return candidate.solution.status is Status.INFEASIBLE, candidate.error
+
+
 def search_starts(
     search: Search,
     starts: int,
@@ -245,7 +250,7 @@ def search_starts(
     """
     sequences = np.random.SeedSequence(seed).spawn(starts)
     found, stopped = run_tasks(explore, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
-    usable = sorted((c for c in found if np.isfinite(c.error)), key=lambda c: c.error)
+    usable = sorted((c for c in found if np.isfinite(c.error)), key=_merit)
     if not usable and stopped:
         return found, None, True
     if not usable:
@@ -255,4 +260,4 @@ def search_starts(
     if search.start == "paper" or stopped:
         return found, usable[0], stopped
     polished, stopped = run_tasks(polish, [(search, c) for c in usable[:keep]], executor, report)
-    return found, min(polished or usable[:1], key=lambda c: c.error), stopped
+    return found, min(polished or usable[:1], key=_merit), stopped

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..elements import PrandtlIshlinskii
 from ..lfr import PILFR, block_shapes
+from ..limits import Limit
 from ..model import Model
 from ..operators import GeneralizedPlay, Play, Stop
 from ..recording import InputError
@@ -110,10 +111,23 @@ def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[
         "labels": tuple(variables),
         "train_nrmse": tuple(errors.ravel().tolist()),
         "linear_nrmse": tuple(linear.ravel().tolist()),
+        "limits": tuple(_limit(file, row) for row in (file.rows(training, "limits") if "limits" in training else [])),
         "active": tuple(str(name) for name in file.rows(training, "active")),
         "candidates": tuple(candidates),
         "seconds": file.number(training, "seconds"),
     }
+
+
+def _limit(file: ModelFile, row: Any) -> Limit:
+    """A constraint or an active bound, where the file has them; no limit is null or infinite."""
+    ends = {"lower": -np.inf, "upper": np.inf, "value": np.nan, "multiplier": np.nan}
+    return Limit(
+        name=file.text(row, "name"),
+        kind=file.text(row, "kind"),
+        active=file.entry(row, "active", bool, "true or false"),
+        met=file.entry(row, "met", bool, "true or false"),
+        **{key: file.number(row, key, missing) for key, missing in ends.items()},
+    )
 
 
 def _initial_states(file: ModelFile, size: int) -> dict[str, np.ndarray]:

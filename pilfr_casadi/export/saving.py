@@ -77,6 +77,7 @@ def _document(fit: Fit) -> dict[str, Any]:
             "linear_nrmse": _plain(fit.linear_nrmse),
             "seconds": fit.seconds,
             "active": list(fit.active),
+            "limits": [_limit(limit) for limit in fit.limits],
             "solve": _solve(solution),
             "variables": dict(zip(fit.labels, _plain(solution.theta), strict=True)),
             "multipliers": _plain(solution.multipliers),
@@ -88,6 +89,12 @@ def _document(fit: Fit) -> dict[str, Any]:
             ],
         },
     }
+
+
+def _limit(limit: Any) -> dict[str, Any]:
+    """A constraint or an active bound."""
+    numbers = {key: _plain(getattr(limit, key), "inf") for key in ("value", "lower", "upper", "multiplier")}
+    return {"name": limit.name, "kind": limit.kind, **numbers, "active": limit.active, "met": limit.met}
 
 
 def _solve(solution: Any) -> dict[str, Any]:
