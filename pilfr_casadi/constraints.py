@@ -10,8 +10,8 @@ out after each step keeps the numbers in range. Where eigenvalues coincide (a do
 m^(n-1) and the left-hand side exceeds `log ρ(A)` by up to `(n - 1) log(m) / m`, 1.3e-5 (n - 1) here, with slopes of the
 size of m. `stable` therefore has a slack, and a violation as small as that slack is no failure of a solver.
 
-Asked for as `exact`, a constraint has no slack and no tolerance: it is solved a little inside its limits, checked on the
-numbers of the result, the spectral radius by its eigenvalues, and where a check fails the result is moved (`exactness`).
+Asked for as `exact`, a constraint has no slack and no tolerance: it is checked on the numbers of the result, the
+spectral radius by its eigenvalues, and where a check fails the result is moved (`exactness`).
 """
 
 from __future__ import annotations
@@ -114,8 +114,8 @@ def stable(
 ) -> Constraint:
     """Spectral radius of `A` (or of another square expression of the parameters) at most `radius`.
 
-    What holds is `radius (1 + slack)`, and with `exact` the radius itself, to the last digit of the eigenvalues. Without
-    slack no solver could meet a limit of 1 at a double integrator.
+    What holds is `radius (1 + slack)`, and with `exact` the radius itself, to the last digit of the eigenvalues.
+    Without slack no solver could meet a limit of 1 at a double integrator.
 
     Raises
     ------

@@ -22,6 +22,7 @@ from .constraints import Constraint
 from .elements import PrandtlIshlinskii
 from .fitted import Fit, Progress, fingerprint
 from .job import Job, interrupted, penalised, rms_error
+from .known_blocks import in_known_coordinates, known_entries
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
@@ -117,7 +118,7 @@ def fit(
         raise SystemExit(1)  # a spawned worker that runs the script again; the first process says what to do
     if l1 is not None and not isinstance(l1, dict):
         raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
-    further = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+    further = constraint_list(constraints)
     if progress is True:
         from .progress import progress_bar
 
@@ -149,7 +150,7 @@ def _fit(
     executor: Executor | None,
 ) -> Fit:
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
-    limits = _stability(structure, stable) if structure and stable else ()
+    limits = stability_limits(structure, stable) if structure else ()
     job = replace(job, limits=(*limits, *job.limits))
     if not isinstance(model, PILFR):
         given = model.model if isinstance(model, Fit) else model
@@ -168,7 +169,7 @@ def _fit(
     )
     if solution.status is Status.INTERRUPTED:
         return job.result(linear, model.linear(), problem, solution)
-    fitted = with_solution(linear, problem, solution)
+    fitted = in_known_coordinates(model, with_solution(linear, problem, solution), job)
     if model.element is None:
         alike = not (model.fixed or model.bounds or model.priors or job.limits[1:]) and job.solver is POLISH
         if alike:  # nothing that the linear model has not seen
@@ -230,6 +231,7 @@ def _from_starts(
     """A PI-LFR from many starts; `problem` and `solution` are those of the linear model."""
     blocks = {k: p.value for k, p in linear.parameters.items()}
     options: dict[str, Any] = {"engine": job.engine, "start": start, "noise": job.noise}
+    options["coordinates"] = not known_entries(structure)
     search = Search(
         structure, job.recordings, blocks, job.solver, job.limits, level=rms_error(problem, solution), **options
     )
@@ -282,9 +284,16 @@ def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any
         raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
 
 
-def _stability(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
+def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
     """The limits that `stable` stands for: a number exactly, True up to a slack that lets an integrator be one."""
+    if bound is False:
+        return ()
     return stability(structure) if bound is True else stability(structure, float(bound), exact=True)
+
+
+def constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
+    """One constraint, or several, as several."""
+    return (given,) if isinstance(given, Constraint) else tuple(given)
 
 
 def _leave_interrupts() -> None:

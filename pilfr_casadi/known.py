@@ -3,8 +3,8 @@
 With `s` the slope of the element (between 0, every play sticks, and 1, every play slips, times Σw; stops the other way
 round), constant inputs and outputs of the model of Krikelis et al. (2024), Eq. 15-17, are tied by
 
-    A' = A + B_w S C_z,   B' = B_u + B_w S D_zu,   C' = C_y + D_yw S C_z,   D' = D_yu + D_yw S D_zu,   S = s diag(Σ_j w_ij)
-    gain = C' (I - A')⁻¹ B' + D'.
+    A' = A + B_w S C_z,   B' = B_u + B_w S D_zu,   C' = C_y + D_yw S C_z,   D' = D_yu + D_yw S D_zu,
+    gain = C' (I - A')⁻¹ B' + D',   S = s diag(Σ_j w_ij).
 
 All are classes, so that they can be sent to other processes.
 """
@@ -71,10 +71,11 @@ def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
     gain, room = np.asarray(value, dtype=float), np.asarray(within, dtype=float)
     if not (np.all(np.isfinite(gain)) and np.all(room >= 0) and 0 <= slope <= 1):
         raise InputError(
-            f"A gain of {value} within {within} at a slope of {slope} was asked for; give finite numbers, a deviation of "
-            "0 or more, and a slope from 0 to 1."
+            f"A gain of {value} within {within} at a slope of {slope} was asked for; give finite numbers, a deviation "
+            "of 0 or more, and a slope from 0 to 1."
         )
-    flat, room = (np.broadcast_to(a, np.broadcast_shapes(gain.shape, room.shape)).ravel(order="F") for a in (gain, room))
+    both = np.broadcast_shapes(gain.shape, room.shape)
+    flat, room = (np.broadcast_to(a, both).ravel(order="F") for a in (gain, room))
     shown = ", ".join(f"{g:g}" for g in flat) + ("" if not np.any(room) else f" ± {np.max(room):g}")
     return Constraint(Gain(slope), flat - room, flat + room, f"DC gain = {shown}", exact=bool(np.all(room > 0)))
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .constraints import TOLERATED
 from .problem import Problem
 from .solution import Solution
 
@@ -59,21 +60,17 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
     size = np.abs(solution.multipliers) if known else np.full(n + len(problem.g_lower), np.nan)
     out: list[Limit] = []
     if len(problem.g_lower):
-        g, unit, active = problem.constraint(theta), problem.constraint_units(theta), problem.active_constraints(theta)
-        over = np.maximum(np.maximum(problem.g_lower - g, g - problem.g_upper), 0.0)
-        room = np.array([np.inf if not np.isfinite(v) else 1e-6 for v in g]) * np.where(unit > 0, unit, 1.0)
-        missing = (over > room) | ~np.isfinite(g)
+        g, low, high = problem.constraint(theta), problem.g_lower, problem.g_upper
+        unit = np.maximum(problem.constraint_units(theta), 1e-300)
+        met = np.maximum(low - g, g - high) <= TOLERATED * unit
         # a solver may stop a little short of a limit that holds it
-        active |= (size[n:] > 0) & (np.minimum(g - problem.g_lower, problem.g_upper - g) <= 1e-5 * np.maximum(unit, 1e-300))
-        rows = zip(problem.g_labels, g, problem.g_lower, problem.g_upper, size[n:], active, ~missing, strict=True)
-        out += [Limit(k, "constraint", *map(float, v), bool(a), bool(m)) for k, *v, a, m in rows]
-        out = [limit if limit.active else _without_multiplier(limit) for limit in out]
+        near = (size[n:] > 0) & (np.minimum(g - low, high - g) <= 10 * TOLERATED * unit)
+        active = problem.active_constraints(theta) | near
+        for i, name in enumerate(problem.g_labels):
+            numbers = float(g[i]), float(low[i]), float(high[i]), float(size[n + i] if active[i] else 0.0)
+            out.append(Limit(name, "constraint", *numbers, active=bool(active[i]), met=bool(met[i])))
     at = (theta == problem.lower) | (theta == problem.upper)
-    for i in np.flatnonzero(at):
-        numbers = theta[i], problem.lower[i], problem.upper[i], size[i]
-        out.append(Limit(str(problem.labels[i]), "bound", *map(float, numbers), True))
+    for i in map(int, np.flatnonzero(at)):
+        numbers = float(theta[i]), float(problem.lower[i]), float(problem.upper[i]), float(size[i])
+        out.append(Limit(str(problem.labels[i]), "bound", *numbers, active=True))
     return tuple(out)
-
-
-def _without_multiplier(limit: Limit) -> Limit:
-    return Limit(limit.name, limit.kind, limit.value, limit.lower, limit.upper, 0.0, False, limit.met)

@@ -60,6 +60,7 @@ class Search:
     l1: dict[str, float] = field(default_factory=dict)
     noise: float | None = None
     level: float = 1.0
+    coordinates: bool = True  # whether the states' coordinates are free to choose
 
     def problem(self, model: Model, engine: Engine | None = None, noise: float | None = None) -> Problem:
         """The simulation-error problem of a model of this structure.
@@ -118,7 +119,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     """
     rng = np.random.default_rng(sequence)
     inputs = [r.u for r in search.recordings]
-    scaled, states = unit_states(search.linear, inputs)
+    scaled, states = unit_states(search.linear, inputs, search.coordinates)
     if search.start == "paper":
         values, solver = paper_start(search.structure, scaled, rng), search.solver
     else:

@@ -32,9 +32,13 @@ def states_of(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:
     return out
 
 
-def unit_states(blocks: Mapping[str, np.ndarray], inputs: list[np.ndarray]) -> tuple[Blocks, list[np.ndarray]]:
-    """Scale each state to unit variance (Sec. 5.3); returns the blocks, and the states of each recording."""
+def unit_states(
+    blocks: Mapping[str, np.ndarray], inputs: list[np.ndarray], free: bool = True
+) -> tuple[Blocks, list[np.ndarray]]:
+    """Scale each state to unit variance (Sec. 5.3), if free; returns the blocks, and the states of each recording."""
     states = [states_of(blocks, u) for u in inputs]
+    if not free:
+        return dict(blocks), states
     spread = np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0))
     spread = np.where(spread > 0, spread, 1.0)
     scaled = dict(blocks)
@@ -84,7 +88,8 @@ def grid_start(
     element = _layer(structure)
     blocks = paper_start(structure, linear, rng)
     u, x = np.concatenate(inputs), np.concatenate(states)
-    fixed, spread = structure.fixed, np.std(u, axis=0)
+    fixed = {k: v for k, v in structure.fixed.items() if not np.any(np.isnan(v))}
+    spread = np.std(u, axis=0)
     blocks["D_zu"] = blocks["D_zu"] / np.where(spread > 0, spread, 1.0)
     at_output, at_input = (np.arange(element.channels) % n for n in (len(linear["C_y"]), u.shape[1]))
     if place == "output":
@@ -105,7 +110,7 @@ def grid_start(
     reach = np.max(np.abs(z), axis=0)
     blocks["r"] = 0.9 * reach[:, None] * np.arange(element.n) / element.n
     blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
-    if place != "random" and not set(blocks) & set(fixed):
+    if place != "random" and not set(blocks) & set(structure.fixed):
         blocks |= _halved(linear, size, at_output if place == "output" else at_input, place == "output")
     return blocks
 

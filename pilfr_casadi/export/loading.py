@@ -172,7 +172,8 @@ def _structure(file: ModelFile, n_u: int, n_y: int) -> PILFR:
     for name, shape in block_shapes(nx, n_u, n_y, 0 if element is None else element.channels).items():
         file.array(file.table(parameters, name).get("value"), shape, f"parameter {name!r}")
     fixed = {
-        name: file.array(value, None, f"the fixed block {name!r}") for name, value in file.table(table, "fixed").items()
+        name: file.array(value, None, f"the fixed block {name!r}", np.nan)
+        for name, value in file.table(table, "fixed").items()
     }
     pairs: dict[str, dict[str, tuple[Any, Any]]] = {}
     for key, ends in (("bounds", (-np.inf, np.inf)), ("priors", (None, None))):
@@ -238,7 +239,7 @@ def _with_values(file: ModelFile, model: Model, structure: PILFR | None) -> Mode
     for name, p in model.parameters.items():
         if np.any((values[name] < p.bounds[0]) | (values[name] > p.bounds[1])):
             file.damaged(f"a value of parameter {name!r} lies outside its bounds")
-        if structure is not None and name in structure.fixed and np.any(values[name] != p.value):
+        if structure is not None and name in structure.fixed and np.any((values[name] != p.value)[p.fixed]):
             file.damaged(f"parameter {name!r} differs from the value that the structure fixes")
     return model.with_parameters(model.parameters.change(**{name: {"value": v} for name, v in values.items()}))
 
