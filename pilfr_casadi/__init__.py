@@ -65,6 +65,8 @@ _EXPORTS = {
     "read_npz": "readers",
     "rmse": "metrics",
     "robust_bla": "bla",
+    "read_run": "runs",
+    "run": "runs",
     "save": "export",
     "select_order": "order_selection",
     "sine_sweep": "signals",

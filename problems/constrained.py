@@ -3,8 +3,8 @@
 Three tables:
 
 1. stability: bounds on the spectral radius of `A` and of `A + B_w diag(Σw) C_z`, which hold exactly at the result's
-   numbers, and what they cost in training NRMSE next to the bound of 1 that every fit has. The rig itself (Krikelis et
-   al. 2024, Table 1) has poles of modulus up to `slowest_pole`: bounds below it deny the physics, and are shown to say so;
+   numbers, and what they cost in training NRMSE next to an identification without any. The rig itself (Krikelis et al.
+   2024, Table 1) has poles of modulus up to `slowest_pole`: bounds below it deny some of the physics;
 2. sparse weights: an L1 penalty with a second fit after pruning, its strength chosen on a validation record, against
    the full fit on the multisine and the sweep, which nothing has seen; on the Masing rig, whose density of operators is
    continuous, and on a machine with three plays;
@@ -34,7 +34,7 @@ from .masing_data import FS, benchmark
 
 FIRST_RECORD = 100
 VALIDATION = 1000  # added to a record's seed
-RADII = (1.0, 0.999, 0.995, 0.992)
+RADII = (1.0, 0.995, 0.99, 0.9895, 0.989)
 MARGIN = 0.1  # of the validation error that a sparser fit may cost
 
 
@@ -78,12 +78,13 @@ def radius(result: Fit) -> float:
 
 
 def stability_table(record: int, n: int, starts: int, radii: Sequence[float] = RADII) -> tuple[Fit, list[Bounded]]:
-    """The fit with the default bound, and fits with exact ones that begin there."""
+    """The identification without a bound, and those with exact ones, all from the same starts."""
     records = benchmark(record).records
-    reference = fit(PILFR(5, PrandtlIshlinskii(Play, n)), records["train"], starts=starts)
+    structure = PILFR(5, PrandtlIshlinskii(Play, n))
+    reference = fit(structure, records["train"], starts=starts, stable=False)
     rows = []
     for bound in radii:
-        found = fit(reference, records["train"], stable=bound)
+        found = fit(structure, records["train"], starts=starts, stable=bound)
         tests = found.nrmse(records["multisine"]), found.nrmse(records["sweep"])
         active = sum(limit.active for limit in found.limits if limit.kind == "constraint")
         cost = found.train_nrmse[0] / reference.train_nrmse[0] - 1
@@ -136,7 +137,7 @@ def infeasible_sentences() -> list[str]:
         (PILFR(1, element, bounds={"r": (0.0, 1.0)}), {"constraints": [ordered("r", gap=2.0)]}),
     ):
         try:
-            found = fit(structure, record, starts=1, **options)  # type: ignore[arg-type]
+            found = fit(structure, record, starts=1, **options)
             missed = [str(limit) for limit in found.limits if not limit.met]
             out.append(f"{found.status.value} ({'; '.join(missed)})")
         except InputError as error:
@@ -155,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"slowest pole of the rig {slowest_pole():.4f}; PI-LFR with 20 plays, train / multisine / sweep")
     for seed in seeds:
         reference, rows = stability_table(seed, 20, options.starts)
-        print(f"record {seed}: default bound, radius {radius(reference):.6f}, train {reference.train_nrmse[0]:.4f}")
+        print(f"record {seed}: no bound, radius {radius(reference):.6f}, train {reference.train_nrmse[0]:.4f}")
         for r in rows:
             print(
                 f"  radius <= {r.bound:<5g} {r.radius:.9f} {'holds' if r.radius <= r.bound else 'FAILS'}, "

@@ -77,6 +77,7 @@ LAYERS = {
         "linear_model",
         "penalty",
         "sparse",
+        "structures",
         "known_blocks",
         "multistart",
         "export",
@@ -85,7 +86,7 @@ LAYERS = {
         "load_simulator",
     ),
     7: ("diagnose", "report"),  # a diagnosis writes its own report
-    8: ("cli", "commands", "diagnose_command", "option_values", "demo"),
+    8: ("cli", "commands", "runs", "diagnose_command", "option_values", "demo"),
 }
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py" and p.parent.name != "demo_data")

@@ -44,7 +44,12 @@ def save(fit: Fit, path: str | os.PathLike[str]) -> None:
     InputError
         If the file cannot be written.
     """
-    write_atomically(path, _text(_document(fit)) + "\n")
+    write_atomically(path, model_text(fit))
+
+
+def model_text(fit: Fit) -> str:
+    """The text of a model file."""
+    return _text(_document(fit)) + "\n"
 
 
 def _document(fit: Fit) -> dict[str, Any]:
