@@ -36,7 +36,7 @@ def run_command(options: argparse.Namespace) -> int:
             if s.role == role and s.job == result.chosen:
                 print(f"NRMSE on {s.recording} ({role}): {s.nrmse:.4f}")
     print(f"chosen: {result.chosen}; {len(result.done)} jobs done now, {len(result.skipped)} before")
-    for name in ("results.csv", "model.json", "report.html", "manifest.json"):
+    for name in ("results.csv", "model.json", *(["report.html"] if given.report else []), "manifest.json"):
         print(result.folder / name)
     useless = min(result.fit.train_nrmse) >= 1.0
     return say("The model explains nothing of the training recording.", NO_RESULT) if useless else DONE

@@ -55,6 +55,8 @@ class Run:
     seeds : tuple of int
     workers : int
     engine : str
+    report : bool
+        Whether to write a page about the job that is chosen.
     """
 
     file: Path
@@ -75,6 +77,7 @@ class Run:
     seeds: tuple[int, ...] = (0,)
     workers: int = 1
     engine: str = "auto"
+    report: bool = True
 
     def located(self, name: str) -> Path:
         """Where a file of the run lies."""
@@ -125,6 +128,7 @@ def _checked(file: Path, content: Any) -> Run:
     more = {
         "workers": top.number("workers", 1, 1, whole=True),
         "engine": top.choice("engine", ("auto", "c", "vm"), "auto"),
+        "report": top.take("report", bool, True),
     }
     top.done()
     return Run(

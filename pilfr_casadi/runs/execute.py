@@ -45,7 +45,7 @@ class RunResult:
     Attributes
     ----------
     folder : Path
-        With `manifest.json`, `results.csv`, `jobs/ID/model.json`; `model.json` and `report.html` of the job that is chosen.
+        With `manifest.json`, `results.csv`, `jobs/ID/model.json`, and `model.json`, `report.html` of the job chosen.
     done, skipped : tuple of str
         Ids of the jobs that were executed now, and of those that had been before.
     chosen : str
@@ -215,7 +215,7 @@ def _finished(
     manifest.put(TABLE, table(scores, usable, entries, best))
     manifest.put(MODEL, (folder / f"jobs/{best}" / MODEL).read_text(encoding="utf-8"))
     key = digest([manifest.content["files"][MODEL], manifest.content["inputs"], given.files, str(given.reading)])
-    if manifest.content.get("report") != key or not manifest.holds(PAGE):
+    if given.report and (manifest.content.get("report") != key or not manifest.holds(PAGE)):
         from ..report.fit_page import fit_page
 
         tell("writing the report")
