@@ -46,10 +46,16 @@ def beyond(problem: Problem, theta: np.ndarray) -> list[str]:
     return names
 
 
+def _far(problem: Problem, theta: np.ndarray, unit: np.ndarray) -> bool:
+    """Whether a step has led away: a constraint is violated by more than its unit."""
+    g = problem.constraint(theta)
+    return bool(np.any(np.maximum(problem.g_lower - g, g - problem.g_upper) > unit))
+
+
 def exactly(problem: Problem, solution: Solution) -> Solution:
     """The solution, moved where an exact constraint does not hold; infeasible where no small step brings it inside."""
     theta = solution.theta
-    if not np.isfinite(solution.cost) or not beyond(problem, theta):
+    if solution.status is Status.INFEASIBLE or not np.isfinite(solution.cost) or not beyond(problem, theta):
         return solution
     exact = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)
     hessian = problem.normal(theta)[2]
@@ -57,7 +63,9 @@ def exactly(problem: Problem, solution: Solution) -> Solution:
     unit = problem.constraint_units(theta, floor)
     unit = np.where(unit > 0, unit, 1.0)
     damped = hessian + 1e-6 * np.diag(floor)
-    scale = 1.0 / np.sqrt(np.diag(damped))
+    squares = np.diag(damped)
+    scale = 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
+    damped = damped + np.diag(np.where(squares > 0, 0.0, 1.0))
     qp, margin = QuadraticProgram(problem.size, len(unit), "daqp"), FIRST
     for _ in range(ROUNDS):
         g, slope = problem.constraint(theta), problem.constraint_jacobian(theta) * scale
@@ -75,9 +83,10 @@ def exactly(problem: Problem, solution: Solution) -> Solution:
             (problem.g_lower + room - g) / row / size,
             (problem.g_upper - room - g) / row / size,
         )
-        if not good:
+        trial = np.clip(theta + scale * size * d, problem.lower, problem.upper)
+        if not good or not np.all(np.isfinite(problem.constraint(trial))) or _far(problem, trial, unit):
             break
-        theta = np.clip(theta + scale * size * d, problem.lower, problem.upper)
+        theta = trial
         if not beyond(problem, theta):
             break
         margin *= 2.0

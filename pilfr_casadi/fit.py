@@ -26,7 +26,7 @@ from .known_blocks import in_known_coordinates, known_entries
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
-from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability
+from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability, within_radius
 from .outcome import with_solution
 from .penalty import check_penalty
 from .problem import Problem
@@ -171,8 +171,8 @@ def _fit(
         return job.result(linear, model.linear(), problem, solution)
     fitted = in_known_coordinates(model, with_solution(linear, problem, solution), job)
     if model.element is None:
-        alike = not (model.fixed or model.bounds or model.priors or job.limits[1:]) and job.solver is POLISH
-        if alike:  # nothing that the linear model has not seen
+        more = model.fixed or model.bounds or model.priors or job.limits[1:] or solution.status is Status.INFEASIBLE
+        if not more and job.solver is POLISH:  # nothing that the linear model has not seen
             return job.result(linear, model, problem, solution)
         return _linear(model, fitted, job)
     return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
@@ -205,7 +205,7 @@ def _from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit |
 
 def _linear(structure: PILFR, fitted: Model, job: Job) -> Fit:
     """A linear model with the structure's bounds and fixed blocks, from the one without."""
-    values = {k: p.value for k, p in fitted.parameters.items()}
+    values = within_radius({k: p.value for k, p in fitted.parameters.items()}, job.limits, structure)
     first = job.recordings[0]
     model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
     problem = job.problem(model)
@@ -231,10 +231,8 @@ def _from_starts(
     """A PI-LFR from many starts; `problem` and `solution` are those of the linear model."""
     blocks = {k: p.value for k, p in linear.parameters.items()}
     options: dict[str, Any] = {"engine": job.engine, "start": start, "noise": job.noise}
-    options["coordinates"] = not known_entries(structure)
-    search = Search(
-        structure, job.recordings, blocks, job.solver, job.limits, level=rms_error(problem, solution), **options
-    )
+    options |= {"level": rms_error(problem, solution), "coordinates": not known_entries(structure)}
+    search = Search(structure, job.recordings, blocks, job.solver, job.limits, **options)
     seen: list[float] = []
 
     def report(candidate: Candidate) -> None:

@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 
 from .compiled import make_engine
-from .constraints import Constraint, stable
+from .constraints import BeyondRadius, Constraint, stable
 from .elements import PrandtlIshlinskii
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
@@ -106,6 +106,22 @@ def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tup
     return limits
 
 
+def within_radius(values: Blocks, constraints: Iterable[Constraint], structure: PILFR) -> Blocks:
+    """Blocks with A and B_w scaled down, where they may be, to meet exact bounds on the spectral radius."""
+    checks = [c.check for c in constraints if isinstance(c.check, BeyondRadius)]
+    if not checks or {"A", "B_w"} & (set(structure.fixed) - _zero(structure)):
+        return values
+    full = {
+        k: p.value for k, p in structure.model(values["B_u"].shape[1], len(values["C_y"]), values).parameters.items()
+    }
+    share = min(0.999 * c.radius / max(c(full) + c.radius, 1e-300) for c in checks)
+    return {**values, **{k: share * values[k] for k in ("A", "B_w") if k in values}} if share < 0.999 else values
+
+
+def _zero(structure: PILFR) -> set[str]:
+    return {k for k, v in structure.fixed.items() if not np.any(v)}
+
+
 def _with_element(p: Any) -> Any:
     return p["A"] + p["B_w"] @ ca.diag(ca.sum2(p["w"])) @ p["C_z"]
 
@@ -125,7 +141,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     else:
         place = PLACES[seed] if seed < len(PLACES) else "random"
         values, solver = grid_start(search.structure, scaled, inputs, states, rng, place), EXPLORE
-    model = search.model(values)
+    model = search.model(within_radius(values, search.constraints, search.structure))
     problem = search.problem(model)
     candidate = _candidate(seed, model, problem, solver.solve(problem))
     done = candidate.solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error)

@@ -96,7 +96,8 @@ class Problem:
             raise InputError("Every parameter is fixed and no initial state is estimated; free at least one parameter.")
         self._columns = np.where(self.free, np.cumsum(self.free) - 1, -1)
         self.noise = noise
-        self._set_penalties(l1 or {}, noise)
+        self.l1 = dict(l1 or {})
+        self._set_penalties(self.l1, noise)
         compiled = compile_constraints(self.constraints, parameters)
         self._g, self._g_slope, self.g_lower, self.g_upper, self.g_labels, self._g_units = compiled
         self.g_sizes = constraint_sizes(self.constraints, parameters)

@@ -67,6 +67,7 @@ LAYERS = {
         "scaling",
         "solution",
         "exactness",
+        "restoration",
         "limits",
     ),
     6: (
