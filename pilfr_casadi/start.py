@@ -142,7 +142,7 @@ def density(r: np.ndarray, w: np.ndarray, grid: np.ndarray, width: float) -> np.
 
 
 def regrid(
-    r: np.ndarray, w: np.ndarray, reach: float, *, beyond: float = 1.3, smooth: float = 1 / 12
+    r: np.ndarray, w: np.ndarray, reach: float, *, beyond: float = 1.3, smooth: float = 1 / 12, count: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds and weights of one channel placed anew along the smoothed density.
 
@@ -156,10 +156,12 @@ def regrid(
         How far the thresholds may reach, in units of `reach`; the tail is extrapolated log-linearly, never rising.
     smooth : float
         Kernel width in units of `reach`.
+    count : int, optional
+        How many there are to be, N by default.
 
     Returns
     -------
-    r, w : array, shape (N,)
+    r, w : array, shape (N,) or (count,)
         New thresholds (ascending) and the weights that the density gives them.
     """
     grid = np.linspace(0.0, beyond * reach, 600)
@@ -170,7 +172,7 @@ def regrid(
     out = grid > 0.85 * reach
     d[out] = np.exp(np.mean(log_d[tail]) + slope * (grid[out] - np.mean(grid[tail])))
     share = _integral(d**0.4, grid)
-    edges = np.interp(np.linspace(0, 1, len(r) + 1), share / share[-1], grid)
+    edges = np.interp(np.linspace(0, 1, (count or len(r)) + 1), share / share[-1], grid)
     mass = np.diff(np.interp(edges, grid, _integral(d, grid)))
     moment = np.diff(np.interp(edges, grid, _integral(d * grid, grid)))
     return moment / np.maximum(mass, 1e-300), mass
