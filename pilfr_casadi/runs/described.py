@@ -2,6 +2,7 @@
 
 A run file is TOML, or a Python file that sets `run` to such a table, in which the model may be a `PILFR` or a closed
 `Model`, the solver an object, and `own` a list of constraints under `constraints`. Paths are relative to the file.
+Where there are objects, the jobs depend on the contents of the Python file; what it imports is not looked at.
 """
 
 from __future__ import annotations
