@@ -13,6 +13,12 @@ __version__ = "0.1.0"
 
 # public name -> submodule that defines it
 _EXPORTS = {
+    "Limit": "limits",
+    "RegularizationPath": "sparse",
+    "dc_gain": "known",
+    "ordered": "known",
+    "prune": "sparse",
+    "regularization_path": "sparse",
     "diagnose": "diagnose",
     "Simulator": "simulator",
     "Port": "simulator",
@@ -67,6 +73,8 @@ _EXPORTS = {
     "read_npz": "readers",
     "rmse": "metrics",
     "robust_bla": "bla",
+    "read_run": "runs",
+    "run": "runs",
     "save": "export",
     "select_order": "order_selection",
     "sine_sweep": "signals",

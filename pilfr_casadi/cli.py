@@ -130,6 +130,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     diagnose.add_argument("--overwrite", action="store_true", help="replace a diagnosis that is in that folder already")
 
+    run = commands.add_parser(
+        "run",
+        help="execute a run file: identifications with all they depend on, skipped where done",
+        allow_abbrev=False,
+    )
+    run.add_argument("run_file", metavar="RUN.toml", help="what to do (.toml, or .py that sets `run`)")
+    run.add_argument("--out", metavar="DIR", help="folder of the results (default: as the file says, else RUN-run)")
+    run.add_argument(
+        "--workers", type=int, help="processes; the numbers do not depend on it (default: as the file says)"
+    )
+    run.add_argument("--overwrite", action="store_true", help="compute everything again, whatever is in the folder")
+
     simulate = commands.add_parser(
         "simulate", help="simulate a saved model on a recording's inputs", allow_abbrev=False
     )

@@ -9,22 +9,19 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from .cli import DONE, INTERRUPTED, NO_RESULT, say
 from .compiled import compiler, make_engine
-from .elements import PrandtlIshlinskii
 from .export import load, write_atomically
 from .fit import Fit
 from .fit import fit as identify
 from .gauss_newton import GaussNewton
 from .interrupts import Clock, deferred_interrupt, insistent, time_limit, worker_pool
 from .ipopt import Ipopt
-from .lfr import PILFR, hammerstein, wiener
+from .lfr import PILFR
 from .metrics import nrmse
-from .operators import GeneralizedPlay, Play, Stop
 from .option_values import bounds, name_list, number, pairs
 from .order_selection import select_order
 from .progress import progress_bar
@@ -32,6 +29,7 @@ from .readers import column_names, read, written_times
 from .recording import InputError, Recording, listed
 from .sensitivities import VirtualMachine
 from .solution import Status
+from .structures import named_structure
 
 # options of a search with their defaults; a saved model to start from has them already
 SEARCH = {
@@ -179,6 +177,13 @@ def diagnose(options: argparse.Namespace) -> int:
     return run_diagnosis(options)
 
 
+def run(options: argparse.Namespace) -> int:
+    """Execute a run file."""
+    from .runs.command import run_command
+
+    return run_command(options)
+
+
 def demo(options: argparse.Namespace) -> int:
     """Identify the rig whose recordings come with the package."""
     from .demo import run_demo
@@ -206,14 +211,15 @@ def _check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> 
 
 
 def _structure(options: argparse.Namespace, nx: int) -> PILFR:
-    kind: Any = {"play": Play, "stop": Stop, "generalized_play": GeneralizedPlay}[options.operator]
-    element = PrandtlIshlinskii(kind, options.operators, options.channels) if options.operators else None
-    fixed = {name: number(value, "--fix") for name, value in pairs(options.fix, "--fix").items()}
-    if options.structure == "lfr" or element is None:
-        base = PILFR(nx, element)
-    else:
-        base = {"hammerstein": hammerstein, "wiener": wiener}[options.structure](nx, element)
-    return PILFR(nx, element, {**base.fixed, **fixed}, bounds(options.bound))
+    return named_structure(
+        nx,
+        structure=options.structure,
+        operator=options.operator,
+        operators=options.operators,
+        channels=options.channels,
+        fixed={name: number(value, "--fix") for name, value in pairs(options.fix, "--fix").items()},
+        bounds=bounds(options.bound),
+    )
 
 
 def _order(options: argparse.Namespace, train: Sequence[Recording]) -> int:

@@ -9,6 +9,9 @@ is one smooth inequality that guarantees the bound, at any point where it holds.
 out after each step keeps the numbers in range. Where eigenvalues coincide (a double integrator) the powers grow as
 m^(n-1) and the left-hand side exceeds `log ρ(A)` by up to `(n - 1) log(m) / m`, 1.3e-5 (n - 1) here, with slopes of the
 size of m. `stable` therefore has a slack, and a violation as small as that slack is no failure of a solver.
+
+Asked for as `exact`, a constraint has no slack and no tolerance: it is checked on the numbers of the result, the
+spectral radius by its eigenvalues, and where a check fails the result is moved (`exactness`).
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from .recording import InputError
 TOLERATED = 1e-6  # violation, in units of a constraint, that is no failure
 UNIT = 100.0  # unit of log ρ: a violation of 1e-4 is tolerated
 SLACK = 1e-4  # share by which `stable` lets the radius exceed its limit
+INSIDE = 2e-7  # how far inside the logarithm of a radius an exact limit is solved: beyond what solvers tolerate
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +47,11 @@ class Constraint:
     unit : float, optional
         A change of the expression that counts: violations are judged next to it. By default the largest change that one
         of its variables brings about when it changes by its own size, so that units do not matter.
+    exact : bool
+        The limits hold at the numbers of the result, not up to a solver's tolerance; for inequalities.
+    check : callable, optional
+        Of an exact constraint: how far named numbers lie beyond the limit in another measure than the expression's,
+        0 or less inside; `stable` looks at the eigenvalues.
     """
 
     expression: Callable[[Mapping[str, Any]], Any]
@@ -50,6 +59,8 @@ class Constraint:
     upper: Any = np.inf
     name: str = "constraint"
     unit: float | None = None
+    exact: bool = False
+    check: Callable[[Mapping[str, Any]], float] | None = None
 
 
 def log_norm_of_power(matrix: Any, squarings: int = 20) -> Any:
@@ -81,15 +92,30 @@ class LogRadius:
         return log_norm_of_power(self.matrix(p), self.squarings)
 
 
+@dataclass(frozen=True)
+class BeyondRadius:
+    """How far the largest eigenvalue of a square matrix of named numbers exceeds a radius."""
+
+    radius: float
+    matrix: Callable[[Mapping[str, Any]], Any] = linear_part
+
+    def __call__(self, p: Mapping[str, Any]) -> float:
+        """0 or less where the bound holds."""
+        numbers = np.asarray(ca.DM(self.matrix({name: ca.DM(value) for name, value in p.items()})))
+        return float(np.max(np.abs(np.linalg.eigvals(numbers)), initial=0.0)) - self.radius
+
+
 def stable(
     radius: float = 1.0,
     matrix: Callable[[Mapping[str, Any]], Any] = linear_part,
     name: str = "spectral radius",
     slack: float = SLACK,
+    exact: bool = False,
 ) -> Constraint:
     """Spectral radius of `A` (or of another square expression of the parameters) at most `radius`.
 
-    What holds is `radius (1 + slack)`. Without slack no solver could meet a limit of 1 at a double integrator.
+    What holds is `radius (1 + slack)`, and with `exact` the radius itself, to the last digit of the eigenvalues.
+    Without slack no solver could meet a limit of 1 at a double integrator.
 
     Raises
     ------
@@ -100,9 +126,9 @@ def stable(
         raise InputError(
             f"The spectral radius was bounded by {radius} with slack {slack}; give a positive number, and 0 or more."
         )
-    return Constraint(
-        LogRadius(matrix), upper=float(np.log(radius) + np.log1p(slack)), name=f"{name} <= {radius:g}", unit=UNIT
-    )
+    limit = float(np.log(radius) + (-INSIDE if exact else np.log1p(slack)))
+    check = BeyondRadius(radius, matrix) if exact else None
+    return Constraint(LogRadius(matrix), upper=limit, name=f"{name} <= {radius:g}", unit=UNIT, exact=exact, check=check)
 
 
 def compile_constraints(
@@ -134,6 +160,11 @@ def compile_constraints(
             ) from None
         if not np.all(low <= high):
             raise InputError(f"The constraint {c.name!r} is infeasible: its lower bound exceeds its upper bound.")
+        if c.exact and np.any(low == high):
+            raise InputError(
+                f"The constraint {c.name!r} is an equation and asked for as exact, which rounding does not allow; "
+                "leave exact out, or give a lower and an upper limit."
+            )
         if c.unit is not None and not 0 < c.unit < np.inf:
             raise InputError(f"The unit of the constraint {c.name!r} is {c.unit!r}; give a positive number, or none.")
         units.append(np.full(size, np.nan if c.unit is None else float(c.unit)))
@@ -145,3 +176,30 @@ def compile_constraints(
     value = ca.Function("g", [vector], [g], ["p"], ["g"])
     slope = ca.Function("g_slope", [vector], [ca.densify(ca.jacobian(g, vector))], ["p"], ["jac"])
     return value, slope, np.concatenate(lower), np.concatenate(upper), tuple(labels), np.concatenate(units)
+
+
+def constraint_sizes(constraints: tuple[Constraint, ...], parameters: ParameterSet) -> tuple[int, ...]:
+    """Number of entries of each constraint."""
+    named = parameters.symbols(ca.MX.sym("p", parameters.size))
+    return tuple(int(ca.vec(c.expression(named)).shape[0]) for c in constraints)
+
+
+def check_free(
+    g: ca.Function, free: np.ndarray, p: np.ndarray, lower: np.ndarray, upper: np.ndarray, labels: tuple[str, ...]
+) -> None:
+    """Refuse a constraint that does not hold and that no free parameter enters.
+
+    Raises
+    ------
+    InputError
+        With its name, its value and its limits.
+    """
+    reach = np.asarray(ca.DM(g.jac_sparsity(0, 0), 1).full(), dtype=bool).reshape(len(labels), len(p))
+    value = np.asarray(g(p)).ravel()
+    for i in np.flatnonzero(~np.any(reach[:, free], axis=1)):
+        room = TOLERATED * max(abs(value[i]), 1.0)
+        if not lower[i] - room <= value[i] <= upper[i] + room:
+            raise InputError(
+                f"The constraint {labels[i]!r} is infeasible: all that enters it is fixed and gives {value[i]:g}, "
+                f"limits {lower[i]:g} and {upper[i]:g}; free a parameter or loosen it."
+            )

@@ -22,10 +22,11 @@ from .constraints import Constraint
 from .elements import PrandtlIshlinskii
 from .fitted import Fit, Progress, fingerprint
 from .job import Job, interrupted, penalised, rms_error
+from .known_blocks import in_known_coordinates, known_entries
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
-from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability
+from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability, within_radius
 from .outcome import with_solution
 from .penalty import check_penalty
 from .problem import Problem
@@ -78,7 +79,8 @@ def fit(
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
         solved and re-gridded.
     stable : bool or float
-        Bound on the spectral radius of a PI-LFR's linear part, 1 by default; False for none.
+        Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope. A number holds
+        exactly, by the eigenvalues of the result; True, the default, is 1 up to 1e-4; False is none.
     constraints
         See `Problem`.
     noise : float, optional
@@ -116,7 +118,7 @@ def fit(
         raise SystemExit(1)  # a spawned worker that runs the script again; the first process says what to do
     if l1 is not None and not isinstance(l1, dict):
         raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
-    further = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+    further = constraint_list(constraints)
     if progress is True:
         from .progress import progress_bar
 
@@ -148,7 +150,7 @@ def _fit(
     executor: Executor | None,
 ) -> Fit:
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
-    limits = stability(structure, 1.0 if stable is True else float(stable)) if structure and stable else ()
+    limits = stability_limits(structure, stable) if structure else ()
     job = replace(job, limits=(*limits, *job.limits))
     if not isinstance(model, PILFR):
         given = model.model if isinstance(model, Fit) else model
@@ -167,10 +169,10 @@ def _fit(
     )
     if solution.status is Status.INTERRUPTED:
         return job.result(linear, model.linear(), problem, solution)
-    fitted = with_solution(linear, problem, solution)
+    fitted = in_known_coordinates(model, with_solution(linear, problem, solution), job)
     if model.element is None:
-        alike = not (model.fixed or model.bounds or model.priors or job.limits[1:]) and job.solver is POLISH
-        if alike:  # nothing that the linear model has not seen
+        more = model.fixed or model.bounds or model.priors or job.limits[1:] or solution.status is Status.INFEASIBLE
+        if not more and job.solver is POLISH:  # nothing that the linear model has not seen
             return job.result(linear, model, problem, solution)
         return _linear(model, fitted, job)
     return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
@@ -203,7 +205,7 @@ def _from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit |
 
 def _linear(structure: PILFR, fitted: Model, job: Job) -> Fit:
     """A linear model with the structure's bounds and fixed blocks, from the one without."""
-    values = {k: p.value for k, p in fitted.parameters.items()}
+    values = within_radius({k: p.value for k, p in fitted.parameters.items()}, job.limits, structure)
     first = job.recordings[0]
     model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
     problem = job.problem(model)
@@ -229,9 +231,8 @@ def _from_starts(
     """A PI-LFR from many starts; `problem` and `solution` are those of the linear model."""
     blocks = {k: p.value for k, p in linear.parameters.items()}
     options: dict[str, Any] = {"engine": job.engine, "start": start, "noise": job.noise}
-    search = Search(
-        structure, job.recordings, blocks, job.solver, job.limits, level=rms_error(problem, solution), **options
-    )
+    options |= {"level": rms_error(problem, solution), "coordinates": not known_entries(structure)}
+    search = Search(structure, job.recordings, blocks, job.solver, job.limits, **options)
     seen: list[float] = []
 
     def report(candidate: Candidate) -> None:
@@ -279,6 +280,18 @@ def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any
             raise InputError(f"{name} = {value!r} was given; give a whole number, {least} or more.")
     if progress is not None and not isinstance(progress, bool) and not callable(progress):
         raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
+
+
+def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
+    """The limits that `stable` stands for: a number exactly, True up to a slack that lets an integrator be one."""
+    if bound is False:
+        return ()
+    return stability(structure) if bound is True else stability(structure, float(bound), exact=True)
+
+
+def constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
+    """One constraint, or several, as several."""
+    return (given,) if isinstance(given, Constraint) else tuple(given)
 
 
 def _leave_interrupts() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from .compiled import make_engine
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
+from .limits import Limit
 from .metrics import nrmse, rmse_per_output
 from .model import Model
 from .multistart import Candidate
@@ -48,6 +49,8 @@ class Fit:
         where the data (and the user's priors, but none of the search's own) say nothing.
     active : tuple of str
         Variables that are at a bound, with their values, and constraints that are at a limit.
+    limits : tuple of Limit
+        Every constraint, and every bound that is active, with its value and its multiplier; see `limits`.
     linear : Model or None
         The linear model that the search began with, `linear_nrmse` its NRMSE on each training recording.
     candidates : tuple of Candidate
@@ -70,6 +73,7 @@ class Fit:
     engine: str = "auto"
     note: str = ""
     linear_nrmse: tuple[float, ...] = ()
+    limits: tuple[Limit, ...] = ()
 
     @property
     def status(self) -> Status:
@@ -216,6 +220,13 @@ class Fit:
         if unknown:
             lines.append(f"the data alone says nothing about {', '.join(unknown)}")
         lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
+        constraints = [limit for limit in self.limits if limit.kind == "constraint"]
+        if constraints:
+            shown = [str(limit) for limit in constraints if limit.active or not limit.met]
+            idle = [limit.name for limit in constraints if limit.met and not limit.active]
+            names = ", ".join(dict.fromkeys(name.partition("[")[0] for name in idle))
+            shown += [f"{len(idle)} not active ({names})"] if idle else []
+            lines.append(f"constraints: {'; '.join(shown)}")
         return "\n".join(lines)
 
     __repr__ = __str__

@@ -141,8 +141,10 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     held = _snap_to_bounds(problem, theta, sensitivity)
     tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, held)
     slopes = problem.constraint_jacobian(theta)[problem.active_constraints(theta)]
-    # a gauge direction that an active constraint forbids is no freedom
-    tangents = tangents @ _null_space(slopes @ tangents)
+    # a gauge direction that an active constraint forbids is no freedom; a constraint on a spectral radius or a gain
+    # forbids none, but for rounding
+    forbidden, size = slopes @ tangents, np.abs(slopes) @ np.abs(tangents)
+    tangents = tangents @ _null_space(np.where(np.abs(forbidden) > 1e-4 * size, forbidden, 0.0))
     used = np.flatnonzero(~held & (sensitivity > 0))
     square, unit = np.ix_(used, used), sensitivity[used]
     removed = np.column_stack([tangents[used] * unit[:, None], slopes[:, used].T / unit[:, None]])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .constraints import Constraint
+from .exactness import exactly
 from .fitted import Fit, Progress
 from .gauss_newton import GaussNewton
 from .interrupts import deferred_interrupt
@@ -20,6 +21,7 @@ from .outcome import outcome, with_solution
 from .penalty import element_alone, merged, restored, sentence, unit_weights, without_idle
 from .problem import Problem
 from .recording import Recording
+from .restoration import restored_radius
 from .solution import Solution, Status
 
 Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
@@ -56,11 +58,15 @@ class Job:
         return problem, solution
 
     def solve(self, problem: Problem, stage: str, start: np.ndarray | None = None) -> Solution:
-        """The solver's solution; those of the package report their iterations."""
+        """The solver's solution; those of the package report their iterations.
+
+        Where it misses an exact bound on the spectral radius, the way back is taken (`restoration`).
+        """
         if not isinstance(self.solver, GaussNewton | Ipopt):
             solution: Solution = self.solver.solve(problem, start)
             return solution
-        return self.solver.solve(problem, start, iterations(self.progress, stage, self.solver.max_iterations))
+        solver, report = self.solver, iterations(self.progress, stage, self.solver.max_iterations)
+        return restored_radius(problem, solver.solve(problem, start, report), lambda p, s: solver.solve(p, s, report))
 
     def result(self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, **more: Any) -> Fit:
         """What a solution of a problem amounts to; Ctrl-C waits until it is known, and is told by the status."""
@@ -68,6 +74,7 @@ class Job:
         given = {"engine": self.engine, **more}
         try:
             with deferred_interrupt():
+                solution = exactly(problem, solution)
                 found.append(outcome(model, structure, problem, solution, self.began, self.recordings, **given))
             if self.progress:
                 self.progress("standard errors", 1, 1, np.nan)

@@ -48,7 +48,8 @@ class PILFR:
     element : Element or None
         The element in the loop, usually `PrandtlIshlinskii`; None for a linear model.
     fixed : mapping
-        Blocks held at a value, for example `{"D_yu": 0.0}`; a scalar fills the block.
+        Blocks held at a value, for example `{"D_yu": 0.0}`; a scalar fills the block, entries that are nan stay free:
+        `{"A": [[0.9, nan], [0.0, nan]]}` says what is known of the physics.
     bounds : mapping
         `(lower, upper)` by parameter name, for example `{"w": (0, 2)}`.
     priors : mapping
@@ -122,7 +123,9 @@ class PILFR:
             value = _shaped(name, fixed.get(name, values.get(name, p.value)), p.value.shape)
             low, high = (_shaped(name, bound, p.value.shape) for bound in self.bounds.get(name, p.bounds))
             if name in fixed:
-                changes[name] = {"value": value, "bounds": (low, high), "fixed": True}
+                free = np.isnan(value)
+                begin = np.clip(_shaped(name, values.get(name, p.value), p.value.shape), low, high)
+                changes[name] = {"value": np.where(free, begin, value), "bounds": (low, high), "fixed": ~free}
             else:
                 changes[name] = {"value": np.clip(value, low, high), "bounds": (low, high)}
             if name in self.priors:

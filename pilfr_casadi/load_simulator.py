@@ -11,7 +11,7 @@ import sys
 import traceback
 import types
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -53,15 +53,8 @@ def simulator_variable(path: str | os.PathLike[str]) -> Any:
     InputError
         As there.
     """
-    path = Path(path)
-    code = _compiled(path, _source(path))
-    module = types.ModuleType(f"_simulator_{''.join(c if c.isalnum() else '_' for c in path.stem)}")
-    module.__file__ = str(path)
-    with _own_imports(path.resolve().parent, module):
-        try:
-            exec(code, module.__dict__)
-        except (Exception, SystemExit) as error:
-            raise InputError(_sentence(path, error)) from error
+
+    def checked(path: Path, module: types.ModuleType) -> None:
         names = [n for n, v in vars(module).items() if isinstance(v, Simulator) and not n.startswith("_")]
         if VARIABLE not in vars(module):
             there = f"it calls a Simulator {names[0]!r}; rename it" if names else "end with simulator = Simulator(...)"
@@ -70,19 +63,51 @@ def simulator_variable(path: str | os.PathLike[str]) -> Any:
             as_simulator(vars(module)[VARIABLE])
         except InputError as error:
             raise InputError(f"In {path}, the variable {VARIABLE!r}: {error}") from error
-    return vars(module)[VARIABLE]
+
+    return user_variable(path, VARIABLE, "the simulator", checked)
 
 
-def _source(path: Path) -> bytes:
+def user_variable(
+    path: str | os.PathLike[str],
+    name: str,
+    what: str,
+    check: Callable[[Path, types.ModuleType], None] | None = None,
+) -> Any:
+    """What a user's Python file calls `name`; `what` it is, in sentences.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, does not run, does not set the variable, or `check` refuses it.
+    """
+    path = Path(path)
+    code = _compiled(path, _source(path, what), what)
+    module = types.ModuleType(f"_{name}_{''.join(c if c.isalnum() else '_' for c in path.stem)}")
+    module.__file__ = str(path)
+    with _own_imports(path.resolve().parent, module):
+        try:
+            exec(code, module.__dict__)
+        except (Exception, SystemExit) as error:
+            raise InputError(_sentence(path, error, what)) from error
+        if check is not None:
+            check(path, module)
+        if name not in vars(module):
+            raise InputError(f"{path} does not set the variable {name!r}; end with {name} = ...")
+    return vars(module)[name]
+
+
+def _source(path: Path, what: str) -> bytes:
     if path.is_dir():
-        raise InputError(f"{path} is a folder; give the simulator's Python file.")
+        raise InputError(f"{path} is a folder; give {what}'s Python file.")
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"The simulator file {path} cannot be read ({error.strerror}); check its name.") from None
+        raise InputError(
+            f"The {what.removeprefix('the ')} file {path} cannot be read ({error.strerror}); check its name."
+        ) from None
 
 
-def _compiled(path: Path, source: bytes) -> Any:
+def _compiled(path: Path, source: bytes, what: str) -> Any:
     try:
         return compile(source, str(path), "exec", dont_inherit=True)
     except SyntaxError as error:
@@ -90,7 +115,7 @@ def _compiled(path: Path, source: bytes) -> Any:
         shown = f" in `{error.text.strip()}`" if error.text and error.text.strip() else ""
         raise InputError(f"{place}: {_tidy(error.msg)}{shown}; correct it.") from None
     except (ValueError, RecursionError, MemoryError) as error:  # null bytes, too deep
-        raise InputError(f"{path} is not a Python file ({_tidy(str(error))}); give the simulator's.") from None
+        raise InputError(f"{path} is not a Python file ({_tidy(str(error))}); give {what}'s.") from None
 
 
 @contextmanager
@@ -120,14 +145,14 @@ def _installed(path: Path) -> bool:
     return "site-packages" in path.parts or path.resolve().is_relative_to(package)
 
 
-def _sentence(path: Path, error: BaseException) -> str:
+def _sentence(path: Path, error: BaseException, what: str) -> str:
     """What went wrong, with the deepest line of the user's file."""
     line = _line(path, error)
     place = f"{path}, line {line}" if line else str(path)
     if isinstance(error, InputError):
         return f"{place}: {_tidy(str(error))}"
     if isinstance(error, SystemExit):
-        return f"{place}: the file ends the program; let it only define the simulator."
+        return f"{place}: the file ends the program; let it only define {what}."
     if isinstance(error, SyntaxError):  # in a module that the file imports
         return f"{place}: {Path(error.filename or '').name}, line {error.lineno}: {_tidy(error.msg)}; correct it."
     said = _tidy(str(error)).rstrip(".")

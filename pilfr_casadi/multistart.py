@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 
 from .compiled import make_engine
-from .constraints import Constraint, stable
+from .constraints import BeyondRadius, Constraint, stable
 from .elements import PrandtlIshlinskii
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
@@ -60,6 +60,7 @@ class Search:
     l1: dict[str, float] = field(default_factory=dict)
     noise: float | None = None
     level: float = 1.0
+    coordinates: bool = True  # whether the states' coordinates are free to choose
 
     def problem(self, model: Model, engine: Engine | None = None, noise: float | None = None) -> Problem:
         """The simulation-error problem of a model of this structure.
@@ -94,15 +95,31 @@ class Candidate:
     note: str = ""
 
 
-def stability(structure: PILFR, radius: float = 1.0) -> tuple[Constraint, ...]:
+def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tuple[Constraint, ...]:
     """Bounds on the spectral radius of A, and of A + B_w diag(Σw) C_z: no operator slips, or all (stops: sticks)."""
     if structure.nx == 0:
         return ()
-    limits: tuple[Constraint, ...] = (stable(radius),)
+    limits: tuple[Constraint, ...] = (stable(radius, exact=exact),)
     element = structure.element
     if isinstance(element, PrandtlIshlinskii):
-        limits += (stable(radius, _with_element, "spectral radius with the element's full slope"),)
+        limits += (stable(radius, _with_element, "spectral radius with the element's full slope", exact=exact),)
     return limits
+
+
+def within_radius(values: Blocks, constraints: Iterable[Constraint], structure: PILFR) -> Blocks:
+    """Blocks with A and B_w scaled down, where they may be, to meet exact bounds on the spectral radius."""
+    checks = [c.check for c in constraints if isinstance(c.check, BeyondRadius)]
+    if not checks or {"A", "B_w"} & (set(structure.fixed) - _zero(structure)):
+        return values
+    full = {
+        k: p.value for k, p in structure.model(values["B_u"].shape[1], len(values["C_y"]), values).parameters.items()
+    }
+    share = min(0.999 * c.radius / max(c(full) + c.radius, 1e-300) for c in checks)
+    return {**values, **{k: share * values[k] for k in ("A", "B_w") if k in values}} if share < 0.999 else values
+
+
+def _zero(structure: PILFR) -> set[str]:
+    return {k for k, v in structure.fixed.items() if not np.any(v)}
 
 
 def _with_element(p: Any) -> Any:
@@ -118,13 +135,13 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     """
     rng = np.random.default_rng(sequence)
     inputs = [r.u for r in search.recordings]
-    scaled, states = unit_states(search.linear, inputs)
+    scaled, states = unit_states(search.linear, inputs, search.coordinates)
     if search.start == "paper":
         values, solver = paper_start(search.structure, scaled, rng), search.solver
     else:
         place = PLACES[seed] if seed < len(PLACES) else "random"
         values, solver = grid_start(search.structure, scaled, inputs, states, rng, place), EXPLORE
-    model = search.model(values)
+    model = search.model(within_radius(values, search.constraints, search.structure))
     problem = search.problem(model)
     candidate = _candidate(seed, model, problem, solver.solve(problem))
     done = candidate.solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error)
@@ -228,6 +245,11 @@ def run_tasks(
     return results, False
 
 
+def _merit(candidate: Candidate) -> tuple[bool, float]:
+    """What candidates are compared by: whether the constraints hold comes first."""
+    return candidate.solution.status is Status.INFEASIBLE, candidate.error
+
+
 def search_starts(
     search: Search,
     starts: int,
@@ -245,7 +267,7 @@ def search_starts(
     """
     sequences = np.random.SeedSequence(seed).spawn(starts)
     found, stopped = run_tasks(explore, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
-    usable = sorted((c for c in found if np.isfinite(c.error)), key=lambda c: c.error)
+    usable = sorted((c for c in found if np.isfinite(c.error)), key=_merit)
     if not usable and stopped:
         return found, None, True
     if not usable:
@@ -255,4 +277,4 @@ def search_starts(
     if search.start == "paper" or stopped:
         return found, usable[0], stopped
     polished, stopped = run_tasks(polish, [(search, c) for c in usable[:keep]], executor, report)
-    return found, min(polished or usable[:1], key=lambda c: c.error), stopped
+    return found, min(polished or usable[:1], key=_merit), stopped

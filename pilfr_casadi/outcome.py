@@ -8,6 +8,7 @@ from typing import Any
 from .fitted import Fit, fingerprint
 from .gauge import standard_errors
 from .lfr import PILFR
+from .limits import limits_of
 from .model import Model
 from .multistart import PRIOR, Candidate
 from .problem import Problem
@@ -72,4 +73,5 @@ def outcome(
         note=note,
         linear_nrmse=linear_nrmse,
         engine=engine,
+        limits=limits_of(problem, solution),
     )

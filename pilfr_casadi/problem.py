@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from .compiled import make_engine
-from .constraints import Constraint, compile_constraints
+from .constraints import Constraint, check_free, compile_constraints, constraint_sizes
 from .layout import lay_out
 from .magnitude import Neighbours
 from .model import Model
@@ -96,9 +96,12 @@ class Problem:
             raise InputError("Every parameter is fixed and no initial state is estimated; free at least one parameter.")
         self._columns = np.where(self.free, np.cumsum(self.free) - 1, -1)
         self.noise = noise
-        self._set_penalties(l1 or {}, noise)
+        self.l1 = dict(l1 or {})
+        self._set_penalties(self.l1, noise)
         compiled = compile_constraints(self.constraints, parameters)
         self._g, self._g_slope, self.g_lower, self.g_upper, self.g_labels, self._g_units = compiled
+        self.g_sizes = constraint_sizes(self.constraints, parameters)
+        check_free(self._g, self.free, self._base, self.g_lower, self.g_upper, self.g_labels)
 
     def _set_penalties(self, l1: dict[str, float], noise: float) -> None:
         parameters = self.model.parameters

@@ -32,9 +32,13 @@ def states_of(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:
     return out
 
 
-def unit_states(blocks: Mapping[str, np.ndarray], inputs: list[np.ndarray]) -> tuple[Blocks, list[np.ndarray]]:
-    """Scale each state to unit variance (Sec. 5.3); returns the blocks, and the states of each recording."""
+def unit_states(
+    blocks: Mapping[str, np.ndarray], inputs: list[np.ndarray], free: bool = True
+) -> tuple[Blocks, list[np.ndarray]]:
+    """Scale each state to unit variance (Sec. 5.3), if free; returns the blocks, and the states of each recording."""
     states = [states_of(blocks, u) for u in inputs]
+    if not free:
+        return dict(blocks), states
     spread = np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0))
     spread = np.where(spread > 0, spread, 1.0)
     scaled = dict(blocks)
@@ -84,7 +88,8 @@ def grid_start(
     element = _layer(structure)
     blocks = paper_start(structure, linear, rng)
     u, x = np.concatenate(inputs), np.concatenate(states)
-    fixed, spread = structure.fixed, np.std(u, axis=0)
+    fixed = {k: v for k, v in structure.fixed.items() if not np.any(np.isnan(v))}
+    spread = np.std(u, axis=0)
     blocks["D_zu"] = blocks["D_zu"] / np.where(spread > 0, spread, 1.0)
     at_output, at_input = (np.arange(element.channels) % n for n in (len(linear["C_y"]), u.shape[1]))
     if place == "output":
@@ -105,7 +110,7 @@ def grid_start(
     reach = np.max(np.abs(z), axis=0)
     blocks["r"] = 0.9 * reach[:, None] * np.arange(element.n) / element.n
     blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
-    if place != "random" and not set(blocks) & set(fixed):
+    if place != "random" and not set(blocks) & set(structure.fixed):
         blocks |= _halved(linear, size, at_output if place == "output" else at_input, place == "output")
     return blocks
 
@@ -137,7 +142,7 @@ def density(r: np.ndarray, w: np.ndarray, grid: np.ndarray, width: float) -> np.
 
 
 def regrid(
-    r: np.ndarray, w: np.ndarray, reach: float, *, beyond: float = 1.3, smooth: float = 1 / 12
+    r: np.ndarray, w: np.ndarray, reach: float, *, beyond: float = 1.3, smooth: float = 1 / 12, count: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds and weights of one channel placed anew along the smoothed density.
 
@@ -151,10 +156,12 @@ def regrid(
         How far the thresholds may reach, in units of `reach`; the tail is extrapolated log-linearly, never rising.
     smooth : float
         Kernel width in units of `reach`.
+    count : int, optional
+        How many there are to be, N by default.
 
     Returns
     -------
-    r, w : array, shape (N,)
+    r, w : array, shape (N,) or (count,)
         New thresholds (ascending) and the weights that the density gives them.
     """
     grid = np.linspace(0.0, beyond * reach, 600)
@@ -165,7 +172,7 @@ def regrid(
     out = grid > 0.85 * reach
     d[out] = np.exp(np.mean(log_d[tail]) + slope * (grid[out] - np.mean(grid[tail])))
     share = _integral(d**0.4, grid)
-    edges = np.interp(np.linspace(0, 1, len(r) + 1), share / share[-1], grid)
+    edges = np.interp(np.linspace(0, 1, (count or len(r)) + 1), share / share[-1], grid)
     mass = np.diff(np.interp(edges, grid, _integral(d, grid)))
     moment = np.diff(np.interp(edges, grid, _integral(d * grid, grid)))
     return moment / np.maximum(mass, 1e-300), mass

@@ -24,10 +24,26 @@ def test_example(path, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_snippets_of_the_readme(tmp_path):
+def copy_demo_data(folder):
     for path in (ROOT / "pilfr_casadi" / "demo_data").iterdir():
         if path.is_file():
-            shutil.copy(path, tmp_path)
+            shutil.copy(path, folder)
+
+
+def test_run_file_of_the_readme(tmp_path):
+    copy_demo_data(tmp_path)
+    (text,) = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    (tmp_path / "rig.toml").write_text(text)
+    code = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "run", "rig.toml"]
+    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    written = {path.name for path in (tmp_path / "rig-run").iterdir()}
+    assert {"manifest.json", "results.csv", "model.json", "report.html", "jobs"} <= written
+
+
+def test_snippets_of_the_readme(tmp_path):
+    copy_demo_data(tmp_path)
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
     assert snippets
     script = tmp_path / "readme.py"

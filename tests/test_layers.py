@@ -56,9 +56,21 @@ LAYERS = {
         "layout",
         "nlp",
         "constraints",
+        "known",
         "baselines",
     ),
-    5: ("gauss_newton", "quadratic_program", "ipopt", "callback", "damping", "scaling", "solution"),
+    5: (
+        "gauss_newton",
+        "quadratic_program",
+        "ipopt",
+        "callback",
+        "damping",
+        "scaling",
+        "solution",
+        "exactness",
+        "restoration",
+        "limits",
+    ),
     6: (
         "fit",
         "fitted",
@@ -66,6 +78,9 @@ LAYERS = {
         "outcome",
         "linear_model",
         "penalty",
+        "sparse",
+        "structures",
+        "known_blocks",
         "multistart",
         "export",
         "feedback",
@@ -74,7 +89,7 @@ LAYERS = {
         "load_simulator",
     ),
     7: ("diagnose", "report"),  # a diagnosis writes its own report
-    8: ("cli", "commands", "diagnose_command", "export_command", "option_values", "demo"),
+    8: ("cli", "commands", "runs", "diagnose_command", "export_command", "option_values", "demo"),
 }
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py" and p.parent.name != "demo_data")

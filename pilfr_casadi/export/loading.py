@@ -17,6 +17,7 @@ import numpy as np
 
 from ..elements import PrandtlIshlinskii
 from ..lfr import PILFR, block_shapes
+from ..limits import Limit
 from ..model import Model
 from ..operators import GeneralizedPlay, Play, Stop
 from ..recording import InputError
@@ -110,10 +111,23 @@ def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[
         "labels": tuple(variables),
         "train_nrmse": tuple(errors.ravel().tolist()),
         "linear_nrmse": tuple(linear.ravel().tolist()),
+        "limits": tuple(_limit(file, row) for row in (file.rows(training, "limits") if "limits" in training else [])),
         "active": tuple(str(name) for name in file.rows(training, "active")),
         "candidates": tuple(candidates),
         "seconds": file.number(training, "seconds"),
     }
+
+
+def _limit(file: ModelFile, row: Any) -> Limit:
+    """A constraint or an active bound, where the file has them; no limit is null or infinite."""
+    ends = {"lower": -np.inf, "upper": np.inf, "value": np.nan, "multiplier": np.nan}
+    return Limit(
+        name=file.text(row, "name"),
+        kind=file.text(row, "kind"),
+        active=file.entry(row, "active", bool, "true or false"),
+        met=file.entry(row, "met", bool, "true or false"),
+        **{key: file.number(row, key, missing) for key, missing in ends.items()},
+    )
 
 
 def _initial_states(file: ModelFile, size: int) -> dict[str, np.ndarray]:
@@ -158,7 +172,8 @@ def _structure(file: ModelFile, n_u: int, n_y: int) -> PILFR:
     for name, shape in block_shapes(nx, n_u, n_y, 0 if element is None else element.channels).items():
         file.array(file.table(parameters, name).get("value"), shape, f"parameter {name!r}")
     fixed = {
-        name: file.array(value, None, f"the fixed block {name!r}") for name, value in file.table(table, "fixed").items()
+        name: file.array(value, None, f"the fixed block {name!r}", np.nan)
+        for name, value in file.table(table, "fixed").items()
     }
     pairs: dict[str, dict[str, tuple[Any, Any]]] = {}
     for key, ends in (("bounds", (-np.inf, np.inf)), ("priors", (None, None))):
@@ -224,7 +239,7 @@ def _with_values(file: ModelFile, model: Model, structure: PILFR | None) -> Mode
     for name, p in model.parameters.items():
         if np.any((values[name] < p.bounds[0]) | (values[name] > p.bounds[1])):
             file.damaged(f"a value of parameter {name!r} lies outside its bounds")
-        if structure is not None and name in structure.fixed and np.any(values[name] != p.value):
+        if structure is not None and name in structure.fixed and np.any((values[name] != p.value)[p.fixed]):
             file.damaged(f"parameter {name!r} differs from the value that the structure fixes")
     return model.with_parameters(model.parameters.change(**{name: {"value": v} for name, v in values.items()}))
 

@@ -44,7 +44,12 @@ def save(fit: Fit, path: str | os.PathLike[str]) -> None:
     InputError
         If the file cannot be written.
     """
-    write_atomically(path, _text(_document(fit)) + "\n")
+    write_atomically(path, model_text(fit))
+
+
+def model_text(fit: Fit) -> str:
+    """The text of a model file."""
+    return _text(_document(fit)) + "\n"
 
 
 def _document(fit: Fit) -> dict[str, Any]:
@@ -77,6 +82,7 @@ def _document(fit: Fit) -> dict[str, Any]:
             "linear_nrmse": _plain(fit.linear_nrmse),
             "seconds": fit.seconds,
             "active": list(fit.active),
+            "limits": [_limit(limit) for limit in fit.limits],
             "solve": _solve(solution),
             "variables": dict(zip(fit.labels, _plain(solution.theta), strict=True)),
             "multipliers": _plain(solution.multipliers),
@@ -88,6 +94,12 @@ def _document(fit: Fit) -> dict[str, Any]:
             ],
         },
     }
+
+
+def _limit(limit: Any) -> dict[str, Any]:
+    """A constraint or an active bound."""
+    numbers = {key: _plain(getattr(limit, key), "inf") for key in ("value", "lower", "upper", "multiplier")}
+    return {"name": limit.name, "kind": limit.kind, **numbers, "active": limit.active, "met": limit.met}
 
 
 def _solve(solution: Any) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from ..fit import Fit
 from ..local_polynomial import plain_bla
 from ..metrics import rmse_per_output
 from ..recording import InputError, Recording, as_recordings
-from .fit_tables import mode_tables, parameter_blocks, usage
+from .fit_tables import limit_blocks, mode_tables, parameter_blocks, usage
 from .page import Block, Code, Page, Picture, Section, Table, Text
 
 RUNAWAY = 1e3  # NRMSE beyond which a simulation is not called a simulation
@@ -40,6 +40,7 @@ def fit_page(
         Section("How well it fits", [Text(_verdict(rows)), _error_table(rows), *_pictures(fit, shown)]),
         *([Section("The hysteresis it found", _hysteresis(fit, shown))] if fit.model.n_w else []),
         Section("The linear part", _linear(fit, used)),
+        Section("What holds it", limit_blocks(fit)),
         Section("How it was found", _search(fit)),
         Section("Parameters", parameter_blocks(fit)),
         Section("How to use it", [Code(usage(fit, model_file))]),

@@ -124,6 +124,30 @@ def _cell(value: float, error: float) -> str:
     return "\u00a0±\u00a0".join(texts)
 
 
+def limit_blocks(fit: Fit) -> list[Block]:
+    """Constraints and active bounds with their multipliers; nothing where there are none."""
+    if not fit.limits:
+        return []
+    rows = [
+        [
+            limit.name,
+            "active" if limit.active else "not active" if limit.met else "NOT MET",
+            limit.value,
+            limit.lower if np.isfinite(limit.lower) else "",
+            limit.upper if np.isfinite(limit.upper) else "",
+            limit.multiplier,
+            limit.kind,
+        ]
+        for limit in fit.limits
+    ]
+    note = (
+        "Multiplier: how fast the objective, half the mean squared error over the output's variance, would fall if the "
+        "limit were moved outwards. A spectral radius is bounded by its logarithm."
+    )
+    columns = ["limit", "state", "value", "lower", "upper", "multiplier", "kind"]
+    return [Table(columns, rows, note=note, emphasis=[i for i, v in enumerate(fit.limits) if not v.met], digits=4)]
+
+
 def usage(fit: Fit, model_file: str) -> str:
     """Code that loads the model and simulates with it."""
     load = (

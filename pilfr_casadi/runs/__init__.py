@@ -1,0 +1,7 @@
+"""Scripted identification runs: a file says what to do, a folder shows what was done, and nothing is done twice."""
+
+from .described import Run, read_run
+from .execute import RunResult, run
+from .jobs import RunJob, jobs_of
+
+__all__ = ["Run", "RunJob", "RunResult", "jobs_of", "read_run", "run"]

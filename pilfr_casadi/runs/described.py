@@ -1,0 +1,285 @@
+"""What a run file says, checked: data, model, solver, constraints, seeds and the folder of the results.
+
+A run file is TOML, or a Python file that sets `run` to such a table, in which the model may be a `PILFR` or a closed
+`Model`, the solver an object, and `own` a list of constraints under `constraints`. Paths are relative to the file.
+Where there are objects, the jobs depend on the contents of the Python file; what it imports is not looked at.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..constraints import Constraint
+from ..gauss_newton import GaussNewton
+from ..ipopt import Ipopt
+from ..known import dc_gain, ordered
+from ..lfr import PILFR
+from ..load_simulator import user_variable
+from ..model import Model
+from ..multistart import POLISH
+from ..recording import InputError
+from ..structures import OPERATORS, STRUCTURES, named_structure
+from .tables import Table, shown
+
+ROLES = ("train", "validation", "test")
+OPTIONS = {"period": int, "hold": str, "skip": int, "dt": float, "time_tolerance": float, "initial": str}
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run, checked.
+
+    Attributes
+    ----------
+    file, out : Path
+        The run file, and the folder of the results.
+    said : dict
+        What the file says under `model`, `solver`, `constraints` and `regularization`, as plain numbers and texts: what
+        a job depends on besides its data and its seed. `own` is True where Python objects are among them.
+    files : dict
+        Recordings by role (`train`, `validation`, `test`), as they are named in the file.
+    reading : dict
+        How they are read: `inputs`, `outputs`, `columns` and fields of `Recording`.
+    model : PILFR or Model
+    solver : GaussNewton or Ipopt, or one of the user's own
+    search : dict
+        `starts` and `start`.
+    stable : bool or float
+    constraints : tuple of Constraint
+    l1, prune, path, margin
+        Of the regularization: a weight, whether to fit again after pruning, strengths of a path (None: no path; empty:
+        the usual ones).
+    seeds : tuple of int
+    workers : int
+    engine : str
+    report : bool
+        Whether to write a page about the job that is chosen.
+    """
+
+    file: Path
+    out: Path
+    said: dict[str, Any]
+    own: bool
+    files: dict[str, tuple[str, ...]]
+    reading: dict[str, Any]
+    model: PILFR | Model
+    solver: Any = POLISH
+    search: dict[str, Any] = field(default_factory=dict)
+    stable: bool | float = True
+    constraints: tuple[Constraint, ...] = ()
+    l1: float | None = None
+    prune: bool = True
+    path: tuple[float, ...] | None = None
+    margin: float = 0.05
+    seeds: tuple[int, ...] = (0,)
+    workers: int = 1
+    engine: str = "auto"
+    report: bool = True
+
+    def located(self, name: str) -> Path:
+        """Where a file of the run lies."""
+        return self.file.parent / name
+
+
+def read_run(path: Any) -> Run:
+    """Read a run file, `.toml` or `.py`.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or says what cannot be done: one sentence with the file and the key.
+    """
+    file = Path(path)
+    if file.suffix.lower() == ".py":
+        content = user_variable(file, "run", "the run")
+    else:
+        try:
+            content = tomllib.loads(file.read_bytes().decode())
+        except OSError as error:
+            raise InputError(f"The run file {file} cannot be read ({error.strerror}); check its name.") from None
+        except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+            raise InputError(f"{file} is not a TOML file ({error}); correct it.") from None
+    return _checked(file, content)
+
+
+def _checked(file: Path, content: Any) -> Run:
+    top = Table(file, "", content)
+    said = {k: content.get(k) for k in ("model", "solver", "constraints", "regularization")}
+    plain, own = _plain(said)
+    data = top.table("data")
+    files = {role: data.names(role, required=role == "train") for role in ROLES}
+    reading = _reading(data)
+    data.done()
+    _check_files(top, files)
+    model = top.any("model", {})
+    model = model if isinstance(model, PILFR | Model) else _model(Table(file, "model", model))
+    solver, search = _solver(top.table("solver"))
+    stable, constraints = _constraints(top.table("constraints"), model)
+    regularization = _regularization(top.table("regularization"), files)
+    seeds = top.any("seeds", [0])
+    seeds = [seeds] if isinstance(seeds, int) else seeds
+    usable = isinstance(seeds, list | tuple | range) and all(type(s) is int and s >= 0 for s in seeds)
+    if not usable or not seeds or len(set(seeds)) < len(seeds):
+        top.fail(f"'seeds' is {shown(seeds)}; give different whole numbers of 0 or more")
+    out = top.take("out", str, f"{file.stem}-run")
+    more = {
+        "workers": top.number("workers", 1, 1, whole=True),
+        "engine": top.choice("engine", ("auto", "c", "vm"), "auto"),
+        "report": top.take("report", bool, True),
+    }
+    top.done()
+    return Run(
+        file,
+        file.parent / out,
+        plain,
+        own,
+        files,
+        reading,
+        model,
+        solver,
+        search,
+        stable,
+        constraints,
+        seeds=tuple(seeds),
+        **regularization,
+        **more,
+    )
+
+
+def _plain(value: Any) -> tuple[Any, bool]:
+    """A value as JSON knows it, objects by a mark; and whether there are any."""
+    if isinstance(value, Mapping):
+        parts = {str(k): _plain(v) for k, v in sorted(value.items(), key=lambda kv: str(kv[0]))}
+        return {k: v for k, (v, _) in parts.items()}, any(o for _, o in parts.values())
+    if isinstance(value, list | tuple | range):
+        items = [_plain(v) for v in value]
+        return [v for v, _ in items], any(o for _, o in items)
+    if isinstance(value, float):
+        return repr(value), False  # inf and nan too
+    if value is None or isinstance(value, bool | int | str):
+        return value, False
+    return f"object {type(value).__name__}", True
+
+
+def _reading(data: Table) -> dict[str, Any]:
+    reading: dict[str, Any] = {key: data.names(key, required=True) for key in ("inputs", "outputs")}
+    columns = data.table("columns")
+    reading["columns"] = {key: columns.take(key, str) for key in list(columns.content)}
+    for key, kind in OPTIONS.items():
+        value = data.take(key, kind)
+        if value is not None:
+            reading[key] = value
+    return reading
+
+
+def _check_files(top: Table, files: Mapping[str, tuple[str, ...]]) -> None:
+    seen: dict[Path, str] = {}
+    for role, names in files.items():
+        for name in names:
+            path = (top.file.parent / name).resolve()
+            if not path.is_file():
+                top.fail(
+                    f"the {role} recording {name} does not exist; check its name, which is relative to the run file"
+                )
+            if path in seen:
+                top.fail(f"{name} is given twice, as {seen[path]} and {role} recording; leave one out")
+            seen[path] = role
+
+
+def _model(table: Table) -> PILFR:
+    nx = table.number("nx", None, 0, whole=True)
+    if nx is None:
+        table.fail("'nx' in [model] is missing; give the number of states")
+    given: dict[str, Any] = {
+        "structure": table.choice("structure", STRUCTURES, "lfr"),
+        "operator": table.choice("operator", tuple(OPERATORS), "play"),
+        "operators": table.number("operators", 20, 0, whole=True),
+        "channels": table.number("channels", 1, 1, whole=True),
+        "neurons": table.number("neurons", None, 0, whole=True),
+        "offset": table.take("offset", bool, True),
+        "fixed": table.take("fix", dict, {}),
+        "bounds": table.take("bounds", dict, {}),
+        "priors": table.take("priors", dict, {}),
+    }
+    table.done()
+    if given["neurons"] is not None and given["operator"] != "generalized_play":
+        table.fail("'neurons' in [model] goes with operator = 'generalized_play'; leave it out")
+    try:
+        return named_structure(nx, **given)
+    except InputError as error:
+        table.fail(f"[model]: {str(error).rstrip('.')}")
+
+
+def _solver(table: Table) -> tuple[Any, dict[str, Any]]:
+    search = {
+        "starts": table.number("starts", 8, 1, whole=True),
+        "start": table.choice("start", ("grid", "paper"), "grid"),
+    }
+    name = table.any("name", "gauss-newton")
+    if not isinstance(name, str):
+        table.done()
+        return name, search
+    if name not in ("gauss-newton", "ipopt"):
+        table.fail(f"'name' in [solver] is {name!r}; give 'gauss-newton' or 'ipopt'")
+    options = {
+        "max_iterations": table.number("max_iterations", None, 1, whole=True),
+        "tolerance": table.number("tolerance", None, 0.0),
+    }
+    if table.has("time_limit"):
+        table.fail("'time_limit' in [solver] would make the result depend on the machine's load; give max_iterations")
+    table.done()
+    given = {k: v for k, v in options.items() if v is not None}
+    if name == "ipopt":
+        return Ipopt(**given), search
+    return (GaussNewton(**{"tolerance": POLISH.tolerance, **given}) if given else POLISH), search
+
+
+def _constraints(table: Table, model: PILFR | Model) -> tuple[bool | float, tuple[Constraint, ...]]:
+    stable = table.any("spectral_radius", True)
+    if not isinstance(stable, bool) and not (isinstance(stable, int | float) and 0 < stable < float("inf")):
+        table.fail(f"'spectral_radius' in [constraints] is {shown(stable)}; give a number above zero, true or false")
+    found: list[Constraint] = []
+    gain, gap = table.any("dc_gain"), table.any("ordered_thresholds", False)
+    try:
+        if gain is not None:
+            given = dict(gain) if isinstance(gain, Mapping) else {"value": gain}
+            found.append(dc_gain(given.pop("value"), **given))
+        if gap is not False:
+            found.append(ordered("r", 0.0 if gap is True else float(gap)))
+    except InputError as error:
+        table.fail(f"[constraints]: {str(error).rstrip('.')}")
+    except (TypeError, ValueError, KeyError):
+        table.fail(
+            f"[constraints] holds dc_gain = {shown(gain)} and ordered_thresholds = {shown(gap)}; give a number (or "
+            "value, within and slope) for the first, and true or a least gap for the second"
+        )
+    own = table.any("own", [])
+    if not isinstance(own, list | tuple) or not all(isinstance(c, Constraint) for c in own):
+        table.fail(f"'own' in [constraints] is {shown(own)}; give a list of Constraint, in a Python run file")
+    table.done()
+    if found and isinstance(model, Model):
+        table.fail("dc_gain and ordered_thresholds are for a PI-LFR, and the model is your own; use 'own'")
+    return stable if isinstance(stable, bool) else float(stable), (*found, *own)
+
+
+def _regularization(table: Table, files: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    path = table.any("path", False)
+    l1, prune = table.number("l1", None, 0.0), table.take("prune", bool, True)
+    margin = table.number("margin", 0.05, 0.0)
+    table.done()
+    if path is not False:
+        usable = path is True or (
+            isinstance(path, list | tuple) and all(isinstance(s, int | float) for s in path) and path
+        )
+        if not usable:
+            table.fail(f"'path' in [regularization] is {shown(path)}; give true, or a list of strengths")
+        if l1 is not None:
+            table.fail("'path' and 'l1' in [regularization] exclude each other; leave one out")
+        if not files["validation"]:
+            table.fail("'path' in [regularization] is chosen by validation; give [data] a validation recording")
+        path = () if path is True else tuple(float(s) for s in path)
+    return {"l1": l1, "prune": prune, "path": None if path is False else path, "margin": margin}

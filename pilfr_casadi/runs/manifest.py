@@ -1,0 +1,161 @@
+"""The manifest of a run: what was computed from what, with which versions, and the SHA-256 of every file.
+
+It carries its own digest, so that a manifest that something else has written to is not taken for one of a run's; the
+digests of the files tell in the same way of models and tables that were changed afterwards.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import platform
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ..export import write_atomically
+from ..recording import InputError
+
+FORMAT, VERSION, NAME = "pilfr_casadi run", 1, "manifest.json"
+
+
+def digest(content: Any) -> str:
+    """SHA-256 of bytes, or of a table in its one canonical form."""
+    data = content if isinstance(content, bytes) else json.dumps(content, sort_keys=True, allow_nan=False).encode()
+    return hashlib.sha256(data).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        return digest(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check its name and permissions.") from None
+
+
+def versions() -> dict[str, str]:
+    """What the numbers of a run depend on besides its inputs."""
+    import casadi
+    import numpy
+    import scipy
+
+    from .. import __version__
+
+    return {
+        "pilfr_casadi": __version__,
+        "casadi": casadi.__version__,
+        "numpy": numpy.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
+
+
+class Manifest:
+    """The manifest in a folder, written anew, atomically, after every step."""
+
+    def __init__(self, folder: Path, content: dict[str, Any]) -> None:
+        self.folder, self.content = folder, content
+
+    @classmethod
+    def found(cls, folder: Path) -> Manifest | None:
+        """The manifest of an earlier run, None where there is none.
+
+        Raises
+        ------
+        InputError
+            If it is damaged, of another version, or was changed after the run wrote it.
+        """
+        path = folder / NAME
+        if not path.exists():
+            return None
+        advice = "restore it, or give --overwrite to compute everything again"
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            assert isinstance(content, dict)
+        except (OSError, ValueError, AssertionError, RecursionError):
+            raise InputError(f"{path} is not a manifest of a run; {advice}.") from None
+        if content.get("format") != FORMAT or content.get("version") != VERSION:
+            raise InputError(f"{path} is not a manifest that this release writes; {advice}.")
+        said = content.pop("sha256", None)
+        if said != digest(content):
+            raise InputError(f"{path} was changed after the run wrote it; {advice}.")
+        tables = [content.get(k) for k in ("jobs", "scores", "files", "inputs")]
+        if not all(isinstance(t, dict) for t in tables):
+            raise InputError(f"{path} is not a manifest that this release writes; {advice}.")
+        return cls(folder, content)
+
+    @classmethod
+    def fresh(cls, folder: Path) -> Manifest:
+        """An empty one."""
+        tables: dict[str, Any] = {key: {} for key in ("jobs", "scores", "files", "inputs")}
+        return cls(folder, {"format": FORMAT, "version": VERSION, **tables})
+
+    def write(self) -> None:
+        """Write it, with its digest."""
+        text = json.dumps({**self.content, "sha256": digest(self.content)}, indent=1, allow_nan=False)
+        write_atomically(self.folder / NAME, text + "\n")
+
+    def holds(self, name: str) -> bool:
+        """Whether a file of the run is there, as the run wrote it; False where it is missing.
+
+        Raises
+        ------
+        InputError
+            If it was changed.
+        """
+        path = self.folder / name
+        if name not in self.content["files"] or not path.is_file():
+            return False
+        # a run that ended between a file and its manifest has said before what it was about to write
+        expected = self.content["files"][name], self.content.get("writing", {}).get(name)
+        if file_digest(path) not in expected:
+            raise InputError(
+                f"{path} was changed after the run wrote it; restore it, remove it, or give --overwrite to compute "
+                "everything again."
+            )
+        return True
+
+    def put(self, name: str, text: str) -> None:
+        """Write a file of the run and note its digest, in the manifest too."""
+        target = self.folder / name
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"The folder {target.parent} cannot be made ({error.strerror}); give another.") from None
+        found = digest(text.encode())
+        if self.content["files"].get(name) == found and self.holds(name):
+            return
+        self.content["writing"] = {name: found}
+        self.write()
+        write_atomically(target, text)
+        self.content["files"][name] = found
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """One run at a time in a folder; the lock goes with the process, however that ends.
+
+    Raises
+    ------
+    InputError
+        If another one is at work there.
+    """
+    try:
+        import fcntl
+    except ImportError:  # no such locks on this system
+        yield
+        return
+    with (folder / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(f"Another run is at work in {folder}; wait for it, or give another --out.") from None
+        yield

@@ -1,0 +1,283 @@
+r"""Fewer operators, stronger priors: a path of fits over the strength of a regularization, chosen by validation.
+
+Along the path the objective is that of Krikelis et al. (2024), Eq. 20, with
+
+    l1 Σ_j w_ij        (what is not needed gets exactly no weight, is taken out, and the rest is fitted again), or
+    s ((θ - m) / σ)²   (a prior of mean m and standard deviation σ, s times as strong).
+
+Every fit is judged by its free-run simulation of a validation recording, which none of them has seen; recommended is
+the strongest regularization whose validation error is within a margin of the smallest. No test recording comes in.
+Penalised estimates are biased towards zero, hence the second fit (relaxed lasso, Meinshausen 2007). It begins twice:
+with the operators that are left, and with as many spread over the density that the first fit has found; validation
+chooses here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .elements import PrandtlIshlinskii
+from .fit import constraint_list, stability_limits
+from .fit import fit as identify
+from .fitted import Fit, fingerprint
+from .job import Job
+from .multistart import POLISH, Candidate, Search, polish
+from .recording import InputError, Recording, as_recordings
+from .solution import Status
+from .start import regrid
+
+LAYER = ("w", "r")
+STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of L1, in units of the objective that is reached without
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RegularizationPath:
+    """Fits over the strength of a regularization.
+
+    Attributes
+    ----------
+    strengths : tuple of float
+        Weakest first; 0 is the fit without.
+    fits : tuple of Fit
+        One a strength.
+    operators : tuple of int
+        Operators that each of them has.
+    train, validation : tuple of float
+        Their NRMSE (Eq. 27) on both.
+    recommended : int
+        Index of the strongest regularization whose validation error is within `margin` of the smallest.
+    margin : float
+        That margin, as a share.
+    """
+
+    strengths: tuple[float, ...]
+    fits: tuple[Fit, ...]
+    operators: tuple[int, ...]
+    train: tuple[float, ...]
+    validation: tuple[float, ...]
+    recommended: int
+    margin: float
+
+    @property
+    def fit(self) -> Fit:
+        """The fit that is recommended."""
+        return self.fits[self.recommended]
+
+    def __repr__(self) -> str:
+        rows = [f"{'strength':>10}  {'operators':>9}  {'train':>9}  {'validation':>10}"]
+        columns = zip(self.strengths, self.operators, self.train, self.validation, strict=True)
+        for i, (s, n, a, b) in enumerate(columns):
+            mark = "  <- recommended" if i == self.recommended else ""
+            rows.append(f"{s:>10.3g}  {n:>9}  {a:>9.5f}  {b:>10.5f}{mark}")
+        return "\n".join([*rows, f"the strongest within {100 * self.margin:g} % of the smallest validation error"])
+
+
+def operators_used(fit: Fit) -> int:
+    """Operators of some weight, over all channels; 0 without an element of operators."""
+    return int(np.sum(fit.parameters["w"] > 0)) if "w" in fit.parameters else 0
+
+
+def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> Fit:
+    """Take the operators without weight out of a fit, and fit the rest again without a penalty.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of a PI-LFR with a Prandtl-Ishlinskii element, usually with an L1 penalty on `w`.
+    train : Recording or sequence of Recording
+        What it was fitted to.
+    options
+        As for `fit`: `solver`, `stable`, `constraints`, `engine`, ...
+
+    Returns
+    -------
+    Fit
+        With as many operators a channel as the fullest channel needs, at least one.
+
+    Raises
+    ------
+    InputError
+        If the model has no such element.
+    """
+    structure = fit.structure
+    if structure is None or not isinstance(structure.element, PrandtlIshlinskii):
+        raise InputError(
+            "Only a PI-LFR with a Prandtl-Ishlinskii element has operators to take out; give a fit of one."
+        )
+    element, weights = structure.element, fit.parameters["w"]
+    n = max(1, int(np.max(np.sum(weights > 0, axis=1))))
+    # the operators that stay, a row of indices a channel in their order; those without weight come last
+    kept = np.sort(np.argsort(weights <= 0, axis=1, kind="stable")[:, :n], axis=1)
+    full = weights.shape
+
+    def some(value: Any) -> Any:
+        array = np.asarray(value, dtype=float)
+        return np.take_along_axis(np.broadcast_to(array, full), kept, axis=1) if array.ndim else array
+
+    smaller = replace(
+        structure,
+        element=replace(element, n=n),
+        fixed={k: some(v) if k in LAYER else v for k, v in structure.fixed.items()},
+        bounds={k: (some(v[0]), some(v[1])) if k in LAYER else v for k, v in structure.bounds.items()},
+        priors={k: (some(v[0]), some(v[1])) if k in LAYER else v for k, v in structure.priors.items()},
+    )
+    old = fit.model
+    values = {k: some(v) if k in LAYER else v for k, v in fit.parameters.items()}
+    model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
+    memory = (np.arange(element.channels)[:, None] * element.n + kept).ravel()
+    initial = {key: np.concatenate([s[: old.n_x], s[old.n_x :][memory]]) for key, s in fit.initial.items()}
+    again = identify(replace(fit, model=model, structure=smaller, initial=initial), train, **options)
+    return again if again.status is Status.INTERRUPTED else polished(again, train, **options)
+
+
+def thinned(fit: Fit, train: Recording | Sequence[Recording], n: int, **options: Any) -> Fit:
+    """A fit with n operators a channel, spread over the density of weights that it had, and fitted again.
+
+    Where a density is continuous, which operators a penalty leaves is chance; how many it leaves is not.
+    """
+    structure, recordings = fit.structure, as_recordings(train)
+    bound = structure is None or set(LAYER) & {*structure.fixed, *structure.bounds, *structure.priors}
+    if structure is None or bound or not isinstance(structure.element, PrandtlIshlinskii):
+        return fit
+    z = np.concatenate([fit.signals(r)["z"] for r in recordings])
+    rows = [
+        regrid(r, w, float(reach), count=n)
+        for r, w, reach in zip(fit.parameters["r"], fit.parameters["w"], np.max(np.abs(z), axis=0), strict=True)
+    ]
+    smaller, old = replace(structure, element=replace(structure.element, n=n)), fit.model
+    values = {**fit.parameters, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
+    model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
+    rest = np.zeros(n * structure.element.channels)
+    initial = {key: np.concatenate([s[: old.n_x], rest]) for key, s in fit.initial.items()}
+    again = identify(replace(fit, model=model, structure=smaller, initial=initial), train, **options)
+    return again if again.status is Status.INTERRUPTED else polished(again, train, **options)
+
+
+def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
+    error = fit.nrmse(recordings)
+    return error if np.isfinite(error) else np.inf
+
+
+def polished(
+    fit: Fit,
+    train: Recording | Sequence[Recording],
+    *,
+    solver: Any = None,
+    stable: bool | float = True,
+    constraints: Any = (),
+    noise: float | None = None,
+    engine: str = "auto",
+) -> Fit:
+    """A fit with its thresholds placed anew, as the search does with its best starts, where that is no worse.
+
+    The weights are then held near a smooth density by a weak prior (`multistart.polish`).
+    """
+    structure, recordings, solver = fit.structure, as_recordings(train), solver or POLISH
+    assert structure is not None
+    limits = (*stability_limits(structure, stable), *constraint_list(constraints))
+    search = Search(
+        structure, recordings, {}, solver, limits, engine, noise=noise, level=float(np.mean(fit.train_nrmse))
+    )
+    problem = search.problem(fit.model)
+    states = [fit.initial_state(r) for r in recordings if isinstance(r.initial, str) and r.initial == "estimate"]
+    theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
+    error = float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
+    best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))
+    if best.model is fit.model and best.error >= error:
+        return fit
+    job = Job(recordings, solver, limits, {}, noise, engine, None)
+    problem = job.problem(best.model, best.error)
+    solution = job.solve(problem, "solve", best.theta)
+    found = job.result(best.model, structure, problem, solution, note=best.note)
+    return replace(found, seconds=found.seconds + fit.seconds, linear=fit.linear, linear_nrmse=fit.linear_nrmse)
+
+
+def regularization_path(
+    fit: Fit,
+    train: Recording | Sequence[Recording],
+    validation: Recording | Sequence[Recording],
+    *,
+    strengths: Sequence[float] | None = None,
+    priors: Mapping[str, tuple[Any, Any]] | None = None,
+    margin: float = 0.05,
+    progress: Callable[[str, int, int, float], None] | None = None,
+    **options: Any,
+) -> RegularizationPath:
+    """Fit with a regularization of growing strength, and choose by validation.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fit without regularization, of a PI-LFR; every fit of the path begins there.
+    train : Recording or sequence of Recording
+        What it was fitted to.
+    validation : Recording or sequence of Recording
+        What is judged on: no training recording, and none that is to be a test afterwards.
+    strengths : sequence of float
+        L1 weights on `w` (default: 1 to 1000 times the objective of the fit), or with `priors` factors on their
+        weight (default: 0.01 to 100).
+    priors : mapping
+        `(mean, std)` by parameter name, in place of the L1 penalty on `w`.
+    margin : float
+        Share of the smallest validation error that a stronger regularization may cost.
+    progress : callable
+        Gets ("path", done, total, smallest validation error so far).
+    options
+        As for `fit`: `solver`, `stable`, `constraints`, `engine`, ...
+
+    Returns
+    -------
+    RegularizationPath
+
+    Raises
+    ------
+    InputError
+        If the fit is not one of a PI-LFR, a strength or the margin is unfit, or validation is training.
+    """
+    structure, seen, judged = fit.structure, as_recordings(train), as_recordings(validation)
+    if structure is None or (priors is None and not isinstance(structure.element, PrandtlIshlinskii)):
+        raise InputError("A regularization path needs a fit of a PI-LFR with an element; give one.")
+    if {fingerprint(r) for r in seen} & {fingerprint(r) for r in judged}:
+        raise InputError("A validation recording is a training recording too; give one that was not fitted.")
+    scale = fit.solution.cost if priors is None else 1.0
+    given = [scale * s for s in STRENGTHS] if priors is None else [0.01, 0.1, 1.0, 10.0, 100.0]
+    given = sorted(set(given if strengths is None else strengths))
+    if not given or not all(0 < s < np.inf for s in given) or not 0 <= margin < np.inf:
+        raise InputError(f"strengths {given} with a margin of {margin} were given; give positive numbers, 0 or more.")
+    fits, errors = [fit], [fit.nrmse(judged)]
+    for i, strength in enumerate(given):
+        if priors is None:
+            penalised = identify(fit, seen, l1={"w": strength}, **options)
+            pruned = prune(penalised, seen, **options)
+            spread = thinned(fit, seen, max(1, pruned.structure.element.n), **options)  # type: ignore[union-attr]
+            found = min((pruned, spread), key=lambda f: _error(f, judged))
+            penalised_stopped = Status.INTERRUPTED in (penalised.status, pruned.status)
+        else:
+            scaled = {k: (m, np.asarray(s, dtype=float) / np.sqrt(strength)) for k, (m, s) in priors.items()}
+            held = replace(structure, priors={**structure.priors, **scaled})
+            model = fit.model.with_parameters(
+                fit.model.parameters.change(**{k: {"prior": held.priors[k]} for k in scaled})
+            )
+            found = identify(replace(fit, structure=held, model=model), seen, **options)
+            penalised_stopped = False
+        if penalised_stopped or found.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        fits.append(found)
+        errors.append(found.nrmse(judged))
+        if progress:
+            progress("path", i + 1, len(given), float(np.nanmin(errors)))
+    usable = np.where(np.isfinite(errors), errors, np.inf)
+    recommended = int(np.max(np.flatnonzero(usable <= (1 + margin) * np.min(usable))))
+    return RegularizationPath(
+        strengths=(0.0, *map(float, given)),
+        fits=tuple(fits),
+        operators=tuple(operators_used(f) for f in fits),
+        train=tuple(f.nrmse(seen) for f in fits),
+        validation=tuple(map(float, errors)),
+        recommended=recommended,
+        margin=float(margin),
+    )

@@ -1,0 +1,281 @@
+"""Constrained and regularized fits: exact to the last digit, multipliers told, sparse where the truth is."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.constraints import BeyondRadius, Constraint, stable
+from pilfr_casadi.exactness import beyond, exactly
+from pilfr_casadi.known import Gain, dc_gain, ordered
+from pilfr_casadi.known_blocks import changed_basis, nearest_basis
+from pilfr_casadi.limits import limits_of
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.recording import InputError
+from pilfr_casadi.solution import Status
+from problems.constrained import infeasible_sentences, radius, slowest_pole, sparse_plays, stability_table, three_plays
+
+PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return three_plays(0, 1200)
+
+
+@pytest.fixture(scope="module")
+def full(record):
+    return pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), record, starts=2)
+
+
+@pytest.mark.parametrize("bound", [0.9, 0.8, 0.79, 0.6, 0.3])
+def test_a_bound_on_the_radius_holds_to_the_last_digit(record, bound):
+    fit = pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=1, stable=bound)
+    assert radius(fit) <= bound
+    assert fit.status is not Status.INFEASIBLE
+
+
+def test_the_bound_holds_after_saving_and_loading(record, tmp_path):
+    fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, stable=0.78)
+    fit.save(tmp_path / "m.json")
+    loaded = pilfr.load(tmp_path / "m.json")
+    assert radius(loaded) <= 0.78 and loaded.limits == fit.limits
+    assert any(limit.active and limit.multiplier > 0 for limit in fit.limits if limit.kind == "constraint")
+
+
+@pytest.mark.parametrize("bound", [0.79, 0.5])
+def test_a_linear_model_is_bounded_exactly_too(record, bound):
+    fit = pilfr.fit(pilfr.PILFR(2), record, stable=bound)
+    assert max(abs(np.linalg.eigvals(fit.parameters["A"]))) <= bound and fit.status is not Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("solver", [pilfr.GaussNewton(), pilfr.Ipopt()])
+def test_every_solver_ends_inside(record, solver):
+    fit = pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=1, stable=0.75, solver=solver)
+    assert radius(fit) <= 0.75
+
+
+def test_a_result_outside_is_moved_inside_by_a_small_step(record, full):
+    limit = stable(float(full.parameters["A"].item()) * (1 - 1e-5), exact=True)
+    held = full.model.with_parameters(full.model.parameters.change(r={"fixed": True}))
+    problem = Problem(held, record, constraints=(limit, dc_gain(float(_gain(full)))))
+    before = pilfr.GaussNewton(max_iterations=0).solve(problem)
+    assert beyond(problem, before.theta) == [limit.name]
+    after = exactly(problem, before)
+    assert not beyond(problem, after.theta) and after.cost <= before.cost * (1 + 1e-3)
+    assert abs(float(problem.constraint(after.theta)[1]) - _gain(full)) < 1e-6  # the other one is kept
+    values = problem.model.parameters.unpack(problem.parameters(after.theta))
+    assert np.array_equal(values["r"], full.parameters["r"])  # and so is what is fixed
+
+
+def test_what_no_small_step_can_mend_is_infeasible(record, full):
+    held = full.model.with_parameters(full.model.parameters.change(A={"bounds": (0.75, 1.0)}))
+    problem = Problem(held, record, constraints=(stable(0.5, exact=True),))
+    solution = pilfr.GaussNewton(max_iterations=30).solve(problem)
+    assert exactly(problem, solution).status is Status.INFEASIBLE
+
+
+def _gain(fit):
+    return float(Gain()({k: ca.DM(v) for k, v in fit.parameters.items()}))
+
+
+@pytest.mark.parametrize("operator, slope", [(pilfr.Play, 1.0), (pilfr.Play, 0.0), (pilfr.Stop, 0.0)])
+def test_the_gain_is_the_one_of_a_simulation(operator, slope):
+    """A ramp to a constant: plays slip all the way (slope 1); below the thresholds they stick (slope 0)."""
+    rng = np.random.default_rng(3)
+    structure = pilfr.PILFR(2, pilfr.PrandtlIshlinskii(operator, 2))
+    blocks = {
+        k: rng.normal(size=s) * 0.3 for k, s in (("B_u", (2, 1)), ("B_w", (2, 1)), ("C_y", (1, 2)), ("C_z", (1, 2)))
+    }
+    blocks |= {"A": [[0.5, 0.1], [0.0, 0.3]], "D_zu": [[0.7]], "D_yu": [[0.2]], "D_yw": [[-0.4]]}
+    small = (slope == 0.0) == (operator is pilfr.Play)
+    model = structure.model(1, 1, {**blocks, "w": [[0.3, 0.4]], "r": [[1e-3, 2e-3]] if not small else [[1e3, 2e3]]})
+    u = np.linspace(0, 50, 4000).reshape(-1, 1)
+    p = {k: v.value for k, v in model.parameters.items()}
+    two = []
+    for top in (50.0, 60.0):
+        state = np.zeros(4)
+        for value in [*np.linspace(0, top, 200), *np.full(200, top)]:
+            state, y = (np.asarray(v).ravel() for v in model.closed(state, value, model.parameters.start))
+        two.append(y[0])
+    assert len(u) and (two[1] - two[0]) / 10.0 == pytest.approx(float(Gain(slope)({k: ca.DM(v) for k, v in p.items()})))
+
+
+def test_a_known_gain_and_its_multiplier(record):
+    free = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1)
+    wanted = 1.02 * _gain(free)
+    fine = {"solver": pilfr.GaussNewton(tolerance=1e-9, max_iterations=500)}
+    begin = pilfr.fit(free, record, constraints=dc_gain(wanted), **fine)
+    fits = [pilfr.fit(begin, record, constraints=dc_gain(g), **fine) for g in (wanted, 1.001 * wanted)]
+    assert _gain(fits[0]) == pytest.approx(wanted, rel=1e-8)
+    limit = next(v for v in fits[0].limits if v.name.startswith("DC gain"))
+    assert limit.active and limit.met and "DC gain" in str(fits[0]) and "multiplier" in str(fits[0])
+    # the multiplier is the slope of the objective over the limit
+    slope = (fits[1].solution.cost - fits[0].solution.cost) / (0.001 * wanted)
+    assert limit.multiplier == pytest.approx(slope, rel=0.1)
+
+
+def test_a_gain_within_limits_is_exact(record):
+    fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, constraints=dc_gain(1.1, within=0.01))
+    assert 1.09 <= _gain(fit) <= 1.11
+
+
+def test_ordered_thresholds_are_ordered_exactly(record):
+    for gap in (0.0, 0.2):
+        fit = pilfr.fit(
+            pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 5)), record, starts=2, constraints=ordered(gap=gap)
+        )
+        assert np.all(np.diff(fit.parameters["r"][0]) >= gap - 1e-15)
+        assert fit.status is not Status.INFEASIBLE
+
+
+def test_limits_that_are_missed_say_so(record, full):
+    problem = Problem(full.model, record, constraints=(Constraint(lambda p: p["A"], upper=0.1, name="pole"),))
+    limit = limits_of(problem, pilfr.GaussNewton(max_iterations=0).solve(problem))[0]
+    assert not limit.met and "NOT MET, off by" in str(limit)
+
+
+def test_the_report_has_the_limits(record, tmp_path):
+    fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, constraints=dc_gain(1.1))
+    page = pilfr.fit_report(fit, record, (), tmp_path).read_text()
+    assert "What holds it" in page and "DC gain = 1.1" in page and "multiplier" in page
+
+
+def test_known_entries_of_blocks_stay_and_the_rest_is_found():
+    rng = np.random.default_rng(0)
+    u = pilfr.multisine(1500, f_max=10.0, fs=100.0, rng=rng)
+    amplifier, q, stage, y = 0.0, 0.0, 0.0, np.zeros_like(u)
+    for k, value in enumerate(u):
+        y[k] = stage
+        q = pilfr.play(amplifier, q, 0.2)
+        amplifier, stage = 0.7 * amplifier + 0.3 * value, 0.9 * stage + 0.05 * amplifier + 0.15 * q
+    record = pilfr.Recording(u, y, dt=0.01, initial="zero")
+    fixed = {"A": [[0.7, 0.0], [np.nan, np.nan]], "B_u": [[0.3], [0.0]], "C_y": [[0.0, 1.0]]}
+    fit = pilfr.fit(pilfr.PILFR(2, PLAYS, fixed=fixed, offset=False), record, starts=3)
+    p = fit.parameters
+    assert (
+        p["A"][0].tolist() == [0.7, 0.0] and p["B_u"].tolist() == [[0.3], [0.0]] and p["C_y"].tolist() == [[0.0, 1.0]]
+    )
+    assert fit.train_nrmse[0] < 0.01
+    assert not np.any(np.isnan(p["A"]))
+
+
+def test_a_linear_model_with_known_entries(tmp_path):
+    a, b, c = np.array([[0.7, 0.2], [0.0, 0.9]]), np.array([[0.0], [0.3]]), np.array([[1.0, 0.0]])
+    x, u, y = np.zeros((2, 1)), np.random.default_rng(0).standard_normal(600), []
+    for value in u:
+        y.append(float((c @ x).item()))
+        x = a @ x + b * value
+    record = pilfr.Recording(u, np.array(y), dt=0.1, initial="zero")
+    fixed = {"A": [[0.7, np.nan], [0.0, np.nan]], "B_u": [[0.0], [0.3]], "C_y": [[1.0, 0.0]], "D_yu": 0.0}
+    fit = pilfr.fit(pilfr.PILFR(2, fixed=fixed, offset=False), record)
+    assert np.allclose(fit.parameters["A"], a, atol=1e-6)
+    fit.save(tmp_path / "m.json")
+    loaded = pilfr.load(tmp_path / "m.json")
+    assert np.array_equal(loaded.simulate(record), fit.simulate(record))
+    assert np.array_equal(loaded.model.parameters["A"].fixed, [[True, False], [True, False]])
+
+
+def test_the_basis_of_known_entries_is_found():
+    rng = np.random.default_rng(1)
+    blocks = {"A": np.diag([0.9, 0.5, -0.2]), "B_u": rng.normal(size=(3, 1)), "C_y": rng.normal(size=(1, 3))}
+    known = changed_basis(blocks, rng.normal(size=(3, 3)))
+    wanted = {"A": np.where(rng.random((3, 3)) < 0.5, known["A"], np.nan), "B_u": known["B_u"], "C_y": known["C_y"]}
+    found = nearest_basis(blocks, wanted)
+    for name, value in wanted.items():
+        np.testing.assert_allclose(found[name][~np.isnan(value)], value[~np.isnan(value)], atol=1e-6)
+    assert np.allclose(np.sort(np.linalg.eigvals(found["A"]).real), [-0.2, 0.5, 0.9])
+
+
+def test_pruning_keeps_what_the_model_does(record, full):
+    penalised = pilfr.fit(full, record, l1={"w": 1e-4})
+    small = pilfr.prune(penalised, record)
+    n = small.structure.element.n
+    assert n == max(1, int(np.sum(penalised.parameters["w"] > 0))) <= 4
+    assert small.parameters["w"].shape == (1, n) and np.all(small.parameters["w"] >= 0)
+    assert small.nrmse(record) < 1.05 * full.nrmse(record)
+    with pytest.raises(InputError, match="operators to take out"):
+        pilfr.prune(pilfr.fit(pilfr.PILFR(1), record), record)
+
+
+def test_pruning_takes_an_estimated_initial_state_along(record):
+    there = record.slice(200, 1200).with_(initial="estimate")
+    full = pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), there, starts=1)
+    small = pilfr.prune(pilfr.fit(full, there, l1={"w": 1e-4}), there)
+    assert len(small.initial_state(there)) == 1 + small.structure.element.n
+    assert small.nrmse(there) < 1.1 * full.nrmse(there)
+
+
+def test_a_path_is_chosen_by_validation_alone(record, full):
+    held = three_plays(7, 1200)
+    path = pilfr.regularization_path(full, record, held)
+    best = min(path.validation)
+    assert path.validation[path.recommended] <= 1.05 * best
+    assert all(v > 1.05 * best for v in path.validation[path.recommended + 1 :])
+    assert path.strengths[0] == 0 and path.fits[0] is full and list(path.strengths) == sorted(path.strengths)
+    assert path.fit is path.fits[path.recommended] and "<- recommended" in repr(path)
+    assert path.operators[path.recommended] <= 3
+
+
+def test_a_path_over_priors(record, full):
+    priors = {"A": (0.75, 0.01)}
+    path = pilfr.regularization_path(full, record, three_plays(7, 1200), priors=priors, strengths=(1e-3, 1e7))
+    poles = [f.parameters["A"].item() for f in path.fits]
+    assert abs(poles[2] - 0.75) < 0.1 * abs(poles[1] - 0.75)
+    assert path.recommended < 2  # the truth is 0.8
+
+
+@pytest.mark.parametrize(
+    "options, says",
+    [({"strengths": (0.0,)}, "positive"), ({"strengths": ()}, "positive"), ({"margin": -1.0}, "margin")],
+)
+def test_what_cannot_be_a_path(record, full, options, says):
+    with pytest.raises(InputError, match=says):
+        pilfr.regularization_path(full, record, three_plays(7, 1200), **options)
+
+
+def test_validation_is_no_training(record, full):
+    with pytest.raises(InputError, match="training recording too"):
+        pilfr.regularization_path(full, record, [record])
+
+
+@pytest.mark.parametrize(
+    "make, says",
+    [
+        (lambda: dc_gain(np.inf), "finite"),
+        (lambda: dc_gain(1.0, within=-1.0), "of 0 or more"),
+        (lambda: dc_gain(1.0, slope=2.0), "from 0 to 1"),
+        (lambda: ordered(gap=-1.0), "gap"),
+    ],
+)
+def test_what_cannot_be_known(make, says):
+    with pytest.raises(InputError, match=says):
+        make()
+
+
+def test_an_exact_equation_is_refused(record, full):
+    with pytest.raises(InputError, match="rounding does not allow"):
+        Problem(full.model, record, constraints=(Constraint(lambda p: p["A"], 0.8, 0.8, exact=True),))
+
+
+def test_the_check_of_a_radius_is_on_eigenvalues():
+    check = BeyondRadius(0.5)
+    assert check({"A": np.diag([0.5, -0.2])}) <= 0 < check({"A": np.diag([np.nextafter(0.5, 1), 0.0])})
+
+
+def test_infeasible_constraints_get_one_sentence():
+    for sentence in infeasible_sentences():
+        assert "infeasible" in sentence or ("cannot be met" in sentence and "off by" in sentence)
+        assert "\n" not in sentence
+
+
+def test_the_table_on_a_small_rig():
+    _, rows = stability_table(100, 5, 1, radii=(0.995, 0.99))
+    assert 0.98 < slowest_pole() < 1
+    for row in rows:
+        assert row.radius <= row.bound and row.cost <= 0.05
+
+
+def test_a_sparse_fit_halves_the_operators():
+    case = sparse_plays(0, starts=2)
+    assert case.operators[1] <= case.operators[0] / 2 and case.share <= 0.1

@@ -1,0 +1,315 @@
+"""Run files: the same numbers again, nothing done twice, interrupted runs go on, changes are noticed."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from test_cli import write_csv
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.cli import main
+from pilfr_casadi.recording import InputError
+from pilfr_casadi.runs.described import read_run
+from pilfr_casadi.runs.jobs import input_digests, jobs_of
+from pilfr_casadi.solution import Status
+
+TEXT = """
+seeds = [0, 1, 2]
+report = false
+
+[data]
+inputs = "u"
+outputs = "y"
+initial = "zero"
+train = "train.csv"
+validation = ["held.csv"]
+test = "test.csv"
+
+[model]
+structure = "hammerstein"
+nx = 1
+operators = 3
+
+[solver]
+starts = 3
+"""
+PYTHON = """
+import pilfr_casadi as pilfr
+run = dict(
+    report=False,
+    data=dict(inputs="u", outputs="y", initial="zero", train="train.csv"),
+    model=pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 2)),
+    solver=dict(name=pilfr.GaussNewton(tolerance=1e-4), starts=1),
+    constraints=dict(own=[pilfr.Constraint(lambda p: p["A"], upper=0.79, name="pole", exact=True)]),
+)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for seed, name in enumerate(("train", "held", "test")):
+        write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
+    (tmp_path / "rig.toml").write_text(TEXT)
+    return tmp_path
+
+
+def changed(folder, old, new):
+    """The run file with one passage replaced."""
+    assert old in TEXT
+    (folder / "rig.toml").write_text(TEXT.replace(old, new))
+    return folder / "rig.toml"
+
+
+def contents(out):
+    """What is the same in every execution of a run."""
+    names = [*out.glob("jobs/*/model.json"), out / "model.json", out / "results.csv"]
+    return {str(p.relative_to(out)): p.read_bytes() for p in names}
+
+
+def command(folder, *more):
+    """The command in a process of its own."""
+    code = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(pilfr.__file__).parent.parent)}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "run", "rig.toml", *more], cwd=folder, env=environment, **pipes
+    )
+
+
+def refused(capsys, *arguments, says):
+    """Status 2, one sentence on stderr."""
+    assert main(["run", *map(str, arguments)]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err
+    for word in (says,) if isinstance(says, str) else says:
+        assert word in err, err
+
+
+def test_a_run_gives_the_same_bytes_twice_and_skips_what_is_done(folder):
+    first = pilfr.run(changed(folder, "report = false", "report = true"))
+    assert first.done == ("seed-0", "seed-1", "seed-2") and first.skipped == ()
+    before = contents(first.folder)
+    report = (first.folder / "report.html").stat().st_mtime_ns
+    again = pilfr.run(folder / "rig.toml")
+    assert again.done == () and again.skipped == first.done and contents(again.folder) == before
+    assert (first.folder / "report.html").stat().st_mtime_ns == report
+    other = pilfr.run(changed(folder, "report = false", "report = false"), out=folder / "other")
+    assert contents(other.folder) == before and not (other.folder / "report.html").exists()
+
+
+def test_what_is_written(folder):
+    result = pilfr.run(changed(folder, "report = false", "report = true"))
+    manifest = json.loads((result.folder / "manifest.json").read_text())
+    assert set(manifest["inputs"]) == {"train.csv", "held.csv", "test.csv"}
+    assert {"pilfr_casadi", "casadi", "numpy", "scipy", "python"} <= set(manifest["versions"])
+    assert [manifest["jobs"][f"seed-{k}"]["seed"] for k in range(3)] == [0, 1, 2]
+    assert set(manifest["files"]) >= {"model.json", "results.csv", "report.html", "jobs/seed-2/model.json"}
+    rows = (result.folder / "results.csv").read_text().splitlines()
+    assert len(rows) == 1 + 3 * 3 and sum(row.split(",")[2] == "1" for row in rows[1:]) == 3
+    loaded = pilfr.load(result.folder / "model.json")
+    test = pilfr.read(folder / "test.csv", "u", "y", initial="zero")
+    by_test = {s.job: s.nrmse for s in result.scores if s.role == "test"}
+    assert loaded.nrmse(test) == by_test[result.chosen]
+    held = {s.job: s.nrmse for s in result.scores if s.role == "validation"}
+    assert held[result.chosen] == min(held.values())
+    assert "<html" in (result.folder / "report.html").read_text().lower()
+
+
+def test_the_numbers_do_not_depend_on_the_executor_or_on_other_seeds(folder):
+    from concurrent.futures import ThreadPoolExecutor
+
+    alone = pilfr.run(changed(folder, "[0, 1, 2]", "1"), out=folder / "alone")
+    with ThreadPoolExecutor(2) as pool:
+        both = pilfr.run(changed(folder, "[0, 1, 2]", "[0, 1]"), out=folder / "both", executor=pool)
+    name = "jobs/seed-1/model.json"
+    assert (alone.folder / name).read_bytes() == (both.folder / name).read_bytes()
+
+
+@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGINT])
+def test_an_interrupted_run_goes_on_and_ends_the_same(folder, kind):
+    out = folder / "rig-run"
+    process = command(folder)
+    deadline = time.monotonic() + 60
+    while not (out / "jobs" / "seed-0" / "model.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.002)
+    process.send_signal(kind)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == (130 if kind == signal.SIGINT else -signal.SIGKILL), err
+    if kind == signal.SIGINT:
+        assert "Interrupted" in err and "goes on" in err and err.count("\n") == 1
+    assert not (out / "results.csv").exists()
+    result = pilfr.run(folder / "rig.toml")
+    assert result.done and len(result.done) + len(result.skipped) == 3
+    whole = pilfr.run(folder / "rig.toml", out=folder / "whole")
+    assert contents(out) == contents(whole.folder)
+
+
+def test_ending_between_a_file_and_its_manifest_is_no_tampering(folder, monkeypatch):
+    from pilfr_casadi.runs import execute as module
+
+    changed(folder, "[0, 1, 2]", "[0]")
+    out, real, calls = folder / "rig-run", module.Manifest.write, []
+    whole = contents(pilfr.run(folder / "rig.toml", out=folder / "whole").folder)
+
+    def dies(manifest):
+        calls.append(1)
+        if len(calls) == 1 + len(cuts):
+            cuts.append(1)
+            raise OSError("power cut")
+        real(manifest)
+
+    cuts, ended = [], False
+    monkeypatch.setattr(module.Manifest, "write", dies)
+    while not ended:  # each time a little further
+        calls.clear()
+        try:
+            pilfr.run(folder / "rig.toml")
+            ended = True
+        except OSError as error:
+            assert str(error) == "power cut"
+    assert len(cuts) > 3 and contents(out) == whole
+
+
+def test_a_changed_file_runs_again_just_what_depends_on_it(folder):
+    first = pilfr.run(folder / "rig.toml")
+    models = {p: p.stat().st_mtime_ns for p in first.folder.glob("jobs/*/model.json")}
+    write_csv(folder / "test.csv", seed=9, m=400)
+    second = pilfr.run(folder / "rig.toml")
+    assert second.done == () and {p: p.stat().st_mtime_ns for p in models} == models
+    old, new = ({(s.job, s.role): s.nrmse for s in r.scores} for r in (first, second))
+    assert all((old[k] == new[k]) == (k[1] != "test") for k in old)
+    write_csv(folder / "train.csv", seed=8, m=400)
+    assert len(pilfr.run(folder / "rig.toml").done) == 3
+    changed(folder, "seeds = [0, 1, 2]", "seeds = [0, 1, 2, 7]")
+    assert pilfr.run(folder / "rig.toml").done == ("seed-7",)
+    changed(folder, "starts = 3", "starts = 2")
+    assert len(pilfr.run(folder / "rig.toml").done) == 3
+
+
+def test_the_same_content_under_another_key_order_is_the_same_job(folder):
+    run = read_run(folder / "rig.toml")
+    text = TEXT.replace('structure = "hammerstein"\nnx = 1\n', 'nx = 1\nstructure = "hammerstein"\n')
+    (folder / "rig.toml").write_text(text)
+    other = read_run(folder / "rig.toml")
+    keys = [[j.key for j in jobs_of(r, input_digests(r))] for r in (run, other)]
+    assert keys[0] == keys[1] and len(set(keys[0])) == 3
+
+
+@pytest.mark.parametrize(
+    "name", ["model.json", "jobs/seed-0/model.json", "results.csv", "manifest.json", "report.html"]
+)
+def test_tampering_is_noticed(capsys, folder, name):
+    page = "true" if name == "report.html" else "false"
+    out = pilfr.run(changed(folder, "seeds = [0, 1, 2]\nreport = false", f"report = {page}")).folder
+    text = (out / name).read_text()
+    assert "0" in text
+    (out / name).write_text(text.replace("0", "1", 1))
+    before = (out / name).read_bytes()
+    refused(capsys, folder / "rig.toml", says=(name, "restore", "--overwrite"))
+    assert (out / name).read_bytes() == before  # nothing is overwritten without being asked
+    assert main(["run", str(folder / "rig.toml"), "--overwrite"]) == 0
+
+
+def test_a_missing_model_is_made_again(folder):
+    first = pilfr.run(folder / "rig.toml")
+    before = contents(first.folder)
+    shutil.rmtree(first.folder / "jobs" / "seed-1")
+    again = pilfr.run(folder / "rig.toml")
+    assert again.done == ("seed-1",) and contents(again.folder) == before
+
+
+@pytest.mark.parametrize(
+    "old, new, says",
+    [
+        ("nx = 1", "nX = 1", "'nx' in [model] is missing"),
+        ("starts = 3", "stars = 3", ("unknown key 'stars'", "starts")),
+        ("nx = 1", "nx = 'one'", ("'nx' in [model] is 'one'", "whole number")),
+        ("operators = 3", "operators = -3", "-3"),
+        ("operators = 3", "operators = true", "True"),
+        ('"train.csv"', '"nowhere.csv"', ("nowhere.csv does not exist",)),
+        ('test = "test.csv"', 'test = "train.csv"', "given twice"),
+        ("seeds = [0, 1, 2]", "seeds = [0, 0]", "different whole numbers"),
+        ("seeds = [0, 1, 2]", "seeds = [0, 0.5]", "different whole numbers"),
+        ("seeds = [0, 1, 2]", "seeds = [0", "is not a TOML file"),
+        ("seeds = [0, 1, 2]", "sedes = 3", "unknown key 'sedes'"),
+        ('"hammerstein"', '"hamerstein"', "'hammerstein'"),
+        ('outputs = "y"', 'outputs = "z"', "z"),
+        ('outputs = "y"', "outputs = 3", "a name, or a list of names"),
+        ('initial = "zero"', 'initial = "nil"', "nil"),
+        ("[solver]", "[solver]\ntime_limit = 3", "max_iterations"),
+        ("[solver]", '[solver]\nname = "newton"', "'gauss-newton' or 'ipopt'"),
+        ("[solver]", "[constraints]\nspectral_radius = -1\n[solver]", "'spectral_radius'"),
+        ("[solver]", "[constraints]\ndc_gain = 'two'\n[solver]", "dc_gain"),
+        ("[solver]", "[constraints]\nown = [1]\n[solver]", "'own'"),
+        ("[solver]", "[regularization]\nl1 = -1\n[solver]", "'l1'"),
+        ("[solver]", "[regularization]\npath = 3\n[solver]", "'path'"),
+        ('validation = ["held.csv"]', "regularisation = 3", "unknown key 'regularisation'"),
+        ("operators = 3", "operators = 3\nbounds = { w = [2, 1] }", "infeasible"),
+        ("operators = 3", "operators = 3\nfix = { E = 1.0 }", "'E'"),
+    ],
+)
+def test_bad_input_gets_one_sentence(capsys, folder, old, new, says):
+    refused(capsys, changed(folder, old, new), says=says)
+    assert not (folder / "rig-run" / "results.csv").exists()
+
+
+def test_constraints_that_cannot_be_met_get_one_sentence(capsys, folder):
+    text = "fix = { A = 0.95, B_u = 0.0, D_yu = 0.0, C_z = 0.0, D_zu = 1.0 }"
+    more = f"operators = 3\n{text}\n[constraints]\nspectral_radius = 0.9"
+    refused(capsys, changed(folder, "operators = 3", more), says=("spectral radius <= 0.9", "infeasible"))
+    gain = "[constraints]\nspectral_radius = 0.5\ndc_gain = { value = 1e9, within = 1.0 }\n[solver]"
+    text = TEXT.replace(
+        "operators = 3", "operators = 3\nbounds = { w = [0, 1], B_w = [0, 1], C_y = [0, 1], D_yw = [0, 1] }"
+    )
+    (folder / "rig.toml").write_text(text.replace("[solver]", gain))
+    refused(capsys, folder / "rig.toml", says=("no job meets its constraints", "DC gain", "off by"))
+
+
+def test_other_bad_places(capsys, folder, tmp_path):
+    refused(capsys, folder / "none.toml", says="cannot be read")
+    refused(capsys, folder / "rig.toml", "--out", folder / "train.csv", says="train.csv")
+    (folder / "mine").mkdir()
+    (folder / "mine" / "model.json").write_text("{}")
+    refused(capsys, folder / "rig.toml", "--out", folder / "mine", says=("model.json", "no manifest"))
+    refused(capsys, folder / "rig.toml", "--workers", "0", says="--workers 0")
+
+
+def test_two_runs_do_not_share_a_folder(capsys, folder):
+    from pilfr_casadi.runs.manifest import alone
+
+    (folder / "rig-run").mkdir()
+    with alone(folder / "rig-run"):
+        refused(capsys, folder / "rig.toml", says="Another run is at work")
+
+
+def test_a_python_file_does_the_same_with_objects(folder):
+    (folder / "mine.py").write_text(PYTHON)
+    first = pilfr.run(folder / "mine.py")
+    assert first.fit.parameters["A"].item() <= 0.79 and first.fit.status is not Status.INFEASIBLE
+    assert pilfr.run(folder / "mine.py").skipped == ("seed-0",)
+    (folder / "mine.py").write_text(PYTHON.replace("0.79", "0.78"))
+    again = pilfr.run(folder / "mine.py")
+    assert again.done == ("seed-0",) and again.fit.parameters["A"].item() <= 0.78
+    (folder / "mine.py").write_text("ran = {}")
+    with pytest.raises(InputError, match="does not set the variable 'run'"):
+        pilfr.run(folder / "mine.py")
+    (folder / "mine.py").write_text("run = 1 / 0")
+    with pytest.raises(InputError, match=r"mine.py, line 1: ZeroDivisionError"):
+        pilfr.run(folder / "mine.py")
+
+
+def test_regularization_in_a_run(folder):
+    text = TEXT.replace("[0, 1, 2]", "0").replace("operators = 3", "operators = 6")
+    (folder / "rig.toml").write_text(text + "\n[regularization]\npath = [1e-4, 1e-3]\n")
+    sparse = pilfr.run(folder / "rig.toml")
+    assert 1 <= sparse.manifest["jobs"]["seed-0"]["operators"] <= 3
+    write_csv(folder / "test.csv", seed=5, m=400)
+    assert pilfr.run(folder / "rig.toml").done == ()  # a path never looks at the test
+    write_csv(folder / "held.csv", seed=6, m=400)
+    assert pilfr.run(folder / "rig.toml").done == ("seed-0",)  # but at the validation
