@@ -8,7 +8,7 @@ With `F(x, u) = (f, h)`, `C = ∂h/∂x` at the prediction and `A = ∂f/∂x` a
 The Jacobian of min and max is that of the active branch, so the filter switches with the operators: a play that sticks
 keeps the variance of its memory, one that slips takes over that of the signal that drives it. Memory has process noise,
 without which a filter that has become sure of it would not correct it any more. Anderson & Moore (1979), Optimal
-Filtering, Sec. 8.2. An unscented filter predicts as well, within a percent, at four times the work (`python -m
+Filtering, Sec. 8.2. An unscented filter predicts as well, within three percent, at four times the work (`python -m
 problems.observer`).
 """
 
