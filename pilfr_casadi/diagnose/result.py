@@ -15,6 +15,8 @@ from .gates import Gate
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
+FAR = 3.0  # times the training error that a test error is worth a warning
+
 
 @dataclass(frozen=True, eq=False)
 class Effect:
@@ -120,6 +122,24 @@ class Diagnosis:
 
         diagnosis_report(self, folder)
 
+    def warnings(self) -> list[str]:
+        """What makes the answer less certain than it looks: parameters at bounds, a test error far above training's."""
+        out, own = [], self.corrected.parameters
+        for name in self.parameters:
+            value, (low, high) = np.asarray(own[name].value), own[name].bounds
+            if not own[name].fixed and np.any((value <= low) | (value >= high)):
+                out.append(
+                    f"{name} came out at its bound ({np.ravel(value)[0]:.4g}); "
+                    "widen it, or take it as a sign that more is missing."
+                )
+        test, train = self.errors["test"], self.errors["train"]
+        if test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"]):
+            out.append(
+                "The test error is far above the training error: what was found does not hold there, or the test "
+                "recording visits what the training recordings do not."
+            )
+        return out
+
     def __str__(self) -> str:
         lines = ["Interrupted: this is what was found until then."] if self.interrupted else []
         lines.append(self.sentence)
@@ -138,7 +158,7 @@ class Diagnosis:
                 shown = " -> ".join("diverges" if not np.isfinite(v) else f"{v:.4f}" for v in errors.values())
                 lines.append(f"NRMSE {kind} (nominal -> refitted without -> with): {shown}")
         lines.append(f"noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})")
-        lines += [f"note: {g.sentence}" for g in self.gates]
+        lines += [f"note: {text}" for text in (*(g.sentence for g in self.gates), *self.warnings())]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
         stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in self.times.items())
