@@ -45,8 +45,18 @@ FLEXIBLE: dict[str, float] = {
     "drift": 1.25,
 }
 # a law -> what it has as special cases: it always does as well, and is no rival of theirs
-CONTAINS = {"hysteresis": ("backlash", "coulomb_friction"), "stribeck_friction": ("coulomb_friction",)}
-IMITATES = {("hysteresis", "coulomb_friction"): 1.4, ("hysteresis", "stribeck_friction"): 1.4}
+CONTAINS = {
+    "hysteresis": ("backlash", "coulomb_friction"),
+    "stribeck_friction": ("coulomb_friction",),
+    "clearance": ("piecewise_stiffness",),  # one side of which is never touched
+}
+# a law and one that it can imitate by its freedom alone -> how much nearer it has to come above the floor
+IMITATES = {
+    ("hysteresis", "coulomb_friction"): 1.4,
+    ("hysteresis", "stribeck_friction"): 1.4,
+    ("hysteresis", "backlash"): 1.4,
+    ("clearance", "piecewise_stiffness"): 1.4,
+}
 FORMS = {
     "mode": 1.15,
     "off-centre": 1.05,
