@@ -87,7 +87,7 @@ ERRORS = {
     "port asks for something else": (("lambda x: x.pos", "lambda v: v"), ("'v'", "'ground'")),
     "twice the same state": (('("pos", "vel")', '("pos", "pos")'), ("unique",)),
     "no dict": (("return dict(position=x.pos)", "return x.pos"), ("dict",)),
-    "branch on a symbol": (("p.k * x.pos", "(p.k * x.pos if x.pos > 0 else 0)"), ("line 6", "truth value")),
+    "branch on a symbol": (("p.k * x.pos", "(p.k * x.pos if x.pos > 0 else 0)"), ("line 6", "casadi.if_else")),
     "math on a symbol": (("p.k * x.pos", "__import__('math').sin(x.pos)"), ("'vel'", "ca.sin")),
     "own symbol": (("p.k * x.pos", "__import__('casadi').SX.sym('extra')"), ("extra",)),
     "value outside bounds": (("1100.0", "100.0"), ("line 15", "bounds")),
