@@ -28,6 +28,25 @@ def usable(values: np.ndarray) -> np.ndarray:
     return np.abs(values) <= LARGEST  # False for nan
 
 
+def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infinite: bool = False) -> np.ndarray:
+    """Return finite numbers as an array; of a shape, to which it is broadcast, where one is given.
+
+    Raises
+    ------
+    InputError
+        If something else is given, or one of them is not finite (nan, where `infinite`).
+    """
+    try:
+        found = np.asarray(values, dtype=float)
+        found = found if shape is None else np.broadcast_to(found, shape)
+    except (TypeError, ValueError):
+        fit = "" if shape is None else f" that fit the shape {shape}"
+        raise InputError(f"{what} cannot be {str(values)[:60]!r}; give numbers{fit}.") from None
+    if np.any(np.isnan(found)) or not (infinite or np.all(np.isfinite(found))):
+        raise InputError(f"{what} holds a value that is not finite (nan or infinite); give finite numbers.")
+    return found
+
+
 def signal(
     values: Any, names: Sequence[str], letter: str, role: str, label: str, none: bool = False
 ) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -1,5 +1,7 @@
 """Observer, limits of observability, inversion and predictive control."""
 
+import re
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pilfr_casadi as pilfr
+from pilfr_casadi import InputError, PredictiveController
 from pilfr_casadi.demo import demo_recordings
 from pilfr_casadi.feedback.kalman import ekf_step
 from pilfr_casadi.operators import play
@@ -289,5 +292,37 @@ def test_what_the_controller_cannot_use_is_refused(small):
         pilfr.PredictiveController(function, 5, inputs=(0, 1), solver="qp")
     with pytest.raises(pilfr.InputError, match="low below high"):
         pilfr.PredictiveController(function, 5, inputs=(1, 0))
-    with pytest.raises(pilfr.InputError, match="A reference of 4"):
+    with pytest.raises(pilfr.InputError, match="a reference of 4"):
         pilfr.PredictiveController(function, 5, inputs=(0, 1))(np.zeros(5), np.zeros(4), [0.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"function": 3}, "casadi.Function"),
+        ({"horizon": 2.5}, "horizon"),
+        ({"inputs": 3}, "(low, high)"),
+        ({"inputs": ("a", "b")}, "numbers"),
+        ({"inputs": (np.nan, 1.0)}, "not finite"),
+        ({"outputs": (np.zeros(3), np.ones(3))}, "shape"),
+        ({"y_scale": 0}, "above zero"),
+        ({"y_scale": np.nan}, "not finite"),
+        ({"move": -1}, "above zero"),
+    ],
+)
+def test_unfit_controllers_are_refused(change, says):
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    given = {"function": ca.Function("f", [x, u], [0.9 * x + u, x]), "horizon": 5, "inputs": (-1.0, 1.0), **change}
+    with pytest.raises(InputError, match=re.escape(says)):
+        PredictiveController(given.pop("function"), given.pop("horizon"), **given)
+
+
+@pytest.mark.parametrize(("place", "value"), [(0, [np.nan]), (0, [0.0, 0.0]), (1, [np.nan] * 5), (2, np.nan)])
+def test_no_plan_is_made_from_numbers_that_are_none(place, value):
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    controller = PredictiveController(ca.Function("f", [x, u], [0.9 * x + u, x]), 5, inputs=(-1.0, 1.0))
+    given = [[0.0], [0.1] * 5, 0.0]
+    assert controller(*given).converged
+    given[place] = value
+    with pytest.raises(InputError, match=r"finite|numbers"):
+        controller(*given)

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from ..checks import numbers
 from ..recording import InputError, Recording
 from .kalman import function_of
 
@@ -59,9 +60,12 @@ class Feedforward:
 
     def inputs(self, wanted: Array, x0: Array | None = None) -> Array:
         """Inputs (M, 1) for a whole wanted path (M,), from the state x0 (at rest by default), without feedback."""
-        path = np.asarray(wanted, dtype=float).ravel()
+        path = numbers(wanted, "The wanted path")
+        if path.size < 1 or path.size != max(path.shape, default=0):
+            raise InputError(f"A path of the shape {path.shape} was given; give one output over at least one sample.")
+        path = path.ravel()
         shifted = np.concatenate([path[self.ahead :], np.full(min(self.ahead, len(path)), path[-1])])
-        start = np.zeros(self.step.size1_in(0)) if x0 is None else np.asarray(x0, dtype=float).ravel()
+        start = np.zeros(self.step.size1_in(0)) if x0 is None else numbers(x0, "The state").ravel()
         x, before, wanted_then = ca.MX.sym("x", len(start)), ca.MX.sym("before"), ca.MX.sym("wanted")
         following, u = self.step(x, before, wanted_then)
         both = ca.Function("both", [ca.vertcat(x, before), wanted_then], [ca.vertcat(following, u), u])

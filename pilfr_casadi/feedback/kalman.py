@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
+from ..checks import numbers
 from ..recording import InputError, Recording
 
 if TYPE_CHECKING:
@@ -69,8 +70,10 @@ class KalmanFilter:
             If u, y or x0 do not fit the model.
         """
         n = len(self.x0)
-        u, y = (np.asarray(v, dtype=float).reshape(len(v), -1) for v in (u, y))
-        x = self.x0 if x0 is None else np.asarray(x0, dtype=float).ravel()
+        if not len(u) or not len(y):
+            raise InputError("There are no samples to filter; give at least one.")
+        u, y = (numbers(v, name).reshape(len(v), -1) for v, name in ((u, "u"), (y, "y")))
+        x = self.x0 if x0 is None else numbers(x0, "The state").ravel()
         n_u, n_y = int(self.step.size1_in(2)), int(self.step.size1_in(3))
         if len(u) != len(y) or u.shape[1] != n_u or y.shape[1] != n_y or len(x) != n:
             raise InputError(

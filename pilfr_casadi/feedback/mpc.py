@@ -18,6 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..checks import numbers
 from ..quadratic_program import unconstrained
 from ..recording import InputError
 
@@ -88,19 +89,30 @@ class PredictiveController:
         solver: str = "sqp",
         iterations: int = 5,
     ) -> None:
+        if not isinstance(function, ca.Function):  # of an observer, of an export
+            function = getattr(function, "function", getattr(function, "step", function))
+        if not isinstance(function, ca.Function):
+            raise InputError(
+                f"A {type(function).__name__} cannot be planned with; give a casadi.Function (x, u) -> (x_next, y), "
+                "such as fit.to_casadi() or observer.function."
+            )
         n_u, n_y = function.size1_in(1), function.size1_out(1)
+        if not isinstance(horizon, int | np.integer) or isinstance(horizon, bool):
+            raise InputError(f"A horizon of {horizon!r} was given; give a number of samples.")
         if horizon < 1 or solver not in ("sqp", "ipopt"):
             raise InputError(f"A horizon of {horizon} and the solver {solver!r} were given; give 1 or more, and 'sqp'.")
         self.function, self.horizon, self.solver, self.iterations = function, int(horizon), solver, iterations
-        self.low, self.high = (np.broadcast_to(np.asarray(v, float), (horizon, n_u)).ravel() for v in inputs)
+        self.low, self.high = _pair(inputs, "The limits of the inputs", (horizon, n_u))
         limits = (-ENORMOUS, ENORMOUS) if outputs is None else outputs
-        self.low_y, self.high_y = (np.broadcast_to(np.asarray(v, float), (horizon, n_y)).ravel() for v in limits)
+        self.low_y, self.high_y = _pair(limits, "The limits of the outputs", (horizon, n_y))
         if np.any(self.low >= self.high) or np.any(self.low_y >= self.high_y):
             raise InputError("A lower limit is not below its upper one; give (low, high) with low below high.")
         self.limited = outputs is not None
-        self.y_scale = np.broadcast_to(np.asarray(y_scale, float), (horizon, n_y)).ravel()
-        self.u_scale = np.broadcast_to(np.asarray(u_scale, float), (horizon, n_u)).ravel()
-        self.rate = np.broadcast_to(np.asarray(np.inf if rate is None else rate, float), (horizon, n_u)).ravel()
+        self.y_scale = numbers(y_scale, "y_scale", (horizon, n_y)).ravel()
+        self.u_scale = numbers(u_scale, "u_scale", (horizon, n_u)).ravel()
+        self.rate = numbers(np.inf if rate is None else rate, "rate", (horizon, n_u), infinite=True).ravel()
+        if np.any(self.y_scale <= 0) or np.any(self.u_scale <= 0) or np.any(self.rate <= 0) or not move >= 0:
+            raise InputError("y_scale, u_scale, rate and move are sizes; give numbers above zero (move may be zero).")
         self._differences = np.eye(horizon * n_u) - np.eye(horizon * n_u, k=-n_u)
         self._weighted = np.sqrt(move) * self._differences / self.u_scale[:, None]
         self._plan: Array | None = None
@@ -113,16 +125,18 @@ class PredictiveController:
         """
         begin = perf_counter()
         n_u, n_y = self.function.size1_in(1), self.function.size1_out(1)
-        wanted = np.asarray(reference, dtype=float).reshape(-1)
-        before = np.asarray(u_previous, dtype=float).reshape(-1)
-        if len(wanted) != self.horizon * n_y or len(before) != n_u:
+        wanted = numbers(reference, "The reference").reshape(-1)
+        before = numbers(u_previous, "The previous input").reshape(-1)
+        state = numbers(x, "The state").ravel()
+        if len(wanted) != self.horizon * n_y or len(before) != n_u or len(state) != self.function.size1_in(0):
             raise InputError(
-                f"A reference of {len(wanted)} and {len(before)} previous inputs were given; give {self.horizon} "
-                f"samples of {n_y} output(s), and {n_u} input(s)."
+                f"A state of {len(state)} numbers, a reference of {len(wanted)} and {len(before)} previous inputs were "
+                f"given; give {self.function.size1_in(0)}, {self.horizon} samples of {n_y} output(s), "
+                f"and {n_u} input(s)."
             )
         start = np.tile(before, self.horizon) if self._plan is None else np.append(self._plan[n_u:], self._plan[-n_u:])
         solve = self._solve_sqp if self.solver == "sqp" else self._solve_ipopt
-        u, y, slack, converged = solve(np.asarray(x, dtype=float).ravel(), wanted, before, start)
+        u, y, slack, converged = solve(state, wanted, before, start)
         self._plan = u
         shaped = u.reshape(-1, n_u), y.reshape(-1, n_y)
         cost = self._cost(u, y, wanted, before)
@@ -261,3 +275,11 @@ class PredictiveController:
         y = np.asarray(self._simulate(x, u.reshape(m, n_u).T)[1]).ravel(order="F")
         over = np.max(np.maximum(0, np.maximum(self.low_y - y, y - self.high_y)), initial=0.0)
         return u, y, float(over), bool(self._nlp.stats()["success"])
+
+
+def _pair(limits: Any, what: str, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Lower and upper limit over the horizon; infinite is none."""
+    if not isinstance(limits, tuple | list) or len(limits) != 2:
+        raise InputError(f"{what} cannot be {limits!r}; give (low, high).")
+    low, high = (numbers(v, what, shape, infinite=True).ravel() for v in limits)
+    return low, high

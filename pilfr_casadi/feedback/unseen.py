@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from ..checks import numbers
 from ..elements import PrandtlIshlinskii
 from ..recording import InputError
 
@@ -81,7 +82,7 @@ def visibility(fit: Fit, observer: KalmanFilter, x: Array, u: Array) -> Visibili
         If x or u do not fit the model.
     """
     model, function, n = fit.model, observer.function, len(observer.x0)
-    x, u = np.asarray(x, dtype=float).ravel(), np.asarray(u, dtype=float)
+    x, u = numbers(x, "The state").ravel(), numbers(u, "u")
     u = u[:, None] if u.ndim == 1 else u
     if len(x) != n or u.ndim != 2 or u.shape[1] != model.n_u or not len(u):
         raise InputError(
