@@ -44,7 +44,7 @@ def restored_radius(problem: Problem, solution: Solution, solve: Solve) -> Solut
         better = exactly(problem, solve(problem, found.theta))
         if better.status.converged and not beyond(problem, better.theta) and better.cost <= found.cost:
             return better
-        return found
+        return replace(found, status=Status.RESTORED)
     return solution
 
 
