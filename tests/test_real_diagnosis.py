@@ -49,7 +49,6 @@ def test_tanks_overflow(tanks_found):
     assert errors["after"]["test"] < 0.5 * errors["before"]["test"]
 
 
-@pytest.mark.xfail(reason="the lower tank overflows as well, which is not found: 0.27 V")
 def test_tanks_are_followed_as_well_as_published_models_do(tanks_found):
     assert tanks_found[True][1]["after"]["test"] <= 0.20
 
