@@ -286,12 +286,18 @@ def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint,
     """The limits that `stable` stands for: a number exactly, True up to a slack that lets an integrator be one."""
     if bound is False:
         return ()
+    if not isinstance(bound, bool | int | float | np.number) or not np.isfinite(bound):
+        raise InputError(f"stable = {bound!r} was given; give True, False or the largest spectral radius, above zero.")
     return stability(structure) if bound is True else stability(structure, float(bound), exact=True)
 
 
 def constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
     """One constraint, or several, as several."""
-    return (given,) if isinstance(given, Constraint) else tuple(given)
+    if isinstance(given, Constraint):
+        return (given,)
+    if not isinstance(given, Sequence) or not all(isinstance(c, Constraint) for c in given):
+        raise InputError(f"constraints = {given!r} was given; give a Constraint, or a list of them.")
+    return tuple(given)
 
 
 def _leave_interrupts() -> None:

@@ -279,3 +279,18 @@ def test_the_table_on_a_small_rig():
 def test_a_sparse_fit_halves_the_operators():
     case = sparse_plays(0, starts=2)
     assert case.operators[1] <= case.operators[0] / 2 and case.share <= 0.1
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"stable": "a"}, "stable = 'a'"),
+        ({"stable": None}, "stable = None"),
+        ({"stable": np.inf}, "stable = inf"),
+        ({"constraints": [3]}, "a Constraint"),
+        ({"constraints": 3}, "a Constraint"),
+    ],
+)
+def test_what_bounds_nothing_is_refused(record, given, says):
+    with pytest.raises(InputError, match=says):
+        pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=1, **given)

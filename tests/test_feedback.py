@@ -326,3 +326,10 @@ def test_no_plan_is_made_from_numbers_that_are_none(place, value):
     given[place] = value
     with pytest.raises(InputError, match=r"finite|numbers"):
         controller(*given)
+
+
+@pytest.mark.parametrize("limits", [3, "a", ("a", "b"), (np.nan, 1.0), (1.0, -1.0), (1.0, 2.0, 3.0)])
+def test_a_compensator_without_usable_limits_is_refused(small, limits):
+    fit, record = small[:2]
+    with pytest.raises(InputError, match="Limits of the input"):
+        pilfr.feedforward(fit, record, limits=limits)

@@ -117,7 +117,10 @@ def feedforward(
             f"The model has {model.n_u} inputs and {model.n_y} output(s); the compensator inverts models of one input "
             "and one output, so fit such a one, or use predictive control."
         )
-    low, high = (np.min(recording.u), np.max(recording.u)) if limits is None else limits
+    try:
+        low, high = (np.min(recording.u), np.max(recording.u)) if limits is None else map(float, limits)
+    except (TypeError, ValueError):
+        low = high = np.nan
     if not low < high:
         raise InputError(f"Limits of the input of {limits!r} were given; give (low, high) with low below high.")
     function = function_of(fit)
