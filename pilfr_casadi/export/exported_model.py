@@ -175,9 +175,10 @@ class Exported:
         def listed(names: Mapping[str, Any] | tuple[str, ...]) -> str:
             return ", ".join(f"{n} [{self.units[n]}]" if self.units.get(n) else n for n in names) or "none"
 
-        exact = f"smoothed, eps = {self.smooth:g}" if self.smooth else "exact"
+        exact = f"smoothed, eps = {self.smooth:g}" if self.smooth else "min and max exact"
         lines = [f"{self.name}: (x, u) -> (x_next, y), a step of {self.dt:g} s, {exact}"]
         lines += [f"x: {listed(self.states)}", f"u: {listed(self.inputs)}", f"y: {listed(self.outputs)}"]
+        lines.append(f"rhs in continuous time: {'none, it is sampled' if self.rhs is None else 'yes'}")
         return "\n".join(lines)
 
     __repr__ = __str__
