@@ -7,6 +7,7 @@ which stay a margin inside those of the machine.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -192,3 +193,25 @@ def draw(outcomes: list[Outcome], task: Task, dt: float, units: tuple[str, str],
     finish(low, "time [s]", f"input [{units[1]}]", legend=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
+
+
+def program(
+    about: str | None,
+    name: str,
+    outcomes: Callable[..., tuple[list[Outcome], Task]],
+    units: tuple[str, str],
+    dt: float,
+    tolerance: float,
+    arguments: Sequence[str] | None,
+) -> None:
+    """The command of a benchmark: print the table, draw the loops; units are those of output and input."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs", name), help="folder for the picture")
+    parser.add_argument("--ipopt", action="store_true", help="plan by IPOPT and multiple shooting as well")
+    parser.add_argument("--do-mpc", action="store_true", help="plan by do-mpc as well, which has to be installed")
+    options = parser.parse_args(arguments)
+    results, task = outcomes(solvers=("ipopt",) * options.ipopt + ("do-mpc",) * options.do_mpc)
+    print(table(results, units[0], dt, tolerance))
+    picture = options.out / "tracking.png"
+    draw(results, task, dt, units, picture)
+    print(f"picture: {picture}")

@@ -9,6 +9,7 @@ sweep; the noise is at an NRMSE of 0.0032.
 from __future__ import annotations
 
 import argparse
+import resource
 from collections.abc import Sequence
 from typing import Any
 
@@ -103,6 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ("noise floor", [0.0032, 0.0032]),
     ]
     print(table("NRMSE", rows, kinds))
+    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
     return 0
 
 

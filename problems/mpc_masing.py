@@ -6,9 +6,7 @@ of mass 2 has to follow a sum of sines that is cut off just below the limit of t
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +15,7 @@ from pilfr_casadi.fit import fit
 from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.operators import Play
 
-from .closed_loop import Outcome, Task, compare, draw, table
+from .closed_loop import Outcome, Task, compare, program
 from .masing import MasingRig, State, _advance, _stepper
 from .masing_data import FS, records
 
@@ -69,17 +67,7 @@ def outcomes(samples: int = 600, *, quick: bool = False, solvers: Sequence[str] 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table and draw the loops."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/mpc_masing"), help="folder for the picture")
-    parser.add_argument("--ipopt", action="store_true", help="plan by IPOPT and multiple shooting as well")
-    parser.add_argument("--do-mpc", action="store_true", help="plan by do-mpc as well, which has to be installed")
-    options = parser.parse_args(arguments)
-    solvers = ("ipopt",) * options.ipopt + ("do-mpc",) * options.do_mpc
-    results, task = outcomes(solvers=solvers)
-    print(table(results, "m", 1 / FS, TOLERANCE))
-    picture = options.out / "tracking.png"
-    draw(results, task, 1 / FS, ("m", "N"), picture)
-    print(f"picture: {picture}")
+    program(__doc__, "mpc_masing", outcomes, ("m", "N"), 1 / FS, TOLERANCE, arguments)
 
 
 if __name__ == "__main__":

@@ -100,8 +100,10 @@ def offsets(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Ga
 
 def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
     """A simulator with effects, its offsets held at zero where it does as well: an effect may have looked like one."""
-    for element in fitted.simulator.elements[: len(bench.simulator.elements)]:
-        if not isinstance(element.law, Offset) or len(fitted.simulator.elements) == len(bench.simulator.elements):
+    before = len(bench.simulator.elements)
+    placed = fitted.simulator.elements
+    for element in placed[:before] if len(placed) > before else ():
+        if not isinstance(element.law, Offset):
             continue
         name = f"{element.prefix}w_0"
         held = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)

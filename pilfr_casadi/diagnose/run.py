@@ -107,11 +107,7 @@ def diagnose(
     search.base = without_idle_offsets(bench, search.base)
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
-    where = max(search.open_before, key=lambda k: search.open_before[k], default="")
-    if accepted and verdict == "missing-physics":
-        where = accepted[0].choice.winner.port if accepted[0].choice else where
-    sure = verdict != "unexplained" and min((confidence(p.choice, search) for p in accepted if p.choice), default=1.0)
-    if sure < UNSURE and (lost := clipped_input(bench, where)) is not None:
+    if (lost := _lost_input(search, verdict)) is not None:
         verdict, sentence, gates = "recording-fault", lost.sentence, (*gates, lost)
     if search.interrupted and not accepted:
         sentence = (
@@ -158,6 +154,16 @@ def diagnose(
         evidence={"search": search, "without": without, "after": after},
         substeps=after.model.substeps,
     )
+
+
+def _lost_input(search: Search, verdict: str) -> Gate | None:
+    """The clipped input that a mismatch without a sure name comes from."""
+    named = [p.choice for p in search.passes if p.accepted and p.choice is not None]
+    if verdict == "missing-physics" and min(confidence(c, search) for c in named) < UNSURE:
+        return clipped_input(search.bench, named[0].winner.port)
+    if verdict == "unexplained":
+        return clipped_input(search.bench, max(search.open_before, key=lambda k: search.open_before[k], default=""))
+    return None
 
 
 def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:

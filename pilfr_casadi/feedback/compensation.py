@@ -25,7 +25,6 @@ import numpy as np
 
 from ..checks import numbers
 from ..recording import InputError, Recording
-from .kalman import function_of
 
 if TYPE_CHECKING:
     from ..fit import Fit
@@ -123,7 +122,7 @@ def feedforward(
         low = high = np.nan
     if not low < high:
         raise InputError(f"Limits of the input of {limits!r} were given; give (low, high) with low below high.")
-    function = function_of(fit)
+    function = fit.to_casadi()
     found = _look_ahead(fit, function, recording, ahead)
     step = inverse_step(function if observer is None else observer.function, found, (float(low), float(high)))
     return Feedforward(step, found, (float(low), float(high)))

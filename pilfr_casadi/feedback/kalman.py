@@ -120,7 +120,7 @@ def kalman_filter(
         raise InputError(f"The share of process noise is {share!r}; give a number above 0, such as 1e-3.")
     if not fit.model.n_state and not disturbance:
         raise InputError("The model has neither states nor memory to observe; ask for disturbance=True.")
-    function = function_of(fit)
+    function = fit.to_casadi()
     start = fit.initial_state(recording)
     residual = (recording.y - fit.simulate(recording))[fit.scored_from(recording) :]
     states = np.asarray(function.mapaccum("states", len(recording))(start, recording.u.T)[0])
@@ -140,11 +140,6 @@ def _filter(function: ca.Function, spread: Array, noise: Array, share: float) ->
     process = np.diag((share * spread) ** 2)
     step = ekf_step(function, process, noise)
     return KalmanFilter(function, step, np.zeros(len(spread)), np.diag(spread**2), process, noise, spread)
-
-
-def function_of(fit: Fit) -> ca.Function:
-    """The fit as `F(x, u) -> (x_next, y)`, memory behind the linear states in x."""
-    return fit.to_casadi()
 
 
 def disturbed(function: ca.Function) -> ca.Function:

@@ -144,7 +144,7 @@ def _run(
             if job.id in ready:
                 tell(f"{job.id}: done before")
                 continue
-            fit = execute(given, job, recordings, engine=given.engine, executor=executor, progress=progress)
+            fit = execute(given, job, recordings, executor=executor, progress=progress)
             if fit.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             entries[job.id] = _entry(job, fit)

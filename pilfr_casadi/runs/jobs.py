@@ -71,7 +71,6 @@ def execute(
     job: RunJob,
     recordings: Mapping[str, tuple[Recording, ...]],
     *,
-    engine: str | None = None,
     executor: Executor | None = None,
     progress: Callable[[str, int, int, float], None] | None = None,
 ) -> Fit:
@@ -86,9 +85,13 @@ def execute(
         "solver": run.solver,
         "stable": run.stable,
         "constraints": run.constraints,
-        "engine": engine or run.engine,
+        "engine": run.engine,
     }
-    search = {**run.search, "seed": int(job.parameters["seed"]), "executor": executor} if _searches(run) else {}
+    search = (
+        {**run.search, "seed": int(job.parameters["seed"]), "executor": executor}
+        if isinstance(run.model, PILFR)
+        else {}
+    )
     train = recordings["train"]
     l1 = {"w": run.l1} if run.l1 else None
     found = identify(run.model, train, **options, **search, l1=l1, progress=progress)
@@ -107,10 +110,6 @@ def execute(
             **options,
         ).fit
     return found
-
-
-def _searches(run: Run) -> bool:
-    return isinstance(run.model, PILFR)
 
 
 def timeless(fit: Fit) -> Fit:
