@@ -28,6 +28,20 @@ def usable(values: np.ndarray) -> np.ndarray:
     return np.abs(values) <= LARGEST  # False for nan
 
 
+def whole(value: Any, what: str, least: int) -> int:
+    """Return a whole number of `least` or more.
+
+    Raises
+    ------
+    InputError
+        If something else is given.
+    """
+    good = isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least
+    if not good:
+        raise InputError(f"{what} is {value!r}; give a whole number, {least} or more.")
+    return int(value)
+
+
 def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infinite: bool = False) -> np.ndarray:
     """Return finite numbers as an array; of a shape, to which it is broadcast, where one is given.
 

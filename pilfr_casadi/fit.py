@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from .checks import numbers
 from .constraints import Constraint
 from .elements import PrandtlIshlinskii
 from .fitted import Fit, Progress, fingerprint
@@ -52,11 +53,12 @@ def fit(
     solver: Any = None,
     starts: int = 8,
     seed: int = 0,
-    start: str = "grid",
+    start: str | Mapping[str, Any] = "grid",
     stable: bool | float = True,
     constraints: Sequence[Constraint] = (),
     l1: dict[str, float] | None = None,
     noise: float | None = None,
+    weights: Sequence[float] | np.ndarray | None = None,
     engine: str = "auto",
     executor: Executor | None = None,
     workers: int = 1,
@@ -75,9 +77,9 @@ def fit(
         Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`.
     starts, seed : int
         Number of random starts and the seed of all of them.
-    start : {"grid", "paper"}
+    start : {"grid", "paper"} or mapping
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
-        solved and re-gridded.
+        solved and re-gridded. A mapping of values by parameter name is the one start of a PI-LFR with any element.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope. A number holds
         exactly, by the eigenvalues of the result; True, the default, is 1 up to 1e-4; False is none.
@@ -92,10 +94,14 @@ def fit(
         is first solved without; then the weights of each channel are scaled to a sum of one and the penalty acts on the
         element alone, all linear blocks held, so that no change of scale evades it (see `penalty`). For a closed model
         of your own see `Problem`.
+    weights : sequence of float, optional
+        How much each recording counts, see `Problem` and `noise_weights`; for a fit from values (a `Model`, a `Fit`, or
+        `start` a mapping).
     engine : {"auto", "c", "vm"}
         Generated C, or CasADi's virtual machine.
     executor, workers
         Where starts run: any `concurrent.futures.Executor`, or a pool of `workers` processes; the numbers are the same.
+        A fit from values runs as many recordings side by side.
         Where processes are spawned, the call belongs below `if __name__ == "__main__":`.
     progress : bool or callable
         True for a bar on the terminal; a callable gets (stage, done, total, smallest training error so far).
@@ -111,8 +117,11 @@ def fit(
     """
     solver = solver or POLISH
     _check_options(model, solver, starts, seed, workers, progress)
-    if start not in ("grid", "paper"):
-        raise InputError(f"The start {start!r} is unknown; use 'grid' or 'paper'.")
+    if not isinstance(start, Mapping) and start not in ("grid", "paper"):
+        raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper', or a mapping of values by name.")
+    search = isinstance(model, PILFR) and not isinstance(start, Mapping)
+    if weights is not None and search:
+        raise InputError("Weights are for a fit from values; give a Model, a Fit, or start={name: value}.")
     own = executor is None and workers > 1
     if own and getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(1)  # a spawned worker that runs the script again; the first process says what to do
@@ -125,9 +134,9 @@ def fit(
         shown: Any = progress_bar()
     else:
         shown = nullcontext(progress or None)
-    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and isinstance(model, PILFR) else None
+    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and search else None
     with shown as report:
-        job = Job((), solver, further, dict(l1 or {}), noise, engine, report)
+        job = Job((), solver, further, dict(l1 or {}), noise, engine, report, weights, 1 if search else workers)
         try:
             return _fit(model, train, job, stable, starts, seed, start, executor or pool)
         except BrokenProcessPool:
@@ -146,22 +155,27 @@ def _fit(
     stable: bool | float,
     starts: int,
     seed: int,
-    start: str,
+    start: str | Mapping[str, Any],
     executor: Executor | None,
 ) -> Fit:
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
     limits = stability_limits(structure, stable) if structure else ()
     job = replace(job, limits=(*limits, *job.limits))
+    if isinstance(model, PILFR) and isinstance(start, Mapping):
+        model = _at_values(model, as_recordings(train)[0], start)
     if not isinstance(model, PILFR):
         given = model.model if isinstance(model, Fit) else model
         job = replace(job, recordings=check_for_identification(train, int(given.parameters.free.sum()) + 2))
         return _from_values(given, structure, job, model if isinstance(model, Fit) else None)
     if not isinstance(model.element, PrandtlIshlinskii | None):
-        raise InputError("A PI-LFR is identified with a PrandtlIshlinskii element; pass a closed Model for any other.")
+        raise InputError(
+            "A start is found for a PrandtlIshlinskii element; for any other give start={name: value} or a Model."
+        )
     first = as_recordings(train)[0]
     shape = model.model(first.n_u, first.n_y).parameters
     if job.l1:
         check_penalty(job.l1, shape, model.element is None)
+    assert isinstance(start, str)
     fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
     job = replace(job, recordings=check_for_identification(train, fewest))
     linear, problem, solution = linear_model(
@@ -176,6 +190,22 @@ def _fit(
             return job.result(linear, model, problem, solution)
         return _linear(model, fitted, job)
     return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
+
+
+def _at_values(structure: PILFR, first: Recording, values: Mapping[str, Any]) -> Model:
+    """The model of a structure at values given by name, with a recording's names of inputs and outputs."""
+    model = structure.model(first.n_u, first.n_y, inputs=first.inputs, outputs=first.outputs)
+    unknown = sorted(set(values) - set(model.parameters))
+    if unknown:
+        raise InputError(
+            f"The start has a value for {unknown[0]!r}, which the model lacks; it has {', '.join(model.parameters)}."
+        )
+    changes = {}
+    for name, value in values.items():
+        p = model.parameters[name]
+        given = numbers(value, f"The start of {name!r}", p.value.shape)
+        changes[name] = {"value": np.where(p.fixed & (name in structure.fixed), p.value, np.clip(given, *p.bounds))}
+    return model.with_parameters(model.parameters.change(**changes))
 
 
 def _from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit | None) -> Fit:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -39,11 +40,14 @@ class Job:
     noise: float | None
     engine: str
     progress: Progress | None
+    weights: Sequence[float] | np.ndarray | None = None
+    threads: int = 1
     began: float = field(default_factory=time.perf_counter)
 
     def problem(self, model: Model, noise: float = 1.0, **options: Any) -> Problem:
         """The simulation-error problem of a model."""
-        given = {"constraints": self.limits, "noise": self.noise or noise, "engine": self.engine, **options}
+        given: dict[str, Any] = {"constraints": self.limits, "noise": self.noise or noise, "engine": self.engine}
+        given |= {"weights": self.weights, "threads": self.threads, **options}
         return Problem(model, self.recordings, **given)
 
     def settled(self, problem: Problem, solution: Solution, stage: str, **options: Any) -> tuple[Problem, Solution]:

@@ -1,7 +1,7 @@
 """How the recordings of a problem are run: from which state, and behind which periods.
 
 The state with memory at the first sample is zero, given, a variable of the problem, or that of the periodic steady
-state, which is reached by running periods before the recording.
+state: the fixed point of one period (`slopes`), or what a given number of periods before the recording leads to.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .checks import numbers
 from .model import Model
 from .recording import InputError, Recording
 from .sensitivities import Engine
@@ -18,28 +19,56 @@ from .sensitivities import Engine
 
 @dataclass(frozen=True)
 class Part:
-    """One recording inside the problem: its first variable (or None), what drives it, and what is run before it."""
+    """One recording inside the problem.
+
+    Attributes
+    ----------
+    recording : Recording
+        Its data.
+    first : int or None
+        The first of its variables, where its initial state is estimated.
+    state : array, (n_state,)
+        State at its first sample, before any periods that are run before.
+    drive, warm_up : array
+        What drives it, and the periods before it.
+    scale : array, (n_y,)
+        What residuals are divided by.
+    guess : array, (n_state,), optional
+        Where it begins at the fixed point of its period: that of the start model.
+    """
 
     recording: Recording
     first: int | None
     state: np.ndarray
     drive: np.ndarray
     warm_up: np.ndarray
+    scale: np.ndarray
+    guess: np.ndarray | None = None
+
+    @property
+    def steady(self) -> bool:
+        """Whether it begins at the fixed point of its period."""
+        return self.guess is not None
 
 
 def lay_out(
-    model: Model, recordings: Sequence[Recording], engine: Engine, at: int, periods: int | None
+    model: Model,
+    recordings: Sequence[Recording],
+    engine: Engine,
+    at: int,
+    periods: int | None,
+    scales: Sequence[np.ndarray],
 ) -> Iterator[Part]:
     """Each recording with its first state, which is a variable from index `at` on where it is to be estimated."""
     n_state = model.n_x + model.n_s
-    for r in recordings:
+    for r, scale in zip(recordings, scales, strict=True):
         zero, drive = np.zeros(n_state), model.drive(r)
         nothing = drive[:0]
         if isinstance(r.initial, str):
             if r.initial == "zero":
-                yield Part(r, None, zero, drive, nothing)
+                yield Part(r, None, zero, drive, nothing, scale)
             elif r.initial == "estimate":
-                yield Part(r, at, zero, drive, nothing)
+                yield Part(r, at, zero, drive, nothing, scale)
                 at += n_state
             else:
                 if r.period is None:
@@ -47,24 +76,42 @@ def lay_out(
                         "A recording in periodic steady state needs its period in samples; give `period=`."
                     )
                 one = drive[: r.period * model.substeps]
-                yield Part(r, None, zero, drive, _periods_before(model, engine, one, periods))
+                count, guess = _periods_before(model, engine, one, periods)
+                warm_up = np.tile(one, (count, 1))
+                yield Part(r, None, zero, drive, warm_up, scale, guess if periods is None else None)
         else:
             given = np.asarray(r.initial, dtype=float).ravel()
             if given.size not in (len(model.states), n_state):
                 raise InputError(
                     f"An initial state of {given.size} numbers was given; expected {len(model.states)} or {n_state}."
                 )
-            yield Part(r, None, np.concatenate([given, zero[given.size :]]), drive, nothing)
+            yield Part(r, None, np.concatenate([given, zero[given.size :]]), drive, nothing, scale)
 
 
-def _periods_before(model: Model, engine: Engine, one: np.ndarray, periods: int | None) -> np.ndarray:
-    """What drives the periods before a periodic recording: as many as the start model takes to settle, 2 to 50."""
-    state = np.zeros(model.n_x + model.n_s)
+def _periods_before(model: Model, engine: Engine, one: np.ndarray, periods: int | None) -> tuple[int, np.ndarray]:
+    """Periods that the start model takes to settle, 2 to 50 (or those given), and its state behind them."""
+    state, found = np.zeros(model.n_x + model.n_s), 2
     for count in range(1, 51 if periods is None else 1):
-        before, state = state, engine.simulate(one, model.parameters.start, state)[1]
-        if not np.all(np.isfinite(state)):
+        before, after = state, engine.simulate(one, model.parameters.start, state)[1]
+        if not np.all(np.isfinite(after)):
             break
-        periods = max(count, 2)
+        state, found = after, max(count, 2)
         if np.max(np.abs(state - before), initial=0.0) <= 1e-6 * np.max(np.abs(state), initial=0.0):
             break
-    return np.tile(one, (periods or 2, 1))
+    return (found if periods is None else periods), state
+
+
+def checked_weights(given: Sequence[float] | np.ndarray | None, count: int) -> np.ndarray:
+    """One weight above zero for each recording, ones where none are given."""
+    weights = numbers(np.ones(count) if given is None else given, "A weight of a recording").ravel()
+    if len(weights) != count or not np.all(weights > 0):
+        raise InputError(
+            f"{len(weights)} weights from {weights.min(initial=np.inf):g} were given for {count} recordings; give one "
+            "above zero for each."
+        )
+    return weights
+
+
+def output_scale(recordings: Sequence[Recording]) -> np.ndarray:
+    """Standard deviation of each output over all recordings, (n_y,)."""
+    return np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)

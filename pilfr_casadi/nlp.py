@@ -44,7 +44,8 @@ class Horizon:
     simulated : tuple of casadi.MX
         Simulated outputs of each recording, one column a sample, shape (n_y, M), in the recording's units.
     initial : tuple of casadi.MX
-        State with the element's memory before each recording (before its warm-up periods, where it is periodic).
+        State with the element's memory before each recording; where it is periodic, before the periods that the start
+        model takes to settle, which are written out before it.
     parameters : mapping of str to casadi.MX
         The model's parameters by name, fixed ones as numbers.
     """
@@ -80,7 +81,7 @@ def to_nlp(problem: Problem) -> Horizon:
         y = y[:, len(part.warm_up) :: model.substeps]
         initial.append(state)
         simulated.append(y)
-        residual.append(ca.vec(((y - r.y.T) / np.tile(problem.scale[:, None], (1, len(r))))[:, r.skip :]))
+        residual.append(ca.vec(((y - r.y.T) / np.tile(part.scale[:, None], (1, len(r))))[:, r.skip :]))
     e = ca.vertcat(*residual)
     prior = 0.5 * ca.dot(problem._prior_weight, (theta - problem._prior_mean) ** 2)
     return Horizon(

@@ -12,17 +12,20 @@ of the record, so memory does not grow with its length.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
 from .compiled import make_engine
 from .constraints import Constraint, check_free, compile_constraints, constraint_sizes
-from .layout import lay_out
+from .layout import Part, checked_weights, lay_out, output_scale
 from .magnitude import Neighbours
 from .model import Model
 from .nlp import Horizon, to_nlp
 from .recording import InputError, Recording, as_recordings
-from .sensitivities import Engine
+from .sensitivities import Engine, VirtualMachine
+from .slopes import Pass, settled, steady_slope, steady_sums, sums
 
 STRETCH = 2_000_000  # numbers in the piece of the Jacobian that is held at a time
 
@@ -45,7 +48,11 @@ class Problem:
     noise : float
         Standard deviation of the noise relative to the output's, against which priors are weighed.
     periods : int, optional
-        Periods run before a recording in periodic steady state; by default as many as the start model takes to settle.
+        Periods run before a recording in periodic steady state; by default the state is the fixed point of a period.
+    weights : sequence of float, optional
+        One a recording: its residuals are multiplied by it (see `periods.noise_weights`). The mean stays one over R.
+    threads : int
+        Recordings that are run at a time, where the engine is compiled; the numbers are the same.
 
     Raises
     ------
@@ -64,6 +71,8 @@ class Problem:
         noise: float = 1.0,
         periods: int | None = None,
         scale: np.ndarray | None = None,
+        weights: Sequence[float] | np.ndarray | None = None,
+        threads: int = 1,
     ) -> None:
         self.model = model
         self.recordings = as_recordings(recordings)
@@ -79,8 +88,11 @@ class Problem:
                     f"The recording has {r.n_u} inputs and {r.n_y} outputs, "
                     f"the model {len(model.inputs)} and {model.n_y}; they must match."
                 )
-        self.scale = _output_scale(self.recordings) if scale is None else np.asarray(scale, dtype=float)
-        self._parts = list(lay_out(model, self.recordings, self.engine, n_free, periods))
+        self.scale = output_scale(self.recordings) if scale is None else np.asarray(scale, dtype=float)
+        self.weights = checked_weights(weights, len(self.recordings))
+        self.threads = 1 if isinstance(self.engine, VirtualMachine) else threads
+        scales = [self.scale / weight for weight in self.weights]
+        self._parts = list(lay_out(model, self.recordings, self.engine, n_free, periods, scales))
         self._residuals = sum((len(p.recording) - p.recording.skip) * model.n_y for p in self._parts)
         n_state = model.n_x + model.n_s
         n_initial = sum(n_state for p in self._parts if p.first is not None)
@@ -147,24 +159,38 @@ class Problem:
 
     def first_states(self, theta: np.ndarray) -> list[np.ndarray]:
         """State with memory at each recording's first sample, the warm-up periods behind it."""
-        p, states = self.parameters(theta), zip(self._parts, self.initial_states(theta), strict=True)
-        return [
-            self.engine.simulate(part.warm_up, p, state)[1] if len(part.warm_up) else state for part, state in states
-        ]
+        p = self.parameters(theta)
+
+        def first(pair: tuple[Part, np.ndarray]) -> np.ndarray:
+            part, state = pair
+            if part.guess is not None:
+                one = part.drive[: (part.recording.period or 1) * self.model.substeps]
+                return settled(self.engine, one, p, part.guess)
+            return self.engine.simulate(part.warm_up, p, state)[1] if len(part.warm_up) else state
+
+        return self._each(first, list(zip(self._parts, self.initial_states(theta), strict=True)))
+
+    def _each(self, function: Any, items: Sequence[Any]) -> list[Any]:
+        """The function of each item, a few at a time."""
+        if self.threads == 1 or len(items) == 1:
+            return [function(item) for item in items]
+        with ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(function, items))
 
     def _penalty(self, theta: np.ndarray) -> float:
         return float(0.5 * self._prior_weight @ (theta - self._prior_mean) ** 2 + self._l1 @ theta)
 
     def simulate(self, theta: np.ndarray) -> list[np.ndarray]:
         """Simulated outputs, one (M, n_y) array a recording."""
-        p, states = self.parameters(theta), zip(self._parts, self.first_states(theta), strict=True)
-        return [self.engine.simulate(part.drive, p, state)[0] for part, state in states]
+        p, states = self.parameters(theta), self.first_states(theta)
+        pairs = [(part.drive, state) for part, state in zip(self._parts, states, strict=True)]
+        return self._each(lambda pair: self.engine.simulate(pair[0], p, pair[1])[0], pairs)
 
     def residual(self, theta: np.ndarray) -> np.ndarray:
         """Normalised residuals `(y_hat - y) / σ_y` of all scored samples, shape (R,)."""
         with np.errstate(over="ignore", invalid="ignore"):
             pairs = zip(self._parts, self.simulate(theta), strict=True)
-            return np.concatenate([((y - p.recording.y) / self.scale)[p.recording.skip :].ravel() for p, y in pairs])
+            return np.concatenate([((y - p.recording.y) / p.scale)[p.recording.skip :].ravel() for p, y in pairs])
 
     def cost(self, theta: np.ndarray) -> float:
         """Value of the objective; infinite where the simulation diverges."""
@@ -173,28 +199,42 @@ class Problem:
             value = 0.5 * float(e @ e) / self._residuals + self._penalty(theta)
         return value if np.isfinite(value) else np.inf
 
+    def _pass(self, part: Part, theta: np.ndarray, state: np.ndarray, slopes: np.ndarray | None = None) -> Pass:
+        """A run with derivatives by the free parameters and, without `slopes` of a steady state, by the first state."""
+        n_free, n_state = int(self.free.sum()), self.model.n_x + self.model.n_s
+        if slopes is None:
+            wide = part.first is not None or part.steady
+            slopes = np.hstack([np.zeros((n_state, n_free)), np.eye(n_state)[:, : n_state * wide]])
+        length = max(1, STRETCH // max(1, slopes.shape[1] * self.model.n_y))
+        return Pass(self.engine, part, self.parameters(theta), self._columns, state, slopes, length)
+
+    def _places(self, part: Part) -> np.ndarray:
+        """Variables that the columns of a recording's Jacobian belong to."""
+        shared = np.arange(int(self.free.sum()))
+        if part.first is None:
+            return shared
+        return np.concatenate([shared, part.first + np.arange(self.model.n_x + self.model.n_s)])
+
     def stretches(self, theta: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Residuals (R_b,), their Jacobian (R_b, n_c) and its columns in θ, stretch by stretch of each recording."""
-        p, n_free, n_state = self.parameters(theta), int(self.free.sum()), self.model.n_x + self.model.n_s
-        for part, state in zip(self._parts, self.initial_states(theta), strict=True):
-            estimated = part.first is not None
-            columns = np.arange(n_free)
-            seed = np.zeros((n_state, n_free + n_state * estimated))
-            if part.first is not None:
-                seed[:, n_free:] = np.eye(n_state)
-                columns = np.concatenate([columns, part.first + np.arange(n_state)])
-            length = max(1, STRETCH // max(1, seed.shape[1] * self.model.n_y))
-            r, n = part.recording, self.model.substeps
-            for a in range(0, len(part.warm_up), length * n):
-                rows = part.warm_up[a : a + length * n]
-                _, _, state, seed = self.engine.sensitivity(rows, p, state, seed, self._columns)
-            for a in range(0, len(r), length):
-                b = min(a + length, len(r))
-                y, jac, state, seed = self.engine.sensitivity(part.drive[a * n : b * n], p, state, seed, self._columns)
-                cut = min(max(r.skip - a, 0), b - a)
-                e = ((y - r.y[a:b]) / self.scale)[cut:].ravel()
-                jac /= self.scale[:, None]
-                yield e, jac[cut:].reshape(e.size, jac.shape[2]), columns
+        n = self.model.substeps
+        for part, state in zip(self._parts, self._begin(theta), strict=True):
+            run = self._pass(part, theta, state)
+            if part.steady:
+                for _ in run.stretches(n):
+                    if run.after_period.size:
+                        break
+                slopes = steady_slope(run.after_period, int(self.free.sum()))
+                run = self._pass(part, theta, state, slopes)
+            for e, jac in run.stretches(n):
+                yield e, jac, self._places(part)
+
+    def _begin(self, theta: np.ndarray) -> list[np.ndarray]:
+        """State from which each recording is run with derivatives: in steady state its first, else before warm-up."""
+        if not any(part.steady for part in self._parts):
+            return self.initial_states(theta)
+        pairs = zip(self._parts, self.initial_states(theta), self.first_states(theta), strict=True)
+        return [settled_state if part.steady else state for part, state, settled_state in pairs]
 
     def jacobian(self, theta: np.ndarray) -> np.ndarray:
         """Jacobian of `residual`, shape (R, size)."""
@@ -206,13 +246,21 @@ class Problem:
 
     def normal(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         """Objective, its gradient and Gauss-Newton Hessian at θ."""
+        n_free, n = int(self.free.sum()), self.model.substeps
+
+        def of(pair: tuple[Part, np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
+            with np.errstate(over="ignore", invalid="ignore"):  # a diverging simulation gives an infinite value
+                run = self._pass(pair[0], theta, pair[1])
+                return steady_sums(run, n, n_free) if pair[0].steady else sums(run, n)
+
         value, gradient, hessian = 0.0, np.zeros(self.size), np.zeros((self.size, self.size))
-        with np.errstate(over="ignore", invalid="ignore"):  # a diverging simulation gives an infinite value
-            for e, jac, columns in self.stretches(theta):
-                value += float(e @ e)
-                gradient[columns] += e @ jac
-                square = np.ix_(columns, columns) if len(columns) < self.size else ...
-                hessian[square] += jac.T @ jac
+        found = self._each(of, list(zip(self._parts, self._begin(theta), strict=True)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for part, (more, slope, square) in zip(self._parts, found, strict=True):
+                columns = self._places(part)
+                value += more
+                gradient[columns] += slope
+                hessian[np.ix_(columns, columns)] += square
         m = self._residuals
         gradient = gradient / m + self._prior_weight * (theta - self._prior_mean) + self._l1
         return 0.5 * value / m + self._penalty(theta), gradient, hessian / m + np.diag(self._prior_weight)
@@ -269,7 +317,3 @@ class Problem:
             size = np.where(rests, self.scale, spread)
             out.append(float(np.mean(np.sqrt(np.mean(error**2, axis=0)) / size)))
         return out
-
-
-def _output_scale(recordings: Sequence[Recording]) -> np.ndarray:
-    return np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)

@@ -83,6 +83,8 @@ def _rougher(problem: Problem, start: np.ndarray) -> Iterator[Problem]:
             l1=problem.l1,
             noise=problem.noise,
             scale=problem.scale,
+            weights=problem.weights,
+            threads=problem.threads,
         )
 
     for squarings in SQUARINGS:

@@ -15,20 +15,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..elements import PrandtlIshlinskii
 from ..lfr import PILFR, block_shapes
 from ..limits import Limit
 from ..model import Model
-from ..operators import GeneralizedPlay, Play, Stop
 from ..recording import InputError
 from ..solution import Iteration, Solution, Status
 from .checked_json import ModelFile
+from .loading_elements import element_of
 from .saving import HISTORY
 
 if TYPE_CHECKING:
     from ..fit import Fit
-
-OPERATORS = {"play": Play, "stop": Stop, "generalized_play": GeneralizedPlay}
 
 
 def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fit:
@@ -168,7 +165,7 @@ def _equations(
 def _structure(file: ModelFile, n_u: int, n_y: int) -> PILFR:
     table = file.table(file.content, "structure")
     nx, parameters = file.count(table, "nx"), file.table(file.content, "parameters")
-    element = None if table.get("element") is None else _element(file, file.table(table, "element"), parameters)
+    element = None if table.get("element") is None else element_of(file, file.table(table, "element"), parameters)
     for name, shape in block_shapes(nx, n_u, n_y, 0 if element is None else element.channels).items():
         file.array(file.table(parameters, name).get("value"), shape, f"parameter {name!r}")
     fixed = {
@@ -187,35 +184,6 @@ def _structure(file: ModelFile, n_u: int, n_y: int) -> PILFR:
         return PILFR(
             nx, element, fixed, pairs["bounds"], pairs["priors"], file.entry(table, "offset", bool, "true or false")
         )
-    except InputError as error:
-        file.damaged(str(error).rstrip("."))
-
-
-def _element(file: ModelFile, table: dict[str, Any], parameters: dict[str, Any]) -> PrandtlIshlinskii:
-    if table.get("kind") != "prandtl_ishlinskii":
-        file.fail(
-            f"has the element {str(table.get('kind'))[:40]!r}, which a file cannot hold; give the model as `model=`"
-        )
-    name = file.text(table, "operator")
-    if name not in OPERATORS:
-        file.fail(f"has the unknown operator {name[:40]!r}; known are {', '.join(OPERATORS)}")
-    n, channels = file.count(table, "n"), file.count(table, "channels")
-    for key in ("w", "r"):
-        file.array(file.table(parameters, key).get("value"), (channels, n), f"parameter {key!r}")
-    operator: Any = OPERATORS[name]()
-    if name == "generalized_play":
-        if file.rows(table, "expressions"):
-            file.fail(
-                "has envelopes that are expressions of your own, which a file cannot hold; give the model as `model=`"
-            )
-        neurons = file.count(table, "neurons")
-        for key in ("a", "b", "d"):
-            file.array(
-                file.table(parameters, f"gamma_l_{key}").get("value"), (channels, neurons), f"parameter 'gamma_l_{key}'"
-            )
-        operator = GeneralizedPlay(neurons)
-    try:
-        return PrandtlIshlinskii(operator, n, channels, file.entry(table, "rounded", bool, "true or false"))
     except InputError as error:
         file.damaged(str(error).rstrip("."))
 

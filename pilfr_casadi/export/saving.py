@@ -16,8 +16,11 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from ..combined import Combined
 from ..elements import PrandtlIshlinskii
+from ..envelope import Envelope
 from ..operators import GeneralizedPlay
+from ..products import Products
 from .files import write_atomically
 
 if TYPE_CHECKING:
@@ -123,6 +126,16 @@ def _structure(structure: PILFR) -> dict[str, Any]:
 
 
 def _element(element: Any) -> dict[str, Any]:
+    if isinstance(element, Combined):
+        parts = [
+            {"name": p.name, "element": _element(p.element), "reads": list(p.reads), "writes": list(p.writes)}
+            for p in element.parts
+        ]
+        return {"kind": element.kind, "channels": element.channels, "parts": parts}
+    if isinstance(element, Envelope):
+        return {"kind": element.kind, "channels": element.channels}
+    if isinstance(element, Products):
+        return {"kind": element.kind, "channels": element.channels, "degrees": list(element.degrees)}
     if not isinstance(element, PrandtlIshlinskii):
         return {"kind": type(element).__name__}
     operator = element.operator
