@@ -81,6 +81,7 @@ _EXPORTS = {
     "rmse": "metrics",
     "robust_bla": "bla",
     "read_run": "runs",
+    "response_bound": "response_bound",
     "run": "runs",
     "save": "export",
     "select_order": "order_selection",

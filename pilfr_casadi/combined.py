@@ -132,11 +132,11 @@ class Combined:
             following.append(after)
         return ca.vertcat(*w), ca.vertcat(*following)
 
-    def bound(self, p: Mapping[str, Any]) -> np.ndarray:
-        """Largest |w| of each channel for any z, (channels,); infinite where a part is unbounded."""
+    def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
+        """Largest |w| of each channel where |z| is at most `size`, (channels,); infinite where a part is unbounded."""
         out = np.zeros(self.channels)
         for part in self.parts:
-            out[list(part.writes)] += element_bound(part.element, _Own(p, part))
+            out[list(part.writes)] += element_bound(part.element, _Own(p, part), np.asarray(size)[list(part.reads)])
         return out
 
 
@@ -157,10 +157,7 @@ class _Own(Mapping[str, Any]):
         return len(self._names)
 
 
-def element_bound(element: Element, p: Mapping[str, Any]) -> np.ndarray:
-    """Largest |w| of each channel of an element for any signal z, (channels,).
-
-    Infinite where nothing is known: of an element without a method `bound`, and of plays, whose output follows z.
-    """
+def element_bound(element: Element, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
+    """Largest |w| of each channel of an element whose signals are at most `size`, (channels,); infinite if unknown."""
     bound = getattr(element, "bound", None)
-    return np.full(element.channels, np.inf) if bound is None else np.asarray(bound(p), dtype=float)
+    return np.full(element.channels, np.inf) if bound is None else np.asarray(bound(p, size), dtype=float)

@@ -7,6 +7,7 @@ H_rij[z_i](k)`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -104,3 +105,17 @@ class PrandtlIshlinskii:
                 s_out.append(q_next)
         w = [sum(w_out[i * self.n + 1 : (i + 1) * self.n], w_out[i * self.n]) for i in range(self.channels)]
         return ca.vertcat(*w), ca.vertcat(*s_out)
+
+    def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
+        """Largest |w| of each channel where |z| is at most `size` (channels,), from memory zero.
+
+        A stop stays within its threshold whatever z does; a play follows z, and so does a generalized play, of which no
+        bound is known here.
+        """
+        w, r, z = np.asarray(p["w"], dtype=float), np.asarray(p["r"], dtype=float), np.asarray(size, dtype=float)
+        if isinstance(self.operator, GeneralizedPlay):
+            return np.full(self.channels, np.inf)
+        rest = np.asarray(p["eps"], dtype=float) / 4 if self.rounded else 0.0
+        z = z[:, None]
+        largest = np.minimum(r, 2 * z) if isinstance(self.operator, Stop) else np.maximum(z - r, 0.0)
+        return np.asarray(np.sum(w * np.where(w > 0, largest + rest, 0.0), axis=1))

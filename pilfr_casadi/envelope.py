@@ -77,8 +77,8 @@ class Envelope:
             following.append(e)
         return ca.vertcat(*w), ca.vertcat(*following)
 
-    def bound(self, p: Mapping[str, Any]) -> np.ndarray:
-        """Largest |w| of each channel for any z, (channels,)."""
-        reach, knee = np.asarray(p["reach"], dtype=float), np.asarray(p["knee"], dtype=float)
-        a = np.sqrt((reach / CREST) ** 2 + SMALL * knee**2)
-        return np.asarray(reach * a / (a + knee))
+    def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
+        """Largest |w| of each channel where |z| is at most `size`, (channels,); finite for any z."""
+        reach, knee = (np.asarray(p[name], dtype=float) for name in ("reach", "knee"))
+        a = np.sqrt(np.minimum(reach / CREST, size) ** 2 + SMALL * knee**2)
+        return np.asarray(np.minimum(reach, size) * a / (a + knee))

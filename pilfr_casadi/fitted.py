@@ -21,6 +21,7 @@ from .multistart import Candidate
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings
 from .sensitivities import Engine
+from .slopes import settled
 from .solution import Solution, Status
 
 Progress = Callable[[str, int, int, float], None]
@@ -264,11 +265,7 @@ def first_state(model: Model, engine: Engine, recording: Recording, samples: int
     state = np.zeros(n)
     if initial == "periodic":
         period = model.drive(recording)[: (recording.period or 1) * model.substeps]
-        for _ in range(200):
-            before = state
-            state = engine.simulate(period, values, state)[1]
-            if np.max(np.abs(state - before), initial=0.0) <= 1e-10 * max(np.max(np.abs(state), initial=0.0), 1e-300):
-                break
+        state = settled(engine, period, values, state)
     elif initial == "estimate" and n:
         samples = min(len(recording), samples or samples_for_state(model))
         held = model.with_parameters(

@@ -33,8 +33,8 @@ class Part:
         What drives it, and the periods before it.
     scale : array, (n_y,)
         What residuals are divided by.
-    guess : array, (n_state,), optional
-        Where it begins at the fixed point of its period: that of the start model.
+    steady : bool
+        Whether it begins at the fixed point of its period, where periods from rest lead.
     """
 
     recording: Recording
@@ -43,12 +43,7 @@ class Part:
     drive: np.ndarray
     warm_up: np.ndarray
     scale: np.ndarray
-    guess: np.ndarray | None = None
-
-    @property
-    def steady(self) -> bool:
-        """Whether it begins at the fixed point of its period."""
-        return self.guess is not None
+    steady: bool = False
 
 
 def lay_out(
@@ -76,9 +71,8 @@ def lay_out(
                         "A recording in periodic steady state needs its period in samples; give `period=`."
                     )
                 one = drive[: r.period * model.substeps]
-                count, guess = _periods_before(model, engine, one, periods)
-                warm_up = np.tile(one, (count, 1))
-                yield Part(r, None, zero, drive, warm_up, scale, guess if periods is None else None)
+                warm_up = _periods_before(model, engine, one, periods)
+                yield Part(r, None, zero, drive, warm_up, scale, periods is None)
         else:
             given = np.asarray(r.initial, dtype=float).ravel()
             if given.size not in (len(model.states), n_state):
@@ -88,17 +82,17 @@ def lay_out(
             yield Part(r, None, np.concatenate([given, zero[given.size :]]), drive, nothing, scale)
 
 
-def _periods_before(model: Model, engine: Engine, one: np.ndarray, periods: int | None) -> tuple[int, np.ndarray]:
-    """Periods that the start model takes to settle, 2 to 50 (or those given), and its state behind them."""
-    state, found = np.zeros(model.n_x + model.n_s), 2
+def _periods_before(model: Model, engine: Engine, one: np.ndarray, periods: int | None) -> np.ndarray:
+    """What drives the periods before a periodic recording: as many as the start model takes to settle, 2 to 50."""
+    state = np.zeros(model.n_x + model.n_s)
     for count in range(1, 51 if periods is None else 1):
-        before, after = state, engine.simulate(one, model.parameters.start, state)[1]
-        if not np.all(np.isfinite(after)):
+        before, state = state, engine.simulate(one, model.parameters.start, state)[1]
+        if not np.all(np.isfinite(state)):
             break
-        state, found = after, max(count, 2)
+        periods = max(count, 2)
         if np.max(np.abs(state - before), initial=0.0) <= 1e-6 * np.max(np.abs(state), initial=0.0):
             break
-    return (found if periods is None else periods), state
+    return np.tile(one, (periods or 2, 1))
 
 
 def checked_weights(given: Sequence[float] | np.ndarray | None, count: int) -> np.ndarray:

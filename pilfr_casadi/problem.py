@@ -163,9 +163,9 @@ class Problem:
 
         def first(pair: tuple[Part, np.ndarray]) -> np.ndarray:
             part, state = pair
-            if part.guess is not None:
+            if part.steady:
                 one = part.drive[: (part.recording.period or 1) * self.model.substeps]
-                return settled(self.engine, one, p, part.guess)
+                return settled(self.engine, one, p, state)
             return self.engine.simulate(part.warm_up, p, state)[1] if len(part.warm_up) else state
 
         return self._each(first, list(zip(self._parts, self.initial_states(theta), strict=True)))

@@ -79,8 +79,8 @@ class Products:
         w = [sum(p["gain"][i, m] * value for m, value in enumerate(products)) for i in range(self.channels)]
         return ca.vertcat(*w), s
 
-    def bound(self, p: Mapping[str, Any]) -> np.ndarray:
-        """Largest |w| of each channel for any z, (channels,)."""
-        reach = np.asarray(p["reach"], dtype=float)
+    def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
+        """Largest |w| of each channel where |z| is at most `size`, (channels,); finite for any z."""
+        reach = np.minimum(np.asarray(p["reach"], dtype=float), size)
         largest = np.array([prod(reach[i] for i in term) for term in self.terms])
         return np.asarray(np.abs(np.asarray(p["gain"], dtype=float)) @ largest)

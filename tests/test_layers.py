@@ -89,6 +89,7 @@ LAYERS = {
         "plots",
         "accepted",
         "load_simulator",
+        "response_bound",
     ),
     7: ("diagnose", "report"),  # a diagnosis writes its own report
     8: ("cli", "commands", "runs", "diagnose_command", "export_command", "option_values", "demo"),

@@ -1,0 +1,240 @@
+"""A real fine steering mirror, 3 x 3, at three levels with one model (`python -m problems.fsm`).
+
+CubeSpec fine steering mirror: three piezo actuators in V, three displacements in m; Floren et al. (2024), ISMA-USD, pp.
+2042-2052, CC BY 4.0, data not included here. At each level (100, 200, 300 mV) six realizations of orthogonal
+random-phase multisines, two periods of 8192 samples in steady state; the sampling rate is not in the files, time is
+counted in samples.
+
+One model for all levels that is told nothing but the input. The last realization of each level is held back; what is
+reported is its relative error, RMSE / std(y), averaged over outputs and periods. The means of the recordings are zero,
+where the mirror rests and creeps is not in them: the models have no offset (`y_0 = 0`), and what mean their own
+hysteresis makes counts as an error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pilfr_casadi.fit import Fit, fit
+from pilfr_casadi.gauss_newton import GaussNewton
+from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.model import Model
+from pilfr_casadi.periods import mean_period, noise_weights, period_noise
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.recording import Recording
+
+from .fsm_linear import Y_UNIT, Spectra, first_modes, fitted_levels, simulated
+from .fsm_model import combined, pure
+from .measured_data import measured
+
+LEVELS = (100, 200, 300)  # mV
+PERIOD, TRAINING, HELD = 8192, (0, 1, 2, 3, 4), 5
+NOISY = 0.02  # relative noise of one period above which a realization is said to be noisy
+PUBLISHED = (
+    ("published: linear, one a level", (8.38, 7.95, 5.63)),
+    ("published: linear, one for all", (18.6, 6.6, 16.3)),
+    ("published: NL-LFR, one for all", (6.37, 4.84, 4.19)),
+)
+
+
+def recordings(folder: Path) -> list[list[Recording]]:
+    """Realizations of each level, two periods each: u1-u3 in V, y1-y3 in m."""
+    options: dict[str, Any] = {"period": PERIOD, "initial": "periodic"}
+    options["units"] = {f"u{i}": "V" for i in (1, 2, 3)} | {f"y{i}": "m" for i in (1, 2, 3)}
+    out = []
+    for level in LEVELS:
+        u, y = (np.load(folder / f"{x}_{level}mV_train.npy") for x in "uy")
+        flat = [[x[:, :, r].transpose(2, 0, 1).reshape(-1, 3) for x in (u, y)] for r in range(u.shape[2])]
+        out.append([Recording(a, b, 1.0, name=f"{level} mV, {r + 1}", **options) for r, (a, b) in enumerate(flat)])
+    return out
+
+
+def relative_error(simulation: np.ndarray, recording: Recording) -> float:
+    """RMSE / std(y) in %, averaged over outputs and periods; `simulation` is one period."""
+    y = recording.y.reshape(-1, PERIOD, 3)
+    return 100 * float(np.mean(np.sqrt(np.mean((simulation - y) ** 2, axis=1)) / np.std(y, axis=1)))
+
+
+def noise_table(data: Sequence[Sequence[Recording]]) -> list[str]:
+    """Relative noise of one period of each realization, and which are noisy."""
+    lines = ["noise of one period [% of std(y)], from the differences between periods", f"{'realization':>16}"]
+    lines[1] += "".join(f"{r + 1:>8}" for r in range(len(data[0])))
+    noisy = []
+    for level, group in zip(LEVELS, data, strict=True):
+        shares = [float(np.mean(period_noise(r) / np.std(r.y, axis=0))) for r in group]
+        noisy += [f"{r.name} ({100 * s:.1f} %)" for r, s in zip(group, shares, strict=True) if s > NOISY]
+        lines.append(f"{level:>13} mV" + "".join(f"{100 * s:8.2f}" for s in shares))
+    return [*lines, f"noisy: {'; '.join(noisy) or 'none'}; they stay in the fit and count less"]
+
+
+def improved(
+    structure: PILFR, values: dict[str, Any], train: Sequence[Recording], options: dict[str, Any], iterations: int
+) -> dict[str, Any]:
+    """Values after some iterations over some of the recordings, without what a `Fit` brings."""
+    first = train[0]
+    model = structure.model(3, 3, values, inputs=first.inputs, outputs=first.outputs)
+    problem = Problem(model, train, **options)
+    solution = GaussNewton(max_iterations=iterations, tolerance=1e-3, damping=1e-3).solve(problem)
+    return {k: p.value for k, p in model.parameters.at(problem.parameters(solution.theta)).items()}
+
+
+class Mirror:
+    """Recordings, their spectra and weights, and the models that are fitted to them."""
+
+    def __init__(self, folder: Path, threads: int) -> None:
+        self.data, self.threads = recordings(folder), threads
+        train = [[level[r] for r in TRAINING] for level in self.data]
+        weights = noise_weights([r for level in train for r in level]).reshape(len(LEVELS), -1)
+        self.train, self.weights = [[mean_period(r) for r in level] for level in train], weights
+        relative = weights / np.max(weights, axis=1, keepdims=True)
+        self.spectra = [
+            Spectra.of(np.stack([r.u for r in level], axis=2), np.stack([r.y for r in level], axis=2), share)
+            for level, share in zip(self.train, relative, strict=True)
+        ]
+        held = [mean_period(level[HELD]) for level in self.data]
+        self.held = [Spectra.of(r.u[:, :, None], r.y[:, :, None], np.ones(1)) for r in held]
+
+    def chosen(self, realizations: Sequence[int]) -> tuple[list[Recording], dict[str, Any]]:
+        """Training recordings of these realizations, and options with their weights."""
+        chosen = [self.train[level][r] for level in range(len(LEVELS)) for r in realizations]
+        weights = [self.weights[level][r] for level in range(len(LEVELS)) for r in realizations]
+        return chosen, {"weights": weights, "threads": self.threads}
+
+    def linear_errors(self, family: Any, theta: np.ndarray, levels: Sequence[int]) -> list[float]:
+        """Errors of the linear family on the held-back realizations."""
+        out = []
+        for level in levels:
+            y, _ = simulated(family, theta, self.held[level], level, PERIOD)
+            out.append(relative_error(y[:, :, 0], self.data[level][HELD]))
+        return out
+
+    def errors(self, result: Fit) -> list[float]:
+        """Errors of a fit on the held-back realizations."""
+        return [relative_error(self.held_simulation(result, level), self.data[level][HELD]) for level in range(3)]
+
+    def held_simulation(self, result: Fit, level: int) -> np.ndarray:
+        """One simulated period of the held-back realization."""
+        return result.simulate(mean_period(self.data[level][HELD]))
+
+
+def run(mirror: Mirror, iterations: tuple[int, int, int], report: Any = print) -> dict[str, Fit]:
+    """Fit every model, report each row, and return the hysteretic ones."""
+    began = time.perf_counter()
+
+    def row(name: str, errors: Sequence[float], parameters: int | str = "") -> None:
+        figures = "".join(f"{e:8.2f}" for e in errors)
+        report(f"{name:<44}{figures}{parameters!s:>12}{time.perf_counter() - began:10.0f} s")
+
+    start = first_modes(mirror.spectra[1], PERIOD)
+    alone = {}
+    for level in (1, 0, 2):
+        family, theta = fitted_levels(start, mirror.spectra, [level], 0, PERIOD)
+        alone[level] = mirror.linear_errors(family, theta, [level])[0]
+        if level == 1:
+            start = {"mask": start["mask"], **{k: family.unpack(theta)[k] for k in "ABCD"}}
+    row("linear, one a level (told the level)", [alone[level] for level in range(3)], len(theta))
+    family, theta = fitted_levels(start, mirror.spectra, [0, 1, 2], 0, PERIOD)
+    row("linear, one for all levels", mirror.linear_errors(family, theta, [0, 1, 2]), len(theta))
+    family, theta = fitted_levels(start, mirror.spectra, [0, 1, 2], 3, PERIOD)
+    row("linear, stiffness of 3 signals by level (told)", mirror.linear_errors(family, theta, [0, 1, 2]), len(theta))
+    signals = [simulated(family, theta, mirror.spectra[k], k, PERIOD)[1][:, :, 0] for k in range(3)]
+    fits = {}
+    for name, (structure, values), some, steps in (
+        ("PI-LFR: stops in the feedback and at inputs", pure(family, theta, signals), (0, 4), (iterations[0], 3)),
+        (
+            "combined: envelope, products, input plays",
+            combined(family, theta, signals, mirror.spectra[1].deviation),
+            (0, 4),
+            iterations[1:],
+        ),
+    ):
+        chosen, options = mirror.chosen(some)
+        values = improved(structure, values, chosen, options, steps[0])
+        everything, options = mirror.chosen(range(len(TRAINING)))
+        solver = GaussNewton(max_iterations=steps[1], tolerance=1e-3, damping=1e-4)
+        result = fit(
+            structure,
+            everything,
+            start=values,
+            solver=solver,
+            weights=options["weights"],
+            workers=mirror.threads,
+        )
+        fits[name] = result
+        row(name, mirror.errors(result), int(result.model.parameters.free.sum()))
+    return fits
+
+
+def picture(mirror: Mirror, result: Fit, path: Path) -> None:
+    """Spectra of the held-back outputs and of what the model leaves, per level."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    panels: Any = figure.subplots(3, 1, sharex=True)
+    for level, panel in enumerate(panels):
+        record = mean_period(mirror.data[level][HELD])
+        left = record.y - mirror.held_simulation(result, level)
+        both = mirror.data[level][HELD].y.reshape(2, PERIOD, 3)
+        for x, label, colour in (
+            (record.y, "output", "0.6"),
+            (left, "what the model leaves", "C3"),
+            ((both[0] - both[1]) / 2, "noise", "C0"),
+        ):
+            size = np.sqrt(np.mean(np.abs(np.fft.rfft(x, axis=0) / PERIOD) ** 2, axis=1)) / Y_UNIT
+            panel.semilogy(np.arange(len(size)), size, ".", ms=2, color=colour, label=label)
+        panel.set(ylabel="amplitude [µm]", title=f"{LEVELS[level]} mV, held-back realization", ylim=(1e-7, None))
+    panels[0].legend(loc="upper right", markerscale=5)
+    panels[-1].set(xlabel="line (cycles a period of 8192 samples)")
+    figure.savefig(path, dpi=130)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table, save the models, draw the spectra."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/fsm"), help="folder for models and picture")
+    parser.add_argument("--threads", type=int, default=2, help="recordings that are run at a time")
+    parser.add_argument(
+        "--iterations", type=int, nargs=3, default=(12, 18, 12), help="PI-LFR; combined on some, then on all"
+    )
+    options = parser.parse_args(arguments)
+    folder = measured("fsm")
+    if folder is None:
+        print(
+            "The mirror's recordings are not here; put them into a folder DATA/fsm and run with PILFR_DATA=DATA, or "
+            "put them into shared/data/fsm beside the repository."
+        )
+        return 1
+    options.out.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter(), time.process_time()
+    mirror = Mirror(folder, options.threads)
+    print("\n".join(noise_table(mirror.data)), flush=True)
+    print(f"\nrelative error on the held-back realization {HELD + 1} [%]")
+    print(f"{'':<44}" + "".join(f"{level:>5} mV" for level in LEVELS) + f"{'parameters':>12}{'time':>12}")
+    for name, errors in PUBLISHED:
+        print(f"{name:<44}" + "".join(f"{e:8.2f}" for e in errors))
+    fits = run(mirror, tuple(options.iterations), lambda line: print(line, flush=True))
+    for name, result in fits.items():
+        path = options.out / f"{'pi_lfr' if name.startswith('PI') else 'combined'}.json"
+        result.save(path)
+        print(f"model: {path}; {radius(result.model)}")
+    picture(mirror, list(fits.values())[-1], options.out / "spectra.png")
+    print(f"picture: {options.out / 'spectra.png'}")
+    wall, work = time.perf_counter() - began[0], time.process_time() - began[1]
+    print(f"{wall:.0f} s, {work:.0f} s of processor time")
+    return 0
+
+
+def radius(model: Model) -> str:
+    """Spectral radius of the linear part."""
+    size = float(np.max(np.abs(np.linalg.eigvals(model.parameters["A"].value))))
+    return f"spectral radius of its linear part {size:.5f}"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,88 @@
+"""Periodic recordings: mean period, noise, weights, and the steady state as a fixed point."""
+
+import numpy as np
+import pytest
+from random_models import random_input, random_lfr
+
+from pilfr_casadi.operators import Play, Stop
+from pilfr_casadi.periods import mean_period, noise_weights, period_noise
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi.slopes import steady_slope
+
+
+def noisy(size=0.1, periods=4, level=1.0, seed=0, **options):
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(size=(500, 1)), level * rng.normal(size=(500, 2)) * [1.0, 5.0]
+    y = np.tile(y, (periods, 1)) + size * level * rng.normal(size=(500 * periods, 2)) * [1.0, 5.0]
+    return Recording(np.tile(u, (periods, 1)), y, 0.1, period=500, **options)
+
+
+def test_noise_is_what_differs_between_periods():
+    r = noisy(0.1)
+    np.testing.assert_allclose(period_noise(r), [0.1, 0.5], rtol=0.05)
+    one = mean_period(r)
+    assert len(one) == 500 and one.initial == "periodic"
+    np.testing.assert_allclose(one.y, r.y.reshape(4, 500, 2).mean(axis=0))
+    late = r.with_(skip=500)
+    np.testing.assert_allclose(mean_period(late).y, r.y[500:].reshape(3, 500, 2).mean(axis=0))
+
+
+def test_noisy_recordings_count_less_and_levels_alike():
+    quiet, loud, noise = noisy(0.001), noisy(0.001, level=3.0), noisy(0.12)
+    weights = noise_weights([quiet, loud, noise], error=0.03)
+    assert weights[0] / weights[1] == pytest.approx(3.0, rel=1e-3)
+    assert weights[2] / weights[0] == pytest.approx(1 / np.sqrt(1 + (0.06 / 0.03) ** 2), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: period_noise(noisy(periods=1)), "has one period"),
+        (lambda: mean_period(noisy().with_(period=None)), "period of the recording is not known"),
+        (lambda: mean_period(noisy().with_(skip=3)), "1997 steady samples"),
+        (lambda: noise_weights(noisy(), error=0.0), "above zero"),
+    ],
+)
+def test_what_is_not_periodic(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def steady(seed=0, length=80, **options):
+    u, y = random_input(seed, length, 1), random_input([seed, 1], length, 1)
+    return Recording(u, y, 0.1, **{"period": 40, "initial": "periodic", **options})
+
+
+@pytest.mark.parametrize("operator", [Play, Stop])
+def test_the_fixed_point_is_where_many_periods_lead(operator):
+    structure, values = random_lfr(0, operator=operator)
+    model, records = structure.model(1, 1, values), [steady(0), steady(1, skip=10)]
+    exact, warm = (Problem(model, records, engine="vm", periods=n) for n in (None, 60))
+    theta = exact.start + 1e-3 * np.random.default_rng(1).normal(size=exact.size)
+    theta = np.clip(theta, exact.lower, exact.upper)
+    for a, b in zip(exact.first_states(theta), warm.first_states(theta), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-8)
+    for a, b in zip(exact.normal(theta), warm.normal(theta), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-7 * np.max(np.abs(b)))
+    jac = exact.jacobian(theta)
+    np.testing.assert_allclose(jac, warm.jacobian(theta), atol=1e-7 * np.max(np.abs(jac)))
+    np.testing.assert_allclose(jac.T @ jac / exact.residuals, exact.normal(theta)[2], atol=1e-12 * np.max(jac**2))
+
+
+def test_memory_that_never_moves_has_no_slope():
+    after = np.array([[1.0, 2.0, 0.5, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(steady_slope(after, 2), [[2.0, 4.0], [0.0, 0.0]])
+
+
+def test_weights_scale_residuals_and_threads_change_nothing():
+    structure, values = random_lfr(0)
+    model, records = structure.model(1, 1, values), [steady(0), steady(1), steady(2, initial="zero")]
+    plain, weighted = (Problem(model, records, weights=w, threads=n) for w, n in ((None, 1), ([1.0, 3.0, 0.5], 2)))
+    e, f = (p.residual(p.start).reshape(3, -1) for p in (plain, weighted))
+    np.testing.assert_allclose(f, e * np.array([[1.0], [3.0], [0.5]]), atol=1e-14)
+    again = Problem(model, records, weights=[1.0, 3.0, 0.5])
+    for a, b in zip(weighted.normal(weighted.start), again.normal(again.start), strict=True):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(InputError, match="2 weights"):
+        Problem(model, records, weights=[1.0, 1.0])
