@@ -146,11 +146,11 @@ def _parser() -> argparse.ArgumentParser:
         "simulate", help="simulate a saved model on a recording's inputs", allow_abbrev=False
     )
     simulate.add_argument("model", help="model.json")
-    simulate.add_argument("data", help="recording (.csv, .mat, .npz); its outputs may be missing")
-    _data_options(simulate, named=False)
     simulate.add_argument(
-        "--out", required=True, metavar="FILE", help="CSV file for time, inputs and simulated outputs"
+        "data", help="recording (.csv, .mat, .npz), or several in one array (.npz, .npy: samples, channels, ...)"
     )
+    _data_options(simulate, named=False)
+    simulate.add_argument("--out", required=True, metavar="FILE", help="CSV file; of several records also .npz or .npy")
 
     export = commands.add_parser(
         "export", help="write a model's step as a serialized CasADi function or as C", allow_abbrev=False

@@ -14,18 +14,17 @@ import numpy as np
 
 from .cli import DONE, INTERRUPTED, NO_RESULT, say
 from .compiled import compiler, make_engine
-from .export import load, write_atomically
+from .export import load
 from .fit import Fit
 from .fit import fit as identify
 from .gauss_newton import GaussNewton
 from .interrupts import Clock, deferred_interrupt, insistent, time_limit, worker_pool
 from .ipopt import Ipopt
 from .lfr import PILFR
-from .metrics import nrmse
 from .option_values import bounds, name_list, number, pairs
 from .order_selection import select_order
 from .progress import progress_bar
-from .readers import column_names, read, written_times
+from .readers import read
 from .recording import InputError, Recording, listed
 from .sensitivities import VirtualMachine
 from .solution import Status
@@ -70,7 +69,7 @@ def fit(options: argparse.Namespace) -> int:
         raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
     saved = load(options.start_from) if options.start_from else None
     if saved is not None:
-        _check_names(saved, inputs, outputs)
+        check_names(saved, inputs, outputs)
     train = [read_file(options, path, inputs, outputs) for path in options.train]
     tests = [read_file(options, path, inputs, outputs) for path in options.test]
     folder = make_folder(options.out)
@@ -88,7 +87,7 @@ def fit(options: argparse.Namespace) -> int:
             insistent(bar) as progress,
         ):
             task: PILFR | Fit = saved if saved is not None else _structure(options, _order(options, train))
-            engine = _engine(task, train[0], options.engine)
+            engine = announced_engine(task, train[0], options.engine)
             search = {} if saved is not None else {"starts": options.starts, "seed": options.seed, "executor": pool}
             result = identify(task, train, solver=solver, engine=engine, progress=progress, **search)
     except KeyboardInterrupt:
@@ -122,45 +121,9 @@ def fit(options: argparse.Namespace) -> int:
 
 def simulate(options: argparse.Namespace) -> int:
     """Simulate a saved model on a file's inputs; judge it where the file has outputs."""
-    out = Path(options.out)
-    for path, what in ((options.data, "recording"), (options.model, "model")):
-        if out.resolve() == Path(path).resolve():
-            raise InputError(f"--out {options.out} would overwrite the {what}; give another file.")
-    if out.suffix.lower() in (".mat", ".npz"):
-        raise InputError(f"--out {options.out} is written as CSV; give a name that ends in .csv.")
-    fitted = load(options.model)
-    inputs = name_list(options.inputs, "--inputs") if options.inputs else fitted.model.inputs
-    outputs = name_list(options.outputs, "--outputs") if options.outputs else fitted.model.outputs
-    if Path(options.data).suffix.lower() not in (".mat", ".npz"):  # there, a matrix stands for several names
-        _check_names(fitted, inputs, outputs)
-    columns = pairs(options.column, "--column")
-    there = column_names(options.data, [columns.get(name, name) for name in (*inputs, *outputs)])
-    measured = bool(options.outputs) or any(name in columns or name in there for name in outputs)
-    if not measured and options.initial == "estimate":
-        raise InputError(
-            f"--initial estimate needs measured outputs, but {options.data} has no column {listed(outputs)}; "
-            "give --initial zero, or --initial periodic with --period SAMPLES."
-        )
-    options.initial = options.initial or ("estimate" if measured else "zero")
-    columns = columns if measured else {k: v for k, v in columns.items() if k not in outputs}
-    recording = read_file(options, options.data, inputs, outputs if measured else ())
-    _check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
-    engine = _engine(fitted, recording, "auto", quiet=True)
-    y = replace(fitted, engine=engine).simulate(recording)
-    if not np.all(np.isfinite(y)):
-        return say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
-    times = written_times(options.data, columns) or [repr(float(f"{t:.12g}")) for t in recording.t]
-    rows = np.column_stack([recording.u, y]).tolist()
-    lines = [",".join([t.strip(), *map(repr, row)]) for t, row in zip(times, rows, strict=True)]
-    header = ",".join(["t", *fitted.model.inputs, *fitted.model.outputs])
-    write_atomically(out, "\n".join([header, *lines]) + "\n")
-    if measured:
-        print(_judged(fitted, recording, y))
-    else:
-        state = "zero" if options.initial == "zero" else "that of the periodic steady state"
-        print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
-    print(f"simulated outputs: {options.out}")
-    return DONE
+    from .simulate_command import run_simulation
+
+    return run_simulation(options)
 
 
 def export(options: argparse.Namespace) -> int:
@@ -200,7 +163,7 @@ def read_file(options: argparse.Namespace, path: str, inputs: tuple[str, ...], o
     return read(path, inputs, outputs, columns=columns, initial=options.initial or "estimate", **more)
 
 
-def _check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> None:
+def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> None:
     """Refuse names that are not the model's, in its order: swapped ones would be simulated without a word."""
     for role, names, own in (("inputs", inputs, fitted.model.inputs), ("outputs", outputs, fitted.model.outputs)):
         if tuple(names) != tuple(own):
@@ -231,7 +194,7 @@ def _order(options: argparse.Namespace, train: Sequence[Recording]) -> int:
     return nx
 
 
-def _engine(task: PILFR | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
+def announced_engine(task: PILFR | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
     """Build the engine once, say which one it is and why; returns the choice that gives it without a warning."""
     if choice != "vm":
         model = task.model(recording.n_u, recording.n_y) if isinstance(task, PILFR) else task.model
@@ -279,10 +242,3 @@ def _tested(result: Fit, recording: Recording) -> str:
     text = f"NRMSE on {recording.name}: {error:.4f} (rms error {', '.join(f'{s:.2f}' for s in share)} % of the range)"
     fitted = first > recording.skip
     return text + (f"; its initial state is fitted to the first {first} samples, not scored" if fitted else "")
-
-
-def _judged(fitted: Fit, recording: Recording, y: np.ndarray) -> str:
-    try:
-        return f"NRMSE on {recording.name}: {nrmse(recording.y, y, skip=fitted.scored_from(recording)):.4f}"
-    except InputError as error:
-        return f"no NRMSE on {recording.name}: {error}"

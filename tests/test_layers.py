@@ -25,6 +25,7 @@ LAYERS = {
         "interrupts",
         "magnitude",
         "periods",
+        "stack",
         "threads",
         "progress",
     ),
@@ -92,7 +93,7 @@ LAYERS = {
         "response_bound",
     ),
     7: ("diagnose", "report"),  # a diagnosis writes its own report
-    8: ("cli", "commands", "runs", "diagnose_command", "export_command", "option_values", "demo"),
+    8: ("cli", "commands", "runs", "diagnose_command", "export_command", "simulate_command", "option_values", "demo"),
 }
 LAYER_OF = {name: layer for layer, names in LAYERS.items() for name in names}
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py" and p.parent.name != "demo_data")
