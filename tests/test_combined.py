@@ -1,5 +1,7 @@
 """Envelopes, products, and elements combined in one port."""
 
+import json
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -222,6 +224,42 @@ def test_a_combined_machine_is_found_again_in_steady_state(tmp_path):
     again = load(tmp_path / "machine.json")
     assert again.structure.element == structure.element
     np.testing.assert_array_equal(again.simulate(fresh[0]), found.simulate(fresh[0]))
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    structure, values = machine()
+    record = steady_records(structure, values, levels=(0.4,))
+    path = tmp_path_factory.mktemp("saved") / "machine.json"
+    fit(structure, record, start=values, solver=GaussNewton(max_iterations=1)).save(path)
+    return json.loads(path.read_text())
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda e: e["parts"][0]["element"].update(kind="spring"), "element 'spring', which a file cannot hold"),
+        (lambda e: e["parts"][0]["element"].update(channels=10**9), "parameter 'envelope_knee'"),
+        (lambda e: e["parts"][1]["element"].update(degrees=[2, 50]), "parameter 'products_gain'"),
+        (lambda e: e["parts"][2]["element"].update(n=10**9), "parameter 'input_w'"),
+        (lambda e: e["parts"][0].update(reads=[0]), "1 channels and its element has 2"),
+        (
+            lambda e: e["parts"][0].update(element=json.loads(json.dumps(e))),
+            "element 'combined', which a file cannot hold",
+        ),
+        (lambda e: e.update(parts=[]), "give a list of Part"),
+        (lambda e: e.update(parts=e["parts"] * 40), "combines 120 elements"),
+        (lambda e: e.update(channels=3), "channel 3 of 3"),
+    ],
+)
+def test_damaged_files_are_refused_in_one_sentence(saved, tmp_path, change, words):
+    content = json.loads(json.dumps(saved))
+    change(content["structure"]["element"])
+    path = tmp_path / "machine.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=words) as error:
+        load(path)
+    assert str(error.value).count(". ") == 0
 
 
 def test_the_response_is_bounded_and_the_bound_holds():
