@@ -151,7 +151,7 @@ class Search:
     def _screen(self) -> Seen:
         began = time.perf_counter()
         self.say("screen", 0, 1, self.base.cost**0.5)
-        seen = screen(self.bench, self.base, self.laws, self.floor.deviation)
+        seen = screen(self.bench, self.base, self.laws, self.floor.deviation, self.workers)
         self._timed("screen", began)
         return seen
 
