@@ -166,7 +166,7 @@ class Compiled:
     """Generated C behind the `Engine` protocol; it keeps nothing between calls, so threads may share it."""
 
     def __init__(self, model: Model) -> None:
-        self.linear = linearize(model)
+        self.linear = linearize(model, staged=True)
         self.loops = _loops(cache_directory())
         self.library = _loaded(build(source_code(self.linear)))
         self.model = ctypes.byref(ctypes.c_char.in_dll(self.library, "pilfr_model"))

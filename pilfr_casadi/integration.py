@@ -161,31 +161,43 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     end, slope = (u1, (u1 - u0) / h) if hold == "linear" else (u0, ca.SX.zeros(n_u))
     middle = (u0 + end) / 2
 
-    def at(state: Any, memory: Any, u: Any, time: Any) -> tuple[Any, ...]:
-        return equations.evaluate(Instant(state, memory, u, slope, time))
+    instant = [ca.SX.sym(name, n) for name, n in (("x", n_x), ("s", s.numel()), ("u", n_u), ("t", 1))]
+    f, y, after, local = equations.evaluate(Instant(*instant[:3], slope, instant[3]))
+    z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
+    at = ca.Function("at", [*instant, u0, u1, vector], [f, y, after, z])  # written out once, called at every stage
 
-    _, _, begun, local = at(x, s, u0, t)
+    def k(state: Any, u: Any, time: Any) -> Any:
+        return at(state, seen, u, time, u0, u1, vector)[0]
+
+    _, _, begun, z = at(x, s, u0, t, u0, u1, vector)
     # a shift register takes in the signal at the step's begin, where it is measured; others have moved on with it when
     # the step begins
     moved = ca.SX.sym("moved", s.numel())
     shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
     seen = ca.vertcat(ca.SX(0, 1), *(s[i] if shift else moved[i] for i, shift in enumerate(shifts)))
-    k1, y, _, _ = at(x, seen, u0, t)
+    k1, y, _, _ = at(x, seen, u0, t, u0, u1, vector)
     n_own = len(simulator.states)
+    stages: tuple[Any, ...] | None = None
     if simulator.discrete:  # laws' own states move with z held over the sample
         x_next = ca.vertcat(k1[:n_own], x[n_own:] + h * k1[n_own:])
     else:
-        k2 = at(x + h / 2 * k1, seen, middle, t + h / 2)[0]
-        k3 = at(x + h / 2 * k2, seen, middle, t + h / 2)[0]
-        k4 = at(x + h * k3, seen, end, t + h)[0]
-        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        c2 = x + h / 2 * k1
+        k2 = k(c2, middle, t + h / 2)
+        c3 = x + h / 2 * k2
+        k3 = k(c3, middle, t + h / 2)
+        c4 = x + h * k3
+        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k(c4, end, t + h))
+        if n_x:  # the same by way of the three states at which the stages are evaluated
+            c = ca.SX.sym("c", 3 * n_x)
+            s2, s3, s4 = ca.vertsplit(c, n_x)
+            by_c = ca.vertcat(c2, x + h / 2 * k(s2, middle, t + h / 2), x + h * k(s3, middle, t + h / 2))
+            stages = c, ca.vertcat(c2, c3, c4), by_c, (s2 + 2 * s3 + s4 - x) / 3 + h / 6 * k(s4, end, t + h)
     reads, columns = ["u"], [u0]
     if hold == "linear":
         reads, columns = [*reads, "next"], [*columns, u1]
     if ca.depends_on(ca.vertcat(x_next, y, begun), t):
         reads, columns = [*reads, "t"], [*columns, t]
     x_next, y = ca.cse([x_next, y])
-    z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
     state, following, port = (x, s), (x_next, begun), None
     if s.numel() and not any(shifts) and not ca.depends_on(z, s):
         # memory that is moved by a port of its own makes the derivatives sparse
@@ -193,9 +205,11 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
         port = z, channels, moved
         following = x_next, equations.memory(channels, s)
     else:
-        x_next, y = ca.substitute([x_next, y], [moved], [begun])
+        x_next, y, *staged = ca.substitute([x_next, y, *(stages or ())[1:]], [moved], [begun])
         empty = ca.SX(0, 1)
         state, following = (ca.vertcat(x, s), empty), (ca.vertcat(x_next, begun), empty)
+        if stages is not None:
+            stages = stages[0], staged[0], staged[1], ca.vertcat(staged[2], begun)
     return from_expressions(
         state,
         ca.vertcat(*columns),
@@ -209,6 +223,7 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
         outputs=simulator.output_names,
         reads=tuple(reads),
         substeps=substeps,
+        stages=stages,
     )
 
 

@@ -214,15 +214,16 @@ def test_partial_derivatives_of_one_step():
     model, u, state, p, _ = case(10, operator=GeneralizedPlay, n_w=2, n=2)
     linear = linearize(model)
     x, s = state[:3], state[3:]
-    x_next, s_next, y, z, w = (np.asarray(a) for a in linear.step(x, s, u[0], p))
+    x_next, s_next, y, z, w, c = (np.asarray(a) for a in linear.step(x, s, u[0], p))
     np.testing.assert_allclose(z, np.asarray(model.port(x, u[0], p)))
     together, _ = model.closed(state, u[0], p)
     np.testing.assert_allclose(np.concatenate([x_next, s_next]), np.asarray(together), atol=1e-15)
-    blocks = linear.blocks({"x": x, "s": s, "z": z, "w": w, "u": u[0], "p": p})
+    blocks = linear.blocks({"x": x, "s": s, "z": z, "w": w, "c": c, "u": u[0], "p": p})
     named = model.parameters.unpack(p)
     np.testing.assert_array_equal(np.asarray(blocks["x", "x"]), named["A"])
     np.testing.assert_array_equal(np.asarray(blocks["y", "w"]), named["D_yw"])
     assert y.shape == (1, 1)
+    assert c.size == 0
 
 
 # ---- the ways to run ----
