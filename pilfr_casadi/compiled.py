@@ -2,8 +2,9 @@
 
 The loops are built once; a model's library is built once a structure. Both are kept in a private per-user cache, keyed
 by source, compiler, processor and CasADi version, in folders by the key's first letters: a cache of many thousands is
-not listed as a whole. A file name holds a digest of its content, so that a damaged library is built anew. A cache directory that others can write to is not used. Without a working C compiler `make_engine` falls
-back to the virtual machine of `sensitivities`, which gives the same numbers.
+not listed as a whole. A file name holds a digest of its content, so that a damaged library is built anew. A cache
+directory that others can write to is not used. Without a working C compiler `make_engine` falls back to the virtual
+machine of `sensitivities`, which gives the same numbers.
 """
 
 from __future__ import annotations

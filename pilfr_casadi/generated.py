@@ -96,16 +96,16 @@ def source_code(linear: Linearization) -> str:
     for target in TARGETS if not staged else ():
         n = sizes[target]
         terms: list[list[str]] = [[] for _ in range(n)]
-        direct: list[list[str]] = [[] for _ in range(n)]
+        directly: list[list[str]] = [[] for _ in range(n)]
         for source in TARGETS[target]:
             pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
             for i, j, value in zip(*pattern.get_triplet(), code.entries[target, source], strict=True):
                 if source == "p":
-                    direct[i].append(f"{{{j},{value}}}")
+                    directly[i].append(f"{{{j},{value}}}")
                 else:
                     terms[i].append(f"{{{_SOURCES[source]},{j},{value}}}")
         lines += [*_table(f"term_{target}", "term_t", f"row_{target}", terms)]
-        lines += [*_table(f"direct_{target}", "direct_t", f"direct_row_{target}", direct)]
+        lines += [*_table(f"direct_{target}", "direct_t", f"direct_row_{target}", directly)]
         most = max(most, sum(map(len, terms)))
     entries = {f: f"pilfr_{f}" for f in code.functions} | {"constants": "constants"}
     if staged:
@@ -126,10 +126,10 @@ def source_code(linear: Linearization) -> str:
 
 
 def _written(linear: Linearization, code: _Code) -> tuple[list[str], list[str], int]:
-    """C code of the slopes of all rows, a few columns at a time, its direct entries {row, parameter, value}, and their rows.
+    """C code of the slopes of all rows, its direct entries {row, parameter, value}, and how many rows these have.
 
-    What depends on a parameter directly is entered into rows of its own, each column's place in them being the same in
-    every step.
+    The code works on a few columns at a time. What depends on a parameter directly is entered into rows of its own, each
+    column's place in them being the same in every step.
     """
     sizes = linear.sizes
     rows = {target: [list[str]() for _ in range(sizes[target])] for target in TARGETS}
@@ -152,13 +152,10 @@ def _written(linear: Linearization, code: _Code) -> tuple[list[str], list[str], 
         lines += [f"const lane_t {name}{i} = {' + '.join(row) or 'NONE'};" for i, row in enumerate(rows[target])]
     stores = [f"AT({k}_next, {i}) = {k}_{i};" for k in ("s", "x") for i in range(sizes[k])]
     stores += [f"if (y) AT(y, {i}) = y_{i};" for i in range(sizes["y"])]
-    head = "OPTIMISED static void slopes(const double *v, const double *x, const double *s, const double *direct, double *s_next,"
-    return [
-        f"{head} double *x_next, double *y, long ld) {{ for (long j = 0; j < ld; j += WIDTH) {{",
-        *lines,
-        *stores,
-        "} }",
-    ], direct, len(own)
+    read = ("const double *v", *(f"const double *{k}" for k in ("x", "s", "direct")))
+    arguments = ", ".join([*read, *(f"double *{k}" for k in ("s_next", "x_next", "y")), "long ld"])
+    head = f"OPTIMISED static void slopes({arguments}) {{ for (long j = 0; j < ld; j += WIDTH) {{"
+    return [head, *lines, *stores, "} }"], direct, len(own)
 
 
 def _text(name: str) -> str:

@@ -161,10 +161,11 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     end, slope = (u1, (u1 - u0) / h) if hold == "linear" else (u0, ca.SX.zeros(n_u))
     middle = (u0 + end) / 2
 
-    instant = [ca.SX.sym(name, n) for name, n in (("x", n_x), ("s", s.numel()), ("u", n_u), ("t", 1))]
-    f, y, after, local = equations.evaluate(Instant(*instant[:3], slope, instant[3]))
+    sizes = (("x", n_x), ("s", s.numel()), ("u", n_u), ("t", 1))
+    now = {name: ca.SX.sym(name, n) for name, n in sizes}
+    f, y, after, local = equations.evaluate(Instant(**now, slope=slope))
     z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
-    at = ca.Function("at", [*instant, u0, u1, vector], [f, y, after, z])  # written out once, called at every stage
+    at = ca.Function("at", [*now.values(), u0, u1, vector], [f, y, after, z])  # written out once, called at every stage
 
     def k(state: Any, u: Any, time: Any) -> Any:
         return at(state, seen, u, time, u0, u1, vector)[0]

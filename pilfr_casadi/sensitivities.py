@@ -6,8 +6,8 @@ the estimated parameters and the initial state:
     Z  = h_x X + h_p,          W = e_z Z + e_s S + e_p,      S⁺ = g_z Z + g_s S + g_p,
     X⁺ = f_x X + f_w W + f_p,  Y = y_x X + y_w W + y_p.
 
-A step of several stages, `c = k(x, u, w, c, p)` and `x⁺ = f(x, u, w, c, p)` with each entry of c made of those before it,
-has sparse derivatives by way of c; `C = k_x X + k_w W + k_c C + k_p` is then carried as well, row by row.
+A step of several stages, `c = k(x, u, w, c, p)` and `x⁺ = f(x, u, w, c, p)` with each entry of c made of those before
+it, has sparse derivatives by way of c; `C = k_x X + k_w W + k_c C + k_p` is then carried as well, row by row.
 
 `Linearization` holds the step and its partial derivatives; both engines run on it: `VirtualMachine` here (CasADi only,
 a few samples unrolled at a time) and the generated C of `compiled.py`. The record is never differentiated as a whole:

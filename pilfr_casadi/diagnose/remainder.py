@@ -1,4 +1,4 @@
-"""What is left of an error once the simulator's own parameters and initial states have followed it, and who explains it.
+"""What is left of an error once the simulator's own parameters and initial states have followed it.
 
 With base the orthonormal directions in which these can change the stacked outputs, the error e leaves
 
@@ -127,9 +127,7 @@ def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
     return out
 
 
-def _tasks(
-    bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]
-) -> list[Task]:
+def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]) -> list[Task]:
     by_name = {port.name: port for port in bench.simulator.all_ports()}
     out = []
     for j, (name, local, part) in enumerate(

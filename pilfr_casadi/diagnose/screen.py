@@ -8,7 +8,6 @@ observer with process noise at every port, on its innovations.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from ..laws import Law
 from ..laws.base import Local
 from ..laws.trace import columns
+from ..threads import side_by_side
 from .linearise import linearised, observer_gain, run
 from .remainder import Remainder, Task, held_out
 from .workbench import Fitted, Workbench
@@ -62,9 +62,8 @@ def screen(
     ways = [("simulation", Remainder.of(bench, probe, runs, laws))]
     if led:
         ways.append(("observer", Remainder.of(bench, probe, led, laws)))
-    with ThreadPoolExecutor(workers) as pool:
-        tasks = [pool.submit(_score, rest, task, source, keep) for source, rest in ways for task in rest.tasks]
-        found = [scored for task in tasks for scored in task.result()]
+    tasks = [(rest, task, source, keep) for source, rest in ways for task in rest.tasks]
+    found = [scored for one in side_by_side(lambda task: _score(*task), tasks, workers) for scored in one]
     seen = any(s.source == "observer" for s in found)
     return sorted(found, key=lambda s: -s.share), signs, gain if seen else None
 

@@ -17,7 +17,8 @@ import numpy as np
 from ..compiled import make_engine
 from ..laws import FINER, Law
 from ..recording import InputError
-from .explain import Candidate, attempt, by_cost, explain, heads, judged, polish
+from .candidate import Candidate, attempt, heads, judged, polish
+from .explain import by_cost, explain
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .linearise import linearised
@@ -177,11 +178,12 @@ class Search:
         )
         self._timed("fits", began)
         began = time.perf_counter()
-        before = self._judged(self.base)
-        self._lower_floor([c.fitted for c in candidates[:5]])
         near = [c for c in candidates[:POLISHED] if c.error < 1.5 * candidates[0].error]
         with ThreadPoolExecutor(self.workers) as pool:
+            bare = pool.submit(self._judged, self.base)
             kept = [*pool.map(lambda c: polish(self.bench, c), near), *(c for c in candidates if c not in near)]
+            before = bare.result()
+        self._lower_floor([c.fitted for c in candidates[:5]])
         # a law may have become the one that it refines
         kept = list({(c.port, type(c.law)): c for c in sorted(kept, key=lambda c: -c.error)}.values())[::-1]
         samples = self._samples(kept)

@@ -73,6 +73,7 @@ def _step(kind: type[Law], lanes: int, grid: float) -> ca.Function:
     return ca.Function("trace", [memory, signals, vector], [ca.vertcat(*after), ca.vertcat(*forces)])
 
 
+@one_at_a_time
 @functools.lru_cache(maxsize=256)
 def _lane(kind: type[Law], grid: float) -> ca.Function:
     """`(memory, [z, dz, t, z_next, dz_next], shape, dt) -> (next memory, forces)` of one shape."""
