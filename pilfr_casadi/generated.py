@@ -128,8 +128,8 @@ def source_code(linear: Linearization) -> str:
 def _written(linear: Linearization, code: _Code) -> tuple[list[str], list[str], int]:
     """C code of the slopes of all rows, its direct entries {row, parameter, value}, and how many rows these have.
 
-    The code works on a few columns at a time. What depends on a parameter directly is entered into rows of its own, each
-    column's place in them being the same in every step.
+    The code works on a few columns at a time. What depends on a parameter directly is entered into rows of its own, in
+    the same place at every step.
     """
     sizes = linear.sizes
     rows = {target: [list[str]() for _ in range(sizes[target])] for target in TARGETS}

@@ -13,7 +13,6 @@ differential equations of its own (`flow`) adds states. The model's state is [x;
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -25,11 +24,7 @@ from .arrays import accumulated
 from .expressions import Named, call
 from .model import Model, from_expressions
 from .parameters import ParameterSet
-from .recording import InputError, Recording
 from .simulator import Placed, Simulator
-
-REACH = 0.25  # largest |λ| h: phase error (λh)⁴/120 = 3e-5 of a cycle's angle
-MOST = 200  # sub-steps a sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +143,7 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     hold : {"zero", "linear"}
         Inputs between samples.
     substeps : int
-        Runge-Kutta steps a sample; see `choose_substeps`.
+        Runge-Kutta steps a sample; see `substeps.choose_substeps`.
     """
     simulator = on_grid(simulator, dt / substeps)
     own = ParameterSet(dict(simulator.parameters))
@@ -269,57 +264,3 @@ def signals(simulator: Simulator) -> ca.Function:
     names = ["x", "u", "slope", "t", "p"]
     columns = [ca.vertcat(*column) for column in zip(*rows, strict=True)]
     return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push"])
-
-
-def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Largest |eigenvalue| of ∂f/∂x, rad/s, at states x (K, n_x) and inputs u (K, n_u), shape (K,); nan if infinite."""
-    n_x = len(simulator.states)
-    if not n_x or simulator.discrete:
-        return np.zeros(len(x))
-    vector = ca.SX.sym("p", len(p))
-    equations = Equations(simulator, vector)
-    xs, us = ca.SX.sym("x", n_x + sum(equations.n_q)), ca.SX.sym("u", len(simulator.inputs))
-    s = ca.SX.zeros(sum(equations.n_s))
-    f = equations.evaluate(Instant(xs, s, us, ca.SX.zeros(us.shape), ca.SX(0.0)))[0]
-    jacobian = ca.Function("f_x", [xs, us, vector], [ca.densify(ca.jacobian(f, xs))])
-    out = np.full(len(x), np.nan)
-    for k, (row, inputs) in enumerate(zip(x, u, strict=True)):
-        full = np.concatenate([row, np.zeros(xs.numel() - len(row))]) if len(row) < xs.numel() else row[: xs.numel()]
-        a = np.asarray(jacobian(full, inputs, p))
-        if np.all(np.isfinite(a)):
-            out[k] = float(np.max(np.abs(np.linalg.eigvals(a))))
-    return out
-
-
-def choose_substeps(simulator: Simulator, recordings: Sequence[Recording]) -> int:
-    """Sub-steps a sample that keep |λ| h below `REACH`, from the Jacobian at rest.
-
-    Where that is very fast, a run is looked at instead (a square root is infinitely steep at zero).
-
-    Raises
-    ------
-    InputError
-        If more than `MOST` would be needed.
-    """
-    p, first = ParameterSet(dict(simulator.parameters)).start, recordings[0]
-    rest = np.zeros((1, len(simulator.states)))
-    rate = float(np.nan_to_num(fastest(simulator, rest, np.mean(first.u, axis=0)[None], p)[0], nan=1e12))
-    if rate * first.dt > 8 * REACH:
-        rate = _along_a_run(simulator, first, p, rate)
-    needed = max(1, int(np.ceil(rate * first.dt / REACH)))
-    if needed > MOST:
-        raise InputError(
-            f"The simulator has an eigenvalue of {rate:.3g} rad/s, too fast for samples {first.dt:g} s apart; "
-            "check its units, or replace the fast state by its steady state."
-        )
-    return needed
-
-
-def _along_a_run(simulator: Simulator, recording: Recording, p: np.ndarray, rate: float) -> float:
-    """A high quantile of the rates along a run from rest, if that runs."""
-    model = discretise(simulator, recording.dt, "zero", substeps=20)
-    short = recording.slice(0, min(len(recording), 400))
-    states = states_along(model, model.drive(short), p, np.zeros(model.n_state))[:: model.substeps]
-    found = fastest(simulator, states[40::20], short.u[40::20], p)
-    found = found[np.isfinite(found)]
-    return min(rate, float(np.quantile(found, 0.9))) if len(found) > 5 else rate

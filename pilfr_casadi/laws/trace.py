@@ -61,7 +61,7 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
 
 @one_at_a_time
 @functools.lru_cache(maxsize=256)
-def _step(kind: type[Law], lanes: int, grid: float) -> ca.Function:
+def _step(kind: Any, lanes: int, grid: float) -> ca.Function:
     """`(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`."""
     lane = _lane(kind, grid)
     n, sizes = lane.size1_in(0), lane.size1_in(2)
@@ -75,7 +75,7 @@ def _step(kind: type[Law], lanes: int, grid: float) -> ca.Function:
 
 @one_at_a_time
 @functools.lru_cache(maxsize=256)
-def _lane(kind: type[Law], grid: float) -> ca.Function:
+def _lane(kind: Any, grid: float) -> ca.Function:
     """`(memory, [z, dz, t, z_next, dz_next], shape, dt) -> (next memory, forces)` of one shape."""
     law = kind()
     law = law.on_grid(grid) if law.shifts else law
@@ -93,7 +93,7 @@ def _lane(kind: type[Law], grid: float) -> ca.Function:
         values = _Values({**shape, **strength})
         if n_s:
             rate = {"dz": dz} if "dz" in law.reads() else {}
-            w, end = law.step(z, own, values, **rate)  # type: ignore[attr-defined]
+            w, end = law.step(z, own, values, **rate)
         else:
             w = _call(law.force, z=z, dz=dz, q=own, t=t, p=values)
             end = _advance(law, own, (z, following), (dz, dz_next), t, values, h) if n_q else own
