@@ -35,6 +35,7 @@ from .sensitivities import Engine, VirtualMachine, linearize
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 FLAGS = (("-march=native", *COMMON), COMMON)  # the second where the first is not understood
 PLAIN, LOOPS = "-O1", "-O2"  # long straight lines take seconds to optimise and gain nothing from it, unlike the loops
+WRITTEN = 64  # states with memory up to which slopes written out fit the nearest cache
 PATIENCE = 600.0  # seconds for one compilation
 _failures: dict[str, str] = {}  # what did not compile is not tried again by this process
 
@@ -167,7 +168,7 @@ class Compiled:
     """Generated C behind the `Engine` protocol; it keeps nothing between calls, so threads may share it."""
 
     def __init__(self, model: Model) -> None:
-        self.linear = linearize(model, staged=True)
+        self.linear = linearize(model, staged=model.n_state <= WRITTEN)
         self.loops = _loops(cache_directory())
         self.library = _loaded(build(source_code(self.linear)))
         self.model = ctypes.byref(ctypes.c_char.in_dll(self.library, "pilfr_model"))
