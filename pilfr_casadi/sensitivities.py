@@ -110,7 +110,7 @@ class Engine(Protocol):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """As `simulate`, with derivatives.
 
-        seed (n_x + n_s, n_c) is the state's derivative, columns (n_p,) gives each parameter's column or -1
+        seed (n_x + n_s, n_c) is the state's derivative, columns (n_p,) gives each parameter's own column or -1
         -> y, J (M, n_y, n_c), next state, next seed; all are the caller's to change.
         """
 
