@@ -7,23 +7,16 @@ digests of the files tell in the same way of models and tables that were changed
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import platform
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ..export import write_atomically
+from ..export import digest, write_atomically
 from ..recording import InputError
 
 FORMAT, VERSION, NAME = "pilfr_casadi run", 1, "manifest.json"
-
-
-def digest(content: Any) -> str:
-    """SHA-256 of bytes, or of a table in its one canonical form."""
-    data = content if isinstance(content, bytes) else json.dumps(content, sort_keys=True, allow_nan=False).encode()
-    return hashlib.sha256(data).hexdigest()
 
 
 def file_digest(path: Path) -> str:
