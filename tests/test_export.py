@@ -334,7 +334,7 @@ def test_what_is_not_a_model_file_is_one_sentence(tmp_path):
     for path, words in {
         tmp_path / "missing": "does not exist",
         tmp_path: "is a folder",
-        "a\0b": "cannot be read",
+        "a\0b": "a text or a Path",
     }.items():
         with pytest.raises(InputError, match=words) as error:
             load(path)

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..recording import InputError
 from .digests import ordered_digest
+from .files import path_text, short
 from .saving import FORMAT, VERSION
 
 WITHOUT_DIGEST = 1  # the version of the format that had none
@@ -23,7 +24,7 @@ class ModelFile:
     """The tables of a model file, and the checks that turn every surprise into one sentence."""
 
     def __init__(self, path: str | os.PathLike[str], given: bool = False) -> None:
-        self.path, self.given = path, given
+        self.path, self.given = path_text(path, "model file"), given
         content = self._parse()
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             self.fail(f"is not a model file (its format is not {FORMAT!r}); give a file that `save` wrote")
@@ -44,7 +45,7 @@ class ModelFile:
 
     def fail(self, what: str) -> NoReturn:
         """Raise the one sentence."""
-        raise InputError(f"The file {self.path} {' '.join(what.split())}.")
+        raise InputError(f"The file {short(self.path)} {' '.join(what.split())}.")
 
     def damaged(self, what: str) -> NoReturn:
         """Raise the sentence for content that `save` never writes, or writes for another model than the one `given`."""
