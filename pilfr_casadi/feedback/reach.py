@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from ..checks import InputError
+from ..checks import LARGEST, InputError
 from ..gauge import covariance, variance
 from ..problem import Problem
 from ..recording import Recording
@@ -76,6 +76,8 @@ def reach(fit: Fit, function: ca.Function, recording: Recording) -> Reach:
     """Linearise a fit of one input and one output, `function` its step, along a recording."""
     start = fit.initial_state(recording)
     states = np.asarray(function.mapaccum("states", len(recording))(start, recording.u.T)[0])
+    if not np.all(np.abs(states) < LARGEST):
+        raise InputError("The model diverges along the recording, so there is nothing to invert; fit a stable one.")
     at = np.unique(np.linspace(min(1, len(recording) - 1), len(recording) - 1, POINTS).astype(int))
     x, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("u")
     slopes = _slopes("slopes", [x, u], x, u, *function(x, u))
