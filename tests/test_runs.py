@@ -336,7 +336,10 @@ def test_an_empty_folder_and_what_a_killed_process_left_will_do(folder):
     (folder / "left").mkdir()
     (folder / "left" / ".lock").touch()
     (folder / "left" / ".manifest.json.0123abcd.tmp").write_text("{")
-    assert pilfr.run(folder / "rig.toml", out=folder / "left").done == ("seed-0",)
+    (folder / "left" / "jobs" / "seed-0").mkdir(parents=True)
+    (folder / "left" / "jobs" / "seed-0" / ".model.json.0123abcd.tmp").write_text("{")
+    left = pilfr.run(folder / "rig.toml", out=folder / "left", overwrite=True)
+    assert left.done == ("seed-0",) and contents(left.folder) == contents(folder / "empty")
 
 
 def test_times_that_are_damaged_do_not_matter(folder):

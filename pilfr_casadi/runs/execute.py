@@ -23,7 +23,7 @@ from ..recording import InputError, Recording
 from ..solution import Status
 from ..sparse import operators_used
 from .described import ROLES, Run, read_run
-from .folder import MODEL, PAGE, TABLE, check_own, note_time, read_times
+from .folder import MODEL, PAGE, TABLE, check_own, note_time, read_times, sweep
 from .jobs import RunJob, execute, input_digests, jobs_of, timeless
 from .manifest import Manifest, alone, digest, versions
 from .results import Score, chosen, scored, table
@@ -129,6 +129,7 @@ def run(
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(alone(folder))
+            sweep(folder)
         except OSError as error:
             raise InputError(f"The folder {folder} cannot be written ({error.strerror}); give another one.") from None
         return _run(given, folder, inputs, jobs, recordings, overwrite, executor, progress, tell)

@@ -7,6 +7,7 @@ jobs took is different every time and lies apart.
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 from ..checks import listed
@@ -54,9 +55,16 @@ def check_own(folder: Path, file: Path, overwrite: bool) -> None:
         raise InputError(f"{folder} holds {found[0]} but no manifest of a run; give another --out, or --overwrite.")
 
 
+def sweep(folder: Path) -> None:
+    """Remove what a run that was killed has left half written; the folder's lock is held."""
+    for path in (*folder.iterdir(), *folder.glob(f"{JOBS}/*/.*")):
+        if _half_written(path.name):
+            path.unlink(missing_ok=True)
+
+
 def _half_written(name: str) -> bool:
-    """Whether a file is one that an ended process has left behind (`write_atomically`)."""
-    return name.startswith(".") and name.endswith(".tmp")
+    """Whether a file is the beginning of a run's file, as `write_atomically` calls it."""
+    return re.fullmatch(rf"\.({'|'.join(map(re.escape, OWN))})\.[0-9a-f]{{8}}\.tmp", name) is not None
 
 
 def read_times(folder: Path) -> dict[str, float]:
