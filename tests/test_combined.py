@@ -12,6 +12,7 @@ from pilfr_casadi import load
 from pilfr_casadi.combined import Combined, Part, element_bound
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.envelope import Envelope
+from pilfr_casadi.export.digests import ordered_digest
 from pilfr_casadi.fit import fit
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.lfr import PILFR
@@ -245,7 +246,7 @@ def saved(tmp_path_factory):
         (lambda e: e["parts"][0].update(reads=[0]), "1 channels and its element has 2"),
         (
             lambda e: e["parts"][0].update(element=json.loads(json.dumps(e))),
-            "element 'combined', which a file cannot hold",
+            "unknown key 'parts'",
         ),
         (lambda e: e.update(parts=[]), "give a list of Part"),
         (lambda e: e.update(parts=e["parts"] * 40), "combines 120 elements"),
@@ -255,6 +256,8 @@ def saved(tmp_path_factory):
 def test_damaged_files_are_refused_in_one_sentence(saved, tmp_path, change, words):
     content = json.loads(json.dumps(saved))
     change(content["structure"]["element"])
+    del content["sha256"]
+    content["sha256"] = ordered_digest(content)
     path = tmp_path / "machine.json"
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match=words) as error:

@@ -30,7 +30,7 @@ LAYERS = {
         "progress",
     ),
     1: ("operators", "elements", "envelope", "products", "combined", "laws"),
-    2: ("model", "simulator", "integration"),
+    2: ("model", "simulator", "integration", "substeps"),
     3: (
         "simulate",
         "sensitivities",
