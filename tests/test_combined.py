@@ -225,6 +225,8 @@ def test_a_combined_machine_is_found_again_in_steady_state(tmp_path):
     again = load(tmp_path / "machine.json")
     assert again.structure.element == structure.element
     np.testing.assert_array_equal(again.simulate(fresh[0]), found.simulate(fresh[0]))
+    assert len(found.plot(fresh).axes) >= 2 * 2 + 2 * 4  # outputs, and loop and loading curve of the channels
+    np.testing.assert_allclose(found.export(start=fresh[0]).x0(), found.initial_state(fresh[0]))
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def plot_fit(
     fit: Fit, recordings: Recording | Sequence[Recording], *, steady: Sequence[Recording] | None = None
 ) -> Figure:
-    """One figure: time and spectrum of every recording and output; loop, loading curve and weights of every channel.
+    """One figure: time and spectrum of every output; loop and loading curve of every channel, and a layer's weights.
 
     Parameters
     ----------
@@ -55,7 +55,8 @@ def plot_fit(
         row = len(rows) + c
         loop(fit, records[0], channel=c, ax=figure.add_subplot(grid[row, :2]))
         loading_curve(fit, records, channel=c, ax=figure.add_subplot(grid[row, 2:4]))
-        weights(fit, records, channel=c, ax=figure.add_subplot(grid[row, 4:]))
+        if {"w", "r"} <= set(fit.parameters):
+            weights(fit, records, channel=c, ax=figure.add_subplot(grid[row, 4:]))
     if not channels:
         convergence(fit, ax=figure.add_subplot(grid[len(rows), :]))
     return figure
