@@ -30,7 +30,7 @@ from pilfr_casadi.recording import Recording
 from pilfr_casadi.response_bound import response_bound
 
 from .fsm_linear import Y_UNIT, Spectra, first_modes, fitted_levels, simulated
-from .fsm_model import combined, pure
+from .fsm_model import combined, envelope_alone, pure
 from .measured_data import measured
 
 LEVELS = (100, 200, 300)  # mV
@@ -38,6 +38,8 @@ PERIOD, TRAINING, HELD = 8192, (0, 1, 2, 3, 4), 5
 LARGEST, SETTLING = 2.0, 20  # V; periods
 RADIUS = 0.998  # the largest spectral radius of the linear part: a guarantee for amplitudes that were not seen
 NOISY = 0.02  # relative noise of one period above which a realization is said to be noisy
+PURE, COMBINED = "PI-LFR: stops in the feedback and at inputs", "combined: envelope, products, input plays"
+MODELS = {PURE: "pi_lfr", "envelope alone": "envelope", COMBINED: "combined"}  # with the names of their files
 PUBLISHED = (
     ("published: linear, one a level", (8.38, 7.95, 5.63)),
     ("published: linear, one for all", (18.6, 6.6, 16.3)),
@@ -125,7 +127,9 @@ class Mirror:
         return result.simulate(mean_period(self.data[level][HELD]))
 
 
-def run(mirror: Mirror, iterations: tuple[int, int, int], report: Any = print) -> dict[str, Fit]:
+def run(
+    mirror: Mirror, iterations: tuple[int, int, int], report: Any = print, models: Sequence[str] = tuple(MODELS)
+) -> dict[str, Fit]:
     """Fit every model, report each row, and return the hysteretic ones."""
     began = time.perf_counter()
 
@@ -146,32 +150,26 @@ def run(mirror: Mirror, iterations: tuple[int, int, int], report: Any = print) -
     family, theta = fitted_levels(start, mirror.spectra, [0, 1, 2], 3, PERIOD)
     row("linear, stiffness of 3 signals by level (told)", mirror.linear_errors(family, theta, [0, 1, 2]), len(theta))
     signals = [simulated(family, theta, mirror.spectra[k], k, PERIOD)[1][:, :, 0] for k in range(3)]
+    everything = combined(family, theta, signals, mirror.spectra[1].deviation)
     fits = {}
-    for name, (structure, values), some, steps in (
-        ("PI-LFR: stops in the feedback and at inputs", pure(family, theta, signals), (0, 4), (iterations[0], 3)),
-        (
-            "combined: envelope, products, input plays",
-            combined(family, theta, signals, mirror.spectra[1].deviation),
-            (0, 4),
-            iterations[1:],
-        ),
+    for name, (structure, values), steps in (
+        (PURE, pure(family, theta, signals), (iterations[0], 3)),
+        ("envelope alone", envelope_alone(*everything), (iterations[0], 3)),
+        (COMBINED, everything, iterations[1:]),
     ):
-        chosen, options = mirror.chosen(some)
-        values = improved(structure, values, chosen, options, steps[0])
-        everything, options = mirror.chosen(range(len(TRAINING)))
-        solver = GaussNewton(max_iterations=steps[1], tolerance=1e-3, damping=1e-3)
-        result = fit(
-            structure,
-            everything,
-            start=values,
-            solver=solver,
-            stable=RADIUS,
-            weights=options["weights"],
-            workers=mirror.threads,
-        )
-        fits[name] = result
-        row(name, mirror.errors(result), int(result.model.parameters.free.sum()))
+        if name in models:
+            fits[name] = hysteretic(mirror, structure, values, steps)
+            row(name, mirror.errors(fits[name]), int(fits[name].model.parameters.free.sum()))
     return fits
+
+
+def hysteretic(mirror: Mirror, structure: PILFR, values: dict[str, Any], steps: tuple[int, int]) -> Fit:
+    """A model fitted to some of the realizations first, then to all."""
+    values = improved(structure, values, *mirror.chosen((0, 4)), steps[0])
+    train, options = mirror.chosen(range(len(TRAINING)))
+    solver = GaussNewton(max_iterations=steps[1], tolerance=1e-3, damping=1e-3)
+    fixed = {"weights": options["weights"], "workers": mirror.threads}
+    return fit(structure, train, start=values, solver=solver, stable=RADIUS, **fixed)
 
 
 def picture(mirror: Mirror, result: Fit, path: Path) -> None:
@@ -205,6 +203,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--iterations", type=int, nargs=3, default=(8, 36, 16), help="PI-LFR; combined on some, then on all"
     )
+    names = tuple(MODELS.values())
+    parser.add_argument("--models", nargs="+", choices=names, default=names, help="which to fit (default: all)")
     options = parser.parse_args(arguments)
     folder = measured("fsm")
     if folder is None:
@@ -221,9 +221,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"{'':<44}" + "".join(f"{level:>5} mV" for level in LEVELS) + f"{'parameters':>12}{'time':>12}")
     for name, errors in PUBLISHED:
         print(f"{name:<44}" + "".join(f"{e:8.2f}" for e in errors))
-    fits = run(mirror, tuple(options.iterations), lambda line: print(line, flush=True))
+    chosen = [name for name, file in MODELS.items() if file in options.models]
+    fits = run(mirror, tuple(options.iterations), lambda line: print(line, flush=True), chosen)
     for name, result in fits.items():
-        path = options.out / f"{'pi_lfr' if name.startswith('PI') else 'combined'}.json"
+        path = options.out / f"{MODELS[name]}.json"
         result.save(path)
         print(f"model: {path}; {response_bound(result, LARGEST)}")
         left = forgotten(mirror, result)

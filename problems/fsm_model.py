@@ -6,6 +6,7 @@ the loop. What depends on the level in `fsm_linear` now depends on the signals' 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -129,6 +130,18 @@ def combined(family: Levels, theta: Array, signals: list[Array], deviation: Arra
     bounds = {"envelope_rate": (1e-4, 0.1)}
     reaches = {name: values[name] for name in values if name.endswith("_reach")}
     return PILFR(n, Combined(parts), {**fixed, **reaches}, bounds, offset=False), values
+
+
+def envelope_alone(structure: PILFR, values: Values) -> tuple[PILFR, Values]:
+    """The combined model without products and plays; the difference is what these are worth."""
+    n = structure.nx
+    silent = {name: np.zeros_like(values[name]) for name in ("further_gain", "input_w")}
+    silent |= {"products_gain": np.zeros_like(values["further_gain"]), "input_r": values["input_r"]}
+    blocks = {name: np.array(structure.fixed[name], dtype=float) for name in ("B_w", "D_yw", "C_z", "D_zu")}
+    blocks["B_w"][:, 3:6], blocks["D_yw"][:, 3:6] = 0.0, 0.0
+    blocks["C_z"][3:6], blocks["D_zu"][3:6] = np.zeros((3, n)), np.zeros((3, 3))
+    fixed = {**structure.fixed, **silent, **blocks}
+    return replace(structure, fixed=fixed), {k: v for k, v in values.items() if k not in silent}
 
 
 def _gain(z: Array, r: float) -> float:
