@@ -38,6 +38,7 @@ PERIOD, TRAINING, HELD = 8192, (0, 1, 2, 3, 4), 5
 LARGEST, SETTLING = 2.0, 20  # V; periods
 RADIUS = 0.998  # the largest spectral radius of the linear part: a guarantee for amplitudes that were not seen
 NOISY = 0.02  # relative noise of one period above which a realization is said to be noisy
+ITERATIONS = (8, 36, 16)  # PI-LFR and envelope; the combined model on some realizations, then on all
 PURE, COMBINED = "PI-LFR: stops in the feedback and at inputs", "combined: envelope, products, input plays"
 MODELS = {PURE: "pi_lfr", "envelope alone": "envelope", COMBINED: "combined"}  # with the names of their files
 PUBLISHED = (
@@ -201,7 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/fsm"), help="folder for models and picture")
     parser.add_argument("--threads", type=int, default=2, help="recordings that are run at a time")
     parser.add_argument(
-        "--iterations", type=int, nargs=3, default=(8, 36, 16), help="PI-LFR; combined on some, then on all"
+        "--iterations", type=int, nargs=3, default=ITERATIONS, help="PI-LFR; combined on some, then on all"
     )
     names = tuple(MODELS.values())
     parser.add_argument("--models", nargs="+", choices=names, default=names, help="which to fit (default: all)")

@@ -5,7 +5,7 @@ import pytest
 
 from pilfr_casadi import load, response_bound
 from pilfr_casadi.cli import main
-from problems.fsm import COMBINED, HELD, LEVELS, PERIOD, PUBLISHED, Mirror, noise_table, run
+from problems.fsm import COMBINED, HELD, ITERATIONS, LEVELS, PERIOD, PUBLISHED, Mirror, noise_table, run
 from problems.fsm_linear import Levels, Spectra, fitted_levels, in_modes, normal, simulated
 from problems.fsm_model import combined, envelope_alone, pure
 from problems.measured_data import measured
@@ -96,7 +96,7 @@ def test_noisy_realizations_are_found_and_kept():
 @pytest.mark.slow
 def test_one_model_for_all_levels_beats_the_published_one(tmp_path, capsys):
     mirror = Mirror(FOLDER, 2)
-    result = run(mirror, (3, 12, 3), models=[COMBINED])[COMBINED]
+    result = run(mirror, ITERATIONS, models=[COMBINED])[COMBINED]
     errors = mirror.errors(result)
     assert all(ours < theirs for ours, theirs in zip(errors, PUBLISHED[-1][1], strict=True))
     path, data, out = (tmp_path / name for name in ("mirror.json", "test.npz", "out.npz"))
