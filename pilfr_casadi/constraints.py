@@ -16,7 +16,7 @@ spectral radius by its eigenvalues, and where a check fails the result is moved 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -129,6 +129,16 @@ def stable(
     limit = float(np.log(radius) + (-INSIDE if exact else np.log1p(slack)))
     check = BeyondRadius(radius, matrix) if exact else None
     return Constraint(LogRadius(matrix), upper=limit, name=f"{name} <= {radius:g}", unit=UNIT, exact=exact, check=check)
+
+
+def loosened(constraints: Sequence[Constraint]) -> tuple[Constraint, ...]:
+    """The constraints with exact bounds on spectral radii at 1, or where they are if that is more, up to the slack."""
+    return tuple(
+        stable(max(c.check.radius, 1.0), c.check.matrix, c.name.partition(" <=")[0])
+        if c.exact and isinstance(c.check, BeyondRadius)
+        else c
+        for c in constraints
+    )
 
 
 def compile_constraints(

@@ -18,15 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from .constraints import Constraint
+from .constraints import Constraint, loosened
 from .elements import PrandtlIshlinskii
+from .exactness import beyond
 from .fitted import Fit, Progress, fingerprint
 from .job import Job, interrupted, penalised, rms_error
 from .known_blocks import in_known_coordinates, known_entries
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
-from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability, within_radius
+from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability
 from .outcome import with_solution
 from .penalty import check_penalty
 from .problem import Problem
@@ -165,15 +166,16 @@ def _fit(
     fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
     job = replace(job, recordings=check_for_identification(train, fewest))
     linear, problem, solution = linear_model(
-        job.recordings, model, engine=job.engine, constraints=limits[:1], progress=job.progress
+        job.recordings, model, engine=job.engine, constraints=loosened(limits[:1]), progress=job.progress
     )
     if solution.status is Status.INTERRUPTED:
         return job.result(linear, model.linear(), problem, solution)
     fitted = in_known_coordinates(model, with_solution(linear, problem, solution), job)
     if model.element is None:
+        bounded = Problem(linear, job.recordings, engine=problem.engine, constraints=job.limits)
         more = model.fixed or model.bounds or model.priors or job.limits[1:] or solution.status is Status.INFEASIBLE
-        if not more and job.solver is POLISH:  # nothing that the linear model has not seen
-            return job.result(linear, model, problem, solution)
+        if not (more or beyond(bounded, solution.theta)) and job.solver is POLISH:
+            return job.result(linear, model, bounded, solution)  # nothing that the linear model has not seen
         return _linear(model, fitted, job)
     return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
 
@@ -205,7 +207,7 @@ def _from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit |
 
 def _linear(structure: PILFR, fitted: Model, job: Job) -> Fit:
     """A linear model with the structure's bounds and fixed blocks, from the one without."""
-    values = within_radius({k: p.value for k, p in fitted.parameters.items()}, job.limits, structure)
+    values = {k: p.value for k, p in fitted.parameters.items()}
     first = job.recordings[0]
     model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
     problem = job.problem(model)

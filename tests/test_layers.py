@@ -68,7 +68,9 @@ LAYERS = {
         "scaling",
         "solution",
         "exactness",
-        "restoration",
+        "tightening",
+        "lifted",
+        "schur",
         "limits",
     ),
     6: (
