@@ -75,13 +75,15 @@ def fit(
     solver : GaussNewton or Ipopt
         Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`.
     starts, seed : int
-        Number of random starts and the seed of all of them.
+        Number of starts and the seed of all of them. With `start="grid"` the first two have the element at the output
+        and at the input, whatever the seed; more are drawn. More starts with the same seed hold those of fewer.
     start : {"grid", "paper"}
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
         solved and re-gridded.
     stable : bool or float
-        Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope. A number holds
-        exactly, by the eigenvalues of the result; True, the default, is 1 up to 1e-4; False is none.
+        Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
+        exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one, nothing grows.
+        A number below 1 is a least rate of decay; False is no bound.
     constraints
         See `Problem`.
     noise : float, optional
@@ -258,7 +260,7 @@ def _from_starts(
     try:
         if stopped:
             latest = interrupted(*latest)
-        elif start != "paper":
+        elif start != "paper" or beyond(problem, best.theta):
             latest = model, problem, job.solve(problem, "solve", best.theta), note
         if structure.priors and not stopped:
             problem, result = job.settled(problem, latest[2], "solve")
@@ -285,12 +287,12 @@ def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any
 
 
 def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
-    """The limits that `stable` stands for: a number exactly, True up to a slack that lets an integrator be one."""
+    """The limits that `stable` stands for."""
     if bound is False:
         return ()
     if not isinstance(bound, bool | int | float | np.number) or not np.isfinite(bound):
         raise InputError(f"stable = {bound!r} was given; give True, False or the largest spectral radius, above zero.")
-    return stability(structure) if bound is True else stability(structure, float(bound), exact=True)
+    return stability(structure, float(bound), exact=True)
 
 
 def constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:

@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 
 from .compiled import make_engine
-from .constraints import Constraint, stable
+from .constraints import Constraint, loosened, stable
 from .elements import PrandtlIshlinskii
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
@@ -73,7 +73,7 @@ class Search:
             model,
             self.recordings,
             engine=engine or self.engine,
-            constraints=self.constraints,
+            constraints=loosened(self.constraints, least=1.0),
             l1=self.l1,
             noise=self.noise or noise or self.level,
         )
@@ -86,7 +86,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """What one start led to."""
+    """What one start led to; `drawn` tells whether its start depends on the seed."""
 
     seed: int
     model: Model
@@ -94,6 +94,7 @@ class Candidate:
     error: float
     solution: Solution
     note: str = ""
+    drawn: bool = True
 
 
 def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tuple[Constraint, ...]:
@@ -129,6 +130,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     model = search.model(values)
     problem = search.problem(model)
     candidate = _candidate(seed, model, problem, within_bounds(problem, None, solver.solve))
+    candidate = replace(candidate, drawn=_drawn(search, seed))
     done = candidate.solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error)
     if search.start != "paper" or done:
         return candidate
@@ -139,6 +141,12 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     problem = search.problem(polished.model, problem.engine, noise=polished.error)
     solution = within_bounds(problem, polished.theta, search.solver.solve)
     return _candidate(seed, polished.model, problem, solution, polished.note)
+
+
+def _drawn(search: Search, seed: int) -> bool:
+    """Whether a start has anything random in it: with the grid, the direction of z where it is free."""
+    fixed = {k for k, v in search.structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))}
+    return search.start == "paper" or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
 
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:

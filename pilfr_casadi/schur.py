@@ -9,8 +9,8 @@ says that F has the eigenvalues of its diagonal blocks. Both of a block lie in t
     1 - det >= 0,   1 - tr + det >= 0,   1 + tr + det >= 0,
 
 and so `ρ(M) <= c`: polynomials in M and in the unknowns X, without the kinks and infinite slopes that eigenvalues have
-where they meet. At the point itself X = 0. Blocks hold complex pairs and those real eigenvalues that are nearest to each
-other, which alone may become a pair.
+where they meet. At the point itself X = 0. Blocks hold complex pairs and those real eigenvalues that are nearest to
+each other, which alone may become a pair.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def below_blocks(n: int) -> Array:
 
 @lru_cache(maxsize=32)
 def bounded_rows(n: int, lifted: bool = True) -> ca.Function:
-    """`(M, X) -> (held, low)`: Jury's rows of the diagonal blocks, and what is below them; M (n, n) of radius 1 or less.
+    """`(M, X) -> (held, low)`: Jury's rows of the diagonal blocks, and what is below them; M (n, n) over its bound.
 
     X holds the entries of `below_blocks` in CasADi's order (column by column); without `lifted` there are none, and M
     has to be block triangular as it is.
