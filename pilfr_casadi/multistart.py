@@ -180,7 +180,7 @@ def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candida
         moved = regridded(search.structure, parameters.unpack(values), np.concatenate([run[2] for run in runs]), beyond)
         model = candidate.model.with_parameters(parameters.at(parameters.pack(moved)))
         if spread:
-            model = _with_prior(model, moved, spread)
+            model = held_near(model, moved, spread)
         problem = search.problem(model, engine, noise=best.error)
         solution = solve(problem, np.concatenate([problem.start[:n_free], best.theta[n_free:]]))
         found.append(_candidate(candidate.seed, model, problem, solution, PRIOR if spread else ""))
@@ -207,7 +207,7 @@ def _best_so_far(found: list[Candidate]) -> Candidate:
     return replace(best, solution=replace(best.solution, status=Status.INTERRUPTED))
 
 
-def _with_prior(model: Model, values: dict[str, Any], spread: float) -> Model:
+def held_near(model: Model, values: dict[str, Any], spread: float) -> Model:
     """Hold weights and thresholds near the smoothed density, with a relative standard deviation `spread`."""
     r, w = values["r"], values["w"]
     gap = np.gradient(r, axis=1) if r.shape[1] > 1 else r

@@ -80,6 +80,7 @@ LAYERS = {
         "outcome",
         "linear_model",
         "penalty",
+        "thinning",
         "sparse",
         "structures",
         "known_blocks",
