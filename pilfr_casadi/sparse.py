@@ -226,11 +226,15 @@ def regularization_path(
     if not given or not all(0 < s < np.inf for s in given) or not 0 <= margin < np.inf:
         raise InputError(f"strengths {given} with a margin of {margin} were given; give positive numbers, 0 or more.")
     fits, errors = [fit], [fit.nrmse(judged)]
+    thin: dict[int, tuple[Fit, ...]] = {}
     for i, strength in enumerate(given):
         if priors is None:
             penalised = identify(fit, seen, l1={"w": strength}, **options)
             pruned = prune(penalised, seen, **options)
-            spread = thinned(fit, seen, max(1, pruned.structure.element.n), **options)  # type: ignore[union-attr]
+            n = max(1, pruned.structure.element.n)  # type: ignore[union-attr]
+            if n not in thin:
+                thin[n] = thinned(fit, seen, n, **options)
+            spread = thin[n]
             found = min((pruned, *spread), key=lambda f: _error(f, judged))
             penalised_stopped = Status.INTERRUPTED in (penalised.status, pruned.status, *(f.status for f in spread))
         else:
