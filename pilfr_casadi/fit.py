@@ -73,7 +73,8 @@ def fit(
     train : Recording or sequence of Recording
         Training data; nothing else is used.
     solver : GaussNewton or Ipopt
-        Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`.
+        Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`. Where an exact bound on a spectral radius
+        holds the solution, a Gauss-Newton SQP has the last word (see `tightening`).
     starts, seed : int
         Number of starts and the seed of all of them. With `start="grid"` the first two have the element at the output
         and at the input, whatever the seed; more are drawn. More starts with the same seed hold those of fewer.

@@ -73,7 +73,11 @@ def within_bounds(
         if found.status in (Status.INTERRUPTED, Status.DIVERGED_START) or _room(problem, found.theta) >= 0:
             return found
         begin = found.theta
-    return tighten(problem, begin, last, progress)
+    tightened = tighten(problem, begin, last, progress)
+    if tightened.status is not Status.INFEASIBLE:
+        return tightened
+    other = solve(problem, start)  # the bound as one row, for what no scaling brings inside
+    return other if other.status is not Status.INFEASIBLE else tightened
 
 
 def at_bounds(problem: Problem, theta: Array) -> bool:
@@ -83,6 +87,8 @@ def at_bounds(problem: Problem, theta: Array) -> bool:
 
 def tighten(problem: Problem, theta: Array, last: GaussNewton, progress: Progress | None = None) -> Solution:
     """The best solution inside that is found when the bounds are tightened from where θ is."""
+    if not np.isfinite(problem.cost(theta)):
+        theta = _scaled(problem, theta)
     if not np.isfinite(problem.cost(theta)):
         return _unsolved(problem, theta, Status.DIVERGED_START)
     for constraints in list(_steps(problem, theta))[:-1]:
@@ -100,13 +106,14 @@ def tighten(problem: Problem, theta: Array, last: GaussNewton, progress: Progres
         iterations += found.iterations
         if found.status is Status.INTERRUPTED:
             return found if best.status is Status.INFEASIBLE else replace(best, status=Status.INTERRUPTED)
-        better = found.status is not Status.INFEASIBLE and (
-            best.status in (Status.INFEASIBLE, Status.RESTORED) or found.cost < best.cost
-        )
+        first = best.status in (Status.INFEASIBLE, Status.RESTORED)
+        # of two that are as good the one that has converged
+        margin = GAIN if found.status.converged and not best.status.converged else 0.0
+        better = found.status is not Status.INFEASIBLE and (first or found.cost < (1.0 + margin) * best.cost)
         gain = 1.0 if best.status is Status.INFEASIBLE else 1.0 - found.cost / max(best.cost, 1e-300)
         best, theta = (found, found.theta) if better else (best, theta)
-        if not better or gain < GAIN:
-            if not coordinates:
+        if not better or gain < GAIN or found.status is Status.TIME_LIMIT:
+            if not coordinates or found.status is Status.TIME_LIMIT:
                 break
             coordinates = False  # the last word has a solve in any coordinates
     return replace(best, iterations=iterations)

@@ -146,8 +146,8 @@ def test_a_tight_bound_on_a_model_with_plays(demo):
 
 
 def test_more_starts_are_never_worse(record):
-    errors = [pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=n, stable=0.5).train_nrmse[0] for n in (1, 2, 4)]
-    assert errors[1] <= errors[0] * 1.0001 and errors[2] <= errors[1] * 1.0001
+    errors = [pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=n, stable=0.5).train_nrmse[0] for n in (1, 3)]
+    assert errors[1] <= errors[0] * 1.0001
 
 
 def test_what_grows_in_the_data_does_not_grow_in_the_model():
