@@ -17,6 +17,7 @@ from .problem import Problem
 from .solution import Solution
 
 AT_RADIUS = 1e-3  # share of a bound by which a radius that it holds may lie inside
+FELT = 1e-3  # multiplier next to the logarithm of a radius, in units of the objective, from which a bound holds it
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
         values = problem.model.parameters.unpack(problem.parameters(theta))
         for i, (name, check) in enumerate(zip(problem.g_labels, checks, strict=True)):
             if isinstance(check, BeyondRadius):
-                out.append(_radius(name, check, values, float(size[n + i])))
+                out.append(_radius(name, check, values, float(size[n + i]), solution.cost))
                 continue
             numbers = float(g[i]), float(low[i]), float(high[i]), float(size[n + i] if active[i] else 0.0)
             out.append(Limit(name, "constraint", *numbers, active=bool(active[i]), met=bool(met[i])))
@@ -86,9 +87,9 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
     return tuple(out)
 
 
-def _radius(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float) -> Limit:
+def _radius(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, cost: float) -> Limit:
     """A bound on a spectral radius; `force` is its multiplier next to the logarithm."""
     excess, bound = check(values), check.radius
-    active = -excess <= AT_RADIUS * bound and (not force <= 0 or -excess <= 10 * TOLERATED * bound)
+    active = -excess <= AT_RADIUS * bound and (not force <= FELT * cost or -excess <= 10 * TOLERATED * bound)
     multiplier = force / bound if active else 0.0
     return Limit(name, "constraint", excess + bound, -np.inf, bound, multiplier, active, met=excess <= 0)
