@@ -28,7 +28,7 @@ LAYERS = {
         "progress",
     ),
     1: ("operators", "elements", "laws"),
-    2: ("model", "simulator", "integration"),
+    2: ("model", "simulator", "integration", "substeps"),
     3: (
         "simulate",
         "sensitivities",
