@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.fit import Fit, fit, stability_limits
+from pilfr_casadi.constraints import stable
+from pilfr_casadi.fit import Fit, fit
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.periods import mean_period, noise_weights, period_noise
@@ -84,7 +85,7 @@ def improved(
     """Values after some iterations over some of the recordings, without what a `Fit` brings."""
     first = train[0]
     model = structure.model(3, 3, values, inputs=first.inputs, outputs=first.outputs)
-    problem = Problem(model, train, constraints=stability_limits(structure, RADIUS), **options)
+    problem = Problem(model, train, constraints=[stable(RADIUS)], **options)
     solution = GaussNewton(max_iterations=iterations, tolerance=1e-3, damping=1e-3).solve(problem)
     return {k: p.value for k, p in model.parameters.at(problem.parameters(solution.theta)).items()}
 
@@ -170,7 +171,7 @@ def hysteretic(mirror: Mirror, structure: PILFR, values: dict[str, Any], steps: 
     train, options = mirror.chosen(range(len(TRAINING)))
     solver = GaussNewton(max_iterations=steps[1], tolerance=1e-3, damping=1e-3)
     fixed = {"weights": options["weights"], "workers": mirror.threads}
-    return fit(structure, train, start=values, solver=solver, stable=RADIUS, **fixed)
+    return fit(structure, train, start=values, solver=solver, stable=False, constraints=stable(RADIUS), **fixed)
 
 
 def picture(mirror: Mirror, result: Fit, path: Path) -> None:

@@ -71,7 +71,9 @@ LAYERS = {
         "scaling",
         "solution",
         "exactness",
-        "restoration",
+        "tightening",
+        "lifted",
+        "schur",
         "limits",
     ),
     6: (
@@ -81,6 +83,7 @@ LAYERS = {
         "outcome",
         "linear_model",
         "penalty",
+        "thinning",
         "sparse",
         "structures",
         "known_blocks",
