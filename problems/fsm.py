@@ -171,7 +171,7 @@ def hysteretic(mirror: Mirror, structure: PILFR, values: dict[str, Any], steps: 
     train, options = mirror.chosen(range(len(TRAINING)))
     solver = GaussNewton(max_iterations=steps[1], tolerance=1e-3, damping=1e-3)
     fixed = {"weights": options["weights"], "workers": mirror.threads}
-    return fit(structure, train, start=values, solver=solver, stable=False, constraints=stable(RADIUS), **fixed)
+    return fit(structure, train, start=values, solver=solver, stable=False, constraints=[stable(RADIUS)], **fixed)
 
 
 def picture(mirror: Mirror, result: Fit, path: Path) -> None:
