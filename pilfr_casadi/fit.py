@@ -172,7 +172,7 @@ def _fit(
     fitted = in_known_coordinates(model, with_solution(linear, problem, solution), job)
     if model.element is None:
         more = model.fixed or model.bounds or model.priors or job.limits[1:] or solution.status is Status.INFEASIBLE
-        if not more and job.solver is POLISH:  # nothing that the linear model has not seen
+        if not more and job.solver == POLISH:  # nothing that the linear model has not seen
             return job.result(linear, model, problem, solution)
         return _linear(model, fitted, job)
     return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)

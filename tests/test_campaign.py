@@ -1,0 +1,374 @@
+"""Campaigns: the same numbers over any executor, nothing lost or doubled when workers or the driver are killed."""
+
+import contextlib
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import write_csv
+from test_runs import PYTHON, contents
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import hand
+from pilfr_casadi.cli import main
+from pilfr_casadi.recording import InputError
+from pilfr_casadi.runs import cluster as cluster_module
+from pilfr_casadi.runs import side_by_side
+from pilfr_casadi.runs.folds import fold
+from pilfr_casadi.runs.manifest import Manifest
+
+TEXT = """
+seeds = { first = 0, count = 4 }
+report = false
+workers = 2
+
+[data]
+inputs = "u"
+outputs = "y"
+initial = "zero"
+train = "train.csv"
+test = "test.csv"
+
+[model]
+structure = "hammerstein"
+nx = 1
+
+[grid]
+operators = [1, 3]
+
+[solver]
+start = "paper"
+starts = 1
+"""
+SLOW = """
+import os, pathlib, time, tomllib
+from pilfr_casadi.multistart import POLISH
+
+class Slow:
+    def __init__(self, folder):
+        self.folder = folder
+
+    def solve(self, problem, start=None, report=None):
+        if problem.model.element is not None and problem.model.element.n == 3:
+            try:
+                os.mkdir(f"{self.folder}/taken")  # by the first of all jobs with three operators
+            except FileExistsError:
+                pass
+            else:
+                TROUBLE
+        return POLISH.solve(problem, start)
+
+run = tomllib.loads(pathlib.Path("FOLDER/rig.toml").read_text())
+run["solver"]["name"] = Slow("FOLDER")
+run["campaign"] = {"time_limit": 5.0}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for seed, name in enumerate(("train", "test")):
+        write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
+    (tmp_path / "rig.toml").write_text(TEXT)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A scheduler and two worker processes of one thread."""
+    from distributed import LocalCluster
+
+    with LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as local:
+        yield local
+
+
+def changed(folder, *changes):
+    text = TEXT
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "rig.toml").write_text(text)
+    return folder / "rig.toml"
+
+
+def rows(out):
+    with (out / "results.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def command(folder, *more):
+    """The command in a process of its own."""
+    code = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(pilfr.__file__).parent.parent)}
+    arguments = [sys.executable, "-c", code, "campaign", "rig.toml", *more]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(arguments, cwd=folder, env=environment, **pipes)
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.01)
+
+
+def refused(capsys, *arguments, says):
+    """Status 2, one sentence on stderr."""
+    assert main(["campaign", *map(str, arguments)]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err
+    for word in (says,) if isinstance(says, str) else says:
+        assert word in err, err
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory):
+    """What `pilfr run` makes of the same file, one job after the other in one process."""
+    place = tmp_path_factory.mktemp("serial")
+    for seed, name in enumerate(("train", "test")):
+        write_csv(place / f"{name}.csv", seed=seed, m=400)
+    (place / "rig.toml").write_text(TEXT)
+    return contents(pilfr.run(place / "rig.toml").folder)
+
+
+def test_the_numbers_do_not_depend_on_the_executor(folder, serial, cluster):
+    found = {"processes": pilfr.campaign(folder / "rig.toml", out=folder / "a").folder}
+    with ProcessPoolExecutor(2) as pool:
+        found["pool"] = pilfr.campaign(folder / "rig.toml", out=folder / "c", executor=pool).folder
+    with cluster.get_client() as client:
+        found["dask"] = pilfr.campaign(folder / "rig.toml", out=folder / "d", executor=client.get_executor()).folder
+    hand.close_hands()
+    for name, out in found.items():
+        assert contents(out) == serial, name
+        assert (out / "spread.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_what_a_campaign_tells(folder, capsys):
+    assert main(["campaign", str(folder / "rig.toml")]) == 0
+    said = capsys.readouterr().out
+    assert "2 cells x 4 seeds" in said and "median" in said and "8 jobs done now" in said
+    table = rows(folder / "rig-campaign")
+    with (folder / "rig-campaign" / "summary.csv").open() as file:
+        summary = {(r["recording"], r["operators"]): r for r in csv.DictReader(file)}
+    for n in "13":
+        errors = [float(r["nrmse"]) for r in table if r["operators"] == n and r["role"] == "test"]
+        row = summary["test.csv", n]
+        assert len(errors) == 4 and row["failed"] == "0" and float(row["median"]) == np.median(errors)
+        assert float(row["upper_quartile"]) == np.percentile(errors, 75)
+    assert main(["campaign", str(folder / "rig.toml")]) == 0
+    assert "8 jobs done before" in capsys.readouterr().out
+    more = changed(folder, ("[1, 3]", "[1, 2, 3]"), ("count = 4", "count = 5"))
+    again = pilfr.campaign(more)
+    assert len(again.done) == 7 and len(again.skipped) == 8  # a grid that grows
+
+
+def test_a_worker_and_the_driver_are_killed(folder, serial, cluster):
+    out, first = folder / "rig-campaign", command(folder, "--dask", cluster.scheduler_address)
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
+    os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 3)
+    first.kill()
+    first.communicate()
+    seen = len(rows(out)) if (out / "results.csv").exists() else 0
+    assert seen % 2 == 0  # a table is never half there
+    second = command(folder, "--dask", cluster.scheduler_address)
+    _, err = second.communicate(timeout=60)
+    assert second.returncode == 0, err
+    assert contents(out) == serial
+    jobs = [(r["job"], r["recording"]) for r in rows(out)]
+    assert len(jobs) == len(set(jobs)) == 16
+
+
+def children(pid):
+    done = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
+    return [int(p) for p in done.stdout.split()]
+
+
+def alive(pid):
+    status = Path(f"/proc/{pid}/stat")
+    return status.exists() and status.read_text().split()[2] != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_processes_are_killed_and_none_is_left_behind(folder, serial):
+    out, driver = folder / "rig-campaign", command(folder)
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
+    hands = children(driver.pid)
+    assert hands
+    os.kill(hands[0], signal.SIGKILL)  # its job is done again by another
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 3)
+    hands = children(driver.pid)
+    driver.kill()
+    driver.communicate()
+    wait_for(lambda: not any(map(alive, hands)))
+    assert pilfr.campaign(folder / "rig.toml").done
+    assert contents(out) == serial
+
+
+def test_an_interrupted_campaign_goes_on(folder, serial):
+    out, driver = folder / "rig-campaign", command(folder)
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
+    driver.send_signal(signal.SIGINT)
+    _, err = driver.communicate(timeout=30)
+    assert driver.returncode == 130 and "goes on" in err and err.count("\n") == 1, err
+    assert pilfr.campaign(folder / "rig.toml").skipped
+    assert contents(out) == serial
+
+
+@pytest.mark.parametrize(
+    "what, status",
+    [("time.sleep(600)", "TIMED_OUT"), ("os.kill(os.getpid(), 9)", ""), ("raise ValueError(7)", "FAILED")],
+)
+def test_a_job_that_hangs_dies_or_fails_does_not_stop_the_others(folder, what, status):
+    (folder / "mine.py").write_text(SLOW.replace("TROUBLE", what).replace("FOLDER", str(folder)))
+    result = pilfr.campaign(folder / "mine.py")
+    failed = [k for k, e in result.manifest["jobs"].items() if e["status"] == status]
+    assert list(result.failed) == failed and len(failed) == (1 if status else 0)  # what dies is tried again
+    assert len(result.done) == 8
+    if status:
+        assert sum(r["nrmse"] == "nan" for r in rows(result.folder)) == 1
+        assert max(s.failure_rate for s in result.summary) == 0.25
+        assert pilfr.campaign(folder / "mine.py").done == ()
+
+
+def test_more_time_or_another_worker_tries_again(folder):
+    path = folder / "rig.toml"
+    first = pilfr.campaign(path)
+    manifest = Manifest.found(first.folder)
+    entries = manifest.content["jobs"]
+    a, b = first.done[:2]
+    entries[a] |= {"status": "TIMED_OUT", "time_limit": 20.0}
+    entries[b] |= {"status": "LOST"}
+    manifest.write()
+    limited = changed(folder, ("[grid]", "[campaign]\ntime_limit = 20.0\n[grid]"))
+    assert pilfr.campaign(limited).done == (b,)
+    longer = changed(folder, ("[grid]", "[campaign]\ntime_limit = 50\n[grid]"))
+    assert pilfr.campaign(longer).done == (a,)
+
+
+def test_cross_validation_recommends_a_structure(folder):
+    path = changed(
+        folder, ("count = 4", "count = 1"), ("report = false", "folds = 2\nreport = false"), ("[1, 3]", "[0, 2, 5]")
+    )
+    result = pilfr.campaign(path)
+    chosen = result.selection
+    assert chosen.names[chosen.cell] == "operators 2" and "recommended" in repr(chosen)
+    assert chosen.errors[0] > 3 * chosen.errors[1]  # a linear model cannot follow
+    assert len(result.done) == 3 * 2 + 1 and result.chosen.startswith("operators-2_seed")
+    held = [s for s in result.summary if s.role == "held"]
+    assert [s.jobs for s in held] == [2, 2, 2] and pilfr.campaign(path).done == ()
+    assert pilfr.run(path, out=folder / "run").selection.errors == chosen.errors
+
+
+def test_a_validation_recording_recommends_one_too(folder):
+    write_csv(folder / "held.csv", seed=7, m=400)
+    result = pilfr.campaign(changed(folder, ('test = "test.csv"', 'validation = "held.csv"'), ("[1, 3]", "[0, 2, 6]")))
+    assert result.selection.names[result.selection.cell] == "operators 2"
+    assert result.chosen.startswith("operators-2")
+
+
+def test_folds_hold_out_every_sample_once(folder):
+    r = pilfr.read(folder / "train.csv", "u", "y", initial="zero")
+    seen = []
+    for k in range(4):
+        train, held = fold([r], k, 4)
+        assert sum(map(len, train)) + sum(map(len, held)) == len(r)
+        assert all(np.isin(part.u[0], r.u).all() for part in train) and train[0].initial == (
+            "zero" if k else "estimate"
+        )
+        seen.append(held[0].u)
+    assert np.array_equal(np.concatenate(seen), r.u)
+    three = [r.with_(name=str(k)) for k in range(3)]
+    assert [[part.name for part in fold(three, k, 2)[1]] for k in range(2)] == [["0", "2"], ["1"]]
+    with pytest.raises(InputError, match="too few for 30 folds"):
+        fold([r], 0, 30)
+
+
+@pytest.mark.parametrize(
+    "old, new, says",
+    [
+        ("[grid]", "[grid]\nnodes = [1, 2]", ("unknown key 'nodes'", "operators")),
+        ("[1, 3]", "3", "'operators' in [grid] is 3; give a list of different values"),
+        ("[1, 3]", "[3, 3]", "different values"),
+        ("[1, 3]", "[3, 'many']", "'operators' in [model] is 'many'"),
+        ("[1, 3]", "[]", "list of different values"),
+        ("count = 4", "number = 4", "unknown key 'number'"),
+        ("count = 4", "count = 0", "'count' in [seeds] is 0"),
+        ("[grid]", "[campaign]\nlimit = 3\n[grid]", "unknown key 'limit'"),
+        ("[grid]", "[campaign]\ntime_limit = -3\n[grid]", "'time_limit' in [campaign] is -3"),
+        ("report = false", "folds = 1", "'folds' is 1"),
+        ("report = false", "folds = 90", "too few for 90 folds"),
+        ('"paper"', '"grid"', "4 seeds with starts = 1 would give one model"),
+        ("nx = 1", "nx = 1\nfix = { A = 0.5 }\nbounds = { A = [0.6, 0.7] }", ("no job gave a model", "outside")),
+    ],
+)
+def test_bad_input_gets_one_sentence(capsys, folder, old, new, says):
+    refused(capsys, changed(folder, (old, new)), says=says)
+
+
+def test_bad_folders_and_places_get_one_sentence(capsys, folder, monkeypatch):
+    path = folder / "rig.toml"
+    monkeypatch.setattr(cluster_module, "PATIENCE", 2.0)
+    refused(capsys, path, "--out", folder / "train.csv", says="train.csv")
+    refused(capsys, path, "--out", "/proc/nowhere", says="cannot be written")
+    refused(capsys, path, "--dask", "tcp://127.0.0.1:1", says=("No Dask scheduler", "127.0.0.1:1"))
+    refused(capsys, path, "--dask", "nonsense://", says="No Dask scheduler")
+    refused(capsys, path, "--dask", "tcp://127.0.0.1:1", "--workers", "2", says="leave one of them out")
+    refused(capsys, path, "--time-limit", "0", says="--time-limit 0")
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    refused(capsys, path, "--dask", "tcp://127.0.0.1:1", says="pilfr-casadi[dask]")
+
+
+def test_results_of_another_version_get_one_sentence(capsys, folder):
+    out = pilfr.campaign(changed(folder, ("count = 4", "count = 1"))).folder
+    manifest = Manifest.found(out)
+    manifest.content["versions"]["pilfr_casadi"] = "0.0.1"
+    manifest.write()
+    refused(capsys, folder / "rig.toml", says=("results of pilfr_casadi 0.0.1", "--overwrite"))
+    (out / "manifest.json").write_text('{"format": "pilfr_casadi run", "version": 7}')
+    refused(capsys, folder / "rig.toml", says=("manifest", "--overwrite"))
+    assert main(["campaign", str(folder / "rig.toml"), "--overwrite"]) == 0
+
+
+def test_objects_of_a_python_file_are_sent(folder, monkeypatch):
+    path = folder / "mine.py"
+    path.write_text(PYTHON.replace("report=False", "report=False, workers=2"))
+    assert contents(pilfr.campaign(path).folder) == contents(pilfr.run(path).folder)
+    monkeypatch.setitem(sys.modules, "cloudpickle", None)
+    with pytest.raises(InputError, match="cannot be sent to other processes"):
+        pilfr.campaign(path, overwrite=True)
+
+
+def test_unfit_workers_get_one_sentence(folder, monkeypatch):
+    with ProcessPoolExecutor(1) as pool, contextlib.suppress(Exception):
+        pool.submit(os._exit, 1).result()
+    with pytest.raises(InputError, match="The executor has stopped"):
+        pilfr.campaign(folder / "rig.toml", executor=pool)
+    real = side_by_side.versions
+    monkeypatch.setattr(side_by_side, "versions", lambda: {**real(), "casadi": "9.9"})
+    with pytest.raises(InputError, match=r"A worker has casadi 3.* and this process 9\.9"):
+        pilfr.campaign(folder / "rig.toml")
+    monkeypatch.setattr(hand.sys, "executable", "/bin/false")
+    with pytest.raises(InputError, match="The workers cannot do any job"):
+        pilfr.campaign(folder / "rig.toml")
+
+
+def test_a_hand_keeps_its_function_and_ends_when_idle():
+    import pickle
+
+    shared = pickle.dumps(abs)
+    assert [hand.do(shared, pickle.dumps(k)).result for k in (-3, -4)] == [3, 4]
+    mine = hand._mine.hand.process.pid
+    assert hand.do(shared, pickle.dumps(-1)).result == 1 and hand._mine.hand.process.pid == mine
+    lost = hand.do(pickle.dumps(os._exit), pickle.dumps(3))
+    assert lost.lost == "its process ended with status 3" and lost.result is None
+    assert "ValueError" in hand.do(pickle.dumps(int), pickle.dumps("x")).lost
+    assert hand.do(pickle.dumps(time.sleep), pickle.dumps(600), 0.2).timed_out
+    assert hand.do(shared, pickle.dumps(-5)).result == 5
+    hand.close_hands()
