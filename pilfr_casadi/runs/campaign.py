@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 from ..hand import close_hands
@@ -27,6 +28,7 @@ def campaign(
     *,
     out: Any = None,
     overwrite: bool = False,
+    workers: int | None = None,
     executor: Executor | None = None,
     ahead: int = AHEAD,
     progress: Progress | None = None,
@@ -46,9 +48,11 @@ def campaign(
         Folder of the results, in place of the file's.
     overwrite : bool
         Compute everything again, whatever is in the folder.
+    workers : int, optional
+        Processes, in place of the file's; 1 without a time limit is this process.
     executor : concurrent.futures.Executor, optional
-        Where jobs run, for example `dask.distributed.Client(address).get_executor()`; by default `workers` of the file
-        processes. Jobs run in processes of their own in any case.
+        Where jobs run in place of these, for example `dask.distributed.Client(address).get_executor()`. Each of its
+        workers does its jobs in a process beside it.
     ahead : int
         How many jobs the executor is given at a time; at least as many as it has workers.
     progress : callable
@@ -69,6 +73,10 @@ def campaign(
         On Ctrl-C; what is complete stays.
     """
     given = path if isinstance(path, Run) else read_run(path, "campaign")
+    if workers is not None:
+        if not isinstance(workers, int) or workers < 1:
+            raise InputError(f"workers = {workers!r} was given; give a whole number, 1 or more.")
+        given = replace(given, workers=workers)
     _check_seeds(given)
     perform = functools.partial(_perform, executor, ahead)
     return carried_out(given, perform, out, overwrite, progress, tell, campaign=True)
