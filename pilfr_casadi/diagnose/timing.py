@@ -20,10 +20,11 @@ from .screen import block_diagonal, orthonormal
 from .workbench import Fitted, Workbench
 
 SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples
-RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 14)[::-1], np.geomspace(1e-4, 0.05, 14)])
+RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 0.05, 28)])
 WHOLE = 0.12  # samples within which a shift counts as whole
 LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
 FAR = 0.04  # mean square error of a refit that may have gone astray
+PROMISING = 0.7  # share of the remainder that a shift or clock rate worth a refit leaves
 DROP = 0.3  # share of the mean square that has to be left at most
 
 Trial = tuple[float, str, str, float, str, tuple[int, ...]]  # share left, channel, what, value, "u" or "y", columns
@@ -90,7 +91,7 @@ def as_given(bench: Workbench, plain: Fitted) -> Fitted:
 
 
 def _trials(bench: Workbench, fitted: Fitted) -> list[Trial]:
-    """Shifts and clock rates of every channel that make the remainder clearly smaller, with its share."""
+    """The best shift and clock rate of every channel that make the remainder clearly smaller, with its share."""
     names = bench.simulator.output_names
     channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(names)]
     if len(names) > 1:
@@ -101,11 +102,27 @@ def _trials(bench: Workbench, fitted: Fitted) -> list[Trial]:
     straight = _remainder(bench, fitted, basis, lambda r: r, False)
     for kind, i, name in channels:
         for what, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
-            for value in values:
-                left = _remainder(bench, fitted, basis, _maker(kind, i, what)(value), kind == "u") / straight
-                if left < 0.7:
-                    out.append((left, name, what, float(value), kind, i))
+            make = _maker(kind, i, what)
+
+            def left(value: float, make: Callable[[float], Change] = make, kind: str = kind) -> float:
+                return _remainder(bench, fitted, basis, make(value), kind == "u") / straight
+
+            shares = [left(value) for value in values]
+            best = int(np.argmin(shares))
+            value, share = float(values[best]), shares[best]
+            if what == "clock":  # over a whole record a small step of a rate is many samples
+                value, share = _narrowed(left, values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)])
+            if share < PROMISING:
+                out.append((share, name, what, value, kind, i))
     return out
+
+
+def _narrowed(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
+    """Where the remainder is smallest between two values, and the remainder there."""
+    from scipy.optimize import minimize_scalar
+
+    found = minimize_scalar(left, bounds=(low, high), method="bounded", options={"maxiter": 20})
+    return float(found.x), float(found.fun)
 
 
 def _refit_at(
@@ -161,8 +178,6 @@ def _refined(
     bench: Workbench, now: Workbench, fitted: Fitted, make: Callable[[float], Change], at: float, width: float
 ) -> float:
     """Shift of the original recordings that fits best around `at`."""
-    from scipy.optimize import minimize_scalar
-
     original = replace(bench, scale=now.scale)
     basis = nominal_directions(original, fitted)
 
@@ -176,7 +191,7 @@ def _refined(
         rest = error - basis @ (basis.T @ error)
         return float(rest @ rest)
 
-    return float(minimize_scalar(left, bounds=(at - width, at + width), method="bounded").x)
+    return _narrowed(left, at - width, at + width)[0]
 
 
 def _gate(name: str, what: str, value: float, dt: float, before: float, after: float, change: Change) -> Gate | None:
