@@ -26,7 +26,7 @@ from .known_blocks import in_known_coordinates, known_entries
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
-from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability, within_radius
+from .multistart import KEEP, POLISH, STARTS, Candidate, Search, search_starts, stability, within_radius
 from .outcome import with_solution
 from .penalty import check_penalty
 from .problem import Problem
@@ -75,9 +75,9 @@ def fit(
         Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`.
     starts, seed : int
         Number of random starts and the seed of all of them.
-    start : {"grid", "paper"}
+    start : {"grid", "paper", "plain"}
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
-        solved and re-gridded.
+        solved and re-gridded, or, "plain", solved and no more, as in the paper.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope. A number holds
         exactly, by the eigenvalues of the result; True, the default, is 1 up to 1e-4; False is none.
@@ -111,8 +111,8 @@ def fit(
     """
     solver = solver or POLISH
     _check_options(model, solver, starts, seed, workers, progress)
-    if start not in ("grid", "paper"):
-        raise InputError(f"The start {start!r} is unknown; use 'grid' or 'paper'.")
+    if start not in STARTS:
+        raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper' or 'plain'.")
     own = executor is None and workers > 1
     if own and getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(1)  # a spawned worker that runs the script again; the first process says what to do
@@ -256,7 +256,7 @@ def _from_starts(
     try:
         if stopped:
             latest = interrupted(*latest)
-        elif start != "paper":
+        elif start == "grid":
             latest = model, problem, job.solve(problem, "solve", best.theta), note
         if structure.priors and not stopped:
             problem, result = job.settled(problem, latest[2], "solve")

@@ -31,6 +31,7 @@ class Reply:
     result: Any = None
     timed_out: bool = False
     lost: str = ""
+    begun: bool = True  # whether the job had begun when the hand was lost
 
 
 def do(shared: bytes, job: bytes, limit: float | None = None) -> Reply:
@@ -46,7 +47,7 @@ def do(shared: bytes, job: bytes, limit: float | None = None) -> Reply:
     hand: Hand | None = getattr(_mine, "hand", None)
     if hand is not None and hand.process.poll() is None:
         reply = hand.ask(shared, job, limit)
-        if hand.begun or not reply.lost:
+        if reply.begun:
             return reply  # else it was idle for too long, just now
     if hand is not None:
         hand.close()
@@ -104,7 +105,7 @@ class Hand:
         except (OSError, EOFError, ValueError):
             lost = self._end()
             self.close()
-            return Reply(timed_out=True) if expired.is_set() else Reply(lost=lost)
+            return Reply(timed_out=True) if expired.is_set() else Reply(lost=lost, begun=self.begun)
 
     def _end(self) -> str:
         """How the process has ended, in words."""

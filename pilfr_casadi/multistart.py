@@ -10,7 +10,8 @@
    A last run without the prior shows what the prior costs.
 4. The smallest training error wins; with the prior wins over without when it is within `margin` of it.
 
-With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start.
+With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start. With
+the plain one, the paper's own protocol, through 2 alone.
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
 """
@@ -42,6 +43,7 @@ from .threads import one_blas_thread
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
 PLACES = ("output", "input")  # of the element in the first starts; in all others it is anywhere
+STARTS = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
 PRIOR = "weights held near a smooth density by a weak prior"
 
@@ -128,7 +130,7 @@ def _with_element(p: Any) -> Any:
 
 @one_blas_thread
 def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Candidate:
-    """One start, run until it has shown what it is worth; with the paper's start to the end, polish included.
+    """One start, run until it has shown what it is worth; with the paper's start to the end, polish included or not.
 
     The paper's start draws thresholds far smaller than z, which end in clusters and beyond the visited range: a solver
     alone does not bring them back.
@@ -136,7 +138,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     rng = np.random.default_rng(sequence)
     inputs = [r.u for r in search.recordings]
     scaled, states = unit_states(search.linear, inputs, search.coordinates)
-    if search.start == "paper":
+    if search.start != "grid":
         values, solver = paper_start(search.structure, scaled, rng), search.solver
     else:
         place = PLACES[seed] if seed < len(PLACES) else "random"
@@ -274,7 +276,7 @@ def search_starts(
         raise InputError(
             "No start gave a finite simulation; check units and the initial state, or choose another order."
         )
-    if search.start == "paper" or stopped:
+    if search.start != "grid" or stopped:
         return found, usable[0], stopped
     polished, stopped = run_tasks(polish, [(search, c) for c in usable[:keep]], executor, report)
     return found, min(polished or usable[:1], key=_merit), stopped

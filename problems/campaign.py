@@ -2,6 +2,7 @@
 
     python -m problems.campaign                  25 of the paper's starts for each of N = 5, 10, 15, 20
     python -m problems.campaign --starts 100     Fig. 11 of Krikelis et al. (2024) in full: 400 jobs
+    python -m problems.campaign --start plain    solved and no more, as in the paper; else each start is re-gridded too
 
 The same run file is executed one job after the other, by two processes, and on a Dask cluster of four workers of which
 one is killed (SIGKILL) when a third of the jobs are done; when half of them are, the driver is killed, and resumed. All
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import logging
 import os
 import shutil
 import signal
@@ -43,19 +45,19 @@ nx = 5
 operators = {operators}
 
 [solver]
-start = "paper"
+start = "{start}"
 starts = 1
 """
 
 
-def prepare(folder: Path, seed: int, starts: int, operators: Sequence[int]) -> Path:
+def prepare(folder: Path, seed: int, start: str, starts: int, operators: Sequence[int]) -> Path:
     """Write the recordings and the run file."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, r in benchmark(seed).records.items():
         rows = (f"{t:.9g},{u!r},{y!r}" for t, u, y in zip(r.t, r.u[:, 0].tolist(), r.y[:, 0].tolist(), strict=True))
         (folder / f"{name}.csv").write_text("t,u,x2\n" + "\n".join(rows) + "\n")
     path = folder / "starts.toml"
-    path.write_text(TEXT.format(starts=starts, operators=list(operators)))
+    path.write_text(TEXT.format(start=start, starts=starts, operators=list(operators)))
     return path
 
 
@@ -72,7 +74,8 @@ def on_a_cluster(path: Path, out: Path, jobs: int, workers: int = 4) -> tuple[fl
 
     shutil.rmtree(out, ignore_errors=True)
     began, said = time.perf_counter(), []
-    with LocalCluster(workers, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "silence_logs": logging.ERROR}
+    with LocalCluster(workers, **options) as cluster:
         command = [sys.executable, "-m", "pilfr_casadi.cli", "campaign", str(path), "--out", str(out)]
         command += ["--dask", cluster.scheduler_address]
         driver = subprocess.Popen(command, stdout=subprocess.DEVNULL)
@@ -130,10 +133,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=100, help="record (default 100)")
     parser.add_argument("--starts", type=int, default=25, help="starts of each row (default 25)")
+    parser.add_argument("--start", choices=("paper", "plain"), default="paper", help="with or without re-gridding")
     parser.add_argument("--operators", type=int, nargs="+", default=[5, 10, 15, 20], metavar="N")
     parser.add_argument("--out", type=Path, default=Path("runs/campaign"))
     options = parser.parse_args(arguments)
-    path = prepare(options.out, options.seed, options.starts, options.operators)
+    path = prepare(options.out, options.seed, options.start, options.starts, options.operators)
     jobs = options.starts * len(options.operators)
     places = {name: options.out / name for name in ("serial", "two", "dask")}
     seconds = {"serial": timed(path, places["serial"], 1)}

@@ -135,7 +135,7 @@ def spread(
     Parameters
     ----------
     errors : mapping
-        Label of the group to its errors; infinite ones (simulations that ran away) are counted, not drawn.
+        Label of the group to its errors; infinite ones (no model, or one that ran away) are counted, not drawn.
     y, x, title : str
         Axis labels and title.
     published : mapping, optional
@@ -175,7 +175,7 @@ def spread(
     for k, (group, drawn) in enumerate(zip(groups, finite, strict=True)):
         if len(drawn) < len(group):
             ax.annotate(
-                f"{len(group) - len(drawn)} ran\naway",
+                f"{len(group) - len(drawn)}\nfailed",
                 (k, 0.01),
                 xycoords=("data", "axes fraction"),
                 ha="center",
@@ -222,7 +222,8 @@ def compared_spread(
     y: str = "NRMSE",
 ) -> Figure:
     """Box plots of several data sets on one scale, one `spread` each; keys are titles, then groups."""
-    figure = new_figure(3.6 * max(len(sets), 1) + 0.6, 4.0)
+    widest = max((len(groups) for groups in sets.values()), default=0)
+    figure = new_figure(max(3.6, 0.5 * widest) * max(len(sets), 1) + 0.6, 4.0)
     first: Axes | None = None
     for k, (title, errors) in enumerate(sets.items()):
         ax = figure.add_subplot(1, len(sets), k + 1, sharey=first)

@@ -31,7 +31,8 @@ def dask_executor(address: str) -> Iterator[tuple[Executor, int, int]]:
         from distributed import Client
     except ImportError:
         raise InputError("--dask needs the package distributed; install pilfr-casadi[dask].") from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters comes as an error of a job
+    for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters comes as an error of a job
     try:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:

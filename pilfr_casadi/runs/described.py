@@ -20,7 +20,7 @@ from ..known import dc_gain, ordered
 from ..lfr import PILFR
 from ..load_simulator import user_variable
 from ..model import Model
-from ..multistart import POLISH
+from ..multistart import POLISH, STARTS
 from ..recording import InputError
 from ..structures import OPERATORS, STRUCTURES, named_structure
 from .grid import Cell, cells_of, seeds_of
@@ -202,7 +202,7 @@ def _model(table: Table) -> PILFR:
 def _solver(table: Table) -> tuple[Any, dict[str, Any]]:
     search = {
         "starts": table.number("starts", 8, 1, whole=True),
-        "start": table.choice("start", ("grid", "paper"), "grid"),
+        "start": table.choice("start", STARTS, "grid"),
     }
     name = table.any("name", "gauss-newton")
     if not isinstance(name, str):

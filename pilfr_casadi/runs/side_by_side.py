@@ -52,32 +52,38 @@ def side_by_side(
     """
     shared = _pickled(function)
     waiting, running = deque((job, 1) for job in jobs), dict[Future[Reply], tuple[RunJob, int]]()
-    begun = False
     try:
         while waiting or running:
             while waiting and len(running) < ahead:
                 job, trial = waiting.popleft()
                 running[executor.submit(do, shared, _pickled(job), time_limit)] = job, trial
             batch: Batch = []
+            stop: Exception | None = None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, trial = running.pop(future)
-                reply = _reply(future)
-                if not reply.lost:
-                    begun = True
-                    batch.append((job, _outcome(reply, time_limit)))
-                elif trial <= retries:
-                    waiting.appendleft((job, trial + 1))
-                elif not begun:
-                    raise InputError(f"The workers cannot do any job ({reply.lost}); see that they run this package.")
-                else:
-                    text = f"Failed: its worker was lost {trial} times, lastly {reply.lost}."
-                    batch.append((job, unfinished(LOST, text)))
+                try:
+                    reply = _reply(future)
+                    if not reply.lost:
+                        batch.append((job, _outcome(reply, time_limit)))
+                    elif trial <= retries:
+                        waiting.appendleft((job, trial + 1))
+                    elif not reply.begun:
+                        raise InputError(
+                            f"The workers cannot begin a job ({reply.lost}); see that they run this package."
+                        )
+                    else:
+                        text = f"Failed: its worker was lost {trial} times, lastly {reply.lost}."
+                        batch.append((job, unfinished(LOST, text)))
+                except (InputError, BrokenExecutor, CancelledError) as error:
+                    stop = error
             if batch:
-                yield batch
+                yield batch  # whatever stops a campaign, what has arrived is kept
+            if stop is not None:
+                raise stop
     except (BrokenExecutor, CancelledError, RuntimeError, OSError) as error:
+        reason = str(error) or type(error).__name__
         raise InputError(
-            f"The executor has stopped ({error or type(error).__name__}); what is done stays, the same command goes on "
-            "from there."
+            f"The executor has stopped ({reason}); what is done stays, the same command goes on from there."
         ) from None
     finally:
         for future in running:
@@ -91,7 +97,8 @@ def _reply(future: Future[Reply]) -> Reply:
     except (BrokenExecutor, CancelledError):
         raise
     except Exception as error:  # a Dask worker was killed, or has not got the package
-        return Reply(lost=f"{type(error).__name__}: {error}".splitlines()[0])
+        name = type(error).__name__
+        return Reply(lost=f"{name}: {error}".splitlines()[0], begun=name == "KilledWorker")
 
 
 def _outcome(reply: Reply, time_limit: float | None) -> Outcome:
