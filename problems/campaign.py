@@ -74,7 +74,7 @@ def on_a_cluster(path: Path, out: Path, jobs: int, workers: int = 4) -> tuple[fl
 
     shutil.rmtree(out, ignore_errors=True)
     began, said = time.perf_counter(), []
-    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "silence_logs": logging.ERROR}
+    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0", "silence_logs": logging.ERROR}
     with LocalCluster(workers, **options) as cluster:
         command = [sys.executable, "-m", "pilfr_casadi.cli", "campaign", str(path), "--out", str(out)]
         command += ["--dask", cluster.scheduler_address]
@@ -118,9 +118,9 @@ def draw(out: Path, target: Path) -> None:
     from pilfr_casadi.plots import compared_spread
 
     errors: dict[str, dict[str, list[float]]] = {name: {} for name in SETS}
-    for row in rows(out):
-        set_of = errors[row["recording"].removesuffix(".csv")]
-        set_of.setdefault(f"N={row['operators']}", []).append(float(row["nrmse"]))
+    for row in rows(out):  # a start without a model has one row and no recording
+        for name in [row["recording"].removesuffix(".csv")] if row["recording"] else SETS:
+            errors[name].setdefault(f"N={row['operators']}", []).append(float(row["nrmse"]))
     published = {name: {r.removeprefix("PI-LFR "): PUBLISHED[r][k] for r in PUBLISHED} for k, name in enumerate(SETS)}
     figure = compared_spread(
         errors, published=published, floor=FLOOR, source="published 25th percentile", x="operators"
@@ -151,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found = contents(places[name])
         different = sum(found.get(k) != v for k, v in expected.items())
         seen = [(r["job"], r["recording"]) for r in rows(places[name])]
-        lost, doubled = 3 * jobs - len(set(seen)), len(seen) - len(set(seen))
+        lost, doubled = jobs - len({job for job, _ in seen}), len(seen) - len(set(seen))
         print(f"{name:<5} results lost {lost}, doubled {doubled}; files that differ from the serial ones {different}")
     with (places["dask"] / "summary.csv").open() as file:
         for r in csv.DictReader(file):

@@ -44,7 +44,7 @@ nx = 1
 operators = [1, 3]
 
 [solver]
-start = "paper"
+start = "plain"
 starts = 1
 """
 SLOW = """
@@ -84,7 +84,7 @@ def cluster():
     """A scheduler and two worker processes of one thread."""
     from distributed import LocalCluster
 
-    with LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=None) as local:
+    with LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=":0") as local:
         yield local
 
 
@@ -308,7 +308,7 @@ def test_folds_hold_out_every_sample_once(folder):
         ("[grid]", "[campaign]\ntime_limit = -3\n[grid]", "'time_limit' in [campaign] is -3"),
         ("report = false", "folds = 1", "'folds' is 1"),
         ("report = false", "folds = 90", "too few for 90 folds"),
-        ('"paper"', '"grid"', "4 seeds with starts = 1 would give one model"),
+        ('"plain"', '"grid"', "4 seeds with starts = 1 would give one model"),
         ("nx = 1", "nx = 1\nfix = { A = 0.5 }\nbounds = { A = [0.6, 0.7] }", ("no job gave a model", "outside")),
     ],
 )

@@ -172,16 +172,14 @@ def spread(
         ax.axhline(floor, color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
     ax.set_yscale("log")
     ax.set_xticks(range(len(groups)), [plain(name) for name in errors])
-    for k, (group, drawn) in enumerate(zip(groups, finite, strict=True)):
-        if len(drawn) < len(group):
-            ax.annotate(
-                f"{len(group) - len(drawn)}\nfailed",
-                (k, 0.01),
-                xycoords=("data", "axes fraction"),
-                ha="center",
-                va="bottom",
-                fontsize=9,
-            )
+    lost = {k: len(group) - len(drawn) for k, (group, drawn) in enumerate(zip(groups, finite, strict=True))}
+    if any(lost.values()):
+        low, high = ax.get_ylim()
+        ax.set_ylim(low, high * (high / low) ** 0.12)  # room above the boxes
+    for k, count in lost.items():
+        if count:
+            place = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "top", "fontsize": 9}
+            ax.annotate(f"{count}\nfailed", (k, 0.99), **place)
     return finish(ax, x, y, title, 3)
 
 

@@ -27,6 +27,7 @@ from ..recording import InputError, Recording
 from ..solution import Status
 from .described import ROLES, Run, read_run
 from .folder import Folder
+from .folds import fold
 from .jobs import Outcome, Recordings, RunJob, input_digests, jobs_of, outcome
 from .manifest import alone, digest
 from .results import MODEL, PAGE, TABLE, Score, chosen, table
@@ -147,6 +148,8 @@ def carried_out(
     """Execute a run whose jobs `perform` does, in any order; a campaign's tables can be read while it is at work."""
     inputs = input_digests(given)
     recordings = {role: tuple(_read(given, name) for name in given.files[role]) for role in ROLES}
+    if given.folds:
+        fold(recordings["train"], 0, given.folds)  # refuses recordings that are too short for it
     folder = made(out if out is not None else given.out)
     with contextlib.ExitStack() as stack:
         try:
