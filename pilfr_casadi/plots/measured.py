@@ -5,7 +5,7 @@ Krikelis et al. (2024), Fig. 3 (operators), 7 (loops), 8 and 13 (best linear app
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -172,15 +172,24 @@ def spread(
         ax.axhline(floor, color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
     ax.set_yscale("log")
     ax.set_xticks(range(len(groups)), [plain(name) for name in errors])
+    if _crowded(errors):
+        ax.set_xticks(range(len(groups)), [plain(", ".join(name.split("\n"))) for name in errors], rotation=90)
     lost = {k: len(group) - len(drawn) for k, (group, drawn) in enumerate(zip(groups, finite, strict=True))}
-    if any(lost.values()):
+    if any(lost.values()):  # room above the boxes
         low, high = ax.get_ylim()
-        ax.set_ylim(low, high * (high / low) ** 0.12)  # room above the boxes
-    for k, count in lost.items():
-        if count:
-            place = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "top", "fontsize": 9}
-            ax.annotate(f"{count}\nfailed", (k, 0.99), **place)
+        most = max([*(float(np.max(g)) for g in finite if len(g)), *(published or {}).values(), low])
+        ax.set_ylim(low, max(high, most * (most / low) ** 0.16))
+    for k, n in lost.items():
+        if n:
+            at_top = ("data", "axes fraction")
+            ax.annotate(f"{n}\nfailed", (k, 0.99), xycoords=at_top, ha="center", va="top", fontsize=9)
     return finish(ax, x, y, title, 3)
+
+
+def _crowded(labels: Iterable[str]) -> bool:
+    """Whether labels side by side, half an inch each, would overlap."""
+    longest = [max(map(len, label.split("\n"))) for label in labels]
+    return len(longest) > 3 and max(longest, default=0) > 6
 
 
 def operators_demo(r: float = 1.0, amplitude: float = 4.0, samples: int = 2000) -> Figure:
@@ -221,7 +230,8 @@ def compared_spread(
 ) -> Figure:
     """Box plots of several data sets on one scale, one `spread` each; keys are titles, then groups."""
     widest = max((len(groups) for groups in sets.values()), default=0)
-    figure = new_figure(max(3.6, 0.5 * widest) * max(len(sets), 1) + 0.6, 4.0)
+    upright = max((len(label) for groups in sets.values() if _crowded(groups) for label in groups), default=0)
+    figure = new_figure(max(3.6, 0.5 * widest) * max(len(sets), 1) + 0.6, 4.0 + 0.08 * upright)
     first: Axes | None = None
     for k, (title, errors) in enumerate(sets.items()):
         ax = figure.add_subplot(1, len(sets), k + 1, sharey=first)
