@@ -188,8 +188,10 @@ class _Execution:
         place, total = self.place, len(before) + len(jobs)
         ready = [j for j in jobs if place.complete(j)]
         self.skipped += [j.id for j in ready]
-        for line in [f"{len(ready)} jobs done before"] if place.campaign else [f"{j.id}: done before" for j in ready]:
-            self.tell(line)
+        if place.campaign and ready:
+            self.tell(f"{len(ready)} jobs done before")
+        for job in () if place.campaign else ready:
+            self.tell(f"{job.id}: done before")
         place.write_table((*before, *ready))
         try:
             for batch in self.perform(place.run, place.recordings, [j for j in jobs if j not in ready]):
