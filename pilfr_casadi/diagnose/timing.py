@@ -53,8 +53,11 @@ def _remainder(bench: Workbench, fitted: Fitted, basis: np.ndarray, change: Chan
     return value if np.isfinite(value) else np.inf
 
 
-def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Look for a shifted channel or clock; returns the corrected bench where it is a fault of the recording."""
+def timing(bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Look for a shifted channel or clock; returns the corrected bench where it is a fault of the recording.
+
+    A late channel counts as shifted where it is late by a multiple of `part` samples.
+    """
     if plain.cost < 4 * noise2:
         return bench, plain, []
     dt = bench.dt
@@ -78,7 +81,7 @@ def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, F
     if best is None or best[0] > DROP * plain.cost:
         return bench, plain, []
     relative, name, what, value, other, found, change = best
-    gate = _gate(name, what, value, dt, plain.cost, relative, change)
+    gate = _gate(name, what, value, dt, plain.cost, relative, change, part)
     return (other, found, [gate]) if gate else (bench, plain, [])
 
 
@@ -194,13 +197,20 @@ def _refined(
     return _narrowed(left, at - width, at + width)[0]
 
 
-def _gate(name: str, what: str, value: float, dt: float, before: float, after: float, change: Change) -> Gate | None:
+def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
+    """Whether a shift is a multiple of `part` samples."""
+    return abs(value / dt - part * round(value / dt / part)) < WHOLE
+
+
+def _gate(
+    name: str, what: str, value: float, dt: float, before: float, after: float, change: Change, part: float
+) -> Gate | None:
     fall = f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
     if what == "clock":
         sentence = f"The clock of {name} runs {value * 100:+.3g} % off the others'; with it corrected {fall}."
         return Gate(name, "clock", value, sentence, True, True, change, left=after / before)
     samples = value / dt
-    whole = abs(samples - round(samples)) < WHOLE and abs(samples) > LONG
+    whole = in_steps(value, dt, part) and abs(samples) > LONG
     if samples > -0.3 and not whole:
         return None  # late, and not by whole samples: a delay is physics
     word = "late" if samples > 0 else "early"

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 AT_FLOOR = 1.15  # times the floor that counts as being at it
 QUANTISED, SOMEWHAT, COLOURED = 2.0, 4.0, 9.0  # times a measured floor, and an estimated one, that noise may be
-LOUD, SILENT = 0.05, 0.05  # largest coloured noise, and what by chance a force explains of it
+LOUD, SILENT = 0.05, 0.01  # largest coloured noise, and what a force may explain of it
+QUIET, CHANCE = 0.01, 0.05  # the same for noise that nobody minds: by chance a force explains that much
 HINT = 0.1  # share of a residual that a flexible force has to explain to count
 PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name that only comes near
 LITTLE = 0.02  # of the excess left, with rivals near and a force that explains most of it
@@ -167,7 +168,8 @@ def left_open(search: Search) -> tuple[float, float]:
 
 def _like_noise(search: Search, times: float) -> bool:
     """Whether a residual so many times the floor can be noise: coloured, or repeated as quantisation is."""
-    unexplained = max(search.open_before.values(), default=0.0) < SILENT
+    most = CHANCE if search.without.cost < QUIET**2 else SILENT
+    unexplained = max(search.open_before.values(), default=0.0) < most
     if search.floor.source != "estimated":
         return times < QUANTISED and unexplained
     return times < SOMEWHAT or (times < COLOURED and unexplained and search.without.cost < LOUD**2)

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 from concurrent.futures import Executor
 from dataclasses import replace
+from pathlib import Path
 
 from ..cli import DONE, INTERRUPTED, NO_RESULT, say
 from ..commands import make_folder
@@ -14,14 +15,13 @@ from ..progress import progress_bar
 from ..recording import InputError
 from .campaign import campaign
 from .described import ROLES, Run, read_run
-from .execute import RunInterrupted, RunResult, run
-from .results import MODEL, PAGE, TABLE
+from .execute import ConstraintsNotMet, RunInterrupted, RunResult, run
+from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own
 from .side_by_side import AHEAD
-from .summary import PICTURE, SUMMARY
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Execute a run file; returns the exit status."""
+    """Execute a run file; returns the exit status: 1 where no job meets its constraints or explains anything."""
     given = _given(options, "run")
     count = len(given.seeds) * len(given.cells)
     print(f"run: {given.file}, {count} job{'s' * (count > 1)}, results in {given.out}", flush=True)
@@ -30,6 +30,8 @@ def run_command(options: argparse.Namespace) -> int:
             result = run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=_tell)
     except RunInterrupted as stop:
         return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
+    except ConstraintsNotMet as missed:
+        return say(str(missed), NO_RESULT)
     return _told(given, result, TABLE, MODEL)
 
 
@@ -64,6 +66,8 @@ def campaign_command(options: argparse.Namespace) -> int:
             )
     except RunInterrupted as stop:
         return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
+    except ConstraintsNotMet as missed:
+        return say(str(missed), NO_RESULT)
     _print_summary(result)
     return _told(given, result, TABLE, SUMMARY, PICTURE, MODEL)
 
@@ -71,6 +75,7 @@ def campaign_command(options: argparse.Namespace) -> int:
 def _given(options: argparse.Namespace, kind: str) -> Run:
     given = read_run(options.run_file, kind)
     if options.out is not None:
+        check_own(Path(options.out), given.file, options.overwrite)
         given = replace(given, out=make_folder(options.out))
     if options.workers is not None:
         if options.workers < 1:

@@ -23,6 +23,7 @@ from ..model import Model
 from ..multistart import POLISH, STARTS
 from ..recording import InputError
 from ..structures import OPERATORS, STRUCTURES, named_structure
+from .folder import check_inside
 from .grid import Cell, cells_of, seeds_of
 from .tables import Table, as_plain, shown
 
@@ -125,6 +126,9 @@ def _checked(file: Path, content: Any, kind: str) -> Run:
     stable, constraints = _constraints(top.table("constraints"), cells[0].model)
     regularization = _regularization(top.table("regularization"), files)
     out = top.take("out", str, f"{file.stem}-{kind}")
+    wrong = check_inside(file, out)
+    if wrong:
+        top.fail(wrong)
     more = {
         "seeds": seeds_of(top),
         "folds": top.number("folds", 0, 2, whole=True),

@@ -2,7 +2,7 @@
 
 After every job its model is written, then the manifest, each atomically: wherever a run ends, by Ctrl-C, `kill -9` or a
 power cut, the next one goes on with the first job that is not complete, and the results are those of a run that was
-never interrupted. Executed twice on a machine, a run gives the same bytes in every model and in the table.
+never interrupted. Executed twice on a machine, a run gives the same bytes in every file but `times.json`.
 
 `run` does the jobs one after the other, `campaign` (in its own file) many side by side; all else is the same.
 """
@@ -26,13 +26,14 @@ from ..readers import read
 from ..recording import InputError, Recording
 from ..solution import Status
 from .described import ROLES, Run, read_run
-from .folder import Folder
+from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own, read_times, sweep
 from .folds import fold
 from .jobs import Outcome, Recordings, RunJob, input_digests, jobs_of, outcome
 from .manifest import alone, digest
-from .results import MODEL, PAGE, TABLE, Score, chosen, table
+from .results import Score, chosen, table
 from .selection import Selection, select
-from .summary import PICTURE, SUMMARY, CellSummary, box_plots, summarised, summary_table
+from .store import Store
+from .summary import CellSummary, box_plots, summarised, summary_table
 
 Progress = Callable[[str, int, int, float], None]
 Tell = Callable[[str], None]
@@ -47,6 +48,10 @@ class RunInterrupted(KeyboardInterrupt):
         self.done, self.total = done, total
 
 
+class ConstraintsNotMet(InputError):
+    """No job of a run meets its constraints; the manifest says by how much each misses them."""
+
+
 @dataclass(frozen=True, eq=False)
 class RunResult:
     """A run that is complete.
@@ -55,7 +60,7 @@ class RunResult:
     ----------
     folder : Path
         With `manifest.json`, `results.csv`, `jobs/ID/model.json`, and `model.json`, `report.html` of the job chosen; of
-        a campaign with `summary.csv` and `spread.png` too.
+        a campaign with `summary.csv` and `spread.png` too. `times.json` says how long each job took.
     done, skipped, failed : tuple of str
         Ids of the jobs that were executed now, of those that had been before, and of those among both without a model.
     chosen : str
@@ -102,9 +107,9 @@ def run(
     path : path or Run
         The file, `.toml` or `.py`, or what `read_run` made of it.
     out : path, optional
-        Folder of the results, in place of the file's.
+        Folder of the results, in place of the file's: an empty one, a new one, or that of an earlier run.
     overwrite : bool
-        Compute everything again, whatever is in the folder.
+        Compute everything again, whatever an earlier run has left in the folder.
     engine : {"auto", "c", "vm"}, optional
         In place of the file's; results differ in the last digits, so keep to one.
     executor : concurrent.futures.Executor, optional
@@ -121,7 +126,8 @@ def run(
     Raises
     ------
     InputError
-        If the run file or a recording cannot be used, constraints cannot be met, or results were changed afterwards.
+        If the run file, a recording or the folder cannot be used, or results were changed afterwards;
+        `ConstraintsNotMet`, which is one, if no job meets its constraints.
     RunInterrupted
         On Ctrl-C; what is complete stays.
     """
@@ -146,24 +152,30 @@ def carried_out(
     campaign: bool = False,
 ) -> RunResult:
     """Execute a run whose jobs `perform` does, in any order; a campaign's tables can be read while it is at work."""
+    folder = Path(out if out is not None else given.out)
+    try:
+        check_own(folder, given.file, overwrite)
+    except OSError as error:
+        raise InputError(f"The folder {folder} cannot be read ({error.strerror}); give another one.") from None
     inputs = input_digests(given)
     recordings = {role: tuple(_read(given, name) for name in given.files[role]) for role in ROLES}
     if given.folds:
         fold(recordings["train"], 0, given.folds)  # refuses recordings that are too short for it
-    folder = made(out if out is not None else given.out)
+    made(folder)
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(alone(folder))
+            sweep(folder)
         except OSError as error:
             raise InputError(f"The folder {folder} cannot be written ({error.strerror}); give another one.") from None
-        place = Folder(folder, given, inputs, recordings, overwrite, campaign)
+        place = Store(folder, given, inputs, recordings, overwrite, campaign)
         return _Execution(place, perform, progress or (lambda *_: None), tell or (lambda line: None)).carry_out()
 
 
 class _Execution:
     """The jobs of a run in a folder: those of the cross-validation first, then those on all of the training."""
 
-    def __init__(self, place: Folder, perform: Perform, progress: Progress, tell: Tell) -> None:
+    def __init__(self, place: Store, perform: Perform, progress: Progress, tell: Tell) -> None:
         self.place, self.perform, self.progress, self.tell = place, perform, progress, tell
         self.done: list[str] = []
         self.skipped: list[str] = []
@@ -215,13 +227,16 @@ class _Execution:
         usable = [j for j in whole if place.has_model(j)]
         if not usable:
             first, met = whole[0].id, entries[whole[0].id]["status"] == Status.INFEASIBLE.name
-            what = "no job meets its constraints" if met else "no job gave a model"
-            raise InputError(f"{given.file}: {what}; {first}: {entries[first]['sentence']}")
+            about = f"{first}: {entries[first]['sentence']}"
+            if met:
+                raise ConstraintsNotMet(f"{given.file}: no job meets its constraints; {about}")
+            raise InputError(f"{given.file}: no job gave a model; {about}")
         scores = place.scores(jobs)
         best = chosen(scores, [j.id for j in usable])
         job = next(j for j in usable if j.id == best)
-        fit = replace(self._model(job), engine=given.engine, seconds=float(entries[best]["seconds"]))
-        summary = summarised(given, jobs, scores, entries)
+        times = read_times(place.path)
+        fit = replace(self._model(job), engine=given.engine)
+        summary = summarised(given, jobs, scores, times)
         manifest.content["chosen"] = best
         manifest.put(TABLE, table(scores, jobs, entries, best))
         manifest.put(MODEL, (place.path / job.model_file).read_text(encoding="utf-8"))
@@ -240,6 +255,7 @@ class _Execution:
         manifest.content.pop("writing", None)
         manifest.write()
         failed = tuple(j.id for j in jobs if not place.ended_well(j))
+        fit = replace(fit, seconds=times.get(best, 0.0))
         parts = tuple(self.done), tuple(self.skipped), failed
         return RunResult(place.path, *parts, best, tuple(scores), fit, manifest.content, summary, selection)
 

@@ -1,139 +1,84 @@
-"""The folder of a run: which jobs are complete there, what has just been done, and the table of all errors."""
+"""The folder of a run's results: one of its own, so that nothing of anybody else's is written over.
+
+Everything in it but `times.json` is the same to the last byte in every execution of a run on one machine; how long the
+jobs took is different every time and lies apart.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import json
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from ..export import load
-from ..model import Model
+from ..checks import listed
+from ..export import write_atomically
 from ..recording import InputError
-from ..solution import Status
-from .described import Run
-from .jobs import FAILED, LOST, TIMED_OUT, Outcome, Recordings, RunJob, error_of
-from .manifest import NAME, Manifest, digest, versions
-from .results import MODEL, PAGE, TABLE, Score, scored_files, table
-from .summary import PICTURE, SUMMARY
+from .manifest import NAME
 
-PAUSE = 1.0  # seconds between two tables of a campaign at work
+TABLE, PAGE, MODEL, TIMES, JOBS, LOCK = "results.csv", "report.html", "model.json", "times.json", "jobs", ".lock"
+SUMMARY, PICTURE = "summary.csv", "spread.png"  # of a campaign
+OWN = (NAME, TABLE, PAGE, MODEL, SUMMARY, PICTURE, TIMES, JOBS)
 
 
-class Folder:
-    """What a run has written, and writes.
+def check_inside(file: Path, out: str) -> str | None:
+    """What is wrong with a folder that a run file names, None where it is a folder below the file's own."""
+    above = file.parent.resolve()
+    try:
+        inside = above in (above / out).resolve().parents
+    except (OSError, RuntimeError, ValueError):
+        inside = False
+    if inside:
+        return None
+    return f"'out' is {out[:60]!r}, which is no folder below that of the run file; give one, or another with --out"
+
+
+def check_own(folder: Path, file: Path, overwrite: bool) -> None:
+    """Refuse a folder that holds the run file, or what is no run's.
 
     Raises
     ------
     InputError
-        If the folder holds something else, or files of the run that were changed afterwards; for a campaign also if
-        its results were computed with other versions.
+        That says what was found there.
     """
-
-    def __init__(
-        self, path: Path, run: Run, inputs: Mapping[str, str], recordings: Recordings, overwrite: bool, campaign: bool
-    ) -> None:
-        self.path, self.run, self.inputs, self.recordings, self.campaign = path, run, inputs, recordings, campaign
-        self.manifest = _manifest(path, overwrite)
-        if campaign:
-            _refuse_other_versions(self.manifest)
-        said = {"file": run.file.name, "said": run.said}
-        self.manifest.content |= {"run": said, "versions": versions(), "inputs": dict(inputs)}
-        self.manifest.write()
-        self.written = -np.inf
-
-    @property
-    def entries(self) -> dict[str, Any]:
-        """What the manifest says of each job."""
-        entries: dict[str, Any] = self.manifest.content["jobs"]
-        return entries
-
-    def complete(self, job: RunJob) -> bool:
-        """Whether a job has been done from the same inputs, and its model is there as it was written."""
-        entry = self.entries.get(job.id, {})
-        if entry.get("key") != job.key or entry["status"] == LOST:
-            return False
-        if entry["status"] == TIMED_OUT:  # more time, and it is tried again
-            return self.campaign and self.run.time_limit is not None and self.run.time_limit <= entry["time_limit"]
-        if entry["status"] == FAILED:
-            return self.campaign
-        return not self.has_model(job) or self.manifest.holds(job.model_file)
-
-    def ended_well(self, job: RunJob) -> bool:
-        """Whether a job gave a model that meets its constraints."""
-        return self.entries[job.id]["status"] not in (FAILED, TIMED_OUT, LOST, Status.INFEASIBLE.name)
-
-    def has_model(self, job: RunJob) -> bool:
-        """Whether there is a model of a job."""
-        return job.fold is None and self.ended_well(job)
-
-    def note(self, batch: Sequence[tuple[RunJob, Outcome]]) -> None:
-        """Write the models of jobs that have been done, then what the manifest says of them."""
-        entries = {job.id: {**job.parameters, "key": job.key, **found.entry} for job, found in batch}
-        models = {job.model_file: found.model for job, found in batch if found.model is not None}
-        for job, found in batch:
-            for name, error in found.errors.items():
-                model = digest(models[job.model_file].encode())
-                self.manifest.content["scores"][self._score_key(model, name)] = error
-        self.manifest.put_all(models, entries)
-
-    def scores(self, jobs: Sequence[RunJob]) -> list[Score]:
-        """Errors of the jobs' models, those that the manifest knows from there."""
-        out = []
-        for job in (j for j in jobs if self.ended_well(j)):
-            if job.fold is not None:
-                entry = self.entries[job.id]
-                name = f"fold {job.fold}"
-                out += [Score(job.id, "train", name, entry["train"]), Score(job.id, "held", name, entry["held"])]
-                continue
-            known, fit = self.manifest.content["scores"], None
-            for role, name, recording in scored_files(self.run, self.recordings):
-                key = self._score_key(self.manifest.content["files"][job.model_file], name)
-                if key not in known:
-                    own = self.run.cells[job.cell].model
-                    fit = fit or load(self.path / job.model_file, model=own if isinstance(own, Model) else None)
-                    known[key] = error_of(replace(fit, engine=self.run.engine), recording)
-                value = known[key]
-                out.append(Score(job.id, role, name, np.nan if value is None else float(value)))
-        return out
-
-    def _score_key(self, model: str, name: str) -> str:
-        reading = {k: str(v) for k, v in self.run.reading.items()}
-        return digest({"model": model, "data": self.inputs[name], "reading": reading})
-
-    def write_table(self, jobs: Sequence[RunJob]) -> None:
-        """The errors so far, for readers of a campaign that is at work."""
-        if not self.campaign or time.monotonic() < self.written + PAUSE or not jobs:
-            return
-        self.manifest.put(TABLE, table(self.scores(jobs), jobs, self.entries, ""))
-        self.written = time.monotonic()
+    if folder.resolve() in file.resolve().parents:
+        raise InputError(f"The folder {folder} holds the run file {file.name}; give results a folder of their own.")
+    if not folder.is_dir():
+        return
+    found = sorted(p.name for p in folder.iterdir() if p.name != LOCK and not _half_written(p.name))
+    if NAME in found:
+        return
+    foreign = [name for name in found if name not in OWN]
+    if foreign:
+        raise InputError(
+            f"{folder} holds {listed(foreign, 3)} and no manifest of a run; give an empty or a new folder as --out."
+        )
+    if found and not overwrite:
+        raise InputError(f"{folder} holds {found[0]} but no manifest of a run; give another --out, or --overwrite.")
 
 
-def _manifest(folder: Path, overwrite: bool) -> Manifest:
-    """The folder's manifest, its results checked, or an empty one."""
-    if overwrite:
-        return Manifest.fresh(folder)
-    files = (TABLE, MODEL, PAGE, SUMMARY, PICTURE)
-    manifest = Manifest.found(folder)
-    if manifest is None:
-        there = [name for name in (*files, "jobs") if (folder / name).exists()]
-        if there:
-            raise InputError(f"{folder} holds {there[0]} but no manifest of a run; give another --out, or --overwrite.")
-        return Manifest.fresh(folder)
-    for name in files:
-        manifest.holds(name)
-    return manifest
+def sweep(folder: Path) -> None:
+    """Remove what a run that was killed has left half written; the folder's lock is held."""
+    for path in (*folder.iterdir(), *folder.glob(f"{JOBS}/*/.*")):
+        if _half_written(path.name):
+            path.unlink(missing_ok=True)
 
 
-def _refuse_other_versions(manifest: Manifest) -> None:
-    """Results of different versions are not mixed in one campaign, whose point is to compare them."""
-    before, now = manifest.content.get("versions", {}), versions()
-    for name in now:
-        if manifest.content["jobs"] and before.get(name) != now[name]:
-            raise InputError(
-                f"{manifest.folder / NAME} has results of {name} {before.get(name)}, and this is {now[name]}; give "
-                "another --out, or --overwrite to compute everything again."
-            )
+def _half_written(name: str) -> bool:
+    """Whether a file is the beginning of a run's file, as `write_atomically` calls it."""
+    return re.fullmatch(rf"\.({'|'.join(map(re.escape, OWN))})\.[0-9a-f]{{8}}\.tmp", name) is not None
+
+
+def read_times(folder: Path) -> dict[str, float]:
+    """Seconds that each job took, as far as they are known."""
+    try:
+        found = json.loads((folder / TIMES).read_text(encoding="utf-8"))
+        return {str(job): float(seconds) for job, seconds in found.items()}
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError):
+        return {}
+
+
+def note_times(folder: Path, seconds: Mapping[str, float]) -> None:
+    """Add the seconds of some jobs to those of the others."""
+    times = {**read_times(folder), **{job: round(value, 3) for job, value in seconds.items()}}
+    write_atomically(folder / TIMES, json.dumps(times, indent=1, sort_keys=True) + "\n")

@@ -56,9 +56,10 @@ class RunJob:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a job amounts to: its line of the manifest, its model file, and its NRMSE by recording."""
+    """What a job amounts to: its line of the manifest, the time it took, its model file, its NRMSE by recording."""
 
     entry: dict[str, Any]
+    seconds: float = 0.0
     model: str | None = None
     errors: Mapping[str, float | None] = field(default_factory=dict)
 
@@ -126,15 +127,14 @@ def outcome(
         "sentence": f"{fit.status.value} ({'; '.join(missed)})" if infeasible else f"{training} {fit.status.value}",
         "train": float(np.mean(fit.train_nrmse)),
         "operators_used": operators_used(fit),
-        "seconds": round(found.seconds, 3),
     }
     if infeasible:
-        return Outcome(about)
+        return Outcome(about, found.seconds)
     if job.fold is not None:
-        return Outcome({**about, "held": fit.nrmse(fold(recordings["train"], job.fold, run.folds)[1])})
+        return Outcome({**about, "held": fit.nrmse(fold(recordings["train"], job.fold, run.folds)[1])}, found.seconds)
     pairs = ((name, r) for role, names in run.files.items() for name, r in zip(names, recordings[role], strict=True))
     errors = {name: error_of(fit, recording) for name, recording in pairs}
-    return Outcome(about, model_text(fit), errors)
+    return Outcome(about, found.seconds, model_text(fit), errors)
 
 
 def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:
@@ -148,7 +148,7 @@ def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:
 
 def unfinished(status: str, sentence: str, **more: Any) -> Outcome:
     """The outcome of a job without a model."""
-    return Outcome({"status": status, "sentence": sentence, "operators_used": "", "seconds": 0.0, **more})
+    return Outcome({"status": status, "sentence": sentence, "operators_used": "", **more})
 
 
 def error_of(fit: Fit, recording: Recording) -> float | None:

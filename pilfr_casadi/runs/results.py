@@ -14,8 +14,6 @@ from ..recording import Recording
 from .described import ROLES, Run
 from .jobs import Recordings, RunJob
 
-TABLE, PAGE, MODEL = "results.csv", "report.html", "model.json"
-
 
 @dataclass(frozen=True)
 class Score:

@@ -19,7 +19,7 @@ from ..recording import InputError
 from .jobs import RunJob
 
 if TYPE_CHECKING:
-    from .folder import Folder
+    from .store import Store
 
 MARGIN = 0.05
 
@@ -59,7 +59,7 @@ class Selection:
         return "\n".join([*rows, f"fewest parameters within {100 * self.margin:g} % of the best on the {self.judge}"])
 
 
-def select(place: Folder, jobs: Sequence[RunJob]) -> Selection:
+def select(place: Store, jobs: Sequence[RunJob]) -> Selection:
     """Compare the cells whose jobs these are.
 
     Raises

@@ -18,7 +18,6 @@ from .grid import Cell
 from .jobs import RunJob
 from .results import Score
 
-SUMMARY, PICTURE = "summary.csv", "spread.png"
 QUARTILES = ("smallest", "lower_quartile", "median", "upper_quartile", "largest")
 FOLDS = "folds"
 
@@ -72,7 +71,7 @@ def errors_by_cell(
 
 
 def summarised(
-    run: Run, jobs: Sequence[RunJob], scores: Sequence[Score], entries: Mapping[str, Any]
+    run: Run, jobs: Sequence[RunJob], scores: Sequence[Score], times: Mapping[str, float]
 ) -> tuple[CellSummary, ...]:
     """One summary a recording and cell."""
     out = []
@@ -81,7 +80,7 @@ def summarised(
             given = np.array(list(errors.values()))
             finite = given[np.isfinite(given)]
             quartiles = np.percentile(finite, (0, 25, 50, 75, 100)) if len(finite) else np.full(5, np.nan)
-            seconds = float(np.median([entries[job]["seconds"] for job in errors]))
+            seconds = float(np.median([times.get(job, 0.0) for job in errors]))
             cell = run.cells[number].values
             failed = len(given) - len(finite)
             out.append(CellSummary(cell, role, name, len(given), failed, tuple(map(float, quartiles)), seconds))
