@@ -29,7 +29,7 @@ LAYERS = {
         "hand",
     ),
     1: ("operators", "elements", "laws"),
-    2: ("model", "simulator", "integration"),
+    2: ("model", "simulator", "integration", "substeps"),
     3: (
         "simulate",
         "sensitivities",

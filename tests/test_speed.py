@@ -168,7 +168,7 @@ def test_damaged_library_is_built_anew(model, fresh, harm):
     library.write_bytes(harm(good))
     again = compiled.build(source)
     assert again.read_bytes() == good
-    assert [p.name for p in cache_directory().iterdir()] == [again.name]
+    assert [p.name for p in cache_directory().glob("*/*")] == [again.name]
 
 
 def test_cache_others_can_write_to_is_not_used(fresh):
@@ -199,7 +199,7 @@ def test_processes_may_build_at_the_same_time(case, tmp_path):
     for thread in threads:
         thread.join()
     assert len(done) == 3
-    assert all(p.suffix == ".so" for p in (tmp_path / "pilfr_casadi").iterdir())
+    assert {p.suffix for p in (tmp_path / "pilfr_casadi").rglob("*") if p.is_file()} == {".so"}
 
 
 @pytest.mark.parametrize("kind", [pytest.param(Compiled, marks=needs_compiler), VirtualMachine])
