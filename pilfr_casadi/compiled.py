@@ -10,6 +10,7 @@ machine of `sensitivities`, which gives the same numbers.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -35,6 +36,7 @@ from .sensitivities import Engine, VirtualMachine, linearize
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 FLAGS = (("-march=native", *COMMON), COMMON)  # the second where the first is not understood
 PLAIN, LOOPS = "-O1", "-O2"  # long straight lines take seconds to optimise and gain nothing from it, unlike the loops
+KEPT = 40  # libraries in each of the cache's 256 folders: some hundred megabytes
 WRITTEN = 64  # states with memory up to which slopes written out fit the nearest cache
 PATIENCE = 600.0  # seconds for one compilation
 _failures: dict[str, str] = {}  # what did not compile is not tried again by this process
@@ -104,6 +106,13 @@ def _shelf(key: str) -> Path:
     return cache_directory() / key[:2]
 
 
+def _thin(shelf: Path) -> None:
+    """Keep a folder's most recently used libraries; one that is loaded stays so without its file."""
+    with contextlib.suppress(OSError):
+        for library in sorted(shelf.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
+            library.unlink()
+
+
 def _compile(cc: str, source: str, key: str, level: str) -> Path:
     """Compile under another name first, so that a library is never half there."""
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
@@ -116,6 +125,7 @@ def _compile(cc: str, source: str, key: str, level: str) -> Path:
                 library = _shelf(key) / f"{key}-{_digest(partial)}.so"
                 library.parent.mkdir(mode=0o700, exist_ok=True)
                 os.replace(partial, library)
+                _thin(library.parent)
                 return library
     raise OSError((done.stderr.strip().splitlines() or ["it wrote no library"])[0][:300])
 
@@ -134,6 +144,8 @@ def build(source: str, level: str = PLAIN) -> Path:
     key = hashlib.sha256("\n".join((source, level, _machine(cc))).encode()).hexdigest()[:32]
     for library in _shelf(key).glob(f"{key}-*.so"):
         if library.stem == f"{key}-{_digest(library)}":
+            with contextlib.suppress(OSError):
+                os.utime(library)  # used now
             return library
         library.unlink(missing_ok=True)
     if key not in _failures:

@@ -69,7 +69,9 @@ LAYERS = {
         "scaling",
         "solution",
         "exactness",
-        "restoration",
+        "tightening",
+        "lifted",
+        "schur",
         "limits",
     ),
     6: (
@@ -79,6 +81,7 @@ LAYERS = {
         "outcome",
         "linear_model",
         "penalty",
+        "thinning",
         "sparse",
         "structures",
         "known_blocks",

@@ -1,5 +1,6 @@
 """Ratios of time and memory, loose enough for a busy machine; compiler and cache, which the fast engine rests on."""
 
+import os
 import threading
 
 import numpy as np
@@ -169,6 +170,18 @@ def test_damaged_library_is_built_anew(model, fresh, harm):
     again = compiled.build(source)
     assert again.read_bytes() == good
     assert [p.name for p in cache_directory().glob("*/*")] == [again.name]
+
+
+@needs_compiler
+def test_the_cache_does_not_grow_without_end(fresh, monkeypatch):
+    monkeypatch.setattr(compiled, "KEPT", 2)
+    monkeypatch.setattr(compiled, "_shelf", lambda key: cache_directory() / "00")
+    sources = [f"int number(void) {{ return {k}; }}" for k in range(4)]
+    first = compiled.build(sources[0])
+    for k, source in enumerate(sources[1:], 1):
+        os.utime(compiled.build(source), (k, k))
+        assert compiled.build(sources[0]) == first, "what is in use stays"
+    assert len(list((cache_directory() / "00").glob("*.so"))) == 2
 
 
 def test_cache_others_can_write_to_is_not_used(fresh):

@@ -111,6 +111,8 @@ def _told(given: Run, result: RunResult, *files: str) -> int:
                 print(f"NRMSE on {s.recording} ({role}): {s.nrmse:.4f}")
     failed = f", {len(result.failed)} of them without a model" if result.failed else ""
     print(f"chosen: {result.chosen}; {len(result.done)} jobs done now, {len(result.skipped)} before{failed}")
+    if len(given.seeds) > 1 and result.fit.candidates and not any(c.drawn for c in result.fit.candidates):
+        print("no start is drawn where there are so few: every seed gives the same model; use one seed, or more starts")
     for name in (*files, *([PAGE] if given.report else []), "manifest.json"):
         print(result.folder / name)
     useless = min(result.fit.train_nrmse) >= 1.0
