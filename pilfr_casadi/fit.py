@@ -18,11 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from .baselines import NARX, NOE
 from .constraints import Constraint
-from .elements import PrandtlIshlinskii
+from .elements import PrandtlIshlinskii, StaticNetwork
 from .fitted import Fit, Progress, fingerprint
 from .job import Job, interrupted, penalised, rms_error
 from .known_blocks import in_known_coordinates, known_entries
+from .lagged_fit import fit_lagged
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
@@ -35,6 +37,7 @@ from .solution import Solution, Status
 from .threads import one_blas_thread
 
 __all__ = ["Fit", "Progress", "fingerprint", "fit"]
+STARTS = ("grid", "paper", "plain")
 DEAD_WORKER = (
     "A worker process ended before it returned a result (it may have run out of memory); use fewer workers, or "
     "workers=1."
@@ -46,7 +49,7 @@ NO_GUARD = (
 
 
 def fit(
-    model: PILFR | Model | Fit,
+    model: PILFR | NARX | NOE | Model | Fit,
     train: Recording | Sequence[Recording],
     *,
     solver: Any = None,
@@ -66,18 +69,17 @@ def fit(
 
     Parameters
     ----------
-    model : PILFR, Model or Fit
-        A PI-LFR structure (start values are found), a closed model of your own, or an earlier fit (started at its
-        values).
+    model : PILFR, NARX, NOE, Model or Fit
+        A structure (start values are found), a closed model of your own, or an earlier fit (started at its values).
     train : Recording or sequence of Recording
         Training data; nothing else is used.
     solver : GaussNewton or Ipopt
         Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`.
     starts, seed : int
         Number of random starts and the seed of all of them.
-    start : {"grid", "paper"}
+    start : {"grid", "paper", "plain"}
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
-        solved and re-gridded.
+        solved and re-gridded; or the same, solved and nothing more.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope. A number holds
         exactly, by the eigenvalues of the result; True, the default, is 1 up to 1e-4; False is none.
@@ -111,8 +113,8 @@ def fit(
     """
     solver = solver or POLISH
     _check_options(model, solver, starts, seed, workers, progress)
-    if start not in ("grid", "paper"):
-        raise InputError(f"The start {start!r} is unknown; use 'grid' or 'paper'.")
+    if start not in STARTS:
+        raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper' or 'plain'.")
     own = executor is None and workers > 1
     if own and getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(1)  # a spawned worker that runs the script again; the first process says what to do
@@ -125,7 +127,7 @@ def fit(
         shown: Any = progress_bar()
     else:
         shown = nullcontext(progress or None)
-    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and isinstance(model, PILFR) else None
+    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and not isinstance(model, Model | Fit) else None
     with shown as report:
         job = Job((), solver, further, dict(l1 or {}), noise, engine, report)
         try:
@@ -140,7 +142,7 @@ def fit(
 
 @one_blas_thread
 def _fit(
-    model: PILFR | Model | Fit,
+    model: PILFR | NARX | NOE | Model | Fit,
     train: Recording | Sequence[Recording],
     job: Job,
     stable: bool | float,
@@ -149,6 +151,11 @@ def _fit(
     start: str,
     executor: Executor | None,
 ) -> Fit:
+    if isinstance(model, NARX | NOE):
+        first = as_recordings(train)[0]
+        unknown = model.structure(first.n_u, first.n_y).model(first.n_u, first.n_y).parameters.free.sum()
+        job = replace(job, recordings=check_for_identification(train, int(unknown) + 2))
+        return fit_lagged(model, job, starts, seed, executor)
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
     limits = stability_limits(structure, stable) if structure else ()
     job = replace(job, limits=(*limits, *job.limits))
@@ -156,8 +163,10 @@ def _fit(
         given = model.model if isinstance(model, Fit) else model
         job = replace(job, recordings=check_for_identification(train, int(given.parameters.free.sum()) + 2))
         return _from_values(given, structure, job, model if isinstance(model, Fit) else None)
-    if not isinstance(model.element, PrandtlIshlinskii | None):
-        raise InputError("A PI-LFR is identified with a PrandtlIshlinskii element; pass a closed Model for any other.")
+    if not isinstance(model.element, PrandtlIshlinskii | StaticNetwork | None):
+        raise InputError(
+            "Start values are known for a PrandtlIshlinskii element and a StaticNetwork; pass a closed Model for any other."
+        )
     first = as_recordings(train)[0]
     shape = model.model(first.n_u, first.n_y).parameters
     if job.l1:
@@ -256,7 +265,7 @@ def _from_starts(
     try:
         if stopped:
             latest = interrupted(*latest)
-        elif start != "paper":
+        elif start == "grid":
             latest = model, problem, job.solve(problem, "solve", best.theta), note
         if structure.priors and not stopped:
             problem, result = job.settled(problem, latest[2], "solve")
@@ -271,8 +280,8 @@ def _from_starts(
 
 def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:
     """Refuse what cannot be used before any long work."""
-    if not isinstance(model, PILFR | Model | Fit):
-        raise InputError(f"The model is a {type(model).__name__}; give a PILFR, a closed Model or a Fit.")
+    if not isinstance(model, PILFR | NARX | NOE | Model | Fit):
+        raise InputError(f"The model is a {type(model).__name__}; give a PILFR, a NARX, a NOE, a closed Model or a Fit.")
     if isinstance(solver, type) or not hasattr(solver, "solve"):
         raise InputError(f"The solver is {solver!r}; give an object such as GaussNewton() or Ipopt().")
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
