@@ -16,7 +16,7 @@ from .problem import Problem
 from .recording import InputError, Recording
 from .solution import Solution, Status
 
-PATIENCE = 8  # points in a row that do not improve on the best
+PATIENCE = 20  # points in a row that do not improve on the best
 
 
 def hold_back(recordings: Sequence[Recording], share: float) -> tuple[tuple[Recording, ...], tuple[Recording, ...]]:

@@ -56,6 +56,7 @@ def fit(
     starts: int = 8,
     seed: int = 0,
     start: str = "grid",
+    linear: Any = None,
     stable: bool | float = True,
     constraints: Sequence[Constraint] = (),
     l1: dict[str, float] | None = None,
@@ -80,6 +81,9 @@ def fit(
     start : {"grid", "paper", "plain"}
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
         solved and re-gridded; or the same, solved and nothing more.
+    linear : control.StateSpace, optional
+        Linear model that the search for a PI-LFR begins with, such as `frequency_subspace` of a BLA, which is the
+        paper's; by default subspace identification refined by output error.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope. A number holds
         exactly, by the eigenvalues of the result; True, the default, is 1 up to 1e-4; False is none.
@@ -131,7 +135,7 @@ def fit(
     with shown as report:
         job = Job((), solver, further, dict(l1 or {}), noise, engine, report)
         try:
-            return _fit(model, train, job, stable, starts, seed, start, executor or pool)
+            return _fit(model, train, job, stable, starts, seed, start, executor or pool, linear)
         except BrokenProcessPool:
             spawned = pool is not None and multiprocessing.get_start_method() != "fork"
             raise InputError(NO_GUARD if spawned else DEAD_WORKER) from None
@@ -150,7 +154,10 @@ def _fit(
     seed: int,
     start: str,
     executor: Executor | None,
+    given: Any,
 ) -> Fit:
+    if given is not None and not isinstance(model, PILFR):
+        raise InputError("A linear model to begin with goes with a PILFR; any other model has its own values.")
     if isinstance(model, NARX | NOE):
         first = as_recordings(train)[0]
         unknown = model.structure(first.n_u, first.n_y).model(first.n_u, first.n_y).parameters.free.sum()
@@ -174,7 +181,7 @@ def _fit(
     fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
     job = replace(job, recordings=check_for_identification(train, fewest))
     linear, problem, solution = linear_model(
-        job.recordings, model, engine=job.engine, constraints=limits[:1], progress=job.progress
+        job.recordings, model, engine=job.engine, constraints=limits[:1], progress=job.progress, given=given
     )
     if solution.status is Status.INTERRUPTED:
         return job.result(linear, model.linear(), problem, solution)

@@ -20,6 +20,7 @@ from .lfr import PILFR
 
 Blocks = dict[str, np.ndarray]
 LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
+FLAT = 0.3  # deviation of the signals of neurons of slope one at the start
 
 
 def states_of(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:
@@ -105,12 +106,15 @@ def network_start(
 ) -> Blocks:
     """Random directions of z of unit deviation, neurons that bend somewhere in its range, `B_w = D_yw = 0`.
 
-    As in Schoukens (2021), the network does nothing at first: the model begins as the linear one.
+    As in Schoukens (2021), the network does nothing at first: the model begins as the linear one. Where slopes are held
+    at one, z has the deviation `FLAT`: neurons that are nearly linear at first end in better minima.
     """
     element = structure.element
     if not isinstance(element, StaticNetwork):
         raise TypeError("these start values are made for a static network")
     blocks, z = _placed(structure, element, linear, inputs, states, rng, "random")
+    if "slope" in structure.fixed and not {"C_z", "D_zu"} & set(structure.fixed):
+        blocks, z = blocks | {k: FLAT * blocks[k] for k in ("C_z", "D_zu")}, FLAT * z
     return blocks | neurons_over(structure, element, z, rng)
 
 
