@@ -2,9 +2,9 @@
 
 All are linear models closed by a `StaticNetwork` (`PILFR`), with some blocks held:
 
-- `ssnn`: `x⁺ = A x + B u + W_x tanh(V_x [x; u] + b_x)`, `y = C x + D u + W_y tanh(V_y [x; u] + b_y) + y_0`, a network with
-  one hidden layer for the state and one for the output beside a linear model (Suykens et al. 1995, Schoukens 2021): one
-  neuron a channel, the first half of the channels enters the state, the second the output;
+- `ssnn`: `x⁺ = A x + B u + W_x tanh(V_x [x; u] + b_x)`, `y = C x + D u + W_y tanh(V_y [x; u] + b_y) + y_0`, a network
+  with one hidden layer for the state and one for the output beside a linear model (Suykens et al. 1995, Schoukens
+  2021): one neuron a channel, the first half of the channels enters the state, the second the output;
 - `network_lfr`: one network in the port of a linear model, `w = Σ gain_j tanh(slope_j z + bias_j)`;
 - `NARX`, `NOE`: `y(k+1) = f(y(k), …, y(k-n_a+1), u(k), …, u(k-n_b+1))` with `f` a linear part and one hidden layer. The
   state holds the past of y and u, so `A` is a shift but for its first rows. Trained in one step they are the same model
@@ -205,9 +205,9 @@ def lagged_start(
 
 
 def reading_output(model: Model, share: float = 1.0) -> Model:
-    """The same model reading the measured output y: its first states, the outputs less `y_0`, become `x + share (y - ŷ)`.
+    """The same model reading the measured output y.
 
-    With a share of one this predicts one step ahead, with zero it runs freely; the share is a parameter that is held.
+    Its first states, the outputs less `y_0`, become `x + share (y - ŷ)` before a step. With a share of one this predicts one step ahead, with zero it runs freely; the share is a parameter that is held.
 
     Raises
     ------

@@ -150,6 +150,11 @@ class StaticNetwork:
 
 def _check_counts(what: str, **counts: Any) -> None:
     for count in counts.values():
-        if isinstance(count, bool) or not isinstance(count, int | float | np.number) or count < 1 or int(count) != count:
+        if (
+            isinstance(count, bool)
+            or not isinstance(count, int | float | np.number)
+            or count < 1
+            or int(count) != count
+        ):
             names, given = " and ".join(f"{k} >= 1" for k in counts), " and ".join(map(repr, counts.values()))
             raise InputError(f"{what} needs whole numbers {names}; {given} were given.")

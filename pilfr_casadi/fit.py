@@ -131,7 +131,11 @@ def fit(
         shown: Any = progress_bar()
     else:
         shown = nullcontext(progress or None)
-    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and not isinstance(model, Model | Fit) else None
+    pool = (
+        ProcessPoolExecutor(workers, initializer=_leave_interrupts)
+        if own and not isinstance(model, Model | Fit)
+        else None
+    )
     with shown as report:
         job = Job((), solver, further, dict(l1 or {}), noise, engine, report)
         try:
@@ -172,7 +176,7 @@ def _fit(
         return _from_values(given, structure, job, model if isinstance(model, Fit) else None)
     if not isinstance(model.element, PrandtlIshlinskii | StaticNetwork | None):
         raise InputError(
-            "Start values are known for a PrandtlIshlinskii element and a StaticNetwork; pass a closed Model for any other."
+            "Start values are known for a PrandtlIshlinskii element and a StaticNetwork; give a closed Model for any other."
         )
     first = as_recordings(train)[0]
     shape = model.model(first.n_u, first.n_y).parameters
@@ -288,7 +292,9 @@ def _from_starts(
 def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:
     """Refuse what cannot be used before any long work."""
     if not isinstance(model, PILFR | NARX | NOE | Model | Fit):
-        raise InputError(f"The model is a {type(model).__name__}; give a PILFR, a NARX, a NOE, a closed Model or a Fit.")
+        raise InputError(
+            f"The model is a {type(model).__name__}; give a PILFR, a NARX, a NOE, a closed Model or a Fit."
+        )
     if isinstance(solver, type) or not hasattr(solver, "solve"):
         raise InputError(f"The solver is {solver!r}; give an object such as GaussNewton() or Ipopt().")
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):

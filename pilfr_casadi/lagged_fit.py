@@ -43,8 +43,7 @@ class LaggedSearch:
 
     def problem(self, model: Model, engine: Engine | None) -> Problem:
         """The error of a model over what is trained on."""
-        job = replace(self.job, recordings=self.kept)
-        return job.problem(model, **({"engine": engine} if engine else {}))
+        return replace(self.job, recordings=self.kept).problem(model, engine=engine or self.job.engine)
 
 
 def fit_lagged(wanted: NARX | NOE, job: Job, starts: int, seed: int, executor: Executor | None) -> Fit:

@@ -113,7 +113,9 @@ def matrices_of(given: Any, nx: int, recording: Recording) -> tuple[Array, Array
             f"expected {wanted[0]}, {wanted[1]} and {wanted[2]}."
         )
     if given.dt not in (None, True) and not np.isclose(float(given.dt), recording.dt, rtol=1e-4):
-        raise InputError(f"The linear model's step is {given.dt} s, the recording's {recording.dt:g} s; sample it anew.")
+        raise InputError(
+            f"The linear model's step is {given.dt} s, the recording's {recording.dt:g} s; sample it anew."
+        )
     return a, b, c, d
 
 

@@ -9,6 +9,7 @@ from random_models import random_input
 import pilfr_casadi as pilfr
 from pilfr_casadi.baselines import lagged_states, reading_output
 from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.early_stopping import hold_back, solve_watched
 from pilfr_casadi.gauge import gauge_tangents
 from pilfr_casadi.problem import Problem
 
@@ -110,7 +111,7 @@ def test_a_narx_predicts_to_the_noise_where_the_noise_enters_its_equation():
 def test_a_noe_simulates_to_the_noise_of_the_output_and_a_narx_does_not():
     train, test = recordings(truth("NARX"), noise=0.1)
     narx = pilfr.fit(pilfr.NARX(2, 3), train, starts=2, seed=0)
-    noe = pilfr.fit(pilfr.NOE(2, 3), train, starts=2, seed=0)
+    noe = pilfr.fit(pilfr.NOE(2, 3), train, starts=4, seed=0)
     level = 0.1 / np.sqrt(1.01)
     assert noe.nrmse(test) < 1.05 * level < narx.nrmse(test)
     size = np.std(train.y)
@@ -132,7 +133,10 @@ def test_derivatives(name, share):
     jac, again = (p.jacobian(theta) for p in engines)
     np.testing.assert_allclose(again, jac, rtol=1e-9, atol=1e-10)
     step = 1e-6
-    columns = [(engines[0].residual(theta + d) - engines[0].residual(theta - d)) / (2 * step) for d in step * np.eye(len(theta))]
+    columns = [
+        (engines[0].residual(theta + d) - engines[0].residual(theta - d)) / (2 * step)
+        for d in step * np.eye(len(theta))
+    ]
     np.testing.assert_allclose(jac, np.array(columns).T, rtol=1e-5, atol=1e-6)
 
 
@@ -225,3 +229,43 @@ def test_bad_input():
     ):
         with pytest.raises(pilfr.InputError, match=words):
             wrong()
+
+
+# ---- early stopping ----
+
+
+def test_early_stopping_takes_the_best_point_on_what_is_held_back():
+    train, _ = recordings(truth("network_lfr"), noise=0.3, length=160)
+    structure = pilfr.network_lfr(2, 6)
+    model = pilfr.fit(structure, train, starts=1, start="plain", solver=pilfr.GaussNewton(max_iterations=1)).model
+    (kept,), (held,) = hold_back([train], 0.4)
+    problem, judged = Problem(model, kept, engine="vm"), Problem(model, held, engine="vm")
+    seen = []
+    free = pilfr.GaussNewton().solve(problem, watch=lambda theta: seen.append(judged.cost(theta)) or False)
+    found = solve_watched(pilfr.GaussNewton(), problem, judged, problem.start)
+    assert judged.cost(found.theta) <= min(seen) * (1 + 1e-12)
+    assert judged.cost(found.theta) < judged.cost(free.theta)
+    assert found.status is pilfr.Status.STOPPED_EARLY and found.status.converged
+    assert found.cost == pytest.approx(problem.cost(found.theta))
+
+
+def test_what_is_held_back():
+    one = pilfr.Recording(np.arange(100.0), np.arange(100.0), 0.1, initial="zero", skip=20)
+    (kept,), (held,) = hold_back([one], 0.25)
+    assert (len(kept), len(held), held.skip) == (80, 100, 80)
+    periodic = one.with_(initial="periodic", period=30, skip=0)
+    (kept,), (held,) = hold_back([periodic], 0.25)
+    assert (len(kept), held.skip) == (60, 60)
+    with pytest.raises(pilfr.InputError, match="one period only"):
+        hold_back([periodic.with_(period=80)], 0.25)
+    several = [one.with_(name=str(k), initial="estimate") for k in range(4)]
+    kept, held = hold_back(several, 0.25)
+    assert [r.name for r in kept] == ["0", "1", "2"] and [r.name for r in held] == ["3"]
+    assert held[0].initial == "zero" and held[0].skip == 20
+
+
+def test_a_noe_of_several_recordings_has_a_state_for_each():
+    records = [r.slice(100, 400) for r in recordings(truth("NARX"))]
+    fit = pilfr.fit(pilfr.NOE(2, 3), records, starts=1)
+    assert len(fit.initial) == 2 and len(fit.train_nrmse) == 2
+    assert max(fit.train_nrmse) < 0.2

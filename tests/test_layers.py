@@ -77,6 +77,8 @@ LAYERS = {
         "job",
         "outcome",
         "linear_model",
+        "lagged_fit",
+        "early_stopping",
         "penalty",
         "sparse",
         "structures",

@@ -191,9 +191,7 @@ def _structure(file: ModelFile, n_u: int, n_y: int) -> PILFR:
         file.damaged(str(error).rstrip("."))
 
 
-def _element(
-    file: ModelFile, table: dict[str, Any], parameters: dict[str, Any]
-) -> PrandtlIshlinskii | StaticNetwork:
+def _element(file: ModelFile, table: dict[str, Any], parameters: dict[str, Any]) -> PrandtlIshlinskii | StaticNetwork:
     if table.get("kind") == "static_network":
         hidden, channels = file.count(table, "hidden"), file.count(table, "channels")
         for key in ("gain", "slope", "bias"):
