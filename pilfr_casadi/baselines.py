@@ -207,7 +207,8 @@ def lagged_start(
 def reading_output(model: Model, share: float = 1.0) -> Model:
     """The same model reading the measured output y.
 
-    Its first states, the outputs less `y_0`, become `x + share (y - ŷ)` before a step. With a share of one this predicts one step ahead, with zero it runs freely; the share is a parameter that is held.
+    Its first states, the outputs less `y_0`, become `x + share (y - ŷ)` before a step. With a share of one this predicts
+    one step ahead, with zero it runs freely; the share is a parameter that is held.
 
     Raises
     ------
@@ -224,7 +225,7 @@ def reading_output(model: Model, share: float = 1.0) -> Model:
     own, both = p[: model.parameters.size], ca.vertcat(u, y)
     z, s = ca.SX.sym("z", model.n_w), ca.SX(0, 1)
     _, y_hat = model.step(x, u, ca.SX.zeros(model.n_w), own)
-    seen = ca.vertcat(x[:n_y] + p[-1] * (y - y_hat), x[n_y:])
+    seen = ca.vertcat(x[:n_y] + p[-1] * (y - y_hat), *(x[i] for i in range(n_y, model.n_x)))
     x_next, _ = model.step(seen, u, w, own)
     return replace(
         model,

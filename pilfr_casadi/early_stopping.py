@@ -40,8 +40,9 @@ def hold_back(recordings: Sequence[Recording], share: float) -> tuple[tuple[Reco
     (r,) = recordings
     cut = r.skip + round((1 - share) * (len(r) - r.skip))
     if isinstance(r.initial, str) and r.initial == "periodic" and r.period:
-        cut = max(cut // r.period, 1) * r.period
-        if cut >= len(r):
+        periods = len(r) // r.period
+        cut = (periods - max(1, round(share * periods))) * r.period
+        if cut < r.skip + r.period:
             raise InputError(
                 "Early stopping holds back a part of the recording, which has one period only; give several "
                 "recordings or periods, or validation=0."

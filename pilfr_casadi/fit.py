@@ -176,7 +176,7 @@ def _fit(
         return _from_values(given, structure, job, model if isinstance(model, Fit) else None)
     if not isinstance(model.element, PrandtlIshlinskii | StaticNetwork | None):
         raise InputError(
-            "Start values are known for a PrandtlIshlinskii element and a StaticNetwork; give a closed Model for any other."
+            "Start values are known for PrandtlIshlinskii and StaticNetwork; give a closed Model for any other element."
         )
     first = as_recordings(train)[0]
     shape = model.model(first.n_u, first.n_y).parameters
