@@ -207,8 +207,8 @@ def lagged_start(
 def reading_output(model: Model, share: float = 1.0) -> Model:
     """The same model reading the measured output y.
 
-    Its first states, the outputs less `y_0`, become `x + share (y - ŷ)` before a step. With a share of one this predicts
-    one step ahead, with zero it runs freely; the share is a parameter that is held.
+    Its first states, the outputs less `y_0`, become `x + share (y - ŷ)` before a step. With a share of one this
+    predicts one step ahead, with zero it runs freely; the share is a parameter that is held.
 
     Raises
     ------
