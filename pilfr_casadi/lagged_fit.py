@@ -52,8 +52,10 @@ def fit_lagged(wanted: NARX | NOE, job: Job, starts: int, seed: int, executor: E
     Raises
     ------
     InputError
-        If no start gives a finite simulation, or the solver cannot stop early.
+        If no start gives a finite simulation, or an option is unfit.
     """
+    if job.l1:
+        raise InputError("An L1 penalty is for the weights of an element; leave l1 out, or give a PILFR.")
     if not isinstance(job.solver, GaussNewton) and wanted.validation:
         raise InputError("Early stopping needs the solver GaussNewton(); give that, or validation=0.")
     first = job.recordings[0]
@@ -77,7 +79,8 @@ def fit_lagged(wanted: NARX | NOE, job: Job, starts: int, seed: int, executor: E
         )
     best = min(usable, key=lambda c: c.error)
     solution = replace(best.solution, status=Status.INTERRUPTED) if stopped else best.solution
-    return job.result(best.model, search.structure, job.problem(best.model), solution, candidates=tuple(found))
+    result = job.result(best.model, search.structure, job.problem(best.model), solution, candidates=tuple(found))
+    return replace(result, errors={})  # theirs are those of a minimum of the simulation error, which this need not be
 
 
 @one_blas_thread

@@ -226,6 +226,7 @@ def test_bad_input():
         (lambda: pilfr.one_step(narx, train.y), "give a Recording"),
         (lambda: pilfr.fit(pilfr.NOE(2), train, solver=pilfr.Ipopt()), "Early stopping needs"),
         (lambda: pilfr.fit(pilfr.NARX(200, 5), train), "at least"),
+        (lambda: pilfr.fit(pilfr.NARX(2, 5), train, l1={"gain": 1e-3}), "An L1 penalty"),
     ):
         with pytest.raises(pilfr.InputError, match=words):
             wrong()
