@@ -163,10 +163,7 @@ def _fit(
     if given is not None and not isinstance(model, PILFR):
         raise InputError("A linear model to begin with goes with a PILFR; any other model has its own values.")
     if isinstance(model, NARX | NOE):
-        first = as_recordings(train)[0]
-        unknown = model.structure(first.n_u, first.n_y).model(first.n_u, first.n_y).parameters.free.sum()
-        job = replace(job, recordings=check_for_identification(train, int(unknown) + 2))
-        return fit_lagged(model, job, starts, seed, executor)
+        return fit_lagged(model, train, job, starts, seed, executor)
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
     limits = stability_limits(structure, stable) if structure else ()
     job = replace(job, limits=(*limits, *job.limits))

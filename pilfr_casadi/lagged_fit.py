@@ -7,6 +7,7 @@ the data passes most of them by. What both are judged and chosen by is the simul
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -23,7 +24,7 @@ from .model import Model
 from .multistart import EXPLORE, Candidate, run_tasks
 from .outcome import with_solution
 from .problem import Problem
-from .recording import InputError, Recording
+from .recording import InputError, Recording, as_recordings, check_for_identification
 from .sensitivities import Engine
 from .solution import Solution, Status
 from .threads import one_blas_thread
@@ -46,21 +47,31 @@ class LaggedSearch:
         return replace(self.job, recordings=self.kept).problem(model, engine=engine or self.job.engine)
 
 
-def fit_lagged(wanted: NARX | NOE, job: Job, starts: int, seed: int, executor: Executor | None) -> Fit:
+def fit_lagged(
+    wanted: NARX | NOE,
+    train: Recording | Sequence[Recording],
+    job: Job,
+    starts: int,
+    seed: int,
+    executor: Executor | None,
+) -> Fit:
     """The fit of a NARX or NOE: every start to its end, the smallest simulation error over the training data.
 
     Raises
     ------
     InputError
-        If no start gives a finite simulation, or an option is unfit.
+        If the recordings hold too little, no start gives a finite simulation, or an option is unfit.
     """
     if job.l1:
         raise InputError("An L1 penalty is for the weights of an element; leave l1 out, or give a PILFR.")
     if not isinstance(job.solver, GaussNewton) and wanted.validation:
         raise InputError("Early stopping needs the solver GaussNewton(); give that, or validation=0.")
-    first = job.recordings[0]
+    first = as_recordings(train)[0]
+    structure = wanted.structure(first.n_u, first.n_y)
+    unknown = int(structure.model(first.n_u, first.n_y).parameters.free.sum())
+    job = replace(job, recordings=check_for_identification(train, unknown + 2))
     split = hold_back(job.recordings, wanted.validation) if wanted.validation else (job.recordings, ())
-    search = LaggedSearch(wanted, wanted.structure(first.n_u, first.n_y), replace(job, progress=None), *split)
+    search = LaggedSearch(wanted, structure, replace(job, progress=None), *split)
     seen: list[float] = []
 
     def report(candidate: Candidate) -> None:

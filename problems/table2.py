@@ -9,6 +9,18 @@ best linear approximation of the three steady periods (Sec. 6.3), with Eq. 22-24
 percentile over the starts, as the paper's, the median, and in brackets the published figure. A start has failed where a
 simulation diverges or the training error is not 1 % below the linear model's. The truth is `problems.masing`; nothing
 of it reaches the identification.
+
+Where figures differ from the published ones, trials say why:
+
+- All rows: the phases drawn. Over 16 records the linear model has 0.27-0.32 / 0.26-0.40 / 0.42-0.52, and NARX with 5
+  lags and 5 neurons 0.22-0.30 / 0.25-0.35 / 0.19-0.46 over 8; record 100 is on the low side.
+- PI-LFR: a start at the minimum of the linear output error, instead of the best linear approximation, gets stuck there
+  in 17 / 25 / 42 % of 24 starts with N = 5 / 10 / 20, instead of 8 %; tolerance, damping and the bound on the spectral
+  radius change nothing about it. Re-gridding frees every one.
+- SS-NN: the paper's text has 10 to 20 neurons, its table 5 and 10; 20 of ours come to 0.056 on the training record with
+  five states, 1000 iterations in place of 200 from 0.067 to 0.063, flatter neurons at the start (the default now) to
+  0.052. None diverges on a test: neurons are bounded, and the radius of `A` is by default.
+- NARX: without a linear part, as in the paper; all training data is used. Holding 30 % back to stop early costs 5 %.
 """
 
 from __future__ import annotations
@@ -193,6 +205,14 @@ def at_or_below(found: Mapping[str, Result]) -> str:
     return "PI-LFR at or below the published figures: " + ", ".join(out) if out else ""
 
 
+def over_published(found: Mapping[str, Result]) -> str:
+    """How the 25th percentiles of the baselines stand to the published figures, smallest and largest ratio."""
+    ours = [(r, BASELINES[r.row.published]) for r in found.values() if r.row.published in BASELINES]
+    pairs = [(e, p) for r, row in ours for e, p in zip(r.percentile(25), row, strict=True) if np.isfinite(p)]
+    ratios = [e / p for e, p in pairs]
+    return f"baselines over the published figures: {min(ratios):.2f} to {max(ratios):.2f}" if ratios else ""
+
+
 def _processor_time() -> float:
     """Seconds that this process and those that it started and that have ended have computed."""
     used = os.times()
@@ -218,7 +238,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not wanted:
         parser.error(f"no row has {' or '.join(options.rows)} in its name")
     found = run(wanted, options.seed, options.workers)
-    print(at_or_below(found))
+    print("\n".join(filter(None, (at_or_below(found), over_published(found)))))
     minutes, busy = (time.perf_counter() - began) / 60, (_processor_time() - computed) / 60
     print(f"{minutes:.1f} minutes with {options.workers} processes, {busy:.1f} minutes of one processor's time")
     if options.figures is not None:

@@ -12,7 +12,15 @@ def test_the_command(capsys, tmp_path):
     wanted = ["--rows", "LTI", "N=5, paper", "nx=5, n=5", "--starts", "2", "--network-starts", "1", "--workers", "1"]
     table2.main([*wanted, "--seed", "101", "--figures", str(tmp_path)])
     said = capsys.readouterr().out
-    for words in ("LTI, 5th order", "(0.3026)", "(0.0441)", "(0.3982)", 'cells with "paper\'s start"', "failed"):
+    for words in (
+        "LTI, 5th order",
+        "(0.3026)",
+        "(0.0441)",
+        "(0.3982)",
+        'cells with "paper\'s start"',
+        "failed",
+        "baselines over",
+    ):
         assert words in said
     assert "default fit" not in said
     assert {p.name for p in tmp_path.iterdir()} == {
