@@ -131,6 +131,9 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
         fitted = with_solution(model, problem, solution)
         others = [r for r in search.job.recordings[len(search.kept) :] if isinstance(r.initial, str)]
         theta = np.concatenate([theta, *(first_state(fitted, engine, r) for r in others if r.initial == "estimate")])
+        more = np.zeros(len(theta) - len(solution.theta))
+        multipliers = np.insert(solution.multipliers, len(solution.theta), more)
+        solution = replace(solution, multipliers=multipliers)
     with np.errstate(over="ignore", invalid="ignore"):
         e = problem.residual(theta)
         error = float(np.sqrt(np.mean(e**2)))

@@ -1,5 +1,6 @@
 """Black-box baselines: each recovers a system of its own class, and is a model like any other."""
 
+import json
 import subprocess
 
 import numpy as np
@@ -10,6 +11,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi.baselines import lagged_states, reading_output
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.early_stopping import hold_back, solve_watched
+from pilfr_casadi.export.digests import ordered_digest
 from pilfr_casadi.gauge import gauge_tangents
 from pilfr_casadi.problem import Problem
 
@@ -195,10 +197,13 @@ def test_saved_and_exported(name, tmp_path):
 def test_a_damaged_network_is_refused(tmp_path):
     fit, _ = fitted("network_lfr")
     fit.save(tmp_path / "model.json")
-    text = (tmp_path / "model.json").read_text()
-    for old, new in (('"hidden": 3', '"hidden": 3000000'), ('"hidden": 3', '"hidden": 0')):
-        (tmp_path / "model.json").write_text(text.replace(old, new))
-        with pytest.raises(pilfr.InputError):
+    content = json.loads((tmp_path / "model.json").read_text())
+    del content["sha256"]
+    for hidden, words in ((3_000_000, "expected"), (0, "whole numbers|expected"), ("three", "hidden")):
+        content["structure"]["element"]["hidden"] = hidden
+        text = json.dumps({**content, "sha256": ordered_digest(content)})
+        (tmp_path / "model.json").write_text(text)
+        with pytest.raises(pilfr.InputError, match=words):
             pilfr.load(tmp_path / "model.json")
 
 
@@ -265,8 +270,11 @@ def test_what_is_held_back():
     assert held[0].initial == "zero" and held[0].skip == 20
 
 
-def test_a_noe_of_several_recordings_has_a_state_for_each():
+def test_a_noe_of_several_recordings_has_a_state_for_each(tmp_path):
     records = [r.slice(100, 400) for r in recordings(truth("NARX"))]
     fit = pilfr.fit(pilfr.NOE(2, 3), records, starts=1)
     assert len(fit.initial) == 2 and len(fit.solution.theta) == len(fit.labels)
     assert fit.train_nrmse[0] < 0.05 and fit.train_nrmse[1] < 0.5
+    fit.save(tmp_path / "model.json")
+    again = pilfr.load(tmp_path / "model.json")
+    np.testing.assert_array_equal(again.simulate(records[1]), fit.simulate(records[1]))
