@@ -24,6 +24,7 @@ import numpy as np
 from .callback import handled_interrupt
 from .constraints import TOLERATED
 from .damping import without_rounding
+from .lifted import Lifted
 from .magnitude import Neighbours
 from .problem import Problem
 from .quadratic_program import QuadraticProgram
@@ -71,7 +72,7 @@ class GaussNewton:
 
     def solve(
         self,
-        problem: Problem,
+        problem: Problem | Lifted,
         start: np.ndarray | None = None,
         progress: Progress | None = None,
         watch: Watch | None = None,
@@ -95,7 +96,7 @@ class _Run:
     def __init__(
         self,
         options: GaussNewton,
-        problem: Problem,
+        problem: Problem | Lifted,
         start: np.ndarray,
         progress: Progress | None,
         watch: Watch | None = None,
