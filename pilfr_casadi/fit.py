@@ -18,12 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from .baselines import NARX, NOE
 from .constraints import Constraint, loosened
-from .elements import PrandtlIshlinskii
+from .elements import PrandtlIshlinskii, StaticNetwork
 from .exactness import beyond
 from .fitted import Fit, Progress, fingerprint
 from .job import Job, interrupted, penalised, rms_error
 from .known_blocks import in_known_coordinates, known_entries
+from .lagged_fit import fit_lagged
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
@@ -47,13 +49,14 @@ NO_GUARD = (
 
 
 def fit(
-    model: PILFR | Model | Fit,
+    model: PILFR | NARX | NOE | Model | Fit,
     train: Recording | Sequence[Recording],
     *,
     solver: Any = None,
     starts: int = 8,
     seed: int = 0,
     start: str = "grid",
+    linear: Any = None,
     stable: bool | float = True,
     constraints: Sequence[Constraint] = (),
     l1: dict[str, float] | None = None,
@@ -67,9 +70,8 @@ def fit(
 
     Parameters
     ----------
-    model : PILFR, Model or Fit
-        A PI-LFR structure (start values are found), a closed model of your own, or an earlier fit (started at its
-        values).
+    model : PILFR, NARX, NOE, Model or Fit
+        A structure (start values are found), a closed model of your own, or an earlier fit (started at its values).
     train : Recording or sequence of Recording
         Training data; nothing else is used.
     solver : GaussNewton or Ipopt
@@ -81,6 +83,9 @@ def fit(
     start : {"grid", "paper", "plain"}
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
         solved and re-gridded, or, "plain", solved and no more, as in the paper.
+    linear : control.StateSpace, optional
+        Linear model that the search for a PI-LFR begins with, such as `frequency_subspace` of a BLA, which is the
+        paper's; by default subspace identification refined by output error.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
         exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one, nothing grows.
@@ -129,11 +134,15 @@ def fit(
         shown: Any = progress_bar()
     else:
         shown = nullcontext(progress or None)
-    pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and isinstance(model, PILFR) else None
+    pool = (
+        ProcessPoolExecutor(workers, initializer=_leave_interrupts)
+        if own and not isinstance(model, Model | Fit)
+        else None
+    )
     with shown as report:
         job = Job((), solver, further, dict(l1 or {}), noise, engine, report)
         try:
-            return _fit(model, train, job, stable, starts, seed, start, executor or pool)
+            return _fit(model, train, job, stable, starts, seed, start, executor or pool, linear)
         except BrokenProcessPool:
             spawned = pool is not None and multiprocessing.get_start_method() != "fork"
             raise InputError(NO_GUARD if spawned else DEAD_WORKER) from None
@@ -144,7 +153,7 @@ def fit(
 
 @one_blas_thread
 def _fit(
-    model: PILFR | Model | Fit,
+    model: PILFR | NARX | NOE | Model | Fit,
     train: Recording | Sequence[Recording],
     job: Job,
     stable: bool | float,
@@ -152,7 +161,12 @@ def _fit(
     seed: int,
     start: str,
     executor: Executor | None,
+    given: Any,
 ) -> Fit:
+    if given is not None and not isinstance(model, PILFR):
+        raise InputError("A linear model to begin with goes with a PILFR; any other model has its own values.")
+    if isinstance(model, NARX | NOE):
+        return fit_lagged(model, train, job, starts, seed, executor)
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
     limits = stability_limits(structure, stable) if structure else ()
     job = replace(job, limits=(*limits, *job.limits))
@@ -160,8 +174,10 @@ def _fit(
         given = model.model if isinstance(model, Fit) else model
         job = replace(job, recordings=check_for_identification(train, int(given.parameters.free.sum()) + 2))
         return _from_values(given, structure, job, model if isinstance(model, Fit) else None)
-    if not isinstance(model.element, PrandtlIshlinskii | None):
-        raise InputError("A PI-LFR is identified with a PrandtlIshlinskii element; pass a closed Model for any other.")
+    if not isinstance(model.element, PrandtlIshlinskii | StaticNetwork | None):
+        raise InputError(
+            "Start values are known for PrandtlIshlinskii and StaticNetwork; give a closed Model for any other element."
+        )
     first = as_recordings(train)[0]
     shape = model.model(first.n_u, first.n_y).parameters
     if job.l1:
@@ -169,7 +185,7 @@ def _fit(
     fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
     job = replace(job, recordings=check_for_identification(train, fewest))
     linear, problem, solution = linear_model(
-        job.recordings, model, engine=job.engine, constraints=loosened(limits[:1]), progress=job.progress
+        job.recordings, model, engine=job.engine, constraints=loosened(limits[:1]), progress=job.progress, given=given
     )
     if solution.status is Status.INTERRUPTED:
         return job.result(linear, model.linear(), problem, solution)
@@ -276,8 +292,10 @@ def _from_starts(
 
 def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:
     """Refuse what cannot be used before any long work."""
-    if not isinstance(model, PILFR | Model | Fit):
-        raise InputError(f"The model is a {type(model).__name__}; give a PILFR, a closed Model or a Fit.")
+    if not isinstance(model, PILFR | NARX | NOE | Model | Fit):
+        raise InputError(
+            f"The model is a {type(model).__name__}; give a PILFR, a NARX, a NOE, a closed Model or a Fit."
+        )
     if isinstance(solver, type) or not hasattr(solver, "solve"):
         raise InputError(f"The solver is {solver!r}; give an object such as GaussNewton() or Ipopt().")
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):

@@ -80,6 +80,8 @@ LAYERS = {
         "job",
         "outcome",
         "linear_model",
+        "lagged_fit",
+        "early_stopping",
         "penalty",
         "thinning",
         "sparse",

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..elements import PrandtlIshlinskii
+from ..elements import PrandtlIshlinskii, StaticNetwork
 from ..lfr import PILFR, block_shapes
 from ..limits import Limit
 from ..model import Model
@@ -205,7 +205,15 @@ def _structure(file: ModelFile, n_u: int, n_y: int) -> PILFR:
         file.damaged(str(error).rstrip("."))
 
 
-def _element(file: ModelFile, table: dict[str, Any], parameters: dict[str, Any]) -> PrandtlIshlinskii:
+def _element(file: ModelFile, table: dict[str, Any], parameters: dict[str, Any]) -> PrandtlIshlinskii | StaticNetwork:
+    if table.get("kind") == "static_network":
+        hidden, channels = file.count(table, "hidden"), file.count(table, "channels")
+        for key in ("gain", "slope", "bias"):
+            file.array(file.table(parameters, key).get("value"), (channels, hidden), f"parameter {key!r}")
+        try:
+            return StaticNetwork(hidden, channels)
+        except InputError as error:
+            file.damaged(str(error).rstrip("."))
     if table.get("kind") != "prandtl_ishlinskii":
         file.fail(
             f"has the element {str(table.get('kind'))[:40]!r}, which a file cannot hold; give the model as `model=`"

@@ -19,7 +19,7 @@ KEYS: dict[tuple[str, ...], tuple[str, ...]] = {
     ("model", "inputs", EACH): ("name", "unit"),
     ("model", "outputs", EACH): ("name", "unit"),
     ("structure",): ("nx", "offset", "element", "fixed", "bounds", "priors"),
-    ("structure", "element"): ("kind", "operator", "n", "channels", "rounded", "neurons", "expressions"),
+    ("structure", "element"): ("kind", "operator", "n", "channels", "rounded", "neurons", "expressions", "hidden"),
     ("parameters", EACH): ("value", "std", "unit"),
     ("training",): (
         *("status", "sentence", "message", "nrmse", "linear_nrmse", "seconds", "active", "limits", "solve"),

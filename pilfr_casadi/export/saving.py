@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from ..elements import PrandtlIshlinskii
+from ..elements import PrandtlIshlinskii, StaticNetwork
 from ..operators import GeneralizedPlay
 from .digests import ordered_digest
 from .files import write_atomically
@@ -133,6 +133,8 @@ def _structure(structure: PILFR) -> dict[str, Any]:
 
 
 def _element(element: Any) -> dict[str, Any]:
+    if isinstance(element, StaticNetwork):
+        return {"kind": element.kind, "hidden": element.hidden, "channels": element.channels}
     if not isinstance(element, PrandtlIshlinskii):
         return {"kind": type(element).__name__}
     operator = element.operator
