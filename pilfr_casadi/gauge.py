@@ -138,7 +138,11 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     if not np.all(np.isfinite(hessian)):
         return np.diag(np.full(problem.size, np.inf)), np.zeros(problem.size, dtype=bool)
     sensitivity = np.sqrt(np.diag(hessian))
+    given = theta.copy()
     held = _snap_to_bounds(problem, theta, sensitivity)
+    if np.any(theta != given):  # a threshold on its bound may slip where it stuck, and so wake what was nearly blind
+        _, _, hessian = problem.normal(theta)
+        sensitivity = np.sqrt(np.diag(hessian))
     tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, held)
     slopes = problem.constraint_jacobian(theta)[problem.active_constraints(theta)]
     # a gauge direction that an active constraint forbids is no freedom; a constraint on a spectral radius or a gain

@@ -29,6 +29,7 @@ import numpy as np
 from .compiled import make_engine
 from .constraints import BeyondRadius, Constraint, stable
 from .elements import PrandtlIshlinskii
+from .envelopes import enveloped, has_networks
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .model import Model
@@ -141,6 +142,8 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     else:
         place = PLACES[seed] if seed < len(PLACES) else "random"
         values, solver = grid_start(search.structure, scaled, inputs, states, rng, place), EXPLORE
+        if has_networks(search.structure):
+            values = enveloped(search.structure, scaled, values, search.recordings, states, place)
     model = search.model(within_radius(values, search.constraints, search.structure))
     problem = search.problem(model)
     candidate = _candidate(seed, model, problem, solver.solve(problem))

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from .elements import PrandtlIshlinskii
+from .envelopes import reach
 from .lfr import PILFR
 
 Blocks = dict[str, np.ndarray]
@@ -184,8 +185,9 @@ def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def regridded(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3) -> dict[str, Any]:
     """The values with every channel's thresholds and weights placed anew; z (M, n_w) is the fitted model's signal."""
+    reaches = [reach(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
     rows = [
-        regrid(r, w, float(np.max(np.abs(z_i))), beyond=beyond) if w.sum() > 0 and np.max(np.abs(z_i)) > 0 else (r, w)
-        for r, w, z_i in zip(values["r"], values["w"], z.T, strict=True)
+        regrid(r, w, most, beyond=beyond) if w.sum() > 0 and most > 0 else (r, w)
+        for r, w, most in zip(values["r"], values["w"], reaches, strict=True)
     ]
     return {**values, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}

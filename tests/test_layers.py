@@ -52,6 +52,7 @@ LAYERS = {
         "gauge",
         "normal_form",
         "start",
+        "envelopes",
         "problem",
         "layout",
         "nlp",
