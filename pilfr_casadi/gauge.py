@@ -138,11 +138,7 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     if not np.all(np.isfinite(hessian)):
         return np.diag(np.full(problem.size, np.inf)), np.zeros(problem.size, dtype=bool)
     sensitivity = np.sqrt(np.diag(hessian))
-    given = theta.copy()
     held = _snap_to_bounds(problem, theta, sensitivity)
-    if np.any(theta != given):  # a threshold on its bound may slip where it stuck, and so wake what was nearly blind
-        _, _, hessian = problem.normal(theta)
-        sensitivity = np.sqrt(np.diag(hessian))
     tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, held)
     slopes = problem.constraint_jacobian(theta)[problem.active_constraints(theta)]
     # a gauge direction that an active constraint forbids is no freedom; a constraint on a spectral radius or a gain
@@ -174,13 +170,19 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
 def _snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, tolerance: float = 1e-9) -> Array:
     """Move variables that are within rounding of a bound onto it, in place; returns which (size,), bool.
 
-    Within rounding means that the move changes the normalised outputs by less than `tolerance`.
+    Within rounding means that the move changes the normalised outputs by less than `tolerance`, by the sensitivity at
+    either end: what hardly counts where it is, such as the slope of a saturated neuron, may count at a bound far away.
     """
-    held = np.zeros(problem.size, dtype=bool)
+    given, held = theta.copy(), np.zeros(problem.size, dtype=bool)
     for bound in (problem.lower, problem.upper):
         near = np.isfinite(bound) & (sensitivity > 0)
         near[near] = np.abs(theta - bound)[near] * sensitivity[near] <= tolerance
         near |= theta == bound
         theta[near] = bound[near]
         held |= near
+    if np.any(theta != given):
+        there = np.sqrt(np.diag(problem.normal(theta)[2]))
+        far = ~(np.abs(theta - given) * there <= tolerance)
+        theta[far] = given[far]
+        held &= ~far
     return held
