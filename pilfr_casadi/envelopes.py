@@ -40,9 +40,9 @@ def has_networks(structure: PILFR) -> bool:
 
 
 def reach(structure: PILFR, values: Mapping[str, Array], z: Array, channel: int) -> float:
-    """The threshold at which a channel's operators would rest over z (M,): its largest size, or half of its envelopes'.
+    """The threshold at which a channel's operators would rest over z (M,): its size, or half of its envelopes'.
 
-    A generalized play rests when its lower curve `γ_l - r` stays below its upper one `γ_r + r` at every two values of z.
+    A generalized play rests when its lower curve `γ_l - r` is below its upper one `γ_r + r` at every two values of z.
     """
     if not has_networks(structure):
         return float(np.max(np.abs(z)))
@@ -84,7 +84,7 @@ def enveloped(
     """
     element = structure.element
     assert isinstance(element, PrandtlIshlinskii)
-    fixed = {k for k in structure.fixed if k != "y_0"}
+    fixed = set(structure.fixed) - {"y_0", "A"}
     before = {"B_u", "D_zu"} <= fixed or (not fixed and place == "input")
     if fixed and not before and not {"C_y", "D_yw"} <= fixed:
         return dict(values)
@@ -125,7 +125,7 @@ def enveloped(
 
 
 def _through(linear: Mapping[str, Array], through: Array, left: Array, before: bool) -> Blocks:
-    """Linear blocks of which channel i carries whole inputs or outputs, `through` (n, channels); `left`: not carried."""
+    """Linear blocks of which channel i carries whole inputs or outputs, `through` (n, channels); others `left`."""
     b, c, d = linear["B_u"], linear["C_y"], linear["D_yu"]
     if before:
         return {"B_w": b @ through, "D_yw": d @ through, "B_u": b * left, "D_yu": d * left}
@@ -171,7 +171,7 @@ def outline(z: Array, v: Array) -> tuple[Array, Array, Array]:
 
     Loops that run the wrong way round have no width.
     """
-    edges = np.linspace(*np.quantile(z, [0.002, 0.998]), BINS + 1)
+    edges = np.linspace(np.quantile(z, 0.002), np.quantile(z, 0.998), BINS + 1)
     centres, bins = (edges[1:] + edges[:-1]) / 2, np.clip(np.searchsorted(edges, z) - 1, 0, BINS - 1)
     low, high, turn = np.full(BINS, np.nan), np.full(BINS, np.nan), 0.0
     rising = np.gradient(z) > 0

@@ -111,7 +111,7 @@ def grid_start(
     reach = np.max(np.abs(z), axis=0)
     blocks["r"] = 0.9 * reach[:, None] * np.arange(element.n) / element.n
     blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
-    if place != "random" and not set(blocks) & set(structure.fixed):
+    if place != "random" and not set(blocks) & set(fixed):
         blocks |= _halved(linear, size, at_output if place == "output" else at_input, place == "output")
     return blocks
 

@@ -69,7 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("runs/asymmetric"), help="folder for the picture")
     options = parser.parse_args(arguments)
-    data, fits = records(options.seed), {}
+    data = records(options.seed)
+    fits: dict[str, Fit] = {}
     print(f"shape-memory wire, NRMSE; tests are held out; noise floor {NOISE}")
     print(f"{'':<30}" + "".join(f"{name:>11}" for name in ("train", *TESTS)))
     with ProcessPoolExecutor(options.workers) as pool:

@@ -53,6 +53,7 @@ LAYERS = {
         "normal_form",
         "start",
         "envelopes",
+        "modal",
         "problem",
         "layout",
         "nlp",
