@@ -158,15 +158,15 @@ def measure(
     n_period: int = N_PERIOD,
     platform: Platform | None = None,
 ) -> Measurement:
-    """Random-phase multisines (Eq. 18) from 0 to `f_max` Hz, of `rms` V, each in steady state over `PERIODS` periods."""
+    """Multisines (Eq. 18) from 0 to `f_max` Hz, of `rms` V, each measured over `PERIODS` steady periods."""
     platform, rng = platform or Platform(), np.random.default_rng([seed, round(f_max)])
     u = np.array([rms * multisine(n_period, f_max, FS, rng) for _ in range(realizations)])
     y = platform.steady(u)
     recordings = []
     for k in range(realizations):
         noisy = np.tile(y[k], PERIODS) + platform.noise * rng.standard_normal(PERIODS * n_period)
-        options = {"period": n_period, "initial": "periodic", "hold": "zero", "name": f"realization {k + 1}"}
-        recordings.append(
-            Recording(np.tile(u[k], PERIODS), noisy, 1 / FS, ("voltage",), ("displacement",), UNITS, **options)
+        r = Recording(
+            np.tile(u[k], PERIODS), noisy, 1 / FS, ("voltage",), ("displacement",), UNITS, n_period, "periodic"
         )
+        recordings.append(r.with_(hold="zero", name=f"realization {k + 1}"))
     return Measurement(tuple(recordings))
