@@ -29,7 +29,7 @@ def usable(values: np.ndarray) -> np.ndarray:
 
 
 def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infinite: bool = False) -> np.ndarray:
-    """Return finite numbers as an array; of a shape, to which it is broadcast, where one is given.
+    """Return finite real numbers as an array; of a shape, to which it is broadcast, where one is given.
 
     Raises
     ------
@@ -37,9 +37,12 @@ def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infini
         If something else is given, or one of them is not finite (nan, where `infinite`).
     """
     try:
-        found = np.asarray(values, dtype=float)
+        given = np.asarray(values)
+        if given.dtype.kind not in "biufO":
+            raise TypeError
+        found = given.astype(float)
         found = found if shape is None else np.broadcast_to(found, shape)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         fit = "" if shape is None else f" that fit the shape {shape}"
         raise InputError(f"{what} cannot be {str(values)[:60]!r}; give numbers{fit}.") from None
     if np.any(np.isnan(found)) or not (infinite or np.all(np.isfinite(found))):

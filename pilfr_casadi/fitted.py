@@ -202,10 +202,11 @@ class Fit:
 
     def __str__(self) -> str:
         errors = ", ".join(f"{e:.4f}" for e in self.train_nrmse)
+        spent = f", {self.seconds:.1f} s in all" if self.seconds else ""
         lines = [
             self.status.value,
             f"NRMSE on the training recording{'s' if len(self.train_nrmse) > 1 else ''}: {errors}",
-            f"{self.solution.iterations} iterations in the last solve, {self.seconds:.1f} s in all",
+            f"{self.solution.iterations} iterations in the last solve{spent}",
         ]
         if self.candidates:
             reached = sorted(c.error for c in self.candidates)

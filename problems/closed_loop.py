@@ -27,7 +27,7 @@ from pilfr_casadi.recording import Recording
 from .controllers import ByDoMpc, Compensated, Given, Plant, Predictive, ProportionalIntegral
 
 Array = np.ndarray
-LINEAR = "MPC, linear model"
+LINEAR, PI = "MPC, linear model", "PI control"
 MOVE = 1e-4  # weight of moves
 
 
@@ -142,7 +142,7 @@ def compare(
     proportional = (0.0,) if quick else (0.0, 0.1, 0.3, 1.0)
     integral = (0.05,) if quick else (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
     loops = [
-        task.close("PI control", ProportionalIntegral(task.reference, gain, a / gain, b / gain, task.inputs))
+        task.close(PI, ProportionalIntegral(task.reference, gain, a / gain, b / gain, task.inputs))
         for a in proportional
         for b in integral
     ]
@@ -170,29 +170,46 @@ def compare(
 
 
 def draw(outcomes: list[Outcome], task: Task, dt: float, units: tuple[str, str], path: Path) -> None:
-    """Reference and outputs above, errors in the middle, inputs (units: output, input) below."""
+    """Outputs, errors of the linear model and better, errors of the hysteresis model alone, inputs; units as printed.
+
+    PI control, whose errors are several times larger, is shown by its output only.
+    """
     from pilfr_casadi import plots
     from pilfr_casadi.plots.canvas import BLUE, GREEN, GREY, INK, ORANGE, VERMILLION, finish, scaled
 
     t = dt * np.arange(len(task.reference))
-    scale, unit = scaled(task.reference, units[0])
-    figure = plots.new_figure(8.0, 8.0)
-    top, middle, low = figure.subplots(3, 1, sharex=True)
+    drawn = [o for o in outcomes if o.name.count(",") < 2 and "no sensor" not in o.name]
+    looks = dict(zip([o.name for o in drawn], [ORANGE, VERMILLION, BLUE, GREEN], strict=True))
+    errors = {o.name: o.y - task.reference for o in drawn if o.name != PI}
+    close = {name: error for name, error in errors.items() if name != LINEAR}
+    figure = plots.new_figure(8.0, 10.0)
+    top, middle, near, low = figure.subplots(4, 1, sharex=True)
+    scale, unit = _prefixed(*scaled(task.reference, units[0]))
     for value in task.outputs:
         top.axhline(value / scale, color=GREY, linewidth=1, linestyle=":")
-    drawn = [o for o in outcomes if o.name.count(",") < 2 and "no sensor" not in o.name]
-    for o, colour in zip(drawn, [ORANGE, VERMILLION, BLUE, GREEN], strict=True):
-        top.plot(t, o.y / scale, color=colour, linewidth=1.2, label=o.name)
-        middle.plot(t, (o.y - task.reference) / scale, color=colour, linewidth=1.0)
-        low.step(t, o.u, color=colour, linewidth=0.8, where="post")
-    top.plot(t, task.reference / scale, color=INK, linewidth=0.8, linestyle="--", label="reference")
-    worst = max(float(np.max(np.abs(o.y - task.reference)[task.skip :])) for o in drawn if o.name == LINEAR) / scale
-    middle.set_ylim(-1.3 * worst, 1.3 * worst)
+    for o in drawn:
+        top.plot(t, o.y / scale, color=looks[o.name], linewidth=1.4, label=o.name)
+    top.plot(t, task.reference / scale, color=INK, linewidth=0.9, linestyle=(0, (1, 3)), label="reference")
     finish(top, "", f"output [{unit}]", columns=3)
-    finish(middle, "", f"error [{unit}]", legend=False)
+    for axes, shown in ((middle, errors), (near, close)):
+        worst = max(float(np.max(np.abs(e[task.skip :]))) for e in shown.values())
+        scale, unit = _prefixed(*scaled(np.array([worst]), units[0]))
+        for name, error in shown.items():
+            axes.plot(t, error / scale, color=looks[name], linewidth=1.0)
+        axes.set_ylim(-1.1 * worst / scale, 1.1 * worst / scale)
+        finish(axes, "", f"error [{unit}]", legend=False)
+    for o in drawn:
+        low.step(t, o.u, color=looks[o.name], linewidth=0.7, where="post")
     finish(low, "time [s]", f"input [{units[1]}]", legend=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
+
+
+def _prefixed(scale: float, unit: str) -> tuple[float, str]:
+    """Millimetres for 10⁻³ m, and the like."""
+    power, _, plain = unit.rpartition(" ")
+    prefixes = {("10⁻³", "m"): "mm", ("10⁻⁶", "m"): "µm", ("10⁻³", "µm"): "nm"}
+    return scale, prefixes.get((power, plain), unit)
 
 
 def program(
@@ -212,6 +229,6 @@ def program(
     options = parser.parse_args(arguments)
     results, task = outcomes(solvers=("ipopt",) * options.ipopt + ("do-mpc",) * options.do_mpc)
     print(table(results, units[0], dt, tolerance))
-    picture = options.out / "tracking.png"
+    picture = options.out / f"{name}.png"
     draw(results, task, dt, units, picture)
     print(f"picture: {picture}")

@@ -61,7 +61,7 @@ def score(case: Case, diagnosis: Mapping[str, Any], seconds: float = 0.0, crash:
     nameable = bool(case.accepted)
     ports = {p for a in case.accepted for p, _ in a}
     confidence = float(effects[0]["confidence"]) if effects else None
-    found = {g.get("channel") for g in diagnosis.get("gates", ())}
+    found = {name for g in diagnosis.get("gates", ()) for name in str(g.get("channel")).split(", ")}
     after = ((diagnosis.get("fit") or {}).get("test") or {}).get("after")
     right = bool(hits) and hits[0]
     return Score(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_export import signed
 
 from pilfr_casadi.cli import in_options, main
 
@@ -202,7 +203,7 @@ def test_an_unstable_start_is_refused(capsys, tmp_path, train):
     document = json.loads(path.read_text())
     document["parameters"]["A"]["value"] = [[1e6]]
     wild = tmp_path / "wild.json"
-    wild.write_text(json.dumps(document))
+    wild.write_text(json.dumps(signed(document)))
     names = ("--inputs", "u", "--outputs", "y", "--initial", "zero")
     refused(capsys, "fit", train, *names, "--from", wild, "--out", tmp_path / "wild", says="diverges")
 

@@ -191,6 +191,14 @@ def test_without_test_recordings_it_says_so(tmp_path):
     assert "no test was given" in text and "none held out" in text and "test (held out)" not in text
 
 
+def test_it_says_what_makes_the_answer_less_certain(tmp_path):
+    d = example()
+    assert "far above the training error" not in Reader(diagnosis_report(d, tmp_path).read_text()).text
+    worse = {**d.errors, "test": {**d.errors["test"], "after": 100 * d.errors["train"]["after"]}}
+    text = Reader(diagnosis_report(replace(d, errors=worse), tmp_path).read_text()).text
+    assert "The test error is far above the training error" in text
+
+
 def test_old_figures_go_and_other_files_stay(tmp_path):
     (tmp_path / "figures").mkdir()
     old, mine = (tmp_path / "figures" / name for name in ("diagnosis-99-old.png", "mine.png"))

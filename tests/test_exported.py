@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from test_cli import refused, run
-from test_export import one_sentence, own_model, recording_for, some_fit
+from test_export import one_sentence, own_model, recording_for, signed, some_fit
 from test_exported_models import lfr, mass_on_spring, wave
 
 from pilfr_casadi import InputError, Parameter, Play, PrandtlIshlinskii, Recording, Simulator, exported, to_casadi
@@ -259,8 +259,8 @@ REFUSED = {
     "hold of a fit": (lambda: exported(some_fit(), hold="zero"), "are for simulators"),
     "substeps": (lambda: exported(mass_on_spring(), dt=0.1, substeps=0), "substeps = 0"),
     "start": (lambda: exported(some_fit(), start=np.zeros(4)), "has 4 numbers; give 3 .* or 7"),
-    "start nan": (lambda: exported(some_fit(), start=[np.nan] * 3), "all finite"),
-    "start text": (lambda: exported(some_fit(), start="zero"), "all finite"),
+    "start nan": (lambda: exported(some_fit(), start=[np.nan] * 3), "finite numbers"),
+    "start text": (lambda: exported(some_fit(), start="zero"), "give numbers"),
     "recording": (lambda: exported(mass_on_spring(), dt=0.1, start=recording_for(some_fit())), "must be the same"),
     "step": (lambda: exported(mass_on_spring(), dt=0.1, start=wave(mass_on_spring(), 0.2)), "step is 0.2 s"),
     "bound": (lambda: exported(some_fit()).bound(np.zeros(3), [0.0]), "3 numbers were given for the state; expected 7"),
@@ -300,7 +300,7 @@ def test_no_code_is_run_from_a_model_file(tmp_path, monkeypatch, text):
     signals["outputs"][0]["unit"] = training["message"] = content["written_by"]["casadi"] = text
     signals["states"] = [text] * len(signals["states"])
     training["active"] = [text]
-    (tmp_path / "model.json").write_text(json.dumps(content))
+    (tmp_path / "model.json").write_text(json.dumps(signed(content)))
     fitted = load("model.json")
     found = exported(fitted, name="rig")
     assert text in str(fitted) and text in str(found)
@@ -311,7 +311,7 @@ def test_no_code_is_run_from_a_model_file(tmp_path, monkeypatch, text):
     assert not any(word in part for part in code for word in ("evil", "system", text))  # but as RIG_U_SYSTEM_TOUCH_EVIL
     for key in ("operator", "kind"):
         content["structure"]["element"][key] = text
-        (tmp_path / "model.json").write_text(json.dumps(content))
+        (tmp_path / "model.json").write_text(json.dumps(signed(content)))
         with pytest.raises(InputError) as error:
             load("model.json")
         one_sentence(error)
@@ -364,7 +364,7 @@ def test_the_command(tmp_path, capsys):
     refused(capsys, "export", model, "--out", out, "--name", "a b", says="cannot be used")
     refused(capsys, "export", model, "--out", out, "--smooth", "-1", says="smooth")
     content = json.loads(model.read_text())
-    for text, says in ((json.dumps(content | {"version": 2}), "version 2"), (model.read_text()[:900], "incomplete")):
+    for text, says in ((json.dumps(content | {"version": 3}), "version 3"), (model.read_text()[:900], "incomplete")):
         (tmp_path / "other.json").write_text(text)
         refused(capsys, "export", tmp_path / "other.json", "--out", out, says=says)
     (tmp_path / "model.json.names.json").write_text(model.read_text())

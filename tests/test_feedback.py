@@ -248,7 +248,7 @@ def test_what_cannot_be_inverted_says_why(small):
     phase = fitted(pilfr.PILFR(2, fixed={"D_yu": 0.0}), delay)
     with pytest.raises(pilfr.InputError, match="no stable inverse with a look-ahead of 1 samples"):
         pilfr.feedforward(*phase, ahead=1)
-    with pytest.raises(pilfr.InputError, match="nothing to invert"):
+    with pytest.raises(pilfr.InputError, match="reaches the output only after 1 "):
         pilfr.feedforward(*phase, ahead=0)
 
 
@@ -292,7 +292,7 @@ def test_what_the_controller_cannot_use_is_refused(small):
         pilfr.PredictiveController(function, 5, inputs=(0, 1), solver="qp")
     with pytest.raises(pilfr.InputError, match="low below high"):
         pilfr.PredictiveController(function, 5, inputs=(1, 0))
-    with pytest.raises(pilfr.InputError, match="a reference of 4"):
+    with pytest.raises(pilfr.InputError, match=r"The reference has the shape \(4,\); give \(5, 1\)"):
         pilfr.PredictiveController(function, 5, inputs=(0, 1))(np.zeros(5), np.zeros(4), [0.0])
 
 

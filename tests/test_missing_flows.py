@@ -10,10 +10,8 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi.diagnose.explain import Candidate, simpler
-from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.linearise import Probe, locals_of, run
 from pilfr_casadi.diagnose.screen import _gain
-from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.verdict import judge
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.gauss_newton import GaussNewton
@@ -190,11 +188,3 @@ def test_a_refinement_that_comes_out_as_zero_is_the_law_that_it_refines():
     assert type(found.law) is PreslidingFriction
     assert found.size == 2
     assert found.fitted.cost < own.cost
-
-
-@pytest.mark.parametrize(("port", "drifts"), [("sensor:position", True), ("guide", False)])
-def test_behind_a_free_integrator_no_sensor_is_blamed_for_what_is_left(port, drifts):
-    bench = Workbench.of(axis(), [moved(0)], "zero")
-    search = Search(bench, bench.fit(bench.simulator), Floor(np.array([1e-5]), "estimated"), (), 1, lambda *_: None)
-    winner = SimpleNamespace(port=port, law=SimpleNamespace(id="hysteresis"))
-    assert search._only_drifts(SimpleNamespace(winner=winner)) is drifts

@@ -68,8 +68,10 @@ def changed(folder, old, new):
 
 def contents(out):
     """What is the same in every execution of a run."""
-    names = [*out.glob("jobs/*/model.json"), out / "model.json", out / "results.csv"]
-    return {str(p.relative_to(out)): p.read_bytes() for p in names}
+    found = {str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    assert json.loads(found.pop("times.json")).keys() == {p.name for p in out.glob("jobs/*")}
+    assert found.pop(".lock") == b"" and {"manifest.json", "model.json", "results.csv"} <= found.keys()
+    return found
 
 
 def command(folder, *more):
@@ -99,8 +101,13 @@ def test_a_run_gives_the_same_bytes_twice_and_skips_what_is_done(folder):
     again = pilfr.run(folder / "rig.toml")
     assert again.done == () and again.skipped == first.done and contents(again.folder) == before
     assert (first.folder / "report.html").stat().st_mtime_ns == report
-    other = pilfr.run(changed(folder, "report = false", "report = false"), out=folder / "other")
-    assert contents(other.folder) == before and not (other.folder / "report.html").exists()
+    other = pilfr.run(folder / "rig.toml", out=folder / "other")
+    assert contents(other.folder) == before and "report.html" in before  # all of it, the manifest and the page too
+    times = [json.loads((f / "times.json").read_text()) for f in (first.folder, other.folder)]
+    assert times[0] != times[1] and all(t > 0 for t in times[0].values()) and first.fit.seconds > 0
+    none = pilfr.run(changed(folder, "report = false", "report = false"), out=folder / "none")
+    models = {k: v for k, v in before.items() if k not in ("report.html", "manifest.json")}
+    assert {k: v for k, v in contents(none.folder).items() if k != "manifest.json"} == models
 
 
 def test_what_is_written(folder):
@@ -268,7 +275,12 @@ def test_constraints_that_cannot_be_met_get_one_sentence(capsys, folder):
         "operators = 3", "operators = 3\nbounds = { w = [0, 1], B_w = [0, 1], C_y = [0, 1], D_yw = [0, 1] }"
     )
     (folder / "rig.toml").write_text(text.replace("[solver]", gain))
-    refused(capsys, folder / "rig.toml", says=("no job meets its constraints", "DC gain", "off by"))
+    assert main(["run", str(folder / "rig.toml")]) == 1  # nothing is wrong with the file, there is no usable result
+    err = capsys.readouterr().err
+    assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err
+    assert all(word in err for word in ("no job meets its constraints", "DC gain", "off by")), err
+    with pytest.raises(InputError, match="no job meets its constraints"):
+        pilfr.run(folder / "rig.toml")
 
 
 def test_other_bad_places(capsys, folder, tmp_path):
@@ -277,7 +289,65 @@ def test_other_bad_places(capsys, folder, tmp_path):
     (folder / "mine").mkdir()
     (folder / "mine" / "model.json").write_text("{}")
     refused(capsys, folder / "rig.toml", "--out", folder / "mine", says=("model.json", "no manifest"))
+    assert (folder / "mine" / "model.json").read_text() == "{}"
     refused(capsys, folder / "rig.toml", "--workers", "0", says="--workers 0")
+
+
+@pytest.mark.parametrize("out", ["..", "../..", ".", "", "/tmp", "x/../..", "../other", "a/../../other", "\\u0000"])
+def test_a_run_file_writes_only_below_its_own_folder(capsys, folder, out):
+    inner = folder / "inner"
+    inner.mkdir()
+    for name in ("train", "held", "test"):
+        shutil.copy(folder / f"{name}.csv", inner)
+    (inner / "rig.toml").write_text(f'out = "{out}"\n' + TEXT)
+    before = sorted(folder.rglob("*"))
+    refused(capsys, inner / "rig.toml", says=("'out' is", "no folder below that of the run file", "--out"))
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_a_link_does_not_lead_out_of_the_folder(capsys, folder):
+    inner = folder / "inner"
+    inner.mkdir()
+    for name in ("train", "held", "test"):
+        shutil.copy(folder / f"{name}.csv", inner)
+    (folder / "elsewhere").mkdir()
+    (inner / "way").symlink_to(folder / "elsewhere")
+    (inner / "rig.toml").write_text('out = "way"\n' + TEXT)
+    refused(capsys, inner / "rig.toml", says="no folder below that of the run file")
+    assert not list((folder / "elsewhere").iterdir())
+
+
+@pytest.mark.parametrize("more", [(), ("--overwrite",)])
+def test_foreign_content_is_not_written_over(capsys, folder, more):
+    (folder / "mine").mkdir()
+    (folder / "mine" / "thesis.tex").write_text("years of work")
+    (folder / "mine" / "model.json").write_text("{}")
+    refused(capsys, folder / "rig.toml", "--out", folder / "mine", *more, says=("thesis.tex", "no manifest of a run"))
+    assert sorted(p.name for p in (folder / "mine").iterdir()) == ["model.json", "thesis.tex"]
+    refused(capsys, folder / "rig.toml", "--out", folder, *more, says=("holds the run file", "a folder of their own"))
+    refused(capsys, folder / "rig.toml", "--out", folder.parent, *more, says="holds the run file")
+    assert not (folder / "manifest.json").exists() and not (folder.parent / "manifest.json").exists()
+
+
+def test_an_empty_folder_and_what_a_killed_process_left_will_do(folder):
+    changed(folder, "[0, 1, 2]", "[0]")
+    (folder / "empty").mkdir()
+    assert pilfr.run(folder / "rig.toml", out=folder / "empty").done == ("seed-0",)
+    (folder / "left").mkdir()
+    (folder / "left" / ".lock").touch()
+    (folder / "left" / ".manifest.json.0123abcd.tmp").write_text("{")
+    (folder / "left" / "jobs" / "seed-0").mkdir(parents=True)
+    (folder / "left" / "jobs" / "seed-0" / ".model.json.0123abcd.tmp").write_text("{")
+    left = pilfr.run(folder / "rig.toml", out=folder / "left", overwrite=True)
+    assert left.done == ("seed-0",) and contents(left.folder) == contents(folder / "empty")
+
+
+def test_times_that_are_damaged_do_not_matter(folder):
+    changed(folder, "[0, 1, 2]", "[0]")
+    out = pilfr.run(folder / "rig.toml").folder
+    (out / "times.json").write_text("[1")
+    again = pilfr.run(folder / "rig.toml")
+    assert again.done == () and again.fit.seconds == 0.0
 
 
 def test_two_runs_do_not_share_a_folder(capsys, folder):

@@ -65,6 +65,13 @@ class Candidate:
         """Root of the geometric mean of both mean squares."""
         return float((self.head * self.tail) ** 0.25)
 
+    @property
+    def at_bound(self) -> bool:
+        """Whether a parameter of the law is held back by one of its bounds."""
+        prefix = self.fitted.simulator.elements[-1].prefix
+        bounds = {k: p.bounds for k, p in self.fitted.model.parameters.items() if k.startswith(prefix)}
+        return any(np.any((self.fitted.values[k] <= a) | (self.fitted.values[k] >= b)) for k, (a, b) in bounds.items())
+
 
 def heads(recordings: Sequence[Recording], share: float = HEAD) -> tuple[Recording, ...]:
     """First part of each recording."""

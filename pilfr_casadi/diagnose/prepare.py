@@ -15,7 +15,7 @@ from .gates import Gate, choose_hold, hold_note, opened, said_hold, wrong_scale
 from .linearise import along, linearised, observer_gain
 from .offset import offsets
 from .proof import errors_of
-from .timing import FAR, WHOLE, as_given, timing
+from .timing import FAR, as_given, in_steps, timing
 from .workbench import THOROUGH, Fitted, Workbench
 
 SUSPECT, LEAST = 25.0, 4e-4  # times the noise, and mean square error, beyond which signs and units are looked at
@@ -64,17 +64,21 @@ def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | N
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
     given, before = bench, without
-    bench, without, more = timing(given, before, noise2)
-    if more and said_hold(simulator, recordings, hold) is None:  # out of step, what looked better says nothing
+    unsaid = said_hold(simulator, recordings, hold) is None
+    # where inputs are taken as held but are interpolated, a late channel is late by half a sample more or less
+    bench, without, more = timing(given, before, noise2, 0.5 if unsaid else 1.0)
+    if more and unsaid:  # out of step, what looked better says nothing
         other = given.otherwise_held()
-        found = timing(other, other.fit(other.simulator, [before.values], states=before.initial), noise2)
+        found = timing(other, other.fit(other.simulator, [before.values], states=before.initial), noise2, 0.5)
         costs = _honest(without, more, bench.dt), _honest(found[1], found[2], bench.dt)
         if costs[1] < costs[0]:
             bench, without, more = found
-        ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
-        gates = [g for g in gates if g not in notes] + (
-            [hold_note(simulator, bench.hold, ratio)] if ratio > 1.02 else []
-        )
+        if any(_late_by_a_part(g, bench.dt) for g in more):  # a delay is physics
+            bench, without, more = given, before, []
+        else:
+            ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
+            held = [hold_note(simulator, bench.hold, ratio)] if ratio > 1.02 else []
+            gates = [g for g in gates if g not in notes] + held
     gates += more
     bench, without, more = offsets(bench, without)
     gates += more
@@ -104,5 +108,10 @@ def refitted(bench: Workbench) -> Fitted:
 
 def _honest(fitted: Fitted, gates: Sequence[Gate], dt: float) -> float:
     """Mean square error; a channel read between its samples has up to half of its noise averaged away."""
-    between = any(g.finding == "alignment" and abs(g.value / dt - round(g.value / dt)) > WHOLE for g in gates)
+    between = any(g.finding == "alignment" and not in_steps(g.value, dt) for g in gates)
     return fitted.cost * (2 if between else 1)
+
+
+def _late_by_a_part(gate: Gate, dt: float) -> bool:
+    """Whether a channel comes late, and not by whole samples."""
+    return gate.finding == "alignment" and gate.value > 0 and not in_steps(gate.value, dt)

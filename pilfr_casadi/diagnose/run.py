@@ -22,7 +22,7 @@ from .offset import without_idle_offsets
 from .prepare import prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
-from .search import Pass, Search
+from .search import MISHELD, Pass, Search
 from .verdict import UNSURE, confidence, judge
 from .workbench import Fitted, arranged
 
@@ -97,9 +97,10 @@ def diagnose(
     ready = prepare(simulator, recordings, hold, engine)
     prepared_at = time.perf_counter()
     bench, without = ready.bench, ready.without
-    search = Search(bench, without, ready.floor, laws, workers, say).run(effects)
+    said = said_hold(simulator, recordings, hold) is not None
+    search = Search(bench, without, ready.floor, laws, workers, say, said).run(effects)
     gates = ready.gates
-    if said_hold(simulator, recordings, hold) is None and (ratio := search.wrongly_held()) > 1.05:
+    if (ratio := search.misheld) > MISHELD:
         ready = prepare(simulator, recordings, bench.otherwise_held().hold, engine)
         bench, without = ready.bench, ready.without
         search = Search(bench, without, ready.floor, laws, workers, say).run(effects)

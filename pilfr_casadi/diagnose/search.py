@@ -35,6 +35,8 @@ POLISHED = 4  # candidates fitted to everything before one is chosen
 MOSTLY = 0.5  # share of the rest that a second effect may leave
 UNSEEN, NO_WORSE = 0.7, 1.1  # shares of the mean square on the unseen part that a second effect may leave
 NOTHING = 0.01  # below this share nothing is explained
+IMITATED = 3  # simpler laws put up against one that can imitate others
+MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
 Seen = tuple[list[Scored], dict[str, int], np.ndarray | None]
 Say = Callable[[str, int, int, float], None]
@@ -62,6 +64,10 @@ class Search:
         The simulator with the effects accepted so far.
     open_before, open_after : dict
         Share of the residual that a flexible force explains, by port, without and with the effects.
+    hold_said : bool
+        Whether somebody said what inputs do between samples; else each effect is a new chance to tell.
+    misheld : float
+        By how much the error falls, with the effects in place, where inputs do the other thing between samples.
     """
 
     bench: Workbench
@@ -70,6 +76,8 @@ class Search:
     laws: Sequence[type[Law]]
     workers: int
     say: Say
+    hold_said: bool = True
+    misheld: float = 1.0
     base: Fitted = field(init=False)
     passes: list[Pass] = field(default_factory=list)
     open_before: dict[str, float] = field(default_factory=dict)
@@ -128,19 +136,22 @@ class Search:
             self._put_more_finely()
             if number:
                 self._look_back()
+            if self._wrongly_held():
+                return
             self.open_after = self._open(self.base)
 
-    def wrongly_held(self) -> float:
-        """By how much the error falls, with the effects in place, where inputs do the other thing between samples."""
-        if self.interrupted or not any(p.accepted for p in self.passes):
-            return 1.0
+    def _wrongly_held(self) -> bool:
+        """Whether, with the effects in place, inputs seem to do the other thing between samples."""
+        if self.hold_said:
+            return False
         try:
             other = self.bench.otherwise_held().fit(
                 self.base.simulator, [self.base.values], states=self.base.initial, solver=THOROUGH
             )
         except InputError:
-            return 1.0
-        return float(np.sqrt(self.base.cost / max(other.cost, 1e-300)))
+            return False
+        self.misheld = float(np.sqrt(self.base.cost / max(other.cost, 1e-300)))
+        return self.misheld > MISHELD
 
     def _much(self) -> bool:
         """Whether enough is left to look for a second effect."""
@@ -165,16 +176,11 @@ class Search:
         if nothing or not scored:
             return Pass(None, (), tuple(scored), before, False)
         began = time.perf_counter()
-        candidates = explain(
-            self.bench,
-            scored,
-            self.base,
-            signs,
-            gain,
-            self.workers,
-            float(np.sqrt(self.floor2 + NEARLY * max(self.base.cost - self.floor2, 0.0))),
-            lambda i, n, e: self.say("fits" if not number else "fits, second effect", i, n, e),
-        )
+        candidates = self._explained(number, scored, signs, gain)
+        simpler = _imitated(candidates, scored)
+        if simpler:
+            more = self._explained(number, simpler, signs, gain)
+            candidates = sorted([*candidates, *more], key=lambda c: c.error)
         self._timed("fits", began)
         began = time.perf_counter()
         before = self._judged(self.base)
@@ -193,9 +199,23 @@ class Search:
         self._timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
+    def _explained(
+        self, number: int, scored: Sequence[Scored], signs: dict[str, int], gain: np.ndarray | None
+    ) -> list[Candidate]:
+        """Full fits, smallest error first."""
+        enough = float(np.sqrt(self.floor2 + NEARLY * max(self.base.cost - self.floor2, 0.0)))
+        stage = "fits" if not number else "fits, second effect"
+        return explain(
+            self.bench, scored, self.base, signs, gain, self.workers, enough, lambda i, n, e: self.say(stage, i, n, e)
+        )
+
     def _only_drifts(self, choice: Choice) -> bool:
-        """Whether a law that imitates others stands at a sensor behind a free integrator, whose drift it can follow."""
-        if choice.winner.law.id not in FLEXIBLE or not choice.winner.port.startswith("sensor:"):
+        """Whether a law that imitates others stands at a sensor behind a free integrator, whose drift it can follow.
+
+        What leaves next to nothing does more than that.
+        """
+        at_sensor = choice.winner.port.startswith("sensor:")
+        if choice.winner.law.id not in FLEXIBLE or not at_sensor or choice.remains < LITTLE:
             return False
         a = linearised(self.bench, self.without)[1][0].mean[0]
         return bool(np.any(np.abs(np.linalg.eigvals(a) - 1) < 1e-6))
@@ -321,3 +341,15 @@ class Search:
                 better = replace(first.choice, winner=again.winner, alike=alike, margin=again.margin)
                 self.passes[-2] = replace(first, choice=better)
         self._timed("look back", began)
+
+
+def _imitated(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
+    """The simpler laws, at the port of one that can imitate them, which the screen did not let through."""
+    if not candidates or candidates[0].law.id not in FLEXIBLE:
+        return []
+    best, tried = candidates[0], {(c.port, type(c.law)) for c in candidates}
+    other = [
+        s for s in scored if s.port == best.port and s.law.id not in FLEXIBLE and (s.port, type(s.law)) not in tried
+    ]
+    chosen = list(dict.fromkeys(type(s.law) for s in other))[:IMITATED]  # `scored` is best first
+    return [s for s in other if type(s.law) in chosen]

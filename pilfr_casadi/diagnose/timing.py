@@ -20,10 +20,11 @@ from .screen import block_diagonal, orthonormal
 from .workbench import Fitted, Workbench
 
 SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples
-RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 14)[::-1], np.geomspace(1e-4, 0.05, 14)])
+RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 0.05, 28)])
 WHOLE = 0.12  # samples within which a shift counts as whole
 LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
 FAR = 0.04  # mean square error of a refit that may have gone astray
+PROMISING = 0.7  # share of the remainder that a shift or clock rate worth a refit leaves
 DROP = 0.3  # share of the mean square that has to be left at most
 
 Trial = tuple[float, str, str, float, str, tuple[int, ...]]  # share left, channel, what, value, "u" or "y", columns
@@ -52,8 +53,11 @@ def _remainder(bench: Workbench, fitted: Fitted, basis: np.ndarray, change: Chan
     return value if np.isfinite(value) else np.inf
 
 
-def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Look for a shifted channel or clock; returns the corrected bench where it is a fault of the recording."""
+def timing(bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Look for a shifted channel or clock; returns the corrected bench where it is a fault of the recording.
+
+    A late channel counts as shifted where it is late by a multiple of `part` samples.
+    """
     if plain.cost < 4 * noise2:
         return bench, plain, []
     dt = bench.dt
@@ -77,7 +81,7 @@ def timing(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, F
     if best is None or best[0] > DROP * plain.cost:
         return bench, plain, []
     relative, name, what, value, other, found, change = best
-    gate = _gate(name, what, value, dt, plain.cost, relative, change)
+    gate = _gate(name, what, value, dt, plain.cost, relative, change, part)
     return (other, found, [gate]) if gate else (bench, plain, [])
 
 
@@ -90,7 +94,7 @@ def as_given(bench: Workbench, plain: Fitted) -> Fitted:
 
 
 def _trials(bench: Workbench, fitted: Fitted) -> list[Trial]:
-    """Shifts and clock rates of every channel that make the remainder clearly smaller, with its share."""
+    """The best shift and clock rate of every channel that make the remainder clearly smaller, with its share."""
     names = bench.simulator.output_names
     channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(names)]
     if len(names) > 1:
@@ -101,11 +105,27 @@ def _trials(bench: Workbench, fitted: Fitted) -> list[Trial]:
     straight = _remainder(bench, fitted, basis, lambda r: r, False)
     for kind, i, name in channels:
         for what, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
-            for value in values:
-                left = _remainder(bench, fitted, basis, _maker(kind, i, what)(value), kind == "u") / straight
-                if left < 0.7:
-                    out.append((left, name, what, float(value), kind, i))
+            make = _maker(kind, i, what)
+
+            def left(value: float, make: Callable[[float], Change] = make, kind: str = kind) -> float:
+                return _remainder(bench, fitted, basis, make(value), kind == "u") / straight
+
+            shares = [left(value) for value in values]
+            best = int(np.argmin(shares))
+            value, share = float(values[best]), shares[best]
+            if what == "clock":  # over a whole record a small step of a rate is many samples
+                value, share = _narrowed(left, values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)])
+            if share < PROMISING:
+                out.append((share, name, what, value, kind, i))
     return out
+
+
+def _narrowed(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
+    """Where the remainder is smallest between two values, and the remainder there."""
+    from scipy.optimize import minimize_scalar
+
+    found = minimize_scalar(left, bounds=(low, high), method="bounded", options={"maxiter": 20})
+    return float(found.x), float(found.fun)
 
 
 def _refit_at(
@@ -161,8 +181,6 @@ def _refined(
     bench: Workbench, now: Workbench, fitted: Fitted, make: Callable[[float], Change], at: float, width: float
 ) -> float:
     """Shift of the original recordings that fits best around `at`."""
-    from scipy.optimize import minimize_scalar
-
     original = replace(bench, scale=now.scale)
     basis = nominal_directions(original, fitted)
 
@@ -176,16 +194,23 @@ def _refined(
         rest = error - basis @ (basis.T @ error)
         return float(rest @ rest)
 
-    return float(minimize_scalar(left, bounds=(at - width, at + width), method="bounded").x)
+    return _narrowed(left, at - width, at + width)[0]
 
 
-def _gate(name: str, what: str, value: float, dt: float, before: float, after: float, change: Change) -> Gate | None:
+def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
+    """Whether a shift is a multiple of `part` samples."""
+    return abs(value / dt - part * round(value / dt / part)) < WHOLE
+
+
+def _gate(
+    name: str, what: str, value: float, dt: float, before: float, after: float, change: Change, part: float
+) -> Gate | None:
     fall = f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
     if what == "clock":
         sentence = f"The clock of {name} runs {value * 100:+.3g} % off the others'; with it corrected {fall}."
         return Gate(name, "clock", value, sentence, True, True, change, left=after / before)
     samples = value / dt
-    whole = abs(samples - round(samples)) < WHOLE and abs(samples) > LONG
+    whole = in_steps(value, dt, part) and abs(samples) > LONG
     if samples > -0.3 and not whole:
         return None  # late, and not by whole samples: a delay is physics
     word = "late" if samples > 0 else "early"

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 AT_FLOOR = 1.15  # times the floor that counts as being at it
 QUANTISED, SOMEWHAT, COLOURED = 2.0, 4.0, 9.0  # times a measured floor, and an estimated one, that noise may be
 LOUD, SILENT = 0.05, 0.01  # largest coloured noise, and what a force may explain of it
+QUIET, CHANCE = 0.01, 0.05  # the same for noise that nobody minds: by chance a force explains that much
 HINT = 0.1  # share of a residual that a flexible force has to explain to count
 PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name that only comes near
 LITTLE = 0.02  # of the excess left, with rivals near and a force that explains most of it
@@ -132,9 +133,12 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
 
     ranked = sorted(usable, key=key)
     winner = ranked[0]
-    close = [c for c in ranked if c.error < (1 + LIKE) * winner.error and c.size < winner.size]
+    close = [c for c in ranked if _near(c, winner) and c.size < winner.size]
     if close:  # what does as well with fewer parameters
         winner = min(close, key=lambda c: (c.size, key(c)))
+    free = [c for c in ranked if _near(c, winner) and c.size <= winner.size and not c.at_bound]
+    if winner.at_bound and free:  # what does as well without being held back
+        winner = min(free, key=lambda c: (c.size, key(c)))
     for rival in ranked[1:]:
         if imitates(winner, rival, floor):
             winner = rival
@@ -164,7 +168,8 @@ def left_open(search: Search) -> tuple[float, float]:
 
 def _like_noise(search: Search, times: float) -> bool:
     """Whether a residual so many times the floor can be noise: coloured, or repeated as quantisation is."""
-    unexplained = max(search.open_before.values(), default=0.0) < SILENT
+    most = CHANCE if search.without.cost < QUIET**2 else SILENT
+    unexplained = max(search.open_before.values(), default=0.0) < most
     if search.floor.source != "estimated":
         return times < QUANTISED and unexplained
     return times < SOMEWHAT or (times < COLOURED and unexplained and search.without.cost < LOUD**2)

@@ -1,5 +1,6 @@
 """Models on disk, and models as CasADi functions."""
 
+from .digests import digest
 from .exported_model import NAMES, Exported
 from .files import made, write_atomically
 from .functions import exported, to_casadi
@@ -11,6 +12,7 @@ __all__ = [
     "NAMES",
     "VERSION",
     "Exported",
+    "digest",
     "exported",
     "load",
     "made",

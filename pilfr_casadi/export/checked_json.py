@@ -12,8 +12,11 @@ from typing import Any, NoReturn
 import numpy as np
 
 from ..recording import InputError
+from .digests import ordered_digest
+from .files import path_text, short
 from .saving import FORMAT, VERSION
 
+WITHOUT_DIGEST = 1  # the version of the format that had none
 LARGEST = 200_000_000  # bytes; a model with 500 states takes 20 million
 
 
@@ -21,20 +24,28 @@ class ModelFile:
     """The tables of a model file, and the checks that turn every surprise into one sentence."""
 
     def __init__(self, path: str | os.PathLike[str], given: bool = False) -> None:
-        self.path, self.given = path, given
+        self.path, self.given = path_text(path, "model file"), given
         content = self._parse()
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             self.fail(f"is not a model file (its format is not {FORMAT!r}); give a file that `save` wrote")
-        if content.get("version") != VERSION:
+        version = content.get("version")
+        if type(version) is not int or version not in (WITHOUT_DIGEST, VERSION):
             self.fail(
-                f"has version {str(content.get('version'))[:20]} of the model format and this release reads "
-                f"version {VERSION}; save the model again with this release, or use the release that wrote it"
+                f"has version {json.dumps(version)[:20]} of the model format and this release reads versions "
+                f"{WITHOUT_DIGEST} and {VERSION}; save the model again with this release, or use the release that "
+                "wrote it"
+            )
+        said = content.pop("sha256", None)
+        if said != ordered_digest(content) and (version == VERSION or said is not None):
+            self.fail(
+                "was changed after it was written (its content does not have the SHA-256 that it was written with); "
+                "restore it, or save the model again"
             )
         self.content: dict[str, Any] = content
 
     def fail(self, what: str) -> NoReturn:
         """Raise the one sentence."""
-        raise InputError(f"The file {self.path} {' '.join(what.split())}.")
+        raise InputError(f"The file {short(self.path)} {' '.join(what.split())}.")
 
     def damaged(self, what: str) -> NoReturn:
         """Raise the sentence for content that `save` never writes, or writes for another model than the one `given`."""
@@ -61,7 +72,12 @@ class ModelFile:
                 f"cannot be read ({getattr(error, 'strerror', None) or error}); check the path and the permissions"
             )
         try:
-            return json.loads(text, parse_constant=self._no_constant)
+            return json.loads(
+                text,
+                parse_constant=self._no_constant,
+                parse_float=self._finite,
+                object_pairs_hook=self._no_twin,
+            )
         except json.JSONDecodeError as error:
             if not text.strip():
                 self.fail("is empty; it may have been cut off while being copied: copy or save it again")
@@ -75,6 +91,17 @@ class ModelFile:
 
     def _no_constant(self, name: str) -> NoReturn:
         self.damaged(f"it holds {name}, which is not a number")
+
+    def _finite(self, text: str) -> float:
+        number = float(text)
+        return number if math.isfinite(number) else self.damaged(f"it holds {text[:20]}, which is not a finite number")
+
+    def _no_twin(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        content = dict(pairs)
+        if len(content) < len(pairs):
+            keys = [key for key, _ in pairs]
+            self.damaged(f"it has the key {next(k for k in keys if keys.count(k) > 1)[:40]!r} twice in one table")
+        return content
 
     def table(self, parent: Any, key: str) -> dict[str, Any]:
         """A table inside a table."""

@@ -13,9 +13,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..checks import numbers
 from ..recording import InputError
 from .c_code import write_c
-from .files import write_atomically
+from .files import path_text, write_atomically
 from .sampled import Sampled
 from .smoothing import enclosed
 
@@ -79,9 +80,9 @@ class Exported:
         Raises
         ------
         InputError
-            If x or u has another size, or the equations hold an operation of which nothing is known.
+            If x or u has another size or is not finite, or the equations hold an operation of which nothing is known.
         """
-        x, u = (np.asarray(v, dtype=float).ravel() for v in (x, u))
+        x, u = numbers(x, "The state").ravel(), numbers(u, "The input").ravel()
         for what, given, wanted in (("state", x, len(self.states)), ("input", u, len(self.inputs))):
             if given.size != wanted:
                 raise InputError(f"{given.size} numbers were given for the {what}; expected {wanted}.")
@@ -125,7 +126,9 @@ class Exported:
         InputError
             If a file cannot be written.
         """
-        write_atomically(f"{os.fspath(path)}{NAMES}", json.dumps(self.names(), indent=1, allow_nan=False) + "\n")
+        write_atomically(
+            f"{path_text(path, 'file')}{NAMES}", json.dumps(self.names(), indent=1, allow_nan=False) + "\n"
+        )
         return write_atomically(path, _saved(self.step))
 
     def to_c(self, folder: str | os.PathLike[str]) -> tuple[Path, Path]:

@@ -7,6 +7,7 @@ import errno
 import os
 import secrets
 from pathlib import Path
+from typing import Any
 
 from ..recording import InputError
 
@@ -22,9 +23,13 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
     InputError
         If the folder does not exist or the file cannot be written there.
     """
-    target = Path(os.path.realpath(path))
-    if target.is_dir():
-        raise InputError(f"{path} is a folder; give the name of a file in it.")
+    target = Path(os.path.realpath(path_text(path, "file")))
+    try:
+        folder = target.is_dir()
+    except OSError as error:
+        raise InputError(f"{short(path)} cannot be written ({error.strerror}); give another path.") from None
+    if folder:
+        raise InputError(f"{short(path)} is a folder; give the name of a file in it.")
     data = content.encode() if isinstance(content, str) else content
     partial = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.tmp")
     try:
@@ -44,7 +49,7 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
             raise InputError(
                 f"The folder {target.parent} does not exist; make it first or give another path."
             ) from error
-        raise InputError(f"{path} cannot be written ({error.strerror or error}); give another path.") from error
+        raise InputError(f"{short(path)} cannot be written ({error.strerror or error}); give another path.") from error
     _sync_folder(target.parent)
     return target
 
@@ -57,11 +62,35 @@ def made(folder: str | os.PathLike[str]) -> Path:
     InputError
         If it cannot be made.
     """
+    made = Path(path_text(folder, "folder"))
     try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
+        made.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"The folder {folder} cannot be made ({error.strerror}); give another one.") from error
-    return Path(folder)
+        raise InputError(f"The folder {short(folder)} cannot be made ({error.strerror}); give another one.") from error
+    return made
+
+
+def path_text(path: Any, kind: str) -> str:
+    """A path as text.
+
+    Raises
+    ------
+    InputError
+        If it is none, or empty.
+    """
+    try:
+        name = os.fspath(path)
+    except TypeError:
+        name = None
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise InputError(f"{short(repr(path))} was given as the name of a {kind}; give a text or a Path, not empty.")
+    return name
+
+
+def short(path: Any) -> str:
+    """A path in a sentence."""
+    text = str(path)
+    return text if len(text) <= 200 else f"{text[:100]}...{text[-60:]}"
 
 
 def _sync_folder(folder: Path) -> None:

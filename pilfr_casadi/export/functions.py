@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..checks import numbers
 from ..compiled import make_engine
 from ..fitted import Fit, first_state
 from ..integration import choose_substeps, discretise
@@ -15,6 +16,7 @@ from ..model import Model
 from ..recording import InputError, Recording
 from ..simulator import Simulator
 from .exported_model import Exported
+from .names import check_name
 from .sampled import Sampled, right_hand_side, sampled
 from .smoothing import smoothed
 
@@ -47,7 +49,7 @@ def exported(
         eps > 0 rounds min, max, |.| and sign (`smoothing`), for solvers that need derivatives everywhere; the error is
         `Exported.bound`.
     name : str
-        Name of the function: letters, digits and single underscores, beginning with a letter.
+        Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; no word of C.
 
     Returns
     -------
@@ -58,9 +60,8 @@ def exported(
     InputError
         If something is missing or does not fit; one sentence says what.
     """
-    if not ca.Function.check_name(name):
-        raise InputError(f"The function name {name!r} cannot be used; give letters, digits and single underscores.")
-    if not isinstance(smooth, int | float) or not 0 <= smooth < np.inf:
+    check_name(name)
+    if isinstance(smooth, bool) or not isinstance(smooth, int | float) or not 0 <= smooth < np.inf:
         raise InputError(f"smooth = {smooth!r} was given; give a number, zero or more, in units of the signals.")
     units: dict[str, str] = {}
     rhs = None
@@ -76,7 +77,8 @@ def exported(
         dt, hold = _duration(dt), hold or model.hold or "zero"
         if hold not in ("zero", "linear"):
             raise InputError(f"hold = {hold!r} was given; use 'zero' or 'linear'.")
-        if substeps is not None and (substeps != int(substeps) or substeps < 1):
+        whole = isinstance(substeps, int | np.integer) and not isinstance(substeps, bool)
+        if substeps is not None and not (whole and substeps >= 1):
             raise InputError(f"substeps = {substeps!r} was given; give a whole number, 1 or more.")
         closed = discretise(model, dt, hold, int(substeps or _substeps(model, dt)))
         units, step = dict(model.units), sampled(closed, dt, model)
@@ -114,7 +116,7 @@ def to_casadi(model: Any, name: str = "model", **options: Any) -> ca.Function:
     model : Fit, Simulator, Model or Diagnosis
         The model; its values become constants of the function.
     name : str
-        Name of the function: letters, digits and single underscores, beginning with a letter.
+        Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; no word of C.
     **options
         Those of `exported`: for a simulator `dt`, `hold`, `substeps`; `smooth`.
 
@@ -170,12 +172,9 @@ def _start(model: Any, closed: Model, step: Sampled, start: Any) -> np.ndarray:
         if not np.all(np.isfinite(state)):
             raise InputError("The state at the recording's first sample is not finite; give another start.")
         return np.append(state, np.zeros(size - n))
-    try:
-        given = np.asarray(start, dtype=float).ravel()
-    except (TypeError, ValueError):
-        given = np.full(1, np.nan)
-    if given.size not in (len(closed.states), n, size) or not np.all(np.isfinite(given)):
+    given = numbers(start, "The start state").ravel()
+    if given.size not in (len(closed.states), n, size):
         raise InputError(
-            f"The start state has {given.size} numbers; give {len(closed.states)} (memory zero) or {size}, all finite."
+            f"The start state has {given.size} numbers; give {len(closed.states)} (memory zero) or {size}."
         )
     return np.append(given, np.zeros(size - given.size))

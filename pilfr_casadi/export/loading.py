@@ -23,6 +23,7 @@ from ..operators import GeneralizedPlay, Play, Stop
 from ..recording import InputError
 from ..solution import Iteration, Solution, Status
 from .checked_json import ModelFile
+from .model_keys import check_keys
 from .saving import HISTORY
 
 if TYPE_CHECKING:
@@ -51,12 +52,13 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     Raises
     ------
     InputError
-        If the file is missing, unreadable, damaged, of another kind or version, does not fit `model`, or holds values
-        that are missing, not finite, or outside their bounds.
+        If the file is missing, unreadable, damaged, of another kind or version, was changed after it was written, does
+        not fit `model`, or holds values that are missing, not finite, or outside their bounds.
     """
     from ..fit import Fit
 
     file = ModelFile(path, given=model is not None)
+    check_keys(file)
     signals, training = file.table(file.content, "model"), file.table(file.content, "training")
     names = _names(file, signals)
     dt = file.number(signals, "dt")
@@ -85,9 +87,10 @@ def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[
     history = file.table(training, "history")
     numbers = file.array(history.get("number"), (len(file.rows(history, "number")),), "the history")
     columns = [file.array(history.get(key), numbers.shape, "the history", np.inf).tolist() for key in HISTORY[1:]]
+    limits = tuple(_limit(file, row) for row in (file.rows(training, "limits") if "limits" in training else []))
     solution = replace(
         _solution(file, training, file.table(training, "solve"), theta),
-        multipliers=file.array(file.rows(training, "multipliers"), None, "a multiplier", np.nan),
+        multipliers=_multipliers(file, training, limits, theta),
         history=tuple(Iteration(int(k), *row) for k, *row in zip(numbers, *columns, strict=True)),
         message=file.text(training, "message"),
     )
@@ -111,7 +114,7 @@ def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[
         "labels": tuple(variables),
         "train_nrmse": tuple(errors.ravel().tolist()),
         "linear_nrmse": tuple(linear.ravel().tolist()),
-        "limits": tuple(_limit(file, row) for row in (file.rows(training, "limits") if "limits" in training else [])),
+        "limits": limits,
         "active": tuple(str(name) for name in file.rows(training, "active")),
         "candidates": tuple(candidates),
         "seconds": file.number(training, "seconds"),
@@ -128,6 +131,16 @@ def _limit(file: ModelFile, row: Any) -> Limit:
         met=file.entry(row, "met", bool, "true or false"),
         **{key: file.number(row, key, missing) for key, missing in ends.items()},
     )
+
+
+def _multipliers(file: ModelFile, training: dict[str, Any], limits: tuple[Limit, ...], theta: np.ndarray) -> np.ndarray:
+    """One for each variable and each constraint, or none; the first files did not say what the constraints are."""
+    rows = file.rows(training, "multipliers")
+    found = file.array(rows, (len(rows),), "a multiplier", np.nan)
+    n = len(theta) + sum(limit.kind == "constraint" for limit in limits)
+    if found.size not in (0, n) and not ("limits" not in training and found.size > n):
+        file.damaged(f"it has {found.size} multipliers of {n} variables and constraints")
+    return found
 
 
 def _initial_states(file: ModelFile, size: int) -> dict[str, np.ndarray]:

@@ -1,7 +1,8 @@
 """Models on disk: the writing side.
 
 A model file is standard JSON: format and version, structure, parameter values by name with units and standard errors,
-sampling, names, and a summary of the training. It holds no code, and every number comes back to the last digit.
+sampling, names, and a summary of the training, under the SHA-256 of all of it (`digests`), so that a number that was
+changed afterwards does not go unnoticed. It holds no code, and every number comes back to the last digit.
 Only the equations of a PI-LFR (Krikelis et al. 2024, Eq. 15-17) can be rebuilt from a file; of a model of the user's
 own equations the file holds the values.
 """
@@ -18,6 +19,7 @@ import numpy as np
 
 from ..elements import PrandtlIshlinskii
 from ..operators import GeneralizedPlay
+from .digests import ordered_digest
 from .files import write_atomically
 
 if TYPE_CHECKING:
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from ..lfr import PILFR
 
 FORMAT = "pilfr_casadi model"
-VERSION = 1
+VERSION = 2  # version 1 had no digest; it is still read
 HISTORY = ("number", "cost", "seconds", "step", "damping")  # columns of a solver's history
 
 
@@ -49,13 +51,15 @@ def save(fit: Fit, path: str | os.PathLike[str]) -> None:
 
 def model_text(fit: Fit) -> str:
     """The text of a model file."""
-    return _text(_document(fit)) + "\n"
+    content = _document(fit)
+    return _text({**content, "sha256": ordered_digest(content)}) + "\n"
 
 
 def _document(fit: Fit) -> dict[str, Any]:
     from .. import __version__
 
     model, solution = fit.model, fit.solution
+    limited = len(solution.theta) + sum(limit.kind == "constraint" for limit in fit.limits)
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -85,7 +89,7 @@ def _document(fit: Fit) -> dict[str, Any]:
             "limits": [_limit(limit) for limit in fit.limits],
             "solve": _solve(solution),
             "variables": dict(zip(fit.labels, _plain(solution.theta), strict=True)),
-            "multipliers": _plain(solution.multipliers),
+            "multipliers": _plain(solution.multipliers if len(solution.multipliers) == limited else ()),
             "history": {key: _plain([getattr(h, key) for h in solution.history]) for key in HISTORY},
             "starts": [
                 {"seed": c.seed, "error": _plain(c.error), "status": c.solution.status.name, "note": c.note}

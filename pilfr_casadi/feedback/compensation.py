@@ -1,39 +1,42 @@
 """The input for a wanted output: a fitted model inverted one look-ahead at a time.
 
-With `F(x, u) = (f, h)` and a look-ahead of d samples, the input u of a sample solves
+With `F(x, u) = (f, h)`, a delay of n samples (`reach`) and a look-ahead of d >= n samples, the input u of a sample
+solves
 
-    y_{k+d}(x_k, u_{k+i} = u + i (u - u_{k-1})) = wanted_{k+d},
+    y_{k+d}(x_k, u_{k+i} = u + min(i, d - n) (u - u_{k-1})) = wanted_{k+d},
 
-the input going on as it went since the sample before: a scalar equation that is piecewise linear and increasing for
-plays (decreasing where the gain is negative). It is solved by Newton steps inside a bracket that each step narrows, for
-a fixed number of steps. Where d is the relative degree this is the exact inverse. Sampled machines often
-have zeros outside the unit circle (Åström, Hagander & Sternby 1984, Automatica 20); then the exact inverse is unstable,
-and a longer look-ahead is taken, under which
+the input going on as it went since the sample before, as long as it still reaches the output: a scalar equation that is
+piecewise linear and increasing for plays (decreasing where the gain is negative). It is solved by Newton steps inside a
+bracket that each step narrows, for a fixed number of steps. Where d = n this is the exact inverse. Sampled machines
+often have zeros outside the unit circle (Åström, Hagander & Sternby 1984, Automatica 20); then the exact inverse is
+unstable, and a longer look-ahead is taken, under which
 
     x⁺ = A x + B u,   u = -(g_x x + g_before u_before) / g_u,   g = ∂y_{k+d},
 
-is stable wherever the model has been driven.
+is stable wherever the model has been driven. That inverse is an approximate one, and the result says so.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from ..checks import numbers
+from ..model import Model
 from ..recording import InputError, Recording
+from .reach import Reach, reach
 
 if TYPE_CHECKING:
     from ..fit import Fit
     from .kalman import KalmanFilter
 
 Array = np.ndarray
-FARTHEST = 12  # samples of look-ahead that are tried
-POINTS = 60  # states along the recording at which the inverse has to be stable
-STABLE = 0.999  # spectral radius of the inverse that is accepted
+FARTHEST = 12  # samples of look-ahead that are tried, from the delay on
+LONGEST = 1000  # that may be asked for
+STABLE = 0.999  # spectral radius of the inverse that is accepted; more where the model's own is as slow
 FAINT = 0.02  # of the largest gain over the look-aheads and along the recording, below which a gain is not used
 STEPS = 40  # of Newton or bisection
 
@@ -48,14 +51,26 @@ class Feedforward:
         `(x, u_before, wanted) -> (x_next, u)`: the input for which the output is the wanted one `ahead` samples later,
         and the model's state after it. In feedback, x is the observer's state and x_next is not used.
     ahead : int
-        Look-ahead, samples.
+        Look-ahead, samples: so far ahead the wanted path has to be known (preview).
     limits : tuple of float
         Smallest and largest input; a wanted output out of reach gets one of them.
+    delay : int
+        Samples after which an input reaches the output at the earliest.
+    zeros : array of complex
+        Zeros of the linearised model on or outside the unit circle, which forbid the exact inverse.
+    note : str
+        What the inverse is: exact, or approximate and why.
     """
 
     step: ca.Function
     ahead: int
     limits: tuple[float, float]
+    delay: int = 0
+    zeros: Array = field(default_factory=lambda: np.zeros(0))
+    note: str = ""
+
+    def __str__(self) -> str:
+        return self.note
 
     def inputs(self, wanted: Array, x0: Array | None = None) -> Array:
         """Inputs (M, 1) for a whole wanted path (M,), from the state x0 (at rest by default), without feedback."""
@@ -91,7 +106,8 @@ def feedforward(
     limits : (low, high), optional
         Of the input; by default those of the recording.
     ahead : int, optional
-        Look-ahead in samples; by default the shortest under which the inverse is stable.
+        Look-ahead in samples; by default the shortest under which the inverse is stable. Beyond the delay the inverse
+        is approximate, and its print says so.
     observer : KalmanFilter, optional
         Where the compensator works on an observer's state, the observer, for its disturbances.
 
@@ -102,9 +118,11 @@ def feedforward(
     Raises
     ------
     InputError
-        If the model cannot be inverted: more outputs than inputs or more than one, an input that reaches no output
-        within the look-ahead, or no stable inverse.
+        If the model cannot be inverted: more outputs than inputs or more than one, an input that does not reach the
+        output, or not within the look-ahead asked for, or no stable inverse.
     """
+    if not isinstance(getattr(fit, "model", None), Model):
+        raise InputError(f"A {type(fit).__name__} was given to feedforward; give a Fit.")
     model = fit.model
     if model.n_y > model.n_u:
         raise InputError(
@@ -116,21 +134,28 @@ def feedforward(
             f"The model has {model.n_u} inputs and {model.n_y} output(s); the compensator inverts models of one input "
             "and one output, so fit such a one, or use predictive control."
         )
+    if not isinstance(recording, Recording) or not len(recording):
+        raise InputError(f"A {type(recording).__name__} was given to feedforward; give a Recording of the machine.")
     try:
         low, high = (np.min(recording.u), np.max(recording.u)) if limits is None else map(float, limits)
     except (TypeError, ValueError):
         low = high = np.nan
-    if not low < high:
-        raise InputError(f"Limits of the input of {limits!r} were given; give (low, high) with low below high.")
+    if not (low < high and np.isfinite(high - low)):
+        given = "none, and the recording's input is constant" if limits is None else repr(limits)
+        raise InputError(
+            f"Limits of the input of {given[:60]} were given; give (low, high), finite, with low below high."
+        )
     function = fit.to_casadi()
-    found = _look_ahead(fit, function, recording, ahead)
-    step = inverse_step(function if observer is None else observer.function, found, (float(low), float(high)))
-    return Feedforward(step, found, (float(low), float(high)))
+    away = reach(fit, function, recording)
+    found, why = _look_ahead(function, recording, away, ahead)
+    delay, ends = away.delay or 0, (float(low), float(high))
+    step = inverse_step(function if observer is None else observer.function, found, ends, delay)
+    return Feedforward(step, found, ends, delay, _outside(away), _note(found, delay, why))
 
 
-def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float]) -> ca.Function:
+def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float], delay: int = 0) -> ca.Function:
     """`(x, u_before, wanted) -> (x_next, u)` of any scalar `F(x, u)`; see `feedforward`."""
-    n, reached = function.size1_in(0), _reached(function, ahead)
+    n, reached = function.size1_in(0), _reached(function, ahead, delay)
     # the bracket (u, low, high) moves; x, u_before, wanted and the sign of the gain are passed on beside it
     whole = ca.MX.sym("whole", n + 6)
     u, low, high, x = whole[0], whole[1], whole[2], whole[3 : 3 + n]
@@ -150,55 +175,107 @@ def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float])
     return ca.Function("feedforward", [x, before, wanted], [function(x, found)[0], found], *names)
 
 
-def _reached(function: ca.Function, ahead: int) -> ca.Function:
-    """`(x, u_before, u) -> (y, y_x, y_before, y_u)`, y the output after `ahead` samples of a ramp."""
+def _reached(function: ca.Function, ahead: int, delay: int) -> ca.Function:
+    """`(x, u_before, u) -> (y, y_x, y_before, y_u)`, y the output after `ahead` samples, the input going on."""
     x, before, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("before"), ca.SX.sym("u")
     state = x
     for i in range(ahead):
-        state = function(state, u + i * (u - before))[0]
-    y = function(state, u + ahead * (u - before))[1]
+        state = function(state, u + min(i, ahead - delay) * (u - before))[0]
+    y = function(state, u + (ahead - delay) * (u - before))[1]
     slopes = [ca.densify(ca.jacobian(y, v)) for v in (x, before, u)]
     return ca.Function("reached", [x, before, u], [y, *slopes])
 
 
-def _look_ahead(fit: Fit, function: ca.Function, recording: Recording, asked: int | None) -> int:
-    """The look-ahead that was asked for, or the shortest that is stable, each at states along the recording."""
-    if asked is not None and (not isinstance(asked, int | np.integer) or not 0 <= asked <= 1000):
-        raise InputError(f"A look-ahead of {asked!r} samples was given; give a whole number, 0 or more.")
-    n, tried = fit.model.n_x, range(FARTHEST + 1) if asked is None else [asked]
-    states = np.asarray(function.mapaccum("states", len(recording))(fit.initial_state(recording), recording.u.T)[0])
-    at = np.unique(np.linspace(1, len(recording) - 1, POINTS).astype(int))
-    x, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("u")
-    following = function(x, u)[0]
-    moves: Any = ca.Function("moves", [x, u], [ca.jacobian(following, x), ca.jacobian(following, u)])
-    linear = [[np.asarray(v) for v in moves(states[:, k - 1], recording.u[k])] for k in at]
-    gains, held, radii = [], [], []
-    for d in tried:
-        reached, poles, constant = _reached(function, d), [], []
-        for k, (a, b) in zip(at, linear, strict=True):
-            slopes = reached(states[:, k - 1], recording.u[k - 1], recording.u[k])
-            _, g_x, g_before, g_u = (np.asarray(v) for v in slopes)
-            gain = float(g_u.item())
-            constant.append(abs(gain + float(g_before.item())))
-            if gain:
-                feedback = -np.hstack([g_x[:, :n], g_before]) / gain
-                inverse = np.vstack([np.hstack([a[:n, :n], np.zeros((n, 1))]) + b[:n] @ feedback, feedback])
-                poles.append((abs(gain), float(np.max(np.abs(np.linalg.eigvals(inverse))))))
-        # where a play sticks the gain may vanish, as in a dead zone; there the input jumps and stays in its bracket
-        usual = float(np.median([g for g, _ in poles] + [0.0] * (len(at) - len(poles))))
-        gains.append(usual)
-        held.append(float(np.median(constant)))  # that of an input that does not go on, which does not grow with d
-        radii.append(max((radius for g, radius in poles if g > FAINT * usual), default=0.0))
-    if max(gains) <= 1e-12 * np.ptp(recording.y) / np.ptp(recording.u):
+def _look_ahead(function: ca.Function, recording: Recording, away: Reach, asked: int | None) -> tuple[int, str]:
+    """The look-ahead that was asked for, or the shortest that is stable, and why it is not the exact one."""
+    whole = isinstance(asked, int | np.integer) and not isinstance(asked, bool)
+    if asked is not None and not (whole and 0 <= asked <= LONGEST):
+        raise InputError(f"A look-ahead of {asked!r} samples was given; give a whole number from 0 to {LONGEST}.")
+    n = away.delay
+    if n is None:
         raise InputError(
-            f"The input reaches the output nowhere within {tried[-1]} samples (no direct feedthrough, no path through "
-            "the states that holds along the recording), so there is nothing to invert; give a longer ahead."
+            "The input reaches the output nowhere along the recording (no direct feedthrough, no path through the "
+            "states), so there is nothing to invert; give a model and a recording in which it does."
         )
-    for d, gain, radius in zip(tried, gains, radii, strict=True):
-        if gain > FAINT * max(held) and radius < STABLE:
-            return int(d)
-    which = f"{asked}" if asked is not None else f"0 to {FARTHEST}"
+    if asked is not None and asked < n:
+        raise InputError(
+            f"The look-ahead is {asked} samples, but the input reaches the output only after {n} (a delay; what "
+            f"the model has before is no larger than its errors, {100 * _early(away):.1g} % of its largest response); "
+            f"know the wanted path {n} samples ahead and give ahead={n} or more, or leave it out."
+        )
+    tried = range(n, n + FARTHEST + 1) if asked is None else sorted({n, asked})
+    found = {d: _inverse(function, recording, away, d) for d in tried}
+    held, limit = max(h for _, h, _ in found.values()), _stable(away)
+    usable = [d for d, (gain, _, radius) in found.items() if gain > FAINT * held and radius < limit]
+    if usable and asked in (None, usable[-1]):
+        taken = usable[0] if asked is None else asked
+        if found[n][2] >= limit:
+            why = f"the exact inverse would be unstable ({_reason(away, found[n][2])})"
+        elif n in usable:
+            why = "a longer look-ahead was asked for"
+        else:
+            why = f"only by less than {100 * FAINT:g} % of what follows"
+        return int(taken), why
+    which = f"{asked}" if asked is not None else f"{n} to {tried[-1]}"
+    smallest = min(radius for d, (_, _, radius) in found.items() if asked in (None, d))
     raise InputError(
-        f"The model has no stable inverse with a look-ahead of {which} samples (non-minimum phase: its "
-        f"inverse has a pole of magnitude {min(radii):.3f}); use predictive control."
+        f"The model has no stable inverse with a look-ahead of {which} samples (non-minimum phase: "
+        f"{_reason(away, smallest)}); use predictive control."
     )
+
+
+def _inverse(function: ca.Function, recording: Recording, away: Reach, d: int) -> tuple[float, float, float]:
+    """Of a look-ahead: usual gain, that of an input which does not go on, spectral radius along the recording."""
+    n = len(away.linear[0][0])
+    reached, poles, constant = _reached(function, d, away.delay or 0), [], []
+    for k, (a, b, _, _) in zip(away.at, away.linear, strict=True):
+        slopes = reached(away.before[:, k], recording.u[max(k - 1, 0)], recording.u[k])
+        _, g_x, g_before, g_u = (np.asarray(v) for v in slopes)
+        gain = float(g_u.item())
+        constant.append(abs(gain + float(g_before.item())))
+        if gain:
+            feedback = -np.hstack([g_x[:, :n], g_before]) / gain
+            inverse = np.vstack([np.hstack([a, np.zeros((n, 1))]) + b @ feedback, feedback])
+            poles.append((abs(gain), float(np.max(np.abs(np.linalg.eigvals(inverse))))))
+    # where a play sticks the gain may vanish, as in a dead zone; there the input jumps and stays in its bracket
+    usual = float(np.median([g for g, _ in poles] + [0.0] * (len(away.at) - len(poles))))
+    radius = max((radius for g, radius in poles if g > FAINT * usual), default=0.0)
+    return usual, float(np.median(constant)), radius
+
+
+def _early(away: Reach) -> float:
+    """Largest answer before the delay has passed, over the largest of all."""
+    return float(np.max(away.markov[: away.delay], initial=0.0) / np.max(away.markov))
+
+
+def _outside(away: Reach) -> Array:
+    zeros = away.zeros()
+    return zeros[np.argsort(-np.abs(zeros))][: int(np.sum(np.abs(zeros) >= _stable(away)))]
+
+
+def _stable(away: Reach) -> float:
+    """A fit often has slow poles that zeros beside them nearly cancel; those are no reason to refuse."""
+    slowest = max(float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a, *_ in away.linear)
+    return max(STABLE, 1 - (1 - min(slowest, 1.0)) / 10)
+
+
+def _reason(away: Reach, radius: float) -> str:
+    outside = _outside(away)
+    if len(outside):
+        return f"zeros on or outside the unit circle at {_listed(outside)}"
+    return f"along the recording its inverse has a pole of magnitude {radius:.4g}, beyond {_stable(away):.4g}"
+
+
+def _listed(zeros: Array) -> str:
+    """Zeros in words, one of each conjugate pair, at most five."""
+    upper = zeros[zeros.imag >= 0]
+    named = [f"{z.real:.4g}" + (f" ± {z.imag:.4g}i" if z.imag else "") for z in upper[:5]]
+    return ", ".join(named) + (f" and {len(upper) - 5} more" if len(upper) > 5 else "")
+
+
+def _note(ahead: int, delay: int, why: str) -> str:
+    samples = f"{delay} sample" + "s" * (delay != 1)
+    begin = f"An input reaches the output after {samples}"
+    if ahead == delay:
+        return f"{begin}: the exact inverse, for a path that is known {samples} ahead."
+    return f"{begin}, but {why}: an approximate inverse, for a path that is known {ahead} samples ahead."

@@ -12,7 +12,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..checks import numbers
 from ..recording import InputError
+from .asked import asked
 from .mpc import PENALTY
 
 Array = np.ndarray
@@ -78,6 +80,8 @@ def do_mpc_controller(
 ) -> Any:
     """A `do_mpc.controller.MPC` that follows a reference; the arguments are those of `PredictiveController`.
 
+    Limits and scales are numbers or one for each signal.
+
     Parameters
     ----------
     reference : array, shape (M, n_y)
@@ -92,9 +96,15 @@ def do_mpc_controller(
     Raises
     ------
     InputError
-        If do-mpc is not installed.
+        If do-mpc is not installed, or an argument is unfit.
     """
-    do_mpc, path = imported(), np.asarray(reference, dtype=float).reshape(len(reference), -1)
+    task = asked(function, horizon, inputs, outputs, None, move, y_scale, u_scale)
+    function, n_y = task.function, task.function.size1_out(1)
+    path = numbers(reference, "The reference")
+    path = path[:, None] if path.ndim == 1 else path
+    if path.ndim != 2 or not len(path) or path.shape[1] != n_y:
+        raise InputError(f"The reference has the shape {path.shape}; give (samples, {n_y}), a row a sample.")
+    do_mpc = imported()
     model = do_mpc_model(function)
     mpc = do_mpc.controller.MPC(model)
     quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.tol": 1e-9}

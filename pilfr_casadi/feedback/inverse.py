@@ -21,6 +21,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..checks import numbers
 from ..operators import Play, Stop, play
 from ..recording import InputError
 
@@ -51,7 +52,7 @@ class Inverse:
         input can bring about.
         """
         order, _, w = self._sorted
-        q = np.zeros(len(order)) if s is None else np.asarray(s, dtype=float).ravel()
+        q = np.zeros(len(order)) if s is None else numbers(s, "The memory").ravel()
         if len(q) != len(order):
             raise InputError(f"{len(q)} memories were given for {len(order)} operators; give one each.")
         q = np.concatenate([[0.0], q[order]])
@@ -84,11 +85,16 @@ def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, 
         If the element has no inverse: its slope right after a reversal or along its loading curve is not positive.
     """
     kind = operator() if isinstance(operator, type) else operator
-    r, w = (np.asarray(v, dtype=float).ravel() for v in (r, w))
+    r, w = numbers(r, "The thresholds").ravel(), numbers(w, "The weights").ravel()
+    gain = float(numbers(gain, "gain", ()))
+    if not isinstance(name, str) or not ca.Function.check_name(name):
+        raise InputError(f"The function name {name!r} cannot be used; give letters, digits and single underscores.")
     if not isinstance(kind, Play | Stop):
         raise InputError(f"The inverse of {operator!r} is not known in closed form; give Play or Stop.")
-    if len(r) != len(w) or np.any(r < 0) or not np.all(np.isfinite(np.concatenate([r, w, [gain]]))):
-        raise InputError(f"{len(r)} thresholds and {len(w)} weights were given; give as many, finite, thresholds >= 0.")
+    if len(r) != len(w):
+        raise InputError(f"{len(r)} thresholds and {len(w)} weights were given; give one weight for each threshold.")
+    if np.any(r < 0):
+        raise InputError(f"A threshold is {np.min(r):.4g}; thresholds are half-widths, give zero or more.")
     if isinstance(kind, Stop):
         gain, w = gain + float(np.sum(w)), -w
     order = np.argsort(r, kind="stable")

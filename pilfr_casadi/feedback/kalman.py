@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from ..checks import numbers
+from ..checks import LARGEST, numbers
+from ..model import Model
 from ..recording import InputError, Recording
 
 if TYPE_CHECKING:
@@ -67,12 +68,16 @@ class KalmanFilter:
         Raises
         ------
         InputError
-            If u, y or x0 do not fit the model.
+            If u, y, x0 or P0 do not fit the model.
         """
         n = len(self.x0)
-        if not len(u) or not len(y):
+        u, y = (numbers(v, name) for v, name in ((u, "u"), (y, "y")))
+        if not u.size or not y.size or not u.ndim or not y.ndim:
             raise InputError("There are no samples to filter; give at least one.")
-        u, y = (numbers(v, name).reshape(len(v), -1) for v, name in ((u, "u"), (y, "y")))
+        u, y = u.reshape(len(u), -1), y.reshape(len(y), -1)
+        P = self.P0 if P0 is None else numbers(P0, "P0")
+        if P.shape != (n, n) or not np.allclose(P, P.T) or np.min(np.diag(P), initial=0.0) < 0:
+            raise InputError(f"P0 of the shape {P.shape} was given; give a covariance, ({n}, {n}) and symmetric.")
         x = self.x0 if x0 is None else numbers(x0, "The state").ravel()
         n_u, n_y = int(self.step.size1_in(2)), int(self.step.size1_in(3))
         if len(u) != len(y) or u.shape[1] != n_u or y.shape[1] != n_y or len(x) != n:
@@ -81,7 +86,7 @@ class KalmanFilter:
                 f"{n_u}), (samples, {n_y}) and {n} numbers."
             )
         steps = self.step.mapaccum("run", len(u), 2)
-        xs, ps, predicted = (np.asarray(v) for v in steps(x, self.P0 if P0 is None else P0, u.T, y.T))
+        xs, ps, predicted = (np.asarray(v) for v in steps(x, P, u.T, y.T))
         return np.vstack([x, xs.T]), predicted.T, ps[:, -n:]
 
 
@@ -116,7 +121,9 @@ def kalman_filter(
     InputError
         If the recording does not fit the model, or the share is not positive.
     """
-    if share is not None and not share > 0:
+    if not isinstance(getattr(fit, "model", None), Model):
+        raise InputError(f"A {type(fit).__name__} was given to observe; give a Fit.")
+    if share is not None and not (isinstance(share, int | float | np.number) and 0 < share < np.inf):
         raise InputError(f"The share of process noise is {share!r}; give a number above 0, such as 1e-3.")
     if not fit.model.n_state and not disturbance:
         raise InputError("The model has neither states nor memory to observe; ask for disturbance=True.")
@@ -124,6 +131,8 @@ def kalman_filter(
     start = fit.initial_state(recording)
     residual = (recording.y - fit.simulate(recording))[fit.scored_from(recording) :]
     states = np.asarray(function.mapaccum("states", len(recording))(start, recording.u.T)[0])
+    if not (np.all(np.abs(states) < LARGEST) and np.all(np.abs(residual) < LARGEST)):
+        raise InputError("The model diverges along the recording, which tells nothing of its noise; fit a stable one.")
     spread = np.sqrt(np.mean(states**2, axis=1))
     spread = np.maximum(spread, 1e-6 * np.max(spread, initial=1e-300))
     level = np.mean(residual**2, axis=0)

@@ -21,11 +21,11 @@ import numpy as np
 from ..checks import numbers
 from ..quadratic_program import unconstrained
 from ..recording import InputError
+from .asked import ENORMOUS, SOLVERS, asked, count, path
 
 Array = np.ndarray
 PENALTY = 30.0  # of a violated output limit, per y_scale
 CLOSE = 1e-5  # of u_scale: a smaller step ends the search
-ENORMOUS = 1e20
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +55,12 @@ class PredictiveController:
     horizon : int
         Samples N.
     inputs : (low, high)
-        Limits of the inputs.
+        Limits of the inputs, numbers or arrays (n_u,); infinite where there is none.
     outputs : (low, high), optional
         Limits of the outputs, kept where that is possible (a common slack is penalised).
     rate : float or array, optional
-        Largest change of an input from sample to sample.
+        Largest change of an input from sample to sample. Where the previous input is so far outside the limits that
+        both cannot be kept, the first change is as large as it takes.
     move : float
         Weight of changes of the inputs.
     y_scale, u_scale : float or array
@@ -72,7 +73,8 @@ class PredictiveController:
     Raises
     ------
     InputError
-        If limits are unfit, or the solver is unknown.
+        If limits are unfit, or the solver is unknown; in a call, if state, reference or previous input have another
+        shape, or are not finite.
     """
 
     def __init__(
@@ -89,30 +91,15 @@ class PredictiveController:
         solver: str = "sqp",
         iterations: int = 5,
     ) -> None:
-        if not isinstance(function, ca.Function):  # of an observer, of an export
-            function = getattr(function, "function", getattr(function, "step", function))
-        if not isinstance(function, ca.Function):
+        task = asked(function, horizon, inputs, outputs, rate, move, y_scale, u_scale)
+        if solver not in SOLVERS or not count(iterations):
             raise InputError(
-                f"A {type(function).__name__} cannot be planned with; give a casadi.Function (x, u) -> (x_next, y), "
-                "such as fit.to_casadi() or observer.function."
+                f"The solver {solver!r} and {iterations!r} iterations were given; give 'sqp' or 'ipopt', and 1 or more."
             )
-        n_u, n_y = function.size1_in(1), function.size1_out(1)
-        if not isinstance(horizon, int | np.integer) or isinstance(horizon, bool):
-            raise InputError(f"A horizon of {horizon!r} was given; give a number of samples.")
-        if horizon < 1 or solver not in ("sqp", "ipopt"):
-            raise InputError(f"A horizon of {horizon} and the solver {solver!r} were given; give 1 or more, and 'sqp'.")
-        self.function, self.horizon, self.solver, self.iterations = function, int(horizon), solver, iterations
-        self.low, self.high = _pair(inputs, "The limits of the inputs", (horizon, n_u))
-        limits = (-ENORMOUS, ENORMOUS) if outputs is None else outputs
-        self.low_y, self.high_y = _pair(limits, "The limits of the outputs", (horizon, n_y))
-        if np.any(self.low >= self.high) or np.any(self.low_y >= self.high_y):
-            raise InputError("A lower limit is not below its upper one; give (low, high) with low below high.")
-        self.limited = outputs is not None
-        self.y_scale = numbers(y_scale, "y_scale", (horizon, n_y)).ravel()
-        self.u_scale = numbers(u_scale, "u_scale", (horizon, n_u)).ravel()
-        self.rate = numbers(np.inf if rate is None else rate, "rate", (horizon, n_u), infinite=True).ravel()
-        if np.any(self.y_scale <= 0) or np.any(self.u_scale <= 0) or np.any(self.rate <= 0) or not move >= 0:
-            raise InputError("y_scale, u_scale, rate and move are sizes; give numbers above zero (move may be zero).")
+        self.function, self.horizon, self.solver, self.iterations = task.function, task.horizon, solver, iterations
+        self.low, self.high, self.low_y, self.high_y = task.low, task.high, task.low_y, task.high_y
+        self.limited, self.rate, self.y_scale, self.u_scale = task.limited, task.rate, task.y_scale, task.u_scale
+        horizon, move, n_u = task.horizon, task.move, task.function.size1_in(1)
         self._differences = np.eye(horizon * n_u) - np.eye(horizon * n_u, k=-n_u)
         self._weighted = np.sqrt(move) * self._differences / self.u_scale[:, None]
         self._plan: Array | None = None
@@ -125,22 +112,33 @@ class PredictiveController:
         """
         begin = perf_counter()
         n_u, n_y = self.function.size1_in(1), self.function.size1_out(1)
-        wanted = numbers(reference, "The reference").reshape(-1)
+        wanted = path(reference, self.horizon, n_y)
         before = numbers(u_previous, "The previous input").reshape(-1)
         state = numbers(x, "The state").ravel()
-        if len(wanted) != self.horizon * n_y or len(before) != n_u or len(state) != self.function.size1_in(0):
+        if len(before) != n_u or len(state) != self.function.size1_in(0):
             raise InputError(
-                f"A state of {len(state)} numbers, a reference of {len(wanted)} and {len(before)} previous inputs were "
-                f"given; give {self.function.size1_in(0)}, {self.horizon} samples of {n_y} output(s), "
-                f"and {n_u} input(s)."
+                f"A state of {len(state)} numbers and {len(before)} previous inputs were given; give "
+                f"{self.function.size1_in(0)} and {n_u}."
             )
         start = np.tile(before, self.horizon) if self._plan is None else np.append(self._plan[n_u:], self._plan[-n_u:])
         solve = self._solve_sqp if self.solver == "sqp" else self._solve_ipopt
-        u, y, slack, converged = solve(state, wanted, before, start)
+        rate = self.rate.copy()
+        rate[:n_u] = np.maximum(rate[:n_u], np.maximum(self.low[:n_u] - before, before - self.high[:n_u]))
+        u, y, slack, converged = solve(state, wanted, before, self._within(start, before, rate), rate)
         self._plan = u
         shaped = u.reshape(-1, n_u), y.reshape(-1, n_y)
         cost = self._cost(u, y, wanted, before)
-        return Plan(*shaped, cost, slack, perf_counter() - begin, converged)
+        return Plan(*shaped, cost, slack, perf_counter() - begin, converged and bool(np.isfinite(cost)))
+
+    def _within(self, u: Array, before: Array, rate: Array) -> Array:
+        """Inputs moved into the limits and the rates, sample by sample."""
+        n, u = len(before), np.clip(u, self.low, self.high)
+        if np.any(np.abs(u - np.concatenate([before, u[:-n]])) > rate):
+            for k in range(0, len(u), n):
+                here = slice(k, k + n)
+                slow = np.clip(u[here], before - rate[here], before + rate[here])
+                u[here] = before = np.clip(slow, self.low[here], self.high[here])
+        return u
 
     def _offset(self, before: Array) -> Array:
         return np.concatenate([before, np.zeros(len(self.low) - len(before))])
@@ -168,20 +166,21 @@ class PredictiveController:
         stacked = ca.vertcat(*outputs)
         self._predict = ca.Function("predict", [x, u], [stacked])
         self._slopes = ca.Function("slopes", [x, u], [stacked, ca.densify(ca.jacobian(stacked, u))])
-        size, rows = len(self.low), 2 * len(self.low_y) * self.limited + len(self.low) * np.isfinite(self.rate).all()
+        size, rows = len(self.low), 2 * len(self.low_y) * self.limited + len(self.low) * np.isfinite(self.rate).any()
         m = size + self.limited
         structure = {"h": ca.Sparsity.dense(m, m), "a": ca.Sparsity.dense(rows, m)}
         unconstrained(np.eye(1), np.zeros(1))  # what it imports is not paid for by the first plan
         self._qp = ca.conic("qp", "daqp", structure, {"error_on_fail": False})
 
-    def _solve_sqp(self, x: Array, wanted: Array, before: Array, u: Array) -> tuple[Array, Array, float, bool]:
-        u = np.clip(u, self.low, self.high)
+    def _solve_sqp(
+        self, x: Array, wanted: Array, before: Array, u: Array, rate: Array
+    ) -> tuple[Array, Array, float, bool]:
         moved, converged, best, y = self._moved(before), False, np.inf, np.zeros(0)
         for _ in range(self.iterations if self._plan is not None else 10 * self.iterations):
             out, jac = self._slopes(x, u)
             y, jac = out.full().ravel(), jac.full()
             best = self._cost(u, y, wanted, before)
-            step = self._qp_step(u, y, jac, wanted, before, moved)
+            step = self._qp_step(u, y, jac, wanted, before, moved, rate)
             if step is None:
                 break
             if np.max(np.abs(step) / self.u_scale) < CLOSE:
@@ -204,8 +203,12 @@ class PredictiveController:
         over = np.max(np.maximum(0, np.maximum(self.low_y - y, y - self.high_y)), initial=0.0)
         return u, y, float(over), bool(converged)
 
-    def _qp_step(self, u: Array, y: Array, jac: Array, wanted: Array, before: Array, moved: Array) -> Array | None:
+    def _qp_step(
+        self, u: Array, y: Array, jac: Array, wanted: Array, before: Array, moved: Array, rate: Array
+    ) -> Array | None:
         """Gauss-Newton step inside the limits, the QP in units of u_scale; None where the solver finds none."""
+        if not (np.all(np.isfinite(y)) and np.all(np.isfinite(jac))):
+            return None
         scaled, weighted = jac * (self.u_scale / self.y_scale[:, None]), self._weighted * self.u_scale
         h = 2 * (scaled.T @ scaled + weighted.T @ weighted)
         g = 2 * (scaled.T @ ((y - wanted) / self.y_scale) + weighted.T @ (self._weighted @ u - moved))
@@ -215,14 +218,15 @@ class PredictiveController:
         free = unconstrained(h, g)
         if free is not None and np.all((lbx <= free) & (free <= ubx)):
             outputs, moves = scaled @ free, changes @ free - gap
-            if np.all((below <= outputs) & (outputs <= above)) and np.all(np.abs(moves) <= self.rate):
+            if np.all((below <= outputs) & (outputs <= above)) and np.all(np.abs(moves) <= rate):
                 return np.asarray(free * self.u_scale)
         a, lba, uba = [], [], []
-        if np.all(np.isfinite(self.rate)):
+        if np.any(np.isfinite(rate)):
+            rate = np.minimum(rate, ENORMOUS)
             a, lba, uba = (
                 [np.hstack([changes, np.zeros((len(u), int(self.limited)))])],
-                [gap - self.rate],
-                [gap + self.rate],
+                [gap - rate],
+                [gap + rate],
             )
         if self.limited:
             h, g = np.pad(h, (0, 1)), np.append(g, PENALTY)
@@ -260,26 +264,21 @@ class PredictiveController:
         self._bounds = {
             "lbx": np.concatenate([np.full(n * m, -np.inf), self.low, [0.0]]),
             "ubx": np.concatenate([np.full(n * m, np.inf), self.high, [np.inf]]),
-            "lbg": np.concatenate([zero, -self.rate, low_y / self.y_scale, -free]),
-            "ubg": np.concatenate([zero, self.rate, free, high_y / self.y_scale]),
         }
+        self._sides = (zero, low_y / self.y_scale, -free), (zero, free, high_y / self.y_scale)
         self._simulate = self.function.mapaccum("simulate", m)
 
-    def _solve_ipopt(self, x: Array, wanted: Array, before: Array, u: Array) -> tuple[Array, Array, float, bool]:
+    def _solve_ipopt(
+        self, x: Array, wanted: Array, before: Array, u: Array, rate: Array
+    ) -> tuple[Array, Array, float, bool]:
         n_u, m = self.function.size1_in(1), self.horizon
         states = np.asarray(self._simulate(x, u.reshape(m, n_u).T)[0]).ravel(order="F")
         p = np.concatenate([x, wanted, before])
-        out = self._nlp(x0=np.concatenate([states, u, [0.0]]), p=p, **self._bounds)
+        (zero, low, free), (_, none, high) = self._sides
+        limits = {"lbg": np.concatenate([zero, -rate, low, free]), "ubg": np.concatenate([zero, rate, none, high])}
+        out = self._nlp(x0=np.concatenate([states, u, [0.0]]), p=p, **self._bounds, **limits)
         found = np.asarray(out["x"]).ravel()
         u = np.clip(found[len(states) : -1], self.low, self.high)
         y = np.asarray(self._simulate(x, u.reshape(m, n_u).T)[1]).ravel(order="F")
         over = np.max(np.maximum(0, np.maximum(self.low_y - y, y - self.high_y)), initial=0.0)
         return u, y, float(over), bool(self._nlp.stats()["success"])
-
-
-def _pair(limits: Any, what: str, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Lower and upper limit over the horizon; infinite is none."""
-    if not isinstance(limits, tuple | list) or len(limits) != 2:
-        raise InputError(f"{what} cannot be {limits!r}; give (low, high).")
-    low, high = (numbers(v, what, shape, infinite=True).ravel() for v in limits)
-    return low, high

@@ -20,11 +20,12 @@ import numpy as np
 
 from ..checks import numbers
 from ..elements import PrandtlIshlinskii
+from ..model import Model
 from ..recording import InputError
+from .kalman import KalmanFilter
 
 if TYPE_CHECKING:
     from ..fit import Fit
-    from .kalman import KalmanFilter
 
 Array = np.ndarray
 UNSEEN = 0.5  # left of the spread, from which on a memory counts as not seen
@@ -81,7 +82,13 @@ def visibility(fit: Fit, observer: KalmanFilter, x: Array, u: Array) -> Visibili
     InputError
         If x or u do not fit the model.
     """
+    if not isinstance(getattr(fit, "model", None), Model) or not isinstance(observer, KalmanFilter):
+        raise InputError(
+            f"A {type(fit).__name__} and a {type(observer).__name__} were given; give a Fit and its kalman_filter."
+        )
     model, function, n = fit.model, observer.function, len(observer.x0)
+    if n < model.n_state:
+        raise InputError(f"The observer has {n} states and the model {model.n_state}; give the model's own observer.")
     x, u = numbers(x, "The state").ravel(), numbers(u, "u")
     u = u[:, None] if u.ndim == 1 else u
     if len(x) != n or u.ndim != 2 or u.shape[1] != model.n_u or not len(u):

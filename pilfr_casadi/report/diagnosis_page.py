@@ -101,7 +101,7 @@ def _verdict(case: _Case) -> list[Block]:
         out.append(Text("No law of the catalogue explains what is missing; below is where it acts, and how."))
     elif d.verdict == "recording-fault":
         out.append(Text("Before physics is looked for, the recordings need a correction; see the checks above."))
-    return [*out, tables.error_table(d)]
+    return [*out, tables.error_table(d), *map(Text, d.warnings())]
 
 
 def _where(case: _Case) -> list[Block]:

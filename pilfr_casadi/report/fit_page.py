@@ -159,7 +159,8 @@ def _facts(fit: Fit, rows: list[dict[str, Any]]) -> dict[str, str]:
     if gain >= 1:
         facts["smaller error than a linear model"] = f"{gain:.2g} ×"
     facts["free parameters"] = str(int(fit.model.parameters.free.sum()))
-    facts["time of the fit"] = f"{fit.seconds:.1f} s"
+    if fit.seconds:
+        facts["time of the fit"] = f"{fit.seconds:.1f} s"
     return facts
 
 
@@ -299,14 +300,15 @@ def _search(fit: Fit) -> list[Block]:
             )
         )
     if fit.candidates:
+        timed = any(c.solution.seconds for c in fit.candidates)
         rows = [
-            [str(c.seed), c.error, c.solution.iterations, c.solution.seconds, c.solution.status.value]
+            [str(c.seed), c.error, c.solution.iterations, *[c.solution.seconds] * timed, c.solution.status.value]
             for c in sorted(fit.candidates, key=lambda c: c.error)
         ]
         note = "Errors at the end of the exploration, before the best ones are polished."
         out.append(
             Table(
-                ["start", "training error", "iterations", "time [s]", "status"],
+                ["start", "training error", "iterations", *["time [s]"] * timed, "status"],
                 rows,
                 caption="All starts, best first",
                 note=note,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
 
 from ..cli import DONE, INTERRUPTED, NO_RESULT, say
 from ..commands import make_folder
@@ -11,13 +12,15 @@ from ..interrupts import insistent, worker_pool
 from ..progress import progress_bar
 from ..recording import InputError
 from .described import ROLES, read_run
-from .execute import RunInterrupted, run
+from .execute import ConstraintsNotMet, RunInterrupted, run
+from .folder import check_own
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Execute a run file; returns the exit status."""
+    """Execute a run file; returns the exit status: 1 where no job meets its constraints or explains anything."""
     given = read_run(options.run_file)
     if options.out is not None:
+        check_own(Path(options.out), given.file, options.overwrite)
         given = replace(given, out=make_folder(options.out))
     if options.workers is not None:
         if options.workers < 1:
@@ -31,6 +34,8 @@ def run_command(options: argparse.Namespace) -> int:
             result = run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=_tell)
     except RunInterrupted as stop:
         return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
+    except ConstraintsNotMet as missed:
+        return say(str(missed), NO_RESULT)
     for role in ROLES:
         for s in result.scores:
             if s.role == role and s.job == result.chosen:

@@ -23,6 +23,7 @@ from ..model import Model
 from ..multistart import POLISH
 from ..recording import InputError
 from ..structures import OPERATORS, STRUCTURES, named_structure
+from .folder import check_inside
 from .tables import Table, shown
 
 ROLES = ("train", "validation", "test")
@@ -126,6 +127,9 @@ def _checked(file: Path, content: Any) -> Run:
     if not usable or not seeds or len(set(seeds)) < len(seeds):
         top.fail(f"'seeds' is {shown(seeds)}; give different whole numbers of 0 or more")
     out = top.take("out", str, f"{file.stem}-run")
+    wrong = check_inside(file, out)
+    if wrong:
+        top.fail(wrong)
     more = {
         "workers": top.number("workers", 1, 1, whole=True),
         "engine": top.choice("engine", ("auto", "c", "vm"), "auto"),

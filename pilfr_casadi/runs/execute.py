@@ -2,7 +2,7 @@
 
 After every job its model is written, then the manifest, each atomically: wherever a run ends, by Ctrl-C, `kill -9` or a
 power cut, the next one goes on with the first job that is not complete, and the results are those of a run that was
-never interrupted. Executed twice on a machine, a run gives the same bytes in every model and in the table.
+never interrupted. Executed twice on a machine, a run gives the same bytes in every file but `times.json`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from ..recording import InputError, Recording
 from ..solution import Status
 from ..sparse import operators_used
 from .described import ROLES, Run, read_run
+from .folder import MODEL, PAGE, TABLE, check_own, note_time, read_times, sweep
 from .jobs import RunJob, execute, input_digests, jobs_of, timeless
 from .manifest import Manifest, alone, digest, versions
-from .results import MODEL, PAGE, TABLE, Score, chosen, scored, table
+from .results import Score, chosen, scored, table
 
 Progress = Callable[[str, int, int, float], None]
 
@@ -38,6 +39,10 @@ class RunInterrupted(KeyboardInterrupt):
         self.done, self.total = done, total
 
 
+class ConstraintsNotMet(InputError):
+    """No job of a run meets its constraints; the manifest says by how much each misses them."""
+
+
 @dataclass(frozen=True, eq=False)
 class RunResult:
     """A run that is complete.
@@ -45,7 +50,8 @@ class RunResult:
     Attributes
     ----------
     folder : Path
-        With `manifest.json`, `results.csv`, `jobs/ID/model.json`, and `model.json`, `report.html` of the job chosen.
+        With `manifest.json`, `results.csv`, `jobs/ID/model.json`, and `model.json`, `report.html` of the job chosen;
+        `times.json` says how long each job took.
     done, skipped : tuple of str
         Ids of the jobs that were executed now, and of those that had been before.
     chosen : str
@@ -84,9 +90,9 @@ def run(
     path : path or Run
         The file, `.toml` or `.py`, or what `read_run` made of it.
     out : path, optional
-        Folder of the results, in place of the file's.
+        Folder of the results, in place of the file's: an empty one, a new one, or that of an earlier run.
     overwrite : bool
-        Compute everything again, whatever is in the folder.
+        Compute everything again, whatever an earlier run has left in the folder.
     engine : {"auto", "c", "vm"}, optional
         In place of the file's; results differ in the last digits, so keep to one.
     executor : concurrent.futures.Executor, optional
@@ -103,20 +109,27 @@ def run(
     Raises
     ------
     InputError
-        If the run file or a recording cannot be used, constraints cannot be met, or results were changed afterwards.
+        If the run file, a recording or the folder cannot be used, or results were changed afterwards;
+        `ConstraintsNotMet`, which is one, if no job meets its constraints.
     RunInterrupted
         On Ctrl-C; what is complete stays.
     """
     given = path if isinstance(path, Run) else read_run(path)
     tell = tell or (lambda line: None)
     given = given if engine is None else replace(given, engine=engine)
+    folder = Path(out if out is not None else given.out)
+    try:
+        check_own(folder, given.file, overwrite)
+    except OSError as error:
+        raise InputError(f"The folder {folder} cannot be read ({error.strerror}); give another one.") from None
     inputs = input_digests(given)
     jobs = jobs_of(given, inputs)
     recordings = {role: tuple(_read(given, name) for name in given.files[role]) for role in ROLES}
-    folder = made(out if out is not None else given.out)
+    made(folder)
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(alone(folder))
+            sweep(folder)
         except OSError as error:
             raise InputError(f"The folder {folder} cannot be written ({error.strerror}); give another one.") from None
         return _run(given, folder, inputs, jobs, recordings, overwrite, executor, progress, tell)
@@ -151,6 +164,7 @@ def _run(
             if fit.status is not Status.INFEASIBLE:
                 manifest.put(job.model_file, model_text(timeless(fit)))
             manifest.write()
+            note_time(folder, job.id, fit.seconds)
             done.append(job.id)
             tell(f"{job.id}: {entries[job.id]['sentence']}")
         return _finished(given, manifest, jobs, recordings, tuple(done), tuple(ready), tell)
@@ -164,9 +178,6 @@ def _manifest(folder: Path, overwrite: bool) -> Manifest:
         return Manifest.fresh(folder)
     manifest = Manifest.found(folder)
     if manifest is None:
-        there = [name for name in (MODEL, PAGE, TABLE, "jobs") if (folder / name).exists()]
-        if there:
-            raise InputError(f"{folder} holds {there[0]} but no manifest of a run; give another --out, or --overwrite.")
         return Manifest.fresh(folder)
     for name in (TABLE, MODEL, PAGE):
         manifest.holds(name)
@@ -189,7 +200,7 @@ def _entry(job: RunJob, fit: Fit) -> dict[str, Any]:
         f"{fit.status.value} ({'; '.join(missed)})" if infeasible else f"NRMSE on training {error}. {fit.status.value}"
     )
     about = {"key": job.key, "status": fit.status.name, "sentence": sentence, "operators": operators_used(fit)}
-    return {**job.parameters, **about, "seconds": round(fit.seconds, 3)}
+    return {**job.parameters, **about}
 
 
 def _finished(
@@ -205,12 +216,12 @@ def _finished(
     folder, entries = manifest.folder, manifest.content["jobs"]
     usable = [j for j in jobs if entries[j.id]["status"] != Status.INFEASIBLE.name]
     if not usable:
-        raise InputError(f"{given.file}: no job meets its constraints; {jobs[0].id}: {entries[jobs[0].id]['sentence']}")
+        first = f"{jobs[0].id}: {entries[jobs[0].id]['sentence']}"
+        raise ConstraintsNotMet(f"{given.file}: no job meets its constraints; {first}")
     equations = given.model if isinstance(given.model, Model) else None
     fits = {j.id: replace(load(folder / j.model_file, model=equations), engine=given.engine) for j in usable}
     scores = [s for j in usable for s in scored(manifest, given, j, fits[j.id], recordings)]
     best = chosen(scores)
-    fit = replace(fits[best], seconds=float(entries[best]["seconds"]))
     manifest.content["chosen"] = best
     manifest.put(TABLE, table(scores, usable, entries, best))
     manifest.put(MODEL, (folder / f"jobs/{best}" / MODEL).read_text(encoding="utf-8"))
@@ -220,10 +231,11 @@ def _finished(
 
         tell("writing the report")
         judged = recordings["validation"] + recordings["test"]
-        manifest.put(PAGE, fit_page(fit, recordings["train"], judged, model_file=MODEL).html())
+        manifest.put(PAGE, fit_page(fits[best], recordings["train"], judged, model_file=MODEL).html())
         manifest.content["report"] = key
     manifest.content.pop("writing", None)
     manifest.write()
+    fit = replace(fits[best], seconds=read_times(folder).get(best, 0.0))
     return RunResult(folder, done, skipped, best, tuple(scores), fit, manifest.content)
 
 

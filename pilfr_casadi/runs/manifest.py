@@ -1,29 +1,23 @@
 """The manifest of a run: what was computed from what, with which versions, and the SHA-256 of every file.
 
 It carries its own digest, so that a manifest that something else has written to is not taken for one of a run's; the
-digests of the files tell in the same way of models and tables that were changed afterwards.
+digests of the files tell in the same way of models and tables that were changed afterwards. No time is in it: the same
+run writes the same bytes.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import platform
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ..export import write_atomically
+from ..export import digest, write_atomically
 from ..recording import InputError
 
 FORMAT, VERSION, NAME = "pilfr_casadi run", 1, "manifest.json"
-
-
-def digest(content: Any) -> str:
-    """SHA-256 of bytes, or of a table in its one canonical form."""
-    data = content if isinstance(content, bytes) else json.dumps(content, sort_keys=True, allow_nan=False).encode()
-    return hashlib.sha256(data).hexdigest()
 
 
 def file_digest(path: Path) -> str:
@@ -100,7 +94,8 @@ class Manifest:
 
     def write(self) -> None:
         """Write it, with its digest."""
-        text = json.dumps({**self.content, "sha256": digest(self.content)}, indent=1, allow_nan=False)
+        content = {**self.content, "sha256": digest(self.content)}
+        text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
         write_atomically(self.folder / NAME, text + "\n")
 
     def holds(self, name: str) -> bool:

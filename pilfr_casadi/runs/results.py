@@ -16,7 +16,6 @@ from .described import ROLES, Run
 from .jobs import RunJob
 from .manifest import Manifest, digest
 
-TABLE, PAGE, MODEL = "results.csv", "report.html", "model.json"
 COLUMNS = ("job", "seed", "chosen", "status", "operators", "role", "recording", "nrmse")
 
 

@@ -1,0 +1,121 @@
+"""Choosing among laws, and what is looked at again once one is in place."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_missing_flows import axis, moved
+
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.gates import Gate
+from pilfr_casadi.diagnose.search import Search, _imitated
+from pilfr_casadi.diagnose.timing import timing
+from pilfr_casadi.diagnose.verdict import choose
+from pilfr_casadi.diagnose.workbench import Workbench
+from pilfr_casadi.parameters import Parameter
+from pilfr_casadi.recording import Recording
+from pilfr_casadi.simulator import Port, Simulator
+
+
+def searching(bench, said=True):
+    """A search on a bench, not yet begun."""
+    floor = Floor(np.full(len(bench.scale), 1e-5), "estimated")
+    return Search(bench, bench.fit(bench.simulator), floor, (), 1, lambda *_: None, said)
+
+
+@pytest.mark.parametrize(
+    ("port", "remains", "drifts"),
+    [("sensor:position", 0.3, True), ("sensor:position", 1e-3, False), ("guide", 0.3, False)],
+)
+def test_behind_a_free_integrator_no_sensor_is_blamed_for_what_is_left(port, remains, drifts):
+    """Unless next to nothing is left then: no drift that is followed does that."""
+    search = searching(Workbench.of(axis(), [moved(0)], "zero"))
+    winner = SimpleNamespace(port=port, law=SimpleNamespace(id="hysteresis"))
+    assert search._only_drifts(SimpleNamespace(winner=winner, remains=remains)) is drifts
+
+
+def candidate(port, law, error, size=2, at_bound=False):
+    """What the choice reads of a fitted candidate."""
+    return SimpleNamespace(
+        port=port,
+        law=SimpleNamespace(id=law, form=""),
+        error=error,
+        size=size,
+        at_bound=at_bound,
+        name=(port, law),
+    )
+
+
+def test_of_two_that_do_as_well_the_one_that_no_bound_holds_back_is_taken():
+    held, free = candidate("spring", "extra_mode", 0.100, at_bound=True), candidate("sensor:x", "extra_mode", 0.102)
+    choice = choose([held, free], (1.0, 1.0), 1e-4, 500.0)
+    assert choice.winner is free and choice.alike == (held,)
+    worse = candidate("sensor:x", "extra_mode", 0.2)
+    assert choose([held, worse], (1.0, 1.0), 1e-4, 500.0).winner is held
+
+
+class Loose:
+    """A law by its id; each has a type of its own."""
+
+    id = "delay"
+
+
+class Looser(Loose):
+    """Another."""
+
+    id = "backlash"
+
+
+def test_a_law_that_can_imitate_others_is_put_up_against_them():
+    scored = [SimpleNamespace(port=port, law=law) for port in ("a", "b") for law in (Loose(), Looser())]
+    flexible = candidate("a", "extra_mode", 0.1)
+    assert [(s.port, s.law.id) for s in _imitated([flexible], scored)] == [("a", "delay"), ("a", "backlash")]
+    tried = SimpleNamespace(port="a", law=Looser())
+    assert [s.law.id for s in _imitated([flexible, tried], scored)] == ["delay"]
+    assert _imitated([candidate("a", "cubic_stiffness", 0.1)], scored) == []
+
+
+def spring():
+    """A mass on a spring, measured at position and velocity."""
+    return Simulator(
+        lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
+        lambda x: {"pos": x.pos, "vel": x.vel},
+        states=("pos", "vel"),
+        inputs=("force",),
+        parameters={"k": Parameter(120.0, bounds=(20, 500)), "d": Parameter(1.0, bounds=(0, 20))},
+        ports=(Port("ground", {"vel": -1.0}, lambda x: x.pos, lambda x: x.vel),),
+    )
+
+
+def shaken(hold, clock=0.0, m=3000, dt=0.02):
+    """The spring recorded; `clock`: by how much each of the outputs' samples takes longer."""
+    rng = np.random.default_rng(3)
+    u = np.convolve(rng.standard_normal(m), np.ones(4) / 2, "same")
+    true = spring().with_parameters({"k": Parameter(100.0), "d": Parameter(1.4)})
+    blank = Recording(u, rng.standard_normal((m, 2)), dt, ("force",), ("pos", "vel"), initial="zero")
+    model = Workbench.of(true, [blank], hold).model(true)
+    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(2))[0]
+    if clock:
+        at = np.arange(m) * (1 + clock)
+        u, y = u[at < m - 1], np.stack([np.interp(at[at < m - 1], np.arange(m), c) for c in y.T], axis=1)
+    y = y + 1e-4 * y.std(axis=0) * rng.standard_normal(y.shape)
+    return Recording(u, y, dt, ("force",), ("pos", "vel"), initial="zero")
+
+
+@pytest.mark.parametrize(
+    ("used", "said", "wrong"), [("zero", False, True), ("zero", True, False), ("linear", False, False)]
+)
+def test_how_inputs_are_held_is_asked_again_with_an_effect_in_place(used, said, wrong):
+    search = searching(Workbench.of(spring(), [shaken("linear")], used), said)
+    search.base = search.without
+    assert search._wrongly_held() is wrong
+    assert (search.misheld > 2) is wrong
+
+
+def test_a_clock_between_the_rates_looked_at_is_found_and_is_that_of_both_outputs():
+    bench = Workbench.of(spring(), [shaken("zero", 3.36e-3)], "zero")
+    _, found, gates = timing(bench, bench.fit(bench.simulator), 1e-8)
+    assert [(g.channel, g.finding) for g in gates] == [("pos, vel", "clock")] and isinstance(gates[0], Gate)
+    assert gates[0].value == pytest.approx(-3.36e-3, rel=0.02)
+    assert found.cost**0.5 < 0.02
