@@ -47,7 +47,7 @@ def draw(wide: Measurement, data: Measurement, fits: Mapping[str, Fit], folder: 
     folder.mkdir(parents=True, exist_ok=True)
     bla, test = robust_bla(wide.recordings), data.averaged()[-1].with_(name="test")
     best = replace(fits[SHOWN], linear=fits["LTI nx=8"].model)
-    linear = frequency_subspace(bla, ORDER, weight=False)
+    linear = frequency_subspace(bla, ORDER)
     fig14 = plots.new_figure(11.0, 4.2)
     plots.time(best, test, ax=fig14.add_subplot(1, 2, 1))
     plots.spectrum(best, test, steady=quietened(data.recordings[-1:]), ax=fig14.add_subplot(1, 2, 2))
