@@ -14,14 +14,6 @@
 #define LANE 8  /* columns are padded to a multiple of this */
 #define TILE 64 /* columns worked on at a time, so that the rows read again and again stay in the nearest cache */
 
-#if defined(__AVX512F__)
-#define WIDTH 8 /* numbers in one register */
-#elif defined(__AVX__)
-#define WIDTH 4
-#else
-#define WIDTH 2
-#endif
-typedef double lane_t __attribute__((vector_size(sizeof(double) * WIDTH), aligned(8), may_alias));
 typedef struct { const double *row; double value; } active_t;
 typedef struct { int first, last, row; } span_t;
 
@@ -94,7 +86,7 @@ int pilfr_simulate(const model_t *m, long length, const double *u, const double 
         const int kept = k % m->stride == 0;
         const long i = k / m->stride;
         res[0] = next; res[1] = next + m->n_x; res[2] = kept ? y + i * m->n_y : y_k;
-        res[3] = z && kept ? z + i * m->n_z : z_k; res[4] = w && kept ? w + i * m->n_z : w_k;
+        res[3] = z && kept ? z + i * m->n_z : z_k; res[4] = w && kept ? w + i * m->n_z : w_k; res[5] = 0;
         m->step(arg, res, iw, work, 0);
         memcpy(state, next, sizeof(double) * n);
     }
@@ -108,18 +100,22 @@ int pilfr_sensitivity(const model_t *m, long length, const double *u, const doub
                       const long *column, long n_c, double *y, double *jac) {
     enum { LINE = 64 };
     const int n_x = m->n_x, n_s = m->n_s, n_z = m->n_z, n_y = m->n_y, n_u = m->n_u, n = n_x + n_s;
-    const int n_rows = n + n_x + 2 * n_z + n_y + (m->keeps ? 0 : n_s);
+    const int n_direct = m->n_direct_rows;
+    const int n_rows = n + n_x + 2 * n_z + n_y + (m->keeps ? 0 : n_s) + n_direct + 1;
     const long ld = (n_c + LANE - 1) / LANE * LANE;
     const size_t doubles = (size_t)n_rows * ld + m->n_values + n + n_y + m->sz_w, terms = m->n_terms + 1, spans = n + n_z + n_y + 1;
-    char *memory = malloc(LINE + sizeof(double) * doubles + sizeof(active_t) * terms + sizeof(span_t) * spans);
+    const size_t scratch = sizeof(active_t) * terms + sizeof(long) * m->n_direct + sizeof(span_t) * spans;
+    char *memory = malloc(LINE + sizeof(double) * doubles + scratch);
     if (!memory) return 1;
     double *x = (double *)(((uintptr_t)memory + LINE - 1) / LINE * LINE), *s = x + n_x * ld, *x_next = s + n_s * ld;
     double *z = x_next + n_x * ld, *w = z + n_z * ld, *y_k = w + n_z * ld, *s_next = m->keeps ? s : y_k + n_y * ld;
     double *value = x + n_rows * ld, *next = value + m->n_values, *work = next + n + n_y;
     active_t *active = (active_t *)(work + m->sz_w);
-    span_t *span = (span_t *)(active + terms);
+    long *where = (long *)(active + terms);
+    span_t *span = (span_t *)(where + m->n_direct);
+    double *direct = x + (n_rows - n_direct - 1) * ld; /* and a row for what no column is wanted of */
     double *at_p = value + m->at_p, *at_fixed = value + m->at_fixed, *at_u = value + m->at_u, *at_x = value + m->at_x;
-    double *at_s = value + m->at_s, *at_z = value + m->at_z, *at_w = value + m->at_w;
+    double *at_s = value + m->at_s, *at_z = value + m->at_z, *at_w = value + m->at_w, *at_c = value + m->at_c;
     const double *arg[SLOTS], *source[4];
     double *res[SLOTS];
     long long iw[SLOTS];
@@ -131,23 +127,33 @@ int pilfr_sensitivity(const model_t *m, long length, const double *u, const doub
     memcpy(at_x, state, sizeof(double) * n);
     arg[0] = at_p; res[0] = at_fixed;
     m->fixed(arg, res, iw, work, 0);
+    for (int t = 0; t < m->n_direct; ++t) {
+        const long j = column[m->direct[t].parameter];
+        where[t] = j < 0 ? n_direct * ld : m->direct[t].row * ld + j;
+    }
 #define ROWS_OF(t, out, count, keep) rows(out, ld, count, &m->t, value, source, column, keep, active, span)
     for (long k = 0; k < length; ++k) {
         memcpy(at_u, u + k * n_u, sizeof(double) * n_u);
         arg[0] = at_x; arg[1] = at_s; arg[2] = at_u; arg[3] = at_p; arg[4] = at_fixed;
         const int kept = k % m->stride == 0;
         const long sample = k / m->stride;
-        res[0] = next; res[1] = next + n_x; res[2] = kept ? y + sample * n_y : next + n; res[3] = at_z; res[4] = at_w;
+        res[0] = next; res[1] = next + n_x; res[2] = kept ? y + sample * n_y : next + n; res[3] = at_z; res[4] = at_w; res[5] = at_c;
         m->step(arg, res, iw, work, 0);
-        arg[0] = at_x; arg[1] = at_s; arg[2] = at_z; arg[3] = at_w; arg[4] = at_u; arg[5] = at_p; arg[6] = at_fixed;
+        arg[0] = at_x; arg[1] = at_s; arg[2] = at_z; arg[3] = at_w; arg[4] = at_c; arg[5] = at_u; arg[6] = at_p;
+        arg[7] = at_fixed;
         res[0] = value + m->at_computed;
         m->computed(arg, res, iw, work, 0);
-        source[0] = x; source[1] = s; source[2] = z; source[3] = w;
-        ROWS_OF(of_z, z, n_z, 0);
-        ROWS_OF(of_w, w, n_z, 0);
-        ROWS_OF(of_s, s_next, n_s, m->keeps);
-        if (kept) ROWS_OF(of_y, y_k, n_y, 0);
-        ROWS_OF(of_x, x_next, n_x, 0);
+        if (m->slopes) {
+            for (int t = 0; t < m->n_direct; ++t) direct[where[t]] = value[m->direct[t].value];
+            m->slopes(value, x, s, direct, s_next, x_next, kept ? y_k : 0, ld);
+        } else {
+            source[0] = x; source[1] = s; source[2] = z; source[3] = w;
+            ROWS_OF(of_z, z, n_z, 0);
+            ROWS_OF(of_w, w, n_z, 0);
+            ROWS_OF(of_s, s_next, n_s, m->keeps);
+            if (kept) ROWS_OF(of_y, y_k, n_y, 0);
+            ROWS_OF(of_x, x_next, n_x, 0);
+        }
         for (int i = 0; kept && i < n_y; ++i) memcpy(jac + (sample * n_y + i) * n_c, y_k + i * ld, sizeof(double) * n_c);
         double *swap = x; x = x_next; x_next = swap;
         if (!m->keeps) { swap = s; s = s_next; s_next = swap; }

@@ -1,14 +1,16 @@
 """The engine that runs generated C: a model's step, called from the time loops of `_kernel.c`.
 
 The loops are built once; a model's library is built once a structure. Both are kept in a private per-user cache, keyed
-by source, compiler, processor and CasADi version; a file name holds a digest of its content, so that a damaged library
-is built anew. A cache directory that others can write to is not used. Without a working C compiler `make_engine` falls
-back to the virtual machine of `sensitivities`, which gives the same numbers.
+by source, compiler, processor and CasADi version, in folders by the key's first letters: a cache of many thousands is
+not listed as a whole. A file name holds a digest of its content, so that a damaged library is built anew. A cache
+directory that others can write to is not used. Without a working C compiler `make_engine` falls back to the virtual
+machine of `sensitivities`, which gives the same numbers.
 """
 
 from __future__ import annotations
 
 import atexit
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -34,6 +36,8 @@ from .sensitivities import Engine, VirtualMachine, linearize
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 FLAGS = (("-march=native", *COMMON), COMMON)  # the second where the first is not understood
 PLAIN, LOOPS = "-O1", "-O2"  # long straight lines take seconds to optimise and gain nothing from it, unlike the loops
+KEPT = 40  # libraries in each of the cache's 256 folders: some hundred megabytes
+WRITTEN = 64  # states with memory up to which slopes written out fit the nearest cache
 PATIENCE = 600.0  # seconds for one compilation
 _failures: dict[str, str] = {}  # what did not compile is not tried again by this process
 
@@ -97,6 +101,18 @@ def _digest(library: Path) -> str:
     return hashlib.sha256(library.read_bytes()).hexdigest()[:16]
 
 
+def _shelf(key: str) -> Path:
+    """The folder of a library."""
+    return cache_directory() / key[:2]
+
+
+def _thin(shelf: Path) -> None:
+    """Keep a folder's most recently used libraries; one that is loaded stays so without its file."""
+    with contextlib.suppress(OSError):
+        for library in sorted(shelf.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
+            library.unlink()
+
+
 def _compile(cc: str, source: str, key: str, level: str) -> Path:
     """Compile under another name first, so that a library is never half there."""
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
@@ -106,8 +122,10 @@ def _compile(cc: str, source: str, key: str, level: str) -> Path:
             command = [cc, level, *flags, str(c_file), "-o", str(partial), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
             if not done.returncode and partial.exists():
-                library = cache_directory() / f"{key}-{_digest(partial)}.so"
+                library = _shelf(key) / f"{key}-{_digest(partial)}.so"
+                library.parent.mkdir(mode=0o700, exist_ok=True)
                 os.replace(partial, library)
+                _thin(library.parent)
                 return library
     raise OSError((done.stderr.strip().splitlines() or ["it wrote no library"])[0][:300])
 
@@ -124,8 +142,10 @@ def build(source: str, level: str = PLAIN) -> Path:
     if cc is None:
         raise InputError("No C compiler was found; install one (cc, gcc or clang) or use engine='vm'.")
     key = hashlib.sha256("\n".join((source, level, _machine(cc))).encode()).hexdigest()[:32]
-    for library in cache_directory().glob(f"{key}-*.so"):
+    for library in _shelf(key).glob(f"{key}-*.so"):
         if library.stem == f"{key}-{_digest(library)}":
+            with contextlib.suppress(OSError):
+                os.utime(library)  # used now
             return library
         library.unlink(missing_ok=True)
     if key not in _failures:
@@ -160,7 +180,7 @@ class Compiled:
     """Generated C behind the `Engine` protocol; it keeps nothing between calls, so threads may share it."""
 
     def __init__(self, model: Model) -> None:
-        self.linear = linearize(model)
+        self.linear = linearize(model, staged=model.n_state <= WRITTEN)
         self.loops = _loops(cache_directory())
         self.library = _loaded(build(source_code(self.linear)))
         self.model = ctypes.byref(ctypes.c_char.in_dll(self.library, "pilfr_model"))

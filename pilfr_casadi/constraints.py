@@ -11,12 +11,13 @@ m^(n-1) and the left-hand side exceeds `log ρ(A)` by up to `(n - 1) log(m) / m`
 size of m. `stable` therefore has a slack, and a violation as small as that slack is no failure of a solver.
 
 Asked for as `exact`, a constraint has no slack and no tolerance: it is checked on the numbers of the result, the
-spectral radius by its eigenvalues, and where a check fails the result is moved (`exactness`).
+spectral radius by its eigenvalues. Where a check fails the result is moved (`exactness`); a radius is bounded by other
+rows than this one, which are smooth where eigenvalues meet (`tightening`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -128,7 +129,19 @@ def stable(
         )
     limit = float(np.log(radius) + (-INSIDE if exact else np.log1p(slack)))
     check = BeyondRadius(radius, matrix) if exact else None
-    return Constraint(LogRadius(matrix), upper=limit, name=f"{name} <= {radius:g}", unit=UNIT, exact=exact, check=check)
+    return Constraint(
+        LogRadius(matrix), upper=limit, name=f"{name} <= {radius:.12g}", unit=UNIT, exact=exact, check=check
+    )
+
+
+def loosened(constraints: Sequence[Constraint], least: float = 0.0) -> tuple[Constraint, ...]:
+    """The constraints with exact bounds on spectral radii, of `least` or more, at 1 or more and up to the slack."""
+    return tuple(
+        stable(max(c.check.radius, 1.0), c.check.matrix, c.name.partition(" <=")[0])
+        if c.exact and isinstance(c.check, BeyondRadius) and c.check.radius >= least
+        else c
+        for c in constraints
+    )
 
 
 def compile_constraints(
@@ -145,12 +158,7 @@ def compile_constraints(
     named = parameters.symbols(vector)
     parts, lower, upper, labels, units = [], [np.zeros(0)], [np.zeros(0)], [], [np.zeros(0)]
     for c in constraints:
-        try:
-            g = ca.vec(c.expression(named))
-        except KeyError as e:
-            raise InputError(
-                f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(parameters)}."
-            ) from e
+        g = _expression(c, named, parameters)
         size = int(g.shape[0])
         try:
             low, high = (np.broadcast_to(np.asarray(b, dtype=float).ravel(), (size,)) for b in (c.lower, c.upper))
@@ -178,16 +186,52 @@ def compile_constraints(
     return value, slope, np.concatenate(lower), np.concatenate(upper), tuple(labels), np.concatenate(units)
 
 
+def _expression(c: Constraint, named: Mapping[str, Any], parameters: ParameterSet) -> Any:
+    """The constraint's expression as a column.
+
+    Raises
+    ------
+    InputError
+        If it fails or names an unknown parameter.
+    """
+    try:
+        g = ca.vec(c.expression(named))
+        if not isinstance(g, ca.MX):
+            g = ca.MX(ca.DM(g))
+    except KeyError as e:
+        raise InputError(
+            f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(parameters)}."
+        ) from e
+    except Exception as e:
+        why = str(e).strip().splitlines()[-1].strip() if str(e).strip() else type(e).__name__
+        if "__bool__" in str(e) or "truth value" in str(e).lower():
+            why = "it asks whether a symbol is true, as `if`, `and`, `min` and `max` of Python do"
+        raise InputError(
+            f"The expression of the constraint {c.name!r} cannot be formed ({why}); use CasADi functions of the named "
+            "parameters, such as casadi.if_else, fmin and fmax."
+        ) from e
+    return g
+
+
 def constraint_sizes(constraints: tuple[Constraint, ...], parameters: ParameterSet) -> tuple[int, ...]:
     """Number of entries of each constraint."""
     named = parameters.symbols(ca.MX.sym("p", parameters.size))
-    return tuple(int(ca.vec(c.expression(named)).shape[0]) for c in constraints)
+    return tuple(int(_expression(c, named, parameters).shape[0]) for c in constraints)
 
 
 def check_free(
-    g: ca.Function, free: np.ndarray, p: np.ndarray, lower: np.ndarray, upper: np.ndarray, labels: tuple[str, ...]
+    g: ca.Function,
+    slope: ca.Function,
+    free: np.ndarray,
+    p: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    labels: tuple[str, ...],
+    held: np.ndarray,
 ) -> None:
-    """Refuse a constraint that does not hold and that no free parameter enters.
+    """Refuse a constraint that is no number at the start, or that does not hold and that no free parameter enters.
+
+    `held` says of which entries a check of their own says that they hold.
 
     Raises
     ------
@@ -196,7 +240,14 @@ def check_free(
     """
     reach = np.asarray(ca.DM(g.jac_sparsity(0, 0), 1).full(), dtype=bool).reshape(len(labels), len(p))
     value = np.asarray(g(p)).ravel()
-    for i in np.flatnonzero(~np.any(reach[:, free], axis=1)):
+    steep = np.asarray(slope(p)).reshape(len(labels), len(p))[:, free]
+    for i in np.flatnonzero(~np.isfinite(value) | ~np.all(np.isfinite(steep), axis=1)):
+        what, shown = ("value", value[i]) if not np.isfinite(value[i]) else ("slope", np.nan)
+        raise InputError(
+            f"The constraint {labels[i]!r} has no finite {what} at the start values of the parameters (it is {shown}); "
+            "give an expression that is finite there, or other start values."
+        )
+    for i in np.flatnonzero(~np.any(reach[:, free], axis=1) & ~held):
         room = TOLERATED * max(abs(value[i]), 1.0)
         if not lower[i] - room <= value[i] <= upper[i] + room:
             raise InputError(

@@ -18,15 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from .constraints import Constraint
+from .constraints import Constraint, loosened
 from .elements import PrandtlIshlinskii
+from .exactness import beyond
 from .fitted import Fit, Progress, fingerprint
 from .job import Job, interrupted, penalised, rms_error
 from .known_blocks import in_known_coordinates, known_entries
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
-from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability, within_radius
+from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability
 from .outcome import with_solution
 from .penalty import check_penalty
 from .problem import Problem
@@ -72,15 +73,18 @@ def fit(
     train : Recording or sequence of Recording
         Training data; nothing else is used.
     solver : GaussNewton or Ipopt
-        Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`.
+        Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`. Where an exact bound on a spectral radius
+        holds the solution, a Gauss-Newton SQP has the last word (see `tightening`).
     starts, seed : int
-        Number of random starts and the seed of all of them.
+        Number of starts and the seed of all of them. With `start="grid"` the first two have the element at the output
+        and at the input, whatever the seed; more are drawn. More starts with the same seed hold those of fewer.
     start : {"grid", "paper"}
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
         solved and re-gridded.
     stable : bool or float
-        Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope. A number holds
-        exactly, by the eigenvalues of the result; True, the default, is 1 up to 1e-4; False is none.
+        Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
+        exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one, nothing grows.
+        A number below 1 is a least rate of decay; False is no bound.
     constraints
         See `Problem`.
     noise : float, optional
@@ -165,15 +169,16 @@ def _fit(
     fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
     job = replace(job, recordings=check_for_identification(train, fewest))
     linear, problem, solution = linear_model(
-        job.recordings, model, engine=job.engine, constraints=limits[:1], progress=job.progress
+        job.recordings, model, engine=job.engine, constraints=loosened(limits[:1]), progress=job.progress
     )
     if solution.status is Status.INTERRUPTED:
         return job.result(linear, model.linear(), problem, solution)
     fitted = in_known_coordinates(model, with_solution(linear, problem, solution), job)
     if model.element is None:
+        bounded = Problem(linear, job.recordings, engine=problem.engine, constraints=job.limits)
         more = model.fixed or model.bounds or model.priors or job.limits[1:] or solution.status is Status.INFEASIBLE
-        if not more and job.solver is POLISH:  # nothing that the linear model has not seen
-            return job.result(linear, model, problem, solution)
+        if not (more or beyond(bounded, solution.theta)) and job.solver is POLISH:
+            return job.result(linear, model, bounded, solution)  # nothing that the linear model has not seen
         return _linear(model, fitted, job)
     return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
 
@@ -205,7 +210,7 @@ def _from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit |
 
 def _linear(structure: PILFR, fitted: Model, job: Job) -> Fit:
     """A linear model with the structure's bounds and fixed blocks, from the one without."""
-    values = within_radius({k: p.value for k, p in fitted.parameters.items()}, job.limits, structure)
+    values = {k: p.value for k, p in fitted.parameters.items()}
     first = job.recordings[0]
     model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
     problem = job.problem(model)
@@ -256,7 +261,7 @@ def _from_starts(
     try:
         if stopped:
             latest = interrupted(*latest)
-        elif start != "paper":
+        elif start != "paper" or beyond(problem, best.theta):
             latest = model, problem, job.solve(problem, "solve", best.theta), note
         if structure.priors and not stopped:
             problem, result = job.settled(problem, latest[2], "solve")
@@ -283,12 +288,12 @@ def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any
 
 
 def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
-    """The limits that `stable` stands for: a number exactly, True up to a slack that lets an integrator be one."""
+    """The limits that `stable` stands for."""
     if bound is False:
         return ()
     if not isinstance(bound, bool | int | float | np.number) or not np.isfinite(bound):
         raise InputError(f"stable = {bound!r} was given; give True, False or the largest spectral radius, above zero.")
-    return stability(structure) if bound is True else stability(structure, float(bound), exact=True)
+    return stability(structure, float(bound), exact=True)
 
 
 def constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:

@@ -210,7 +210,10 @@ class Fit:
         ]
         if self.candidates:
             reached = sorted(c.error for c in self.candidates)
-            lines.append(f"{len(reached)} starts, explored to NRMSE {reached[0]:.4f} ... {reached[-1]:.4f}")
+            some = f"{len(reached)} starts" if len(reached) > 1 else "1 start"
+            lines.append(f"{some}, explored to NRMSE {reached[0]:.4f} ... {reached[-1]:.4f}")
+            if not any(c.drawn for c in self.candidates):
+                lines.append("none of them is drawn, so the seed changes nothing")
         if self.linear_nrmse:
             alone = ", ".join(f"{e:.4f}" for e in self.linear_nrmse)
             lines.append(f"the linear model alone, to judge the element by: NRMSE {alone}")
@@ -224,9 +227,10 @@ class Fit:
         constraints = [limit for limit in self.limits if limit.kind == "constraint"]
         if constraints:
             shown = [str(limit) for limit in constraints if limit.active or not limit.met]
-            idle = [limit.name for limit in constraints if limit.met and not limit.active]
-            names = ", ".join(dict.fromkeys(name.partition("[")[0] for name in idle))
-            shown += [f"{len(idle)} not active ({names})"] if idle else []
+            idle = [limit for limit in constraints if limit.met and not limit.active]
+            shown += [str(limit) for limit in idle if "[" not in limit.name]
+            rows = [limit.name.partition("[")[0] for limit in idle if "[" in limit.name]
+            shown += [f"{len(rows)} not active ({', '.join(dict.fromkeys(rows))})"] if rows else []
             lines.append(f"constraints: {'; '.join(shown)}")
         return "\n".join(lines)
 

@@ -23,6 +23,7 @@ import numpy as np
 from .callback import handled_interrupt
 from .constraints import TOLERATED
 from .damping import without_rounding
+from .lifted import Lifted
 from .magnitude import Neighbours
 from .problem import Problem
 from .quadratic_program import QuadraticProgram
@@ -67,7 +68,9 @@ class GaussNewton:
         if not ca.has_conic(str(self.qp)):
             raise InputError(f"The QP solver {self.qp!r} is not there; use 'daqp', or another conic plugin of CasADi.")
 
-    def solve(self, problem: Problem, start: np.ndarray | None = None, progress: Progress | None = None) -> Solution:
+    def solve(
+        self, problem: Problem | Lifted, start: np.ndarray | None = None, progress: Progress | None = None
+    ) -> Solution:
         """Minimise from `start` (n,), by default the problem's own."""
         return _Run(self, problem, problem.start if start is None else start, progress).run()
 
@@ -84,7 +87,9 @@ class _Step:
 class _Run:
     """One solve: the point, its derivatives and the damping; constraints, limits and multipliers of them are scaled."""
 
-    def __init__(self, options: GaussNewton, problem: Problem, start: np.ndarray, progress: Progress | None) -> None:
+    def __init__(
+        self, options: GaussNewton, problem: Problem | Lifted, start: np.ndarray, progress: Progress | None
+    ) -> None:
         self.options, self.problem, self.progress = options, problem, progress
         self.theta = np.clip(np.asarray(start, dtype=float), problem.lower, problem.upper)
         self.n_g = len(problem.g_lower)

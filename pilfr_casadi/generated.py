@@ -2,6 +2,9 @@
 
 Most partial derivatives of a state-space model are parameters, signals or constants themselves. The loops look these
 up; only the others are written out as code. What depends on parameters alone is evaluated once a run.
+
+The slopes of a state-space model with many operators are looked up in tables, whose zeros cost nothing. Those of a step
+of several stages, of which nearly none is ever zero, are written out term by term.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from .sensitivities import BLOCKS, TARGETS, Linearization
 from .threads import one_at_a_time
 
 _SOURCES = {"x": 0, "s": 1, "z": 2, "w": 3}
-_VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "computed")
+_VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "c", "computed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,23 +92,29 @@ def source_code(linear: Linearization) -> str:
     for function in code.functions.values():
         generator.add(function)
     lines = [f"static const double constants[] = {{{', '.join(map(repr, code.constants)) or '0'}}};"]
-    most = 0
-    for target in TARGETS:
+    staged, most = sizes["c"] > 0, 0
+    for target in TARGETS if not staged else ():
         n = sizes[target]
         terms: list[list[str]] = [[] for _ in range(n)]
-        direct: list[list[str]] = [[] for _ in range(n)]
+        directly: list[list[str]] = [[] for _ in range(n)]
         for source in TARGETS[target]:
             pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
             for i, j, value in zip(*pattern.get_triplet(), code.entries[target, source], strict=True):
                 if source == "p":
-                    direct[i].append(f"{{{j},{value}}}")
+                    directly[i].append(f"{{{j},{value}}}")
                 else:
                     terms[i].append(f"{{{_SOURCES[source]},{j},{value}}}")
         lines += [*_table(f"term_{target}", "term_t", f"row_{target}", terms)]
-        lines += [*_table(f"direct_{target}", "direct_t", f"direct_row_{target}", direct)]
+        lines += [*_table(f"direct_{target}", "direct_t", f"direct_row_{target}", directly)]
         most = max(most, sum(map(len, terms)))
     entries = {f: f"pilfr_{f}" for f in code.functions} | {"constants": "constants"}
-    entries |= {f"of_{t}": f"{{row_{t}, term_{t}, direct_row_{t}, direct_{t}}}" for t in TARGETS}
+    if staged:
+        written, direct, n_rows = _written(linear, code)
+        lines += [*written, f"static const entered_t direct[] = {{{','.join(direct) or '{0}'}}};"]
+        entries |= {"slopes": "slopes", "direct": "direct", "n_direct": str(len(direct))}
+        entries["n_direct_rows"] = str(n_rows)
+    else:
+        entries |= {f"of_{t}": f"{{row_{t}, term_{t}, direct_row_{t}, direct_{t}}}" for t in TARGETS if t != "c"}
     entries |= {f"n_{k}": str(sizes[k]) for k in ("x", "s", "z", "y", "u", "p")}
     entries |= {f"at_{k}": str(at[k]) for k in _VALUES if k != "constant"}
     entries |= {"n_fixed": str(at["u"] - at["fixed"]), "n_values": str(at["end"]), "n_terms": str(most)}
@@ -114,6 +123,39 @@ def source_code(linear: Linearization) -> str:
     entries["keeps"] = str(int(linear.partial.sparsity_out(BLOCKS.index(("s", "s"))).is_diag()))
     model = ", ".join(f".{name} = {value}" for name, value in entries.items())
     return "\n".join([generator.dump(), _text("_kernel.h"), *lines, f"const model_t pilfr_model = {{{model}}};\n"])
+
+
+def _written(linear: Linearization, code: _Code) -> tuple[list[str], list[str], int]:
+    """C code of the slopes of all rows, its direct entries {row, parameter, value}, and how many rows these have.
+
+    The code works on a few columns at a time. What depends on a parameter directly is entered into rows of its own, in
+    the same place at every step.
+    """
+    sizes = linear.sizes
+    rows = {target: [list[str]() for _ in range(sizes[target])] for target in TARGETS}
+    own: dict[tuple[str, int], int] = {}
+    direct = list[str]()
+    for target, sources in TARGETS.items():
+        for source in sources:
+            pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
+            for i, j, value in zip(*pattern.get_triplet(), code.entries[target, source], strict=True):
+                if source != "p":
+                    factor = repr(code.constants[value]) if value < code.at["p"] else f"v[{value}]"
+                    rows[target][i].append(f"{source}{j}" if factor == "1.0" else f"{factor} * {source}{j}")
+                    continue
+                if (target, i) not in own:
+                    own[target, i] = len(own)
+                    rows[target][i].append(f"AT(direct, {own[target, i]})")
+                direct.append(f"{{{own[target, i]},{j},{value}}}")
+    lines = [f"const lane_t {source}{j} = AT({source}, {j});" for source in ("x", "s") for j in range(sizes[source])]
+    for target, name in (("z", "z"), ("w", "w"), ("s", "s_"), ("c", "c"), ("x", "x_"), ("y", "y_")):
+        lines += [f"const lane_t {name}{i} = {' + '.join(row) or 'NONE'};" for i, row in enumerate(rows[target])]
+    stores = [f"AT({k}_next, {i}) = {k}_{i};" for k in ("s", "x") for i in range(sizes[k])]
+    stores += [f"if (y) AT(y, {i}) = y_{i};" for i in range(sizes["y"])]
+    read = ("const double *v", *(f"const double *{k}" for k in ("x", "s", "direct")))
+    arguments = ", ".join([*read, *(f"double *{k}" for k in ("s_next", "x_next", "y")), "long ld"])
+    head = f"OPTIMISED static void slopes({arguments}) {{ for (long j = 0; j < ld; j += WIDTH) {{"
+    return [head, *lines, *stores, "} }"], direct, len(own)
 
 
 def _text(name: str) -> str:

@@ -13,7 +13,6 @@ differential equations of its own (`flow`) adds states. The model's state is [x;
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -25,11 +24,7 @@ from .arrays import accumulated
 from .expressions import Named, call
 from .model import Model, from_expressions
 from .parameters import ParameterSet
-from .recording import InputError, Recording
 from .simulator import Placed, Simulator
-
-REACH = 0.25  # largest |λ| h: phase error (λh)⁴/120 = 3e-5 of a cycle's angle
-MOST = 200  # sub-steps a sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +143,7 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     hold : {"zero", "linear"}
         Inputs between samples.
     substeps : int
-        Runge-Kutta steps a sample; see `choose_substeps`.
+        Runge-Kutta steps a sample; see `substeps.choose_substeps`.
     """
     simulator = on_grid(simulator, dt / substeps)
     own = ParameterSet(dict(simulator.parameters))
@@ -161,31 +156,44 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     end, slope = (u1, (u1 - u0) / h) if hold == "linear" else (u0, ca.SX.zeros(n_u))
     middle = (u0 + end) / 2
 
-    def at(state: Any, memory: Any, u: Any, time: Any) -> tuple[Any, ...]:
-        return equations.evaluate(Instant(state, memory, u, slope, time))
+    sizes = (("x", n_x), ("s", s.numel()), ("u", n_u), ("t", 1))
+    now = {name: ca.SX.sym(name, n) for name, n in sizes}
+    f, y, after, local = equations.evaluate(Instant(**now, slope=slope))
+    z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
+    at = ca.Function("at", [*now.values(), u0, u1, vector], [f, y, after, z])  # written out once, called at every stage
 
-    _, _, begun, local = at(x, s, u0, t)
+    def k(state: Any, u: Any, time: Any) -> Any:
+        return at(state, seen, u, time, u0, u1, vector)[0]
+
+    _, _, begun, z = at(x, s, u0, t, u0, u1, vector)
     # a shift register takes in the signal at the step's begin, where it is measured; others have moved on with it when
     # the step begins
     moved = ca.SX.sym("moved", s.numel())
     shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
     seen = ca.vertcat(ca.SX(0, 1), *(s[i] if shift else moved[i] for i, shift in enumerate(shifts)))
-    k1, y, _, _ = at(x, seen, u0, t)
+    k1, y, _, _ = at(x, seen, u0, t, u0, u1, vector)
     n_own = len(simulator.states)
+    stages: tuple[Any, ...] | None = None
     if simulator.discrete:  # laws' own states move with z held over the sample
         x_next = ca.vertcat(k1[:n_own], x[n_own:] + h * k1[n_own:])
     else:
-        k2 = at(x + h / 2 * k1, seen, middle, t + h / 2)[0]
-        k3 = at(x + h / 2 * k2, seen, middle, t + h / 2)[0]
-        k4 = at(x + h * k3, seen, end, t + h)[0]
-        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        c2 = x + h / 2 * k1
+        k2 = k(c2, middle, t + h / 2)
+        c3 = x + h / 2 * k2
+        k3 = k(c3, middle, t + h / 2)
+        c4 = x + h * k3
+        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k(c4, end, t + h))
+        if n_x:  # the same by way of the three states at which the stages are evaluated
+            c = ca.SX.sym("c", 3 * n_x)
+            s2, s3, s4 = ca.vertsplit(c, n_x)
+            by_c = ca.vertcat(c2, x + h / 2 * k(s2, middle, t + h / 2), x + h * k(s3, middle, t + h / 2))
+            stages = c, ca.vertcat(c2, c3, c4), by_c, (s2 + 2 * s3 + s4 - x) / 3 + h / 6 * k(s4, end, t + h)
     reads, columns = ["u"], [u0]
     if hold == "linear":
         reads, columns = [*reads, "next"], [*columns, u1]
     if ca.depends_on(ca.vertcat(x_next, y, begun), t):
         reads, columns = [*reads, "t"], [*columns, t]
     x_next, y = ca.cse([x_next, y])
-    z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
     state, following, port = (x, s), (x_next, begun), None
     if s.numel() and not any(shifts) and not ca.depends_on(z, s):
         # memory that is moved by a port of its own makes the derivatives sparse
@@ -193,9 +201,11 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
         port = z, channels, moved
         following = x_next, equations.memory(channels, s)
     else:
-        x_next, y = ca.substitute([x_next, y], [moved], [begun])
+        x_next, y, *staged = ca.substitute([x_next, y, *(stages or ())[1:]], [moved], [begun])
         empty = ca.SX(0, 1)
         state, following = (ca.vertcat(x, s), empty), (ca.vertcat(x_next, begun), empty)
+        if stages is not None:
+            stages = stages[0], staged[0], staged[1], ca.vertcat(staged[2], begun)
     return from_expressions(
         state,
         ca.vertcat(*columns),
@@ -209,6 +219,7 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
         outputs=simulator.output_names,
         reads=tuple(reads),
         substeps=substeps,
+        stages=stages,
     )
 
 
@@ -253,57 +264,3 @@ def signals(simulator: Simulator) -> ca.Function:
     names = ["x", "u", "slope", "t", "p"]
     columns = [ca.vertcat(*column) for column in zip(*rows, strict=True)]
     return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push"])
-
-
-def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Largest |eigenvalue| of ∂f/∂x, rad/s, at states x (K, n_x) and inputs u (K, n_u), shape (K,); nan if infinite."""
-    n_x = len(simulator.states)
-    if not n_x or simulator.discrete:
-        return np.zeros(len(x))
-    vector = ca.SX.sym("p", len(p))
-    equations = Equations(simulator, vector)
-    xs, us = ca.SX.sym("x", n_x + sum(equations.n_q)), ca.SX.sym("u", len(simulator.inputs))
-    s = ca.SX.zeros(sum(equations.n_s))
-    f = equations.evaluate(Instant(xs, s, us, ca.SX.zeros(us.shape), ca.SX(0.0)))[0]
-    jacobian = ca.Function("f_x", [xs, us, vector], [ca.densify(ca.jacobian(f, xs))])
-    out = np.full(len(x), np.nan)
-    for k, (row, inputs) in enumerate(zip(x, u, strict=True)):
-        full = np.concatenate([row, np.zeros(xs.numel() - len(row))]) if len(row) < xs.numel() else row[: xs.numel()]
-        a = np.asarray(jacobian(full, inputs, p))
-        if np.all(np.isfinite(a)):
-            out[k] = float(np.max(np.abs(np.linalg.eigvals(a))))
-    return out
-
-
-def choose_substeps(simulator: Simulator, recordings: Sequence[Recording]) -> int:
-    """Sub-steps a sample that keep |λ| h below `REACH`, from the Jacobian at rest.
-
-    Where that is very fast, a run is looked at instead (a square root is infinitely steep at zero).
-
-    Raises
-    ------
-    InputError
-        If more than `MOST` would be needed.
-    """
-    p, first = ParameterSet(dict(simulator.parameters)).start, recordings[0]
-    rest = np.zeros((1, len(simulator.states)))
-    rate = float(np.nan_to_num(fastest(simulator, rest, np.mean(first.u, axis=0)[None], p)[0], nan=1e12))
-    if rate * first.dt > 8 * REACH:
-        rate = _along_a_run(simulator, first, p, rate)
-    needed = max(1, int(np.ceil(rate * first.dt / REACH)))
-    if needed > MOST:
-        raise InputError(
-            f"The simulator has an eigenvalue of {rate:.3g} rad/s, too fast for samples {first.dt:g} s apart; "
-            "check its units, or replace the fast state by its steady state."
-        )
-    return needed
-
-
-def _along_a_run(simulator: Simulator, recording: Recording, p: np.ndarray, rate: float) -> float:
-    """A high quantile of the rates along a run from rest, if that runs."""
-    model = discretise(simulator, recording.dt, "zero", substeps=20)
-    short = recording.slice(0, min(len(recording), 400))
-    states = states_along(model, model.drive(short), p, np.zeros(model.n_state))[:: model.substeps]
-    found = fastest(simulator, states[40::20], short.u[40::20], p)
-    found = found[np.isfinite(found)]
-    return min(rate, float(np.quantile(found, 0.9))) if len(found) > 5 else rate

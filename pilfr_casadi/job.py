@@ -21,10 +21,11 @@ from .outcome import outcome, with_solution
 from .penalty import element_alone, merged, restored, sentence, unit_weights, without_idle
 from .problem import Problem
 from .recording import Recording
-from .restoration import restored_radius
 from .solution import Solution, Status
+from .tightening import within_bounds
 
 Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
+LAST = GaussNewton()  # at a bound on a radius, where another solver is asked for
 ROUNDS, AGREE = 5, 0.05  # of noise estimates: how many at most, and the relative change that ends them
 
 
@@ -60,13 +61,14 @@ class Job:
     def solve(self, problem: Problem, stage: str, start: np.ndarray | None = None) -> Solution:
         """The solver's solution; those of the package report their iterations.
 
-        Where it misses an exact bound on the spectral radius, the way back is taken (`restoration`).
+        Where it leaves an exact bound on a spectral radius, the bound is tightened (`tightening`).
         """
         if not isinstance(self.solver, GaussNewton | Ipopt):
             solution: Solution = self.solver.solve(problem, start)
             return solution
         solver, report = self.solver, iterations(self.progress, stage, self.solver.max_iterations)
-        return restored_radius(problem, solver.solve(problem, start, report), lambda p, s: solver.solve(p, s, report))
+        last = solver if isinstance(solver, GaussNewton) else LAST
+        return within_bounds(problem, start, lambda p, s: solver.solve(p, s, report), last, progress=report)
 
     def result(self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, **more: Any) -> Fit:
         """What a solution of a problem amounts to; Ctrl-C waits until it is known, and is told by the status."""

@@ -6,13 +6,18 @@ over the output's deviation) would fall if the limit were moved outwards: it say
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from .constraints import TOLERATED
+from .constraints import TOLERATED, BeyondRadius
 from .problem import Problem
 from .solution import Solution
+
+AT_RADIUS = 1e-3  # share of a bound by which a radius that it holds may lie inside
+FELT = 1e-3  # multiplier next to the logarithm of a radius, in units of the objective, from which a bound holds it
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,8 @@ class Limit:
     kind : str
         "constraint" or "bound".
     value, lower, upper : float
-        The expression's value and its limits; infinite where there is none.
+        The expression's value and its limits; infinite where there is none. Of a bound on a spectral radius the radius
+        itself, by the eigenvalues of the result, and what it is to be at most.
     multiplier : float
         Fall of the objective for each unit that the limit is moved outwards; 0 where it is not active, nan where the
         solver gave none.
@@ -50,7 +56,7 @@ class Limit:
             short = max(self.lower - self.value, self.value - self.upper)
             return f"{self.name}: NOT MET, off by {short:.3g}"
         cost = f", multiplier {self.multiplier:.3g}" if np.isfinite(self.multiplier) else ""
-        return f"{self.name}: active{cost}" if self.active else f"{self.name}: not active"
+        return f"{self.name}: {self.value:.9g}, {f'active{cost}' if self.active else 'not active'}"
 
 
 def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
@@ -66,7 +72,12 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
         # a solver may stop a little short of a limit that holds it
         near = (size[n:] > 0) & (np.minimum(g - low, high - g) <= 10 * TOLERATED * unit)
         active = problem.active_constraints(theta) | near
-        for i, name in enumerate(problem.g_labels):
+        checks = [c.check for c, k in zip(problem.constraints, problem.g_sizes, strict=True) for _ in range(k)]
+        values = problem.model.parameters.unpack(problem.parameters(theta))
+        for i, (name, check) in enumerate(zip(problem.g_labels, checks, strict=True)):
+            if isinstance(check, BeyondRadius):
+                out.append(_radius(name, check, values, float(size[n + i]), solution.cost))
+                continue
             numbers = float(g[i]), float(low[i]), float(high[i]), float(size[n + i] if active[i] else 0.0)
             out.append(Limit(name, "constraint", *numbers, active=bool(active[i]), met=bool(met[i])))
     at = (theta == problem.lower) | (theta == problem.upper)
@@ -74,3 +85,11 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
         numbers = float(theta[i]), float(problem.lower[i]), float(problem.upper[i]), float(size[i])
         out.append(Limit(str(problem.labels[i]), "bound", *numbers, active=True))
     return tuple(out)
+
+
+def _radius(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, cost: float) -> Limit:
+    """A bound on a spectral radius; `force` is its multiplier next to the logarithm."""
+    excess, bound = check(values), check.radius
+    active = -excess <= AT_RADIUS * bound and (not force <= FELT * cost or -excess <= 10 * TOLERATED * bound)
+    multiplier = force / bound if active else 0.0
+    return Limit(name, "constraint", excess + bound, -np.inf, bound, multiplier, active, met=excess <= 0)

@@ -49,6 +49,9 @@ class Model:
         What the columns of the step's u are; see `drive`.
     substeps : int
         Steps within a sample; outputs are those at the first of them.
+    stages : casadi.Function, optional
+        `(x, u, w, p, c) -> (values of c, c by c, x_next by c)`: the step by way of intermediate values c (n_c,), each
+        of which depends on those before it alone. Its derivatives are sparse where those of `step` are dense.
     """
 
     step: ca.Function
@@ -61,6 +64,7 @@ class Model:
     outputs: tuple[str, ...]
     reads: tuple[str, ...] = ("u",)
     substeps: int = 1
+    stages: ca.Function | None = None
 
     def drive(self, recording: Recording) -> np.ndarray:
         """What the step reads while a recording is run, shape (M * substeps, n_u): the columns named in `reads`.
@@ -202,6 +206,7 @@ def from_expressions(
     outputs: tuple[str, ...],
     reads: tuple[str, ...] = ("u",),
     substeps: int = 1,
+    stages: tuple[Any, Any, Any, Any] | None = None,
 ) -> Model:
     """A closed model from expressions of symbols; the other fields are as in `Model`.
 
@@ -214,10 +219,13 @@ def from_expressions(
     port : (z, channels, moved), optional
         The signals that move the memory (expressions of x, u and p), the symbols by which `s_next` reads them, and
         those by which `x_next` and `y` read the memory once moved; each as long as s. Without it, s is empty.
+    stages : (c, values, by_c, x_next), optional
+        Symbols of intermediate values, and what `Model.stages` gives.
     """
     (x, s), (x_next, s_next) = state, following
     z, channels, moved = port or (ca.SX(0, 1),) * 3
     w = s_next if port else ca.SX(0, 1)
+    c, *staged = stages or (ca.SX(0, 1),)
     return Model(
         step=ca.Function("step", [x, u, moved, p], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),
         port=ca.Function("port", [x, u, p], [z], ["x", "u", "p"], ["z"]),
@@ -229,6 +237,7 @@ def from_expressions(
         outputs=outputs,
         reads=reads,
         substeps=substeps,
+        stages=ca.Function("stages", [x, u, moved, p, c], staged) if stages else None,
     )
 
 
@@ -263,4 +272,5 @@ def close_loop(model: Any, element: Element, port: str | None = None) -> Any:
         memory=ca.Function("memory", [z, s, vector], [w_out, s_next], ["z", "s", "p"], ["w", "s_next"]),
         parameters=parameters,
         element=element,
+        stages=None,
     )

@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 
 from .compiled import make_engine
-from .constraints import BeyondRadius, Constraint, stable
+from .constraints import Constraint, loosened, stable
 from .elements import PrandtlIshlinskii
 from .envelopes import enveloped, has_networks
 from .gauss_newton import GaussNewton
@@ -39,6 +39,7 @@ from .sensitivities import Engine
 from .solution import Solution, Status
 from .start import Blocks, grid_start, paper_start, regridded, unit_states
 from .threads import one_blas_thread
+from .tightening import at_bounds, within_bounds
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
@@ -73,7 +74,7 @@ class Search:
             model,
             self.recordings,
             engine=engine or self.engine,
-            constraints=self.constraints,
+            constraints=loosened(self.constraints, least=1.0),
             l1=self.l1,
             noise=self.noise or noise or self.level,
         )
@@ -86,7 +87,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """What one start led to."""
+    """What one start led to; `drawn` tells whether its start depends on the seed."""
 
     seed: int
     model: Model
@@ -94,6 +95,7 @@ class Candidate:
     error: float
     solution: Solution
     note: str = ""
+    drawn: bool = True
 
 
 def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tuple[Constraint, ...]:
@@ -105,22 +107,6 @@ def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tup
     if isinstance(element, PrandtlIshlinskii):
         limits += (stable(radius, _with_element, "spectral radius with the element's full slope", exact=exact),)
     return limits
-
-
-def within_radius(values: Blocks, constraints: Iterable[Constraint], structure: PILFR) -> Blocks:
-    """Blocks with A and B_w scaled down, where they may be, to meet exact bounds on the spectral radius."""
-    checks = [c.check for c in constraints if isinstance(c.check, BeyondRadius)]
-    if not checks or {"A", "B_w"} & (set(structure.fixed) - _zero(structure)):
-        return values
-    full = {
-        k: p.value for k, p in structure.model(values["B_u"].shape[1], len(values["C_y"]), values).parameters.items()
-    }
-    share = min(0.999 * c.radius / max(c(full) + c.radius, 1e-300) for c in checks)
-    return {**values, **{k: share * values[k] for k in ("A", "B_w") if k in values}} if share < 0.999 else values
-
-
-def _zero(structure: PILFR) -> set[str]:
-    return {k for k, v in structure.fixed.items() if not np.any(v)}
 
 
 def _with_element(p: Any) -> Any:
@@ -144,9 +130,10 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
         values, solver = grid_start(search.structure, scaled, inputs, states, rng, place), EXPLORE
         if has_networks(search.structure):
             values = enveloped(search.structure, scaled, values, search.recordings, states, place)
-    model = search.model(within_radius(values, search.constraints, search.structure))
+    model = search.model(values)
     problem = search.problem(model)
-    candidate = _candidate(seed, model, problem, solver.solve(problem))
+    candidate = _candidate(seed, model, problem, within_bounds(problem, None, solver.solve))
+    candidate = replace(candidate, drawn=_drawn(search, seed))
     done = candidate.solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error)
     if search.start != "paper" or done:
         return candidate
@@ -155,7 +142,14 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
         return polished
     # the user's solver has the last word
     problem = search.problem(polished.model, problem.engine, noise=polished.error)
-    return _candidate(seed, polished.model, problem, search.solver.solve(problem, polished.theta), polished.note)
+    solution = within_bounds(problem, polished.theta, search.solver.solve)
+    return _candidate(seed, polished.model, problem, solution, polished.note)
+
+
+def _drawn(search: Search, seed: int) -> bool:
+    """Whether a start has anything random in it: with the grid, the direction of z where it is free."""
+    fixed = {k for k, v in search.structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))}
+    return search.start == "paper" or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
 
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:
@@ -175,37 +169,48 @@ def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candida
         return candidate
     engine = make_engine(candidate.model, search.engine)
     n_free = int(parameters.free.sum())
+    held = _held(search, candidate)
+
+    def solve(problem: Problem, start: np.ndarray) -> Solution:
+        return within_bounds(problem, start, POLISH.solve, held=held)
+
     found = [candidate]
     for beyond, spread in ((1.0, 0.0), (1.3, 0.02)):
-        best = min(found, key=lambda c: c.error)
+        best = min(found, key=_merit)
         problem = search.problem(best.model, engine)
         values, states = problem.parameters(best.theta), problem.first_states(best.theta)
         runs = [engine.simulate(r.u, values, s, True) for r, s in zip(search.recordings, states, strict=True)]
         moved = regridded(search.structure, parameters.unpack(values), np.concatenate([run[2] for run in runs]), beyond)
         model = candidate.model.with_parameters(parameters.at(parameters.pack(moved)))
         if spread:
-            model = _with_prior(model, moved, spread)
+            model = held_near(model, moved, spread)
         problem = search.problem(model, engine, noise=best.error)
-        solution = POLISH.solve(problem, np.concatenate([problem.start[:n_free], best.theta[n_free:]]))
+        solution = solve(problem, np.concatenate([problem.start[:n_free], best.theta[n_free:]]))
         found.append(_candidate(candidate.seed, model, problem, solution, PRIOR if spread else ""))
         if solution.status is Status.INTERRUPTED:
             return _best_so_far(found)
     smooth = found[-1]
     problem = search.problem(candidate.model, engine, noise=smooth.error)
-    found.append(_candidate(candidate.seed, candidate.model, problem, POLISH.solve(problem, smooth.theta)))
+    found.append(_candidate(candidate.seed, candidate.model, problem, solve(problem, smooth.theta)))
     if found[-1].solution.status is Status.INTERRUPTED:
         return _best_so_far(found)
-    best = min(found, key=lambda c: c.error)
-    return smooth if smooth.error <= margin * best.error else best
+    best = min(found, key=_merit)
+    usable = _merit(smooth)[0] == _merit(best)[0]
+    return smooth if usable and smooth.error <= margin * best.error else best
+
+
+def _held(search: Search, candidate: Candidate) -> bool:
+    """Whether a candidate is at an exact bound on a spectral radius."""
+    return at_bounds(search.problem(candidate.model), candidate.theta)
 
 
 def _best_so_far(found: list[Candidate]) -> Candidate:
     """The candidate of the smallest error, as one that was interrupted."""
-    best = min(found, key=lambda c: c.error)
+    best = min(found, key=_merit)
     return replace(best, solution=replace(best.solution, status=Status.INTERRUPTED))
 
 
-def _with_prior(model: Model, values: dict[str, Any], spread: float) -> Model:
+def held_near(model: Model, values: dict[str, Any], spread: float) -> Model:
     """Hold weights and thresholds near the smoothed density, with a relative standard deviation `spread`."""
     r, w = values["r"], values["w"]
     gap = np.gradient(r, axis=1) if r.shape[1] > 1 else r
@@ -279,5 +284,10 @@ def search_starts(
         )
     if search.start == "paper" or stopped:
         return found, usable[0], stopped
-    polished, stopped = run_tasks(polish, [(search, c) for c in usable[:keep]], executor, report)
+    chosen = usable[:keep]
+    if any(_held(search, c) for c in usable):
+        # what exploring reaches says less: every one that was among the best when it came, so that more starts are
+        # never worse than fewer
+        chosen = [c for i, c in enumerate(found) if c in sorted(found[: i + 1], key=_merit)[:keep] and c in usable]
+    polished, stopped = run_tasks(polish, [(search, c) for c in chosen], executor, report)
     return found, min(polished or usable[:1], key=_merit), stopped

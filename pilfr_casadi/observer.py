@@ -41,14 +41,20 @@ def led(model: Model, gain: np.ndarray) -> Model:
     following, y = model.step(x, u, w, p[:-1])
     full = np.zeros((model.n_x, model.n_y))
     full[: len(gain)] = gain[: model.n_x]
-    following = following + p[-1] * (ca.DM(full) @ (measured - y))
+    pushed = p[-1] * (ca.DM(full) @ (measured - y))
+    stages = model.stages
+    if stages is not None:
+        c = ca.SX.sym("c", stages.size1_in(4))
+        values, by_c, end = stages(x, u, w, p[:-1], c)
+        stages = ca.Function("stages", [x, read, w, p, c], [values, by_c, end + pushed])
     return replace(
         model,
-        step=ca.Function("step", [x, read, w, p], [following, y], ["x", "u", "w", "p"], ["x_next", "y"]),
+        step=ca.Function("step", [x, read, w, p], [following + pushed, y], ["x", "u", "w", "p"], ["x_next", "y"]),
         port=ca.Function("port", [x, read, p], [model.port(x, u, p[:-1])], ["x", "u", "p"], ["z"]),
         memory=ca.Function("memory", [z, s, p], list(model.memory(z, s, p[:-1])), ["z", "s", "p"], ["w", "s_next"]),
         parameters=parameters,
         reads=(*model.reads, "y"),
+        stages=stages,
     )
 
 

@@ -54,8 +54,8 @@ def outcome(
         for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
         if value in (low, high)
     ]
-    limits = problem.active_constraints(theta)
-    at_bound += [name for name, active in zip(problem.g_labels, limits, strict=True) if active]
+    limits = limits_of(problem, solution)
+    at_bound += [limit.name for limit in limits if limit.active and limit.kind == "constraint"]
     return Fit(
         model=fitted,
         structure=structure,
@@ -73,5 +73,5 @@ def outcome(
         note=note,
         linear_nrmse=linear_nrmse,
         engine=engine,
-        limits=limits_of(problem, solution),
+        limits=limits,
     )

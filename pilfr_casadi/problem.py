@@ -101,7 +101,18 @@ class Problem:
         compiled = compile_constraints(self.constraints, parameters)
         self._g, self._g_slope, self.g_lower, self.g_upper, self.g_labels, self._g_units = compiled
         self.g_sizes = constraint_sizes(self.constraints, parameters)
-        check_free(self._g, self.free, self._base, self.g_lower, self.g_upper, self.g_labels)
+        named = parameters.unpack(self._base)
+        held = np.repeat([c.check is not None and c.check(named) <= 0 for c in self.constraints], self.g_sizes)
+        check_free(
+            self._g,
+            self._g_slope,
+            self.free,
+            self._base,
+            self.g_lower,
+            self.g_upper,
+            self.g_labels,
+            np.asarray(held, dtype=bool),
+        )
 
     def _set_penalties(self, l1: dict[str, float], noise: float) -> None:
         parameters = self.model.parameters

@@ -6,6 +6,9 @@ the estimated parameters and the initial state:
     Z  = h_x X + h_p,          W = e_z Z + e_s S + e_p,      S⁺ = g_z Z + g_s S + g_p,
     X⁺ = f_x X + f_w W + f_p,  Y = y_x X + y_w W + y_p.
 
+A step of several stages, `c = k(x, u, w, c, p)` and `x⁺ = f(x, u, w, c, p)` with each entry of c made of those before
+it, has sparse derivatives by way of c; `C = k_x X + k_w W + k_c C + k_p` is then carried as well, row by row.
+
 `Linearization` holds the step and its partial derivatives; both engines run on it: `VirtualMachine` here (CasADi only,
 a few samples unrolled at a time) and the generated C of `compiled.py`. The record is never differentiated as a whole:
 time and memory are linear in its length.
@@ -23,7 +26,14 @@ import numpy as np
 from .model import Model
 from .threads import one_at_a_time
 
-TARGETS = {"z": ("x", "p"), "w": ("z", "s", "p"), "s": ("z", "s", "p"), "x": ("x", "w", "p"), "y": ("x", "w", "p")}
+TARGETS = {
+    "z": ("x", "p"),
+    "w": ("z", "s", "p"),
+    "s": ("z", "s", "p"),
+    "c": ("x", "w", "c", "p"),
+    "x": ("x", "w", "c", "p"),
+    "y": ("x", "w", "p"),
+}
 BLOCKS = tuple((target, source) for target, sources in TARGETS.items() for source in sources)
 
 
@@ -34,11 +44,11 @@ class Linearization:
     Attributes
     ----------
     step : casadi.Function
-        `(x, s, u, p) -> (x_next, s_next, y, z, w)`.
+        `(x, s, u, p) -> (x_next, s_next, y, z, w, c)`.
     partial : casadi.Function
-        `(x, s, z, w, u, p) -> z_x, z_p, w_z, ...`: one sparse matrix for each of `BLOCKS`, (target, source).
+        `(x, s, z, w, c, u, p) -> z_x, z_p, w_z, ...`: one sparse matrix for each of `BLOCKS`, (target, source).
     sizes : dict
-        Length of x, s, z, w, u, p and y.
+        Length of x, s, z, w, c, u, p and y.
     substeps : int
         Steps a sample.
     """
@@ -49,29 +59,34 @@ class Linearization:
     substeps: int = 1
 
     def symbols(self) -> dict[str, Any]:
-        """Fresh symbols x, s, z, w, u, p."""
+        """Fresh symbols x, s, z, w, c, u, p."""
         return {k: ca.SX.sym(k, n) for k, n in self.sizes.items() if k != "y"}
 
     def blocks(self, values: dict[str, Any]) -> dict[tuple[str, str], Any]:
-        """The partial derivatives at values of x, s, z, w, u, p."""
+        """The partial derivatives at values of x, s, z, w, c, u, p."""
         found = self.partial(*(values[k] for k in self.partial.name_in()))
         return dict(zip(BLOCKS, found, strict=True))
 
 
 @one_at_a_time
-def linearize(model: Model) -> Linearization:
-    """Differentiate one step of a closed model symbolically."""
+def linearize(model: Model, staged: bool = False) -> Linearization:
+    """Differentiate one step of a closed model symbolically, `staged` by way of its intermediate values, if any."""
     x, s, u, p = model.symbols()
     z_now = model.port(x, u, p)
     w_now, s_now = model.memory(z_now, s, p)
     x_now, y_now = model.step(x, u, w_now, p)
-    outputs = ca.cse([x_now, s_now, y_now, z_now, w_now])
-    step = ca.Function("pilfr_step", [x, s, u, p], outputs, ["x", "s", "u", "p"], ["x_next", "s_next", "y", "z", "w"])
+    stages = model.stages if staged else None
+    c = ca.SX.sym("c", stages.size1_in(4) if stages else 0)
+    c_now = stages(x, u, w_now, p, c)[0] if stages else c
+    outputs = ca.cse([x_now, s_now, y_now, z_now, w_now, c_now])
+    names = ["x_next", "s_next", "y", "z", "w", "c"]
+    step = ca.Function("pilfr_step", [x, s, u, p], outputs, ["x", "s", "u", "p"], names)
     z, w = ca.SX.sym("z", model.n_w), ca.SX.sym("w", model.n_w)
     w_out, s_next = model.memory(z, s, p)
     x_next, y = model.step(x, u, w, p)
-    value = {"z": model.port(x, u, p), "w": w_out, "s": s_next, "x": x_next, "y": y}
-    symbol = {"x": x, "s": s, "z": z, "w": w, "u": u, "p": p}
+    by_c, x_next = stages(x, u, w, p, c)[1:] if stages else (c, x_next)
+    value = {"z": model.port(x, u, p), "w": w_out, "s": s_next, "c": by_c, "x": x_next, "y": y}
+    symbol = {"x": x, "s": s, "z": z, "w": w, "c": c, "u": u, "p": p}
     blocks = [ca.jacobian(value[target], symbol[source]) for target, source in BLOCKS]
     names = [f"{target}_{source}" for target, source in BLOCKS]
     partial = ca.Function("pilfr_partial", list(symbol.values()), ca.cse(blocks), list(symbol), names)
@@ -95,7 +110,7 @@ class Engine(Protocol):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """As `simulate`, with derivatives.
 
-        seed (n_x + n_s, n_c) is the state's derivative, columns (n_p,) gives each parameter's column or -1
+        seed (n_x + n_s, n_c) is the state's derivative, columns (n_p,) gives each parameter's own column or -1
         -> y, J (M, n_y, n_c), next state, next seed; all are the caller's to change.
         """
 
@@ -121,7 +136,7 @@ class VirtualMachine:
             first = ca.MX.sym("state", n["x"] + n["s"])
             x, s, signals = first[: n["x"]], first[n["x"] :], []
             for k in range(length * stride):
-                x, s, *now = self.linear.step(x, s, u[:, k], p)
+                x, s, *now, _ = self.linear.step(x, s, u[:, k], p)
                 if k % stride == 0:
                     signals.append(now)
             columns = [ca.horzcat(*each) for each in zip(*signals, strict=True)]
@@ -146,7 +161,7 @@ class VirtualMachine:
                     for source in sources[:-1]:
                         if block[target, source].nnz():
                             total = ca.mac(slope[source], block[target, source], total)
-                    (slope if target in ("z", "w") else following)[target] = total
+                    (slope if target in ("z", "w", "c") else following)[target] = total
                 slope = following
                 if k % stride == 0:
                     y.append(y_k)
@@ -160,7 +175,7 @@ class VirtualMachine:
         value, used = self.linear.symbols(), np.flatnonzero(columns >= 0)
         select = ca.DM.triplet(columns[used].tolist(), used.tolist(), ca.DM.ones(len(used)), n_c, len(columns))
         arguments = [value[k] for k in ("x", "s", "u", "p")]
-        *following, value["z"], value["w"] = self.linear.step(*arguments)
+        *following, value["z"], value["w"], value["c"] = self.linear.step(*arguments)
         blocks = self.linear.blocks(value)
         turned = [ca.mtimes(select, b.T) if source == "p" else b.T for (_, source), b in blocks.items()]
         return ca.Function("linear", arguments, ca.cse([*following, *turned]))

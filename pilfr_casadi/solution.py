@@ -19,7 +19,7 @@ class Status(Enum):
     INTERRUPTED = "Not converged: interrupted; the best point so far is returned."
     DIVERGED_START = "Failed: the simulation diverges at the start values; start from a stable model."
     INFEASIBLE = "Failed: the constraints cannot be met from this start; loosen them or start elsewhere."
-    RESTORED = "Not converged: the exact bounds are met by a way back that has not found their best point; loosen them."
+    RESTORED = "Not converged: the exact bounds are met by scaling the model alone; loosen them or start elsewhere."
     SOLVER_FAILED = "Not converged: the solver stopped early; the best point so far is returned."
 
     @property

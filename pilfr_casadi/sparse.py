@@ -7,9 +7,9 @@ Along the path the objective is that of Krikelis et al. (2024), Eq. 20, with
 
 Every fit is judged by its free-run simulation of a validation recording, which none of them has seen; recommended is
 the strongest regularization whose validation error is within a margin of the smallest. No test recording comes in.
-Penalised estimates are biased towards zero, hence the second fit (relaxed lasso, Meinshausen 2007). It begins twice:
-with the operators that are left, and with as many spread over the density that the first fit has found; validation
-chooses here too.
+Penalised estimates are biased towards zero, hence the second fit (relaxed lasso, Meinshausen 2007). It is done with the
+operators that are left, and with as many spread in several ways over the density that the first fit has found, which
+holds their weights; validation chooses here too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .job import Job
 from .multistart import POLISH, Candidate, Search, polish
 from .recording import InputError, Recording, as_recordings
 from .solution import Status
-from .start import regrid
+from .thinning import thinned
 
 LAYER = ("w", "r")
 STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of L1, in units of the objective that is reached without
@@ -134,29 +134,6 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     return again if again.status is Status.INTERRUPTED else polished(again, train, **options)
 
 
-def thinned(fit: Fit, train: Recording | Sequence[Recording], n: int, **options: Any) -> Fit:
-    """A fit with n operators a channel, spread over the density of weights that it had, and fitted again.
-
-    Where a density is continuous, which operators a penalty leaves is chance; how many it leaves is not.
-    """
-    structure, recordings = fit.structure, as_recordings(train)
-    bound = structure is None or set(LAYER) & {*structure.fixed, *structure.bounds, *structure.priors}
-    if structure is None or bound or not isinstance(structure.element, PrandtlIshlinskii):
-        return fit
-    z = np.concatenate([fit.signals(r)["z"] for r in recordings])
-    rows = [
-        regrid(r, w, float(reach), count=n)
-        for r, w, reach in zip(fit.parameters["r"], fit.parameters["w"], np.max(np.abs(z), axis=0), strict=True)
-    ]
-    smaller, old = replace(structure, element=replace(structure.element, n=n)), fit.model
-    values = {**fit.parameters, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
-    model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
-    rest = np.zeros(n * structure.element.channels)
-    initial = {key: np.concatenate([s[: old.n_x], rest]) for key, s in fit.initial.items()}
-    again = identify(replace(fit, model=model, structure=smaller, initial=initial), train, **options)
-    return again if again.status is Status.INTERRUPTED else polished(again, train, **options)
-
-
 def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
     error = fit.nrmse(recordings)
     return error if np.isfinite(error) else np.inf
@@ -249,13 +226,17 @@ def regularization_path(
     if not given or not all(0 < s < np.inf for s in given) or not 0 <= margin < np.inf:
         raise InputError(f"strengths {given} with a margin of {margin} were given; give positive numbers, 0 or more.")
     fits, errors = [fit], [fit.nrmse(judged)]
+    thin: dict[int, tuple[Fit, ...]] = {}
     for i, strength in enumerate(given):
         if priors is None:
             penalised = identify(fit, seen, l1={"w": strength}, **options)
             pruned = prune(penalised, seen, **options)
-            spread = thinned(fit, seen, max(1, pruned.structure.element.n), **options)  # type: ignore[union-attr]
-            found = min((pruned, spread), key=lambda f: _error(f, judged))
-            penalised_stopped = Status.INTERRUPTED in (penalised.status, pruned.status)
+            n = max(1, pruned.structure.element.n)  # type: ignore[union-attr]
+            if n not in thin:
+                thin[n] = thinned(fit, seen, n, **options)
+            spread = thin[n]
+            found = min((pruned, *spread), key=lambda f: _error(f, judged))
+            penalised_stopped = Status.INTERRUPTED in (penalised.status, pruned.status, *(f.status for f in spread))
         else:
             scaled = {k: (m, np.asarray(s, dtype=float) / np.sqrt(strength)) for k, (m, s) in priors.items()}
             held = replace(structure, priors={**structure.priors, **scaled})

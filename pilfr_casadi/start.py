@@ -143,7 +143,14 @@ def density(r: np.ndarray, w: np.ndarray, grid: np.ndarray, width: float) -> np.
 
 
 def regrid(
-    r: np.ndarray, w: np.ndarray, reach: float, *, beyond: float = 1.3, smooth: float = 1 / 12, count: int | None = None
+    r: np.ndarray,
+    w: np.ndarray,
+    reach: float,
+    *,
+    beyond: float = 1.3,
+    smooth: float = 1 / 12,
+    count: int | None = None,
+    spacing: float = 0.4,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Thresholds and weights of one channel placed anew along the smoothed density.
 
@@ -159,6 +166,8 @@ def regrid(
         Kernel width in units of `reach`.
     count : int, optional
         How many there are to be, N by default.
+    spacing : float
+        There are as many thresholds to a length as this power of the density: 0 for an even grid.
 
     Returns
     -------
@@ -172,7 +181,7 @@ def regrid(
     slope = min(float(np.polyfit(grid[tail], log_d[tail], 1)[0]), 0.0)
     out = grid > 0.85 * reach
     d[out] = np.exp(np.mean(log_d[tail]) + slope * (grid[out] - np.mean(grid[tail])))
-    share = _integral(d**0.4, grid)
+    share = _integral(d**spacing, grid)
     edges = np.interp(np.linspace(0, 1, (count or len(r)) + 1), share / share[-1], grid)
     mass = np.diff(np.interp(edges, grid, _integral(d, grid)))
     moment = np.diff(np.interp(edges, grid, _integral(d * grid, grid)))

@@ -1,4 +1,4 @@
-"""Threads: one for BLAS, and one at a time for symbolic work.
+"""Threads: how many, one for BLAS, and one at a time for symbolic work.
 
 The matrices here are at most a few thousand rows by a few hundred columns: more BLAS threads do not help one fit, and
 where several fits run side by side they fight for the cores. CasADi lets go of the interpreter in each of the many
@@ -8,12 +8,15 @@ tiny calls that build an expression, which costs far more than it brings where t
 from __future__ import annotations
 
 import functools
+import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 SYMBOLIC = threading.RLock()
 
 
@@ -44,3 +47,18 @@ def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return limited
+
+
+def processors() -> int:
+    """Processors that this process may run on."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
+def side_by_side(function: Callable[[T], R], items: Iterable[T], workers: int) -> list[R]:
+    """Results of a function for each item, in their order; where one fails, what has not begun is dropped."""
+    pool = ThreadPoolExecutor(workers)
+    try:
+        return [task.result() for task in [pool.submit(function, item) for item in items]]
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -3,10 +3,11 @@
 import numpy as np
 
 from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.integration import choose_substeps, discretise
+from pilfr_casadi.integration import discretise
 from pilfr_casadi.parameters import Parameter
 from pilfr_casadi.recording import Recording
 from pilfr_casadi.simulator import Port, Simulator
+from pilfr_casadi.substeps import choose_substeps
 
 DT, SAMPLES = 2e-3, 2500
 

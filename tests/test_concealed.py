@@ -7,10 +7,11 @@ import pytest
 
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.integration import choose_substeps, discretise
+from pilfr_casadi.integration import discretise
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.readers import read_csv
 from pilfr_casadi.recording import Recording
+from pilfr_casadi.substeps import choose_substeps
 from problems.concealed import KINDS, case, export, run_one, score
 from problems.concealed_case import _Draw
 from problems.concealed_noise import FAULTS, LOUDEST, QUIETEST, draw_fault

@@ -13,6 +13,7 @@ from pilfr_casadi.limits import limits_of
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import InputError
 from pilfr_casadi.solution import Status
+from pilfr_casadi.thinning import WAYS, thinned
 from problems.constrained import infeasible_sentences, radius, slowest_pole, sparse_plays, stability_table, three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
@@ -204,6 +205,17 @@ def test_pruning_takes_an_estimated_initial_state_along(record):
     small = pilfr.prune(pilfr.fit(full, there, l1={"w": 1e-4}), there)
     assert len(small.initial_state(there)) == 1 + small.structure.element.n
     assert small.nrmse(there) < 1.1 * full.nrmse(there)
+
+
+def test_operators_are_spread_over_the_density(record, full):
+    fits = thinned(full, record, 3)
+    assert len(fits) == len(WAYS) and all(f.structure.element.n == 3 for f in fits)
+    assert len({tuple(f.parameters["r"][0]) for f in fits}) > 1
+    assert min(f.nrmse(record) for f in fits) < 2 * full.nrmse(record)
+    assert all(p.prior is None for f in fits for p in f.model.parameters.values())
+    element = pilfr.PrandtlIshlinskii(pilfr.Play, 4)
+    bounded = pilfr.fit(pilfr.PILFR(1, element, bounds={"r": (0.0, 1.0)}), record, starts=1)
+    assert thinned(bounded, record, 2) == ()
 
 
 def test_a_path_is_chosen_by_validation_alone(record, full):

@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pilfr_casadi.constraints import SLACK, Constraint, compile_constraints, log_norm_of_power, stable
+from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.parameters import Parameter, ParameterSet
-from pilfr_casadi.recording import InputError
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.recording import InputError, Recording
 
 matrices = st.integers(1, 5).flatmap(lambda n: hnp.arrays(float, (n, n), elements=st.floats(-2, 2, width=32)))
 
@@ -128,3 +130,34 @@ def test_no_constraints():
 def test_what_cannot_be_a_constraint(make, words):
     with pytest.raises(InputError, match=words):
         make()
+
+
+@pytest.mark.parametrize(
+    "expression, words",
+    [
+        (lambda p: p["gain"] if p["A"][0, 0] > 0 else p["A"], "cannot be formed"),
+        (lambda p: max(p["gain"], 1.0), "whether a symbol is true"),
+        (lambda p: None, "cannot be formed"),
+        (lambda p: p["A"][5, 5], "cannot be formed"),
+    ],
+)
+def test_what_is_no_expression_gets_one_sentence(expression, words):
+    with pytest.raises(InputError, match=words) as refused:
+        compile_constraints((Constraint(expression, upper=1.0, name="mine"),), system())
+    assert "'mine'" in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "expression, words",
+    [
+        (lambda p: ca.log(-p["D_yu"] - 1), "no finite value"),
+        (lambda p: p["y_0"] / 0, "no finite value"),
+        (lambda p: ca.sqrt(p["y_0"]), "no finite slope"),
+    ],
+)
+def test_what_is_no_number_at_the_start_gets_one_sentence(expression, words):
+    model = PILFR(1).model(1, 1, {"A": 0.5, "B_u": 1.0, "C_y": 1.0, "D_yu": 0.1})
+    record = Recording(np.ones(20), np.ones(20), dt=0.1, initial="zero")
+    with pytest.raises(InputError, match=words) as refused:
+        Problem(model, record, constraints=(Constraint(expression, upper=1.0, name="mine"),), engine="vm")
+    assert "'mine'" in str(refused.value) and "\n" not in str(refused.value)

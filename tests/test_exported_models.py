@@ -12,12 +12,13 @@ from test_laws import simulator as mass_on_spring
 
 from pilfr_casadi import GeneralizedPlay, Play, PrandtlIshlinskii, Recording, Stop, close_loop, exported
 from pilfr_casadi.compiled import compiler
-from pilfr_casadi.integration import discretise, fastest
+from pilfr_casadi.integration import discretise
 from pilfr_casadi.laws import CubicStiffness, StopHysteresis
 from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.load_simulator import load_simulator
 from pilfr_casadi.parameters import ParameterSet
 from pilfr_casadi.sensitivities import VirtualMachine
+from pilfr_casadi.substeps import fastest
 from problems import emps, masing_diagnosis, piezo_diagnosis, silverbox, tanks
 from problems.concealed_rigs_more import RIGS
 from problems.zoo import CASES

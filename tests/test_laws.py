@@ -11,9 +11,10 @@ import pilfr_casadi.laws as laws
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi.compiled import compiler, make_engine
 from pilfr_casadi.integration import discretise
-from pilfr_casadi.laws import CATALOGUE, FINER, readable_unit
+from pilfr_casadi.laws import CATALOGUE, FINER, BoucWen, CubicStiffness, Delay, StopHysteresis, readable_unit
 from pilfr_casadi.laws.base import Local
 from pilfr_casadi.laws.trace import columns, trace
+from pilfr_casadi.observer import led
 from pilfr_casadi.sensitivities import VirtualMachine
 
 DT, M = 0.01, 240
@@ -79,6 +80,23 @@ def test_derivatives_and_engines(kind, record):
     slopes = np.array([approx_fprime(p, projected, np.where(place == i, step, 0.0) + 1e-300)[i] for i in place])
     exact = np.einsum("k,kp->p", weight, jac[:, 0])
     np.testing.assert_allclose(exact, slopes, rtol=2e-3, atol=2e-3 * np.max(np.abs(slopes)))
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("kind", (CubicStiffness, StopHysteresis, BoucWen, Delay))
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_slopes_by_way_of_the_stages_where_an_observer_leads_and_columns_are_left_out(kind, hold, record):
+    model = led(model_of(kind, hold), np.array([[0.3], [2.0]]))
+    drive, rng = model.drive(record.with_(y=0.1 * record.u)), np.random.default_rng(4)
+    p = np.where(model.parameters.start == 0, 0.7, model.parameters.start)
+    place = np.append(-1, np.arange(len(p) - 1))[rng.permutation(len(p))]
+    state = 0.1 * rng.standard_normal(model.n_state)
+    seed = rng.standard_normal((model.n_state, len(p) + 3))
+    compiled = make_engine(model, "c")
+    assert compiled.linear.sizes["c"] == 3 * (2 + kind().order)
+    found, expected = (e.sensitivity(drive, p, state, seed, place) for e in (compiled, VirtualMachine(model)))
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11 * np.max(np.abs(b)))
 
 
 @pytest.mark.parametrize("kind", EVERY, ids=lambda kind: kind.__name__)

@@ -28,7 +28,7 @@ LAYERS = {
         "progress",
     ),
     1: ("operators", "elements", "laws"),
-    2: ("model", "simulator", "integration"),
+    2: ("model", "simulator", "integration", "substeps"),
     3: (
         "simulate",
         "sensitivities",
@@ -70,7 +70,9 @@ LAYERS = {
         "scaling",
         "solution",
         "exactness",
-        "restoration",
+        "tightening",
+        "lifted",
+        "schur",
         "limits",
     ),
     6: (
@@ -80,6 +82,7 @@ LAYERS = {
         "outcome",
         "linear_model",
         "penalty",
+        "thinning",
         "sparse",
         "structures",
         "known_blocks",

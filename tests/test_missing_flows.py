@@ -9,7 +9,7 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
-from pilfr_casadi.diagnose.explain import Candidate, simpler
+from pilfr_casadi.diagnose.candidate import Candidate, simpler
 from pilfr_casadi.diagnose.linearise import Probe, locals_of, run
 from pilfr_casadi.diagnose.screen import _gain
 from pilfr_casadi.diagnose.verdict import judge

@@ -81,7 +81,7 @@ def test_the_limit_with_the_elements_full_slope():
 def test_the_users_priors_stay():
     structure, values = random_lfr(1, nx=2, n=3)
     structure = replace(structure, priors={"w": (1.0, 0.5)})
-    model = multistart._with_prior(structure.model(1, 1, values), values, 0.02)
+    model = multistart.held_near(structure.model(1, 1, values), values, 0.02)
     assert model.parameters["w"].prior == (1.0, 0.5)
     np.testing.assert_array_equal(model.parameters["r"].prior[0], values["r"])
 

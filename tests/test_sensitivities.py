@@ -214,15 +214,16 @@ def test_partial_derivatives_of_one_step():
     model, u, state, p, _ = case(10, operator=GeneralizedPlay, n_w=2, n=2)
     linear = linearize(model)
     x, s = state[:3], state[3:]
-    x_next, s_next, y, z, w = (np.asarray(a) for a in linear.step(x, s, u[0], p))
+    x_next, s_next, y, z, w, c = (np.asarray(a) for a in linear.step(x, s, u[0], p))
     np.testing.assert_allclose(z, np.asarray(model.port(x, u[0], p)))
     together, _ = model.closed(state, u[0], p)
     np.testing.assert_allclose(np.concatenate([x_next, s_next]), np.asarray(together), atol=1e-15)
-    blocks = linear.blocks({"x": x, "s": s, "z": z, "w": w, "u": u[0], "p": p})
+    blocks = linear.blocks({"x": x, "s": s, "z": z, "w": w, "c": c, "u": u[0], "p": p})
     named = model.parameters.unpack(p)
     np.testing.assert_array_equal(np.asarray(blocks["x", "x"]), named["A"])
     np.testing.assert_array_equal(np.asarray(blocks["y", "w"]), named["D_yw"])
     assert y.shape == (1, 1)
+    assert c.size == 0
 
 
 # ---- the ways to run ----
@@ -244,7 +245,7 @@ def test_another_structure_is_another_library():
     assert source_code(linearize(case(0)[0])) == source_code(linearize(case(1)[0]))  # values are not part of it
     for changes, libraries in (({}, 1), ({}, 1), ({"operator": Stop}, 2)):
         Compiled(case(libraries, nx=1, n=1, **changes)[0])
-        kept = list(cache_directory().iterdir())
+        kept = list(cache_directory().glob("*/*"))
         assert [path.suffix for path in kept] == [".so"] * (1 + libraries)  # the loops, and nothing half done
 
 

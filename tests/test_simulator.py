@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from pilfr_casadi import InputError, Parameter, Port, PrandtlIshlinskii, Recording, Simulator, Stop, multisine, play
 from pilfr_casadi.compiled import compiler, make_engine
 from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.integration import MOST, REACH, choose_substeps, discretise
+from pilfr_casadi.integration import discretise
 from pilfr_casadi.laws import (
     Backlash,
     BoucWen,
@@ -26,6 +26,7 @@ from pilfr_casadi.model import close_loop
 from pilfr_casadi.parameters import ParameterSet
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.sensitivities import VirtualMachine
+from pilfr_casadi.substeps import MOST, REACH, choose_substeps
 
 DT, M = 0.02, 250
 VALUES = {"m": 1.3, "k": 90.0, "d": 1.1}
@@ -312,6 +313,33 @@ def test_substeps_follow_the_fastest_eigenvalue(record):
     too_fast = rig(parameters={**rig().parameters, "k": Parameter(90.0 * (MOST * 50) ** 2)})
     with pytest.raises(InputError, match="too fast"):
         choose_substeps(too_fast, [record])
+
+
+@pytest.mark.parametrize(
+    ("equations", "said"),
+    [
+        (lambda x, u: {"a": x.b, "b": u.f - ca.log(x.a)}, r"derivative of the state 'b' .* at a = 0, b = 0, f = 2,"),
+        (lambda x, u, p: {"a": x.b, "b": (u.f - x.a) / p.m}, r"derivative of the state 'b' .* at .*, m = 0;"),
+        (lambda x, u: {"a": -1 / x.b, "b": u.f}, r"derivative of the state 'a' .* at a = 0, b = 0, f = 2"),
+        (lambda x, u: {"a": 0.1 * x.b, "b": -1 - ca.sqrt(x.b)}, r"derivative of the state 'b' .*, b = -0"),
+        (
+            lambda x, u: {"a": x.b, "b": -ca.sqrt(1e9 * x.b)},
+            r"slope of the derivative of 'b' by the state 'b'.* b = 0",
+        ),
+    ],
+)
+def test_what_is_not_finite_is_named(equations, said):
+    wrong = Simulator(equations, lambda x: {"y": x.a}, ("a", "b"), ("f",), {"m": Parameter(0.0)})
+    recording = Recording(np.full(50, 2.0), np.arange(50.0), 0.1, ("f",), ("y",))
+    with pytest.raises(InputError, match=said) as error:
+        choose_substeps(wrong, [recording])
+    assert str(error.value).endswith(".") and ". " not in str(error.value)
+
+
+def test_a_logarithm_is_looked_at_where_the_recording_begins():
+    tank = Simulator(lambda x, u: {"a": u.f - ca.log(x.a)}, lambda x: {"y": x.a}, ("a",), ("f",))
+    recording = Recording(np.full(50, 2.0), np.arange(50.0), 0.1, ("f",), ("y",), initial=np.array([3.0]))
+    assert choose_substeps(tank, [recording]) == 1
 
 
 def test_a_discrete_simulator_steps_once_a_sample(record):

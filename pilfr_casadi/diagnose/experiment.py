@@ -10,7 +10,7 @@ import numpy as np
 
 from ..laws import Law
 from .linearise import linearised
-from .screen import columns_of, folds, held_out
+from .remainder import Remainder, held_out
 from .workbench import Fitted, Workbench
 
 SHARES = (0.1, 0.3, 1.0)  # of the largest amplitude
@@ -98,12 +98,7 @@ def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[floa
             replace(r, z=np.roll(r.z, len(r.z) // 2, axis=0), dz=np.roll(r.dz, len(r.dz) // 2, axis=0)) if moved else r
             for r in runs
         ]
-        tasks, phi, left = columns_of(bench, probe, shifted, [type(law)])
-        odd, at, best = folds(len(left), len(runs)), 0, 0.0
-        for task in tasks:
-            width = task.forces.shape[1]
-            if task.port.name == port:
-                best = held_out(phi[:, at : at + width], left, odd, (1e-6, 1e-3))
-            at += width
-        shares.append(best)
+        rest = Remainder.of(bench, probe, shifted, [type(law)], at=port)
+        found = [held_out(rest.columns(task)[0], rest.left, rest.odd, (1e-6, 1e-3)) for task in rest.tasks]
+        shares.append(found[0] if found else 0.0)
     return shares[0], shares[1]

@@ -18,7 +18,7 @@ from ..laws.dynamic import Creep, Relaxation
 from ..laws.hysteresis import PlayHysteresis, StopHysteresis
 from ..parameters import Parameter
 from .linearise import linearised
-from .screen import columns_of, folds, held_out
+from .remainder import Remainder, held_out
 from .workbench import Fitted, Workbench
 
 DEGREE = 4
@@ -70,11 +70,6 @@ def explainable(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     if any(len(r) > most for r in bench.recordings):
         bench = bench.on([r.slice(0, max(most, r.skip + LEAST // 10)) for r in bench.recordings])
     probe, runs = linearised(bench, fitted)
-    tasks, phi, left = columns_of(bench, probe, runs, FLEXIBLE)
-    odd = folds(len(left), len(runs))
-    out, at = {}, 0
-    for task in tasks:
-        width = task.forces.shape[1]
-        out[task.port.name] = held_out(phi[:, at : at + width], left, odd, (1e-6, 1e-3))
-        at += width
-    return out
+    rest = Remainder.of(bench, probe, runs, FLEXIBLE)
+    ridges = (1e-6, 1e-3)
+    return {t.port.name: held_out(rest.columns(t)[0], rest.left, rest.odd, ridges) for t in rest.tasks}

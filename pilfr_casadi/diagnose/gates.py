@@ -15,6 +15,7 @@ import numpy as np
 from ..compiled import make_engine
 from ..gauss_newton import GaussNewton
 from ..recording import InputError, Recording
+from ..threads import side_by_side
 from .workbench import QUICK, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]
@@ -195,8 +196,8 @@ def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine:
         raise error
 
 
-def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Sign and unit slips of each channel, and of the time."""
+def wrong_scale(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Sign and unit slips of each channel, and of the time, looked at `workers` at a time."""
     best, found = plain, None
     trials: list[tuple[str, str, float, Change]] = []
     sizes, lost = _sizes(bench), plain.cost > 1  # a size says nothing where a simulator has left its working range
@@ -208,18 +209,21 @@ def wrong_scale(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, lis
         trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if lost or any(_near(v / f) for v in sizes)]
     for factor in (1e-3, 1e3, 60.0, 1 / 60) if plain.cost > (STRAINED if plain.at_bounds > 0.3 else HOPELESS) else ():
         trials.append(("time", "time-unit", factor, slower_by(factor)))
-    for name, finding, value, change in trials:
-        other: Workbench = changed(bench, change)
+
+    def tried(trial: tuple[str, str, float, Change]) -> tuple[Workbench, Fitted | None]:
+        other: Workbench = changed(bench, trial[3])
         same: Fitted | None = plain
-        if finding == "time-unit":
+        if trial[1] == "time-unit":
             try:
                 other, same = Workbench.of(bench.simulator, other.recordings, bench.hold, bench.engine), None
             except InputError:
-                continue
+                return other, None
         near = refit(other, solver=GLANCE, within=plain.cost, same=same)
-        result = None if near is None else refit(other, near, same=near)
+        return other, None if near is None else refit(other, near, same=near)
+
+    for trial, (other, result) in zip(trials, side_by_side(tried, trials, workers), strict=True):
         if result is not None and result.cost < best.cost:
-            best, found = result, (name, finding, value, change, other)
+            best, found = result, (*trial, other)
     if found is None or best.cost > CURED * plain.cost or best.cost > 0.3:
         return bench, plain, []
     name, finding, value, change, other = found

@@ -18,7 +18,7 @@ from ..recording import InputError
 from .floor import effective_size
 from .gates import Gate
 from .linearise import linearised, propagate
-from .screen import block_diagonal, orthonormal
+from .remainder import block_diagonal, orthonormal
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats that an offset has to gain

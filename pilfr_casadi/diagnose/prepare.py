@@ -43,7 +43,9 @@ class Prepared:
     floor: Floor
 
 
-def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | None, engine: str) -> Prepared:
+def prepare(
+    simulator: Simulator, recordings: Sequence[Recording], hold: str | None, engine: str, workers: int = 1
+) -> Prepared:
     """Open the bench, look at the dull causes, refit, and measure the floor."""
     bench, gates = opened(simulator, tuple(recordings), hold or "zero", engine)
     between, notes = choose_hold(simulator, bench.recordings, hold, engine)
@@ -52,7 +54,7 @@ def prepare(simulator: Simulator, recordings: Sequence[Recording], hold: str | N
     without = refitted(bench)
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     if without.cost > SUSPECT * float(np.mean((first.deviation / bench.scale) ** 2)) and without.cost > LEAST:
-        bench, without, more = wrong_scale(bench, without)
+        bench, without, more = wrong_scale(bench, without, workers)
         gates = [*gates, *more]
         if more:  # what looked better on wrong data says nothing
             between, notes = choose_hold(simulator, bench.recordings, hold, engine)

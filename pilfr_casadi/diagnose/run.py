@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -12,10 +11,10 @@ import numpy as np
 from ..accepted import as_simulator
 from ..laws import CATALOGUE, Law, readable_unit
 from ..recording import InputError, Recording, as_recordings, check_for_identification
-from ..threads import one_blas_thread
+from ..threads import one_blas_thread, processors
+from .candidate import Candidate
 from .clipping import clipped_input
 from .experiment import next_experiment, placebo
-from .explain import Candidate
 from .gates import Gate, hold_note, said_hold
 from .mismatch import mismatch
 from .offset import without_idle_offsets
@@ -76,7 +75,7 @@ def diagnose(
         If simulator and recordings do not fit each other.
     """
     began = time.perf_counter()
-    workers = workers or min(os.cpu_count() or 1, 4)
+    workers = workers or min(processors(), 4)
     say = progress or (lambda stage, done, total, best: None)
     simulator = as_simulator(simulator, as_recordings(train))
     recordings = check_for_identification([arranged(simulator, r) for r in as_recordings(train)], 20)
@@ -94,14 +93,14 @@ def diagnose(
                 f"{', '.join(simulator.inputs)}."
             )
     say("refit", 0, 1, np.inf)
-    ready = prepare(simulator, recordings, hold, engine)
+    ready = prepare(simulator, recordings, hold, engine, workers)
     prepared_at = time.perf_counter()
     bench, without = ready.bench, ready.without
     said = said_hold(simulator, recordings, hold) is not None
     search = Search(bench, without, ready.floor, laws, workers, say, said).run(effects)
     gates = ready.gates
     if (ratio := search.misheld) > MISHELD:
-        ready = prepare(simulator, recordings, bench.otherwise_held().hold, engine)
+        ready = prepare(simulator, recordings, bench.otherwise_held().hold, engine, workers)
         bench, without = ready.bench, ready.without
         search = Search(bench, without, ready.floor, laws, workers, say).run(effects)
         gates = (*ready.gates, hold_note(simulator, bench.hold, ratio))

@@ -1,8 +1,8 @@
 """From a refitted simulator to the effects it lacks: one pass for each, then a look back at the first.
 
 A second effect is looked for where the first leaves more than a few per cent of the excess and a flexible force could
-explain it. It is accepted at another port when it removes most of what is left. Then the first law is put up again
-against its rivals, with the second in place, and dropped where the second does as well alone.
+explain it. It is accepted at another port when it removes most of what is left. What was accepted is looked at again
+(`review`).
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..compiled import make_engine
-from ..laws import FINER, Law
+from ..laws import Law
 from ..recording import InputError
-from .explain import Candidate, attempt, by_cost, explain, heads, judged, polish
+from .candidate import Candidate, heads, judged, polish
+from .explain import explain
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .linearise import linearised
+from .review import look_back, prefer_what_leaves_nothing, put_more_finely
 from .screen import Scored, screen
-from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, imitates, left_open
+from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, left_open
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
 FEWEST = 100.0  # effective samples that a comparison is made on at least
 MORE, LOUD = 0.03, 3.0  # share of the excess, or times the noise, that has to be left to look for a second effect
 SEEN = 2.5e-5  # mean square error below which what is more than noise is not worth a second effect
-FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 POLISHED = 4  # candidates fitted to everything before one is chosen
 MOSTLY = 0.5  # share of the rest that a second effect may leave
@@ -90,13 +90,15 @@ class Search:
         """Mean square of the noise in units of the outputs' variance."""
         return float(np.mean((self.floor.deviation / self.bench.scale) ** 2))
 
-    def _timed(self, stage: str, began: float) -> None:
+    def timed(self, stage: str, began: float) -> None:
+        """Add the seconds since `began` to a stage."""
         self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - began
 
-    def _open(self, fitted: Fitted) -> dict[str, float]:
+    def flexible(self, fitted: Fitted) -> dict[str, float]:
+        """Share of a fit's residual that a flexible force explains, by port."""
         began = time.perf_counter()
         found = explainable(self.bench, fitted)
-        self._timed("flexible", began)
+        self.timed("flexible", began)
         return found
 
     def run(self, effects: int) -> Search:
@@ -112,7 +114,7 @@ class Search:
         linearised(self.bench, self.without)  # what both of the next look at
         with ThreadPoolExecutor(1) as other:
             looked = other.submit(self._screen)
-            self.open_before = self.open_after = self._open(self.without)
+            self.open_before = self.open_after = self.flexible(self.without)
             seen = looked.result()
         for number in range(effects):
             if number:
@@ -126,19 +128,19 @@ class Search:
             if not found.accepted:
                 break
             assert found.choice is not None
-            winner = self._polished(found.choice.winner)
+            winner = self.polished(found.choice.winner)
             if winner is None:
                 self.passes[-1] = replace(found, accepted=False)
                 break
             self.base = winner.fitted
             self.passes[-1] = replace(found, choice=replace(found.choice, winner=winner))
-            self._prefer_what_leaves_nothing()
-            self._put_more_finely()
+            prefer_what_leaves_nothing(self)
+            put_more_finely(self)
             if number:
-                self._look_back()
+                look_back(self)
             if self._wrongly_held():
                 return
-            self.open_after = self._open(self.base)
+            self.open_after = self.flexible(self.base)
 
     def _wrongly_held(self) -> bool:
         """Whether, with the effects in place, inputs seem to do the other thing between samples."""
@@ -162,8 +164,8 @@ class Search:
     def _screen(self) -> Seen:
         began = time.perf_counter()
         self.say("screen", 0, 1, self.base.cost**0.5)
-        seen = screen(self.bench, self.base, self.laws, self.floor.deviation)
-        self._timed("screen", began)
+        seen = screen(self.bench, self.base, self.laws, self.floor.deviation, self.workers)
+        self.timed("screen", began)
         return seen
 
     def _pass(self, number: int, seen: Seen) -> Pass:
@@ -181,22 +183,23 @@ class Search:
         if simpler:
             more = self._explained(number, simpler, signs, gain)
             candidates = sorted([*candidates, *more], key=lambda c: c.error)
-        self._timed("fits", began)
+        self.timed("fits", began)
         began = time.perf_counter()
-        before = self._judged(self.base)
-        self._lower_floor([c.fitted for c in candidates[:5]])
         near = [c for c in candidates[:POLISHED] if c.error < 1.5 * candidates[0].error]
         with ThreadPoolExecutor(self.workers) as pool:
+            bare = pool.submit(self._judged, self.base)
             kept = [*pool.map(lambda c: polish(self.bench, c), near), *(c for c in candidates if c not in near)]
+            before = bare.result()
+        self._lower_floor([c.fitted for c in candidates[:5]])
         # a law may have become the one that it refines
         kept = list({(c.port, type(c.law)): c for c in sorted(kept, key=lambda c: -c.error)}.values())[::-1]
-        samples = self._samples(kept)
+        samples = self.effective_samples(kept)
         choice = choose(kept, before, self.floor2, samples)
         accepted = choice is not None and choice.gain > ROOM
         if accepted and number:  # what is not fitted has to improve as well
             assert choice is not None
             accepted = self._stands(choice, before[1]) and not self._only_drifts(choice)
-        self._timed("choice", began)
+        self.timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
     def _explained(
@@ -231,7 +234,7 @@ class Search:
         clear = choice.remains < MOSTLY and choice.winner.tail < UNSEEN * unseen
         return clear or (sure and choice.winner.tail < NO_WORSE * unseen)
 
-    def _samples(self, candidates: Sequence[Candidate]) -> float:
+    def effective_samples(self, candidates: Sequence[Candidate]) -> float:
         """Effective samples of the best candidate's residual."""
         best = min(candidates, key=lambda c: c.error, default=None)
         return max(effective_size(best.fitted.residual if best else self.base.residual), FEWEST)
@@ -248,99 +251,10 @@ class Search:
             found = [self.floor.deviation, *(white_part(f.residual) for f in fits)]
             self.floor = Floor(np.min(found, axis=0), "estimated")
 
-    def _polished(self, candidate: Candidate) -> Candidate | None:
+    def polished(self, candidate: Candidate) -> Candidate | None:
         """A candidate fitted to everything; None where it does not hold there."""
         done = candidate if np.isfinite(candidate.full) else polish(self.bench, candidate)
         return done if np.isfinite(done.full) else None
-
-    def _prefer_what_leaves_nothing(self) -> None:
-        """Where the winner leaves what a flexible force explains, and a closer law at its port does not: take that."""
-        found = self.passes[-1]
-        assert found.choice is not None
-        winner = found.choice.winner
-        nearer = [c for c in found.candidates if c.port == winner.port and c.error < 0.95 * winner.error]
-        closer = [c for c in nearer if not imitates(c, winner, self.floor2)]
-        still = self._open(self.base).get(winner.port, 0.0) if closer else 0.0
-        if still < HINT:
-            return
-        rival = self._polished(min(closer, key=lambda c: c.error))
-        if rival is not None and self._open(rival.fitted).get(winner.port, 0.0) < 0.5 * still:
-            self.base = rival.fitted
-            margin = winner.error / rival.error
-            choice = replace(found.choice, winner=rival, margin=min(margin, found.choice.margin), alike=())
-            self.passes[-1] = replace(found, choice=choice)
-
-    def _put_more_finely(self) -> None:
-        """The named law in a finer form, where there is one that fits better."""
-        found = self.passes[-1]
-        assert found.choice is not None
-        winner = found.choice.winner
-        element = self.base.simulator.elements[-1]
-        bare = self.base.simulator.without_last_element()
-        local = next((s.local for s in found.scored if s.port == winner.port), None)
-        for kind in FINER.get(type(winner.law), ()):
-            if local is None:
-                return
-            began = time.perf_counter()
-            total = float(np.sum(self.base.values[f"{element.prefix}w"]))
-            shapes = [{**shape, **dict.fromkeys(kind.strength, total)} for shape in kind().shapes(local)]
-            law = kind().at(shapes[0], kind().bounds(local))
-            own = [{f"{element.prefix}{k}": v for k, v in shape.items()} for shape in shapes]
-            starts = [{**self.base.values, **values} for values in own]
-            placed = bare.with_element(element.port, law)
-            model = self.bench.model(placed)
-            engine = make_engine(model, self.bench.engine)
-            nearest = by_cost(self.bench, model, engine, starts, self.base)[:1]
-            try:
-                finer = self.bench.fit(placed, nearest, states=self.base.begin, model=model, engine=engine)
-            except InputError:
-                continue
-            if finer.cost < FINER_BY * self.base.cost:
-                self.base = finer
-                size = law.size({k: finer.values[f"{element.prefix}{k}"] for k in law.parameters()})
-                head, tail = judged(self.bench, finer)
-                better = replace(winner, law=law, fitted=finer, head=head, tail=tail, full=finer.cost, size=size)
-                self.passes[-1] = replace(found, choice=replace(found.choice, winner=better))
-            self._timed("finer form", began)
-
-    def _look_back(self) -> None:
-        """With the second effect in place: its rivals in the first's place, and the second alone."""
-        began = time.perf_counter()
-        first, second = self.passes[-2], self.passes[-1]
-        assert first.choice is not None
-        assert second.choice is not None
-        kept = self.base.simulator.elements[-1]
-        bare = self.bench.simulator
-        alone = attempt(self.bench, bare.with_element(kept.port, kept.law), [self.base.values], states=self.base.begin)
-        near = alone is not None and alone.error < 1.1 * second.choice.winner.error
-        alone = self._polished(alone) if alone is not None and near else None
-        if alone is not None:
-            self.base = alone.fitted
-            self.passes[-2:] = [replace(second, choice=replace(second.choice, winner=alone))]
-            self._timed("look back", began)
-            return
-        rivals: list[Candidate] = []
-        winner = first.choice.winner
-        for c in first.candidates:
-            if c.port != winner.port or type(c.law) is type(winner.law) or len(rivals) >= 6:
-                continue
-            own = c.fitted.simulator.elements[-1]
-            placed = bare.with_element(own.port, own.law).with_element(kept.port, kept.law)
-            values = {**self.base.values, **{k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}}
-            found = attempt(self.bench, placed, [values], states=self.base.begin)
-            if found is not None:
-                rivals.append(replace(found, port=own.port, law=own.law, size=c.size))
-        own_now = attempt(self.bench, self.base.simulator, [self.base.values], states=self.base.initial)
-        if own_now is not None and rivals:
-            stay = replace(own_now, port=winner.port, law=winner.law, size=winner.size)
-            again = choose([stay, *rivals], first.before, self.floor2, self._samples([stay, *rivals]))
-            other = None if again is None or again.winner is stay else self._polished(again.winner)
-            if again is not None and (again.winner is stay or other is not None):
-                self.base = self.base if other is None else other.fitted
-                alike = tuple(c for c in again.alike if c.port == winner.port)
-                better = replace(first.choice, winner=again.winner, alike=alike, margin=again.margin)
-                self.passes[-2] = replace(first, choice=better)
-        self._timed("look back", began)
 
 
 def _imitated(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:

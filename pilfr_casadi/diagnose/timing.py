@@ -16,7 +16,7 @@ import numpy as np
 from ..recording import Recording
 from .gates import Change, Gate, changed, refit, shifted
 from .linearise import linearised, propagate
-from .screen import block_diagonal, orthonormal
+from .remainder import block_diagonal, orthonormal
 from .workbench import Fitted, Workbench
 
 SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .explain import Candidate
+from .candidate import Candidate
 from .floor import swells_with
 from .gates import Gate
 

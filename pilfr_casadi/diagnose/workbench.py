@@ -10,7 +10,7 @@ import numpy as np
 
 from ..compiled import make_engine
 from ..gauss_newton import GaussNewton
-from ..integration import REACH, choose_substeps, discretise, fastest
+from ..integration import discretise
 from ..model import Model
 from ..observer import GAMMA, led
 from ..parameters import ParameterSet
@@ -18,6 +18,7 @@ from ..problem import Problem
 from ..recording import InputError, Recording
 from ..sensitivities import Engine
 from ..simulator import Simulator
+from ..substeps import MOST, REACH, choose_substeps, fastest, wanted_substeps
 from ..threads import one_at_a_time
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
@@ -119,10 +120,8 @@ class Workbench:
         """More where a law is fast, up to a limit: a stiff start of a law is not worth a fine grid."""
         if not simulator.elements:
             return self.substeps
-        try:
-            wanted = choose_substeps(simulator, self.recordings)
-        except InputError:
-            wanted = 0
+        wanted = wanted_substeps(simulator, self.recordings)[0]
+        wanted = wanted if wanted <= MOST else 0
         if self.typical is not None:  # a contact is not felt at rest
             p = ParameterSet(dict(simulator.parameters)).start
             rates = fastest(simulator, *self.typical, p)

@@ -11,10 +11,11 @@ import numpy as np
 from ..checks import numbers
 from ..compiled import make_engine
 from ..fitted import Fit, first_state
-from ..integration import choose_substeps, discretise
+from ..integration import discretise
 from ..model import Model
 from ..recording import InputError, Recording
 from ..simulator import Simulator
+from ..substeps import choose_substeps
 from .exported_model import Exported
 from .names import check_name
 from .sampled import Sampled, right_hand_side, sampled

@@ -102,6 +102,7 @@ def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[
             error=file.number(start, "error", np.inf),
             solution=_solution(file, start, start, np.zeros(0)),
             note=file.text(start, "note"),
+            drawn=file.entry(start, "drawn", bool, "true or false") if "drawn" in start else True,
         )
         for start in file.rows(training, "starts")
     ]

@@ -28,7 +28,7 @@ KEYS: dict[tuple[str, ...], tuple[str, ...]] = {
     ("training", "limits", EACH): ("name", "kind", "value", "lower", "upper", "multiplier", "active", "met"),
     ("training", "solve"): SOLVE,
     ("training", "history"): HISTORY,
-    ("training", "starts", EACH): ("seed", "error", "status", "note", *SOLVE),
+    ("training", "starts", EACH): ("seed", "error", "status", "note", "drawn", *SOLVE),
 }
 TEXTS = (  # that are written for people and for other programs; nothing is built from them
     ("written_by", EACH),

@@ -92,7 +92,13 @@ def _document(fit: Fit) -> dict[str, Any]:
             "multipliers": _plain(solution.multipliers if len(solution.multipliers) == limited else ()),
             "history": {key: _plain([getattr(h, key) for h in solution.history]) for key in HISTORY},
             "starts": [
-                {"seed": c.seed, "error": _plain(c.error), "status": c.solution.status.name, "note": c.note}
+                {
+                    "seed": c.seed,
+                    "error": _plain(c.error),
+                    "status": c.solution.status.name,
+                    "note": c.note,
+                    "drawn": c.drawn,
+                }
                 | _solve(c.solution)
                 for c in fit.candidates
             ],

@@ -55,40 +55,50 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
             found.append(accumulated(step, np.zeros(step.size1_in(0)), rows, same)[1])
         else:
             found.append(mapped(step, np.zeros((m, 0)), rows, vector)[1][:, :, 0])
-    return np.vstack(found).reshape(len(local.z), len(shapes), -1)
+    forces = np.concatenate(found) if len(found) > 1 else found[0]
+    return forces.reshape(len(local.z), len(shapes), -1)
 
 
 @one_at_a_time
 @functools.lru_cache(maxsize=256)
-def _step(kind: type[Law], lanes: int, grid: float) -> ca.Function:
+def _step(kind: Any, lanes: int, grid: float) -> ca.Function:
     """`(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`."""
+    lane = _lane(kind, grid)
+    n, sizes = lane.size1_in(0), lane.size1_in(2)
+    memory, signals = ca.SX.sym("memory", n * lanes), ca.SX.sym("signals", 5)
+    vector = ca.SX.sym("shapes", sizes * lanes + 1)
+    spans = [(slice(i * n, (i + 1) * n), slice(i * sizes, (i + 1) * sizes)) for i in range(lanes)]
+    found = [lane(memory[own], signals, vector[shape], vector[-1]) for own, shape in spans]
+    after, forces = zip(*found, strict=True)
+    return ca.Function("trace", [memory, signals, vector], [ca.vertcat(*after), ca.vertcat(*forces)])
+
+
+@one_at_a_time
+@functools.lru_cache(maxsize=256)
+def _lane(kind: Any, grid: float) -> ca.Function:
+    """`(memory, [z, dz, t, z_next, dz_next], shape, dt) -> (next memory, forces)` of one shape."""
     law = kind()
     law = law.on_grid(grid) if law.shifts else law
     p = law.parameters()
     names = [name for name in p if name not in law.strength]
     sizes = [p[n].size for n in names]
-    vector, signals = ca.SX.sym("shapes", sum(sizes) * lanes + 1), ca.SX.sym("signals", 5)
+    vector, signals, h = ca.SX.sym("shape", sum(sizes)), ca.SX.sym("signals", 5), ca.SX.sym("h")
     z, dz, t, following, dz_next = ca.vertsplit(signals)
-    h = vector[-1]
     n_q, n_s = law.order, int(getattr(law, "memory", 0)) if hasattr(law, "step") else 0
-    memory = ca.SX.sym("memory", (n_q + n_s) * lanes)
-    forces, after = [], []
-    for i in range(lanes):
-        own = memory[i * (n_q + n_s) : (i + 1) * (n_q + n_s)]
-        edges = i * sum(sizes) + np.cumsum([0, *sizes])
-        spans = zip(names, edges[:-1], edges[1:], strict=True)
-        shape = {n: vector[int(a) : int(b)] for n, a, b in spans}
-        for strength in _units(law):
-            values = _Values({**shape, **strength})
-            if n_s:
-                rate = {"dz": dz} if "dz" in law.reads() else {}
-                w, end = law.step(z, own, values, **rate)  # type: ignore[attr-defined]
-            else:
-                w = _call(law.force, z=z, dz=dz, q=own, t=t, p=values)
-                end = _advance(law, own, (z, following), (dz, dz_next), t, values, h) if n_q else own
-            forces.append(w)
-        after.append(end)
-    return ca.Function("trace", [memory, signals, vector], [ca.vertcat(*after), ca.densify(ca.vertcat(*forces))])
+    own = ca.SX.sym("memory", n_q + n_s)
+    edges = np.cumsum([0, *sizes])
+    shape = {n: vector[int(a) : int(b)] for n, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
+    forces = []
+    for strength in _units(law):
+        values = _Values({**shape, **strength})
+        if n_s:
+            rate = {"dz": dz} if "dz" in law.reads() else {}
+            w, end = law.step(z, own, values, **rate)
+        else:
+            w = _call(law.force, z=z, dz=dz, q=own, t=t, p=values)
+            end = _advance(law, own, (z, following), (dz, dz_next), t, values, h) if n_q else own
+        forces.append(w)
+    return ca.Function("lane", [own, signals, vector, h], [ca.densify(end), ca.densify(ca.vertcat(*forces))])
 
 
 def _units(law: Law) -> list[dict[str, Any]]:

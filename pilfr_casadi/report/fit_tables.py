@@ -142,10 +142,10 @@ def limit_blocks(fit: Fit) -> list[Block]:
     ]
     note = (
         "Multiplier: how fast the objective, half the mean squared error over the output's variance, would fall if the "
-        "limit were moved outwards. A spectral radius is bounded by its logarithm."
+        "limit were moved outwards. A spectral radius is the one of the eigenvalues of the result's own numbers."
     )
     columns = ["limit", "state", "value", "lower", "upper", "multiplier", "kind"]
-    return [Table(columns, rows, note=note, emphasis=[i for i, v in enumerate(fit.limits) if not v.met], digits=4)]
+    return [Table(columns, rows, note=note, emphasis=[i for i, v in enumerate(fit.limits) if not v.met], digits=9)]
 
 
 def usage(fit: Fit, model_file: str) -> str:

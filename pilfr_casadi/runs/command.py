@@ -41,6 +41,8 @@ def run_command(options: argparse.Namespace) -> int:
             if s.role == role and s.job == result.chosen:
                 print(f"NRMSE on {s.recording} ({role}): {s.nrmse:.4f}")
     print(f"chosen: {result.chosen}; {len(result.done)} jobs done now, {len(result.skipped)} before")
+    if len(given.seeds) > 1 and result.fit.candidates and not any(c.drawn for c in result.fit.candidates):
+        print("no start is drawn where there are so few: every seed gives the same model; use one seed, or more starts")
     for name in ("results.csv", "model.json", *(["report.html"] if given.report else []), "manifest.json"):
         print(result.folder / name)
     useless = min(result.fit.train_nrmse) >= 1.0

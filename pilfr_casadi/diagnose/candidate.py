@@ -1,0 +1,161 @@
+"""A port and law, fitted: to the first part of every recording, judged on the rest, and at last fitted to everything.
+
+A law one of whose strengths may as well be zero is the law that it refines; one whose strengths may all be zero is out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..laws import Law
+from ..recording import InputError, Recording
+from ..simulator import Simulator
+from .proof import deviations, shown
+from .workbench import QUICK, THOROUGH, Fitted, Workbench
+
+HEAD = 0.7  # share of each recording that candidates are fitted to
+WEAK, NO_WORSE = 2.0, 1.03  # standard errors within which a part of a law is idle, and error without it
+SHOWN = 3.0  # standard errors that a law's strength is from zero at least
+LONG = 12000  # samples that candidates are fitted to
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A port and law, fitted.
+
+    Attributes
+    ----------
+    fitted : Fitted
+        On the first part; on everything once `polished`.
+    head, tail : float
+        Mean square errors of the first part (fitted) and of the rest (not seen), in units of the outputs' variance.
+    size : int
+        Parameters of the law.
+    """
+
+    port: str
+    law: Law
+    fitted: Fitted
+    head: float
+    tail: float
+    size: int
+    full: float = np.nan
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """Port and law id."""
+        return self.port, self.law.id
+
+    @property
+    def error(self) -> float:
+        """Root of the geometric mean of both mean squares."""
+        return float((self.head * self.tail) ** 0.25)
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether a parameter of the law is held back by one of its bounds."""
+        prefix = self.fitted.simulator.elements[-1].prefix
+        bounds = {k: p.bounds for k, p in self.fitted.model.parameters.items() if k.startswith(prefix)}
+        return any(np.any((self.fitted.values[k] <= a) | (self.fitted.values[k] >= b)) for k, (a, b) in bounds.items())
+
+
+def heads(recordings: Sequence[Recording], share: float = HEAD) -> tuple[Recording, ...]:
+    """First part of each recording."""
+    total, out = sum(map(len, recordings)), []
+    for r in recordings:
+        most = int(len(r) * min(1.0, LONG / (share * total)))
+        cut = max(int(share * most), min(len(r), r.skip + 20))
+        part = r.slice(0, cut)
+        out.append(
+            part.with_(initial="estimate", period=None)
+            if isinstance(part.initial, str) and part.initial == "periodic"
+            else part
+        )
+    return tuple(out)
+
+
+def judged(bench: Workbench, fitted: Fitted) -> tuple[float, float]:
+    """Mean square error on the first part and on the rest of each recording."""
+    head, tail = [], []
+    vector = fitted.vector
+    firsts = heads(bench.recordings)
+    for r, first, state in zip(bench.recordings, firsts, fitted.initial, strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):
+            y = fitted.engine.simulate(fitted.model.drive(r), vector, state)[0]
+            e = ((y - r.y) / bench.scale) ** 2
+        cut = len(first)
+        head.append(e[r.skip : cut])
+        tail.append(e[cut:] if len(r) - cut > 5 else e[r.skip :])
+    with np.errstate(over="ignore", invalid="ignore"):
+        means = [float(np.mean(np.concatenate(part))) for part in (head, tail)]
+    return means[0], means[1] if np.isfinite(means[1]) else np.inf
+
+
+def attempt(
+    bench: Workbench, simulator: Simulator, starts: Sequence[Mapping[str, Any]], **options: Any
+) -> Candidate | None:
+    """Fit a simulator to the first parts and judge it on the rest; its last element is the candidate's law.
+
+    `options` are those of `Workbench.fit`; None where every start diverges.
+    """
+    alone = len(simulator.elements) == len(bench.simulator.elements) + 1
+    # a trend in time cannot be judged on a time that it has not seen; beside another effect it has to stand that all
+    # the same, for what an integrator makes of that effect's error looks like a trend
+    trend = alone and getattr(simulator.elements[-1].law, "id", "") == "drift"
+    part = bench if trend else bench.on(heads(bench.recordings))
+    try:
+        fitted = part.fit(simulator, starts, **{"solver": QUICK, **options})
+    except InputError:
+        return None
+    head, tail = judged(bench, fitted)
+    element = simulator.elements[-1]
+    values = {k: fitted.values[f"{element.prefix}{k}"] for k in element.law.parameters()}
+    return Candidate(
+        element.port, element.law, fitted, head, tail if np.isfinite(tail) else 1e12, element.law.size(values)
+    )
+
+
+def polish(bench: Workbench, candidate: Candidate) -> Candidate:
+    """Fit a candidate to everything; one whose strength may as well be zero lives off its initial state and is out."""
+    candidate = simpler(bench, candidate)
+    placed = candidate.fitted.corrected()  # sub-steps for the law as it was fitted
+    out = replace(candidate, head=np.inf, tail=np.inf, full=np.inf)
+    try:
+        fitted = bench.fit(placed, [candidate.fitted.values], states=candidate.fitted.initial, solver=THOROUGH)
+    except InputError:
+        return out
+    if shown(bench, fitted) < SHOWN:
+        return out
+    done = replace(candidate, fitted=fitted, full=fitted.cost)
+    plain = simpler(bench, done, deviations(bench, fitted))
+    return done if plain is done else polish(bench, plain)
+
+
+def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray] | None = None) -> Candidate:
+    """A law one of whose strengths is zero is the law that it refines, started where it stands.
+
+    With standard errors, what may as well be zero counts as zero.
+    """
+    element = candidate.fitted.simulator.elements[-1]
+    if element.port != candidate.port or type(element.law) is not type(candidate.law):  # another was put in after it
+        return candidate
+    plain: Any = type(candidate.law).__base__
+    own = {
+        k.removeprefix(element.prefix): v for k, v in candidate.fitted.values.items() if k.startswith(element.prefix)
+    }
+    doubt = {name: WEAK * std[f"{element.prefix}{name}"] if std else 0.0 for name in candidate.law.strength}
+    idle = [name for name, most in doubt.items() if np.all(np.abs(own[name]) <= most)]
+    if not idle or not getattr(plain, "units", {}) or not set(plain.units) <= set(own) - set(idle):
+        return candidate
+    if not set(candidate.law.places) <= set(plain.places):
+        return candidate
+    law = plain().at(
+        {k: own[k] for k in plain.units}, {k: v for k, v in candidate.law.limits.items() if k in plain.units}
+    )
+    placed = candidate.fitted.simulator.without_last_element().with_element(element.port, law)
+    found = attempt(bench, placed, [candidate.fitted.values], states=candidate.fitted.begin)
+    return found if found is not None and found.error < (NO_WORSE if std else 1.01) * candidate.error else candidate

@@ -1,0 +1,198 @@
+"""What is left of an error once the simulator's own parameters and initial states have followed it.
+
+With base the orthonormal directions in which these can change the stacked outputs, the error e leaves
+
+    e' = e - base baseᵀ e,    φ' = φ - base baseᵀ φ
+
+where φ holds the outputs' changes by a small dose of each law at a port, a column for each of its shapes and strengths.
+One port is looked at after the other: its columns are the largest arrays of a diagnosis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..laws import Law
+from ..laws.base import Local
+from ..laws.trace import trace
+from ..simulator import Port
+from .linearise import Probe, Run, locals_of, propagate
+from .workbench import Workbench
+
+MOST = 6000  # samples looked at
+HUGE = 1e60  # times an output's deviation
+BLOCKS = 10  # a recording, odd and even ones in turn
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A port, its local signals over the whole recordings, and each law that may stand there with its shapes."""
+
+    index: int
+    port: Port
+    local: Local
+    part: Local
+    pairs: list[tuple[Law, list[dict[str, Any]]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder:
+    """The error along runs, and what the simulator's own parameters leave of it.
+
+    Attributes
+    ----------
+    runs : list of Run
+        The stretches that are looked at.
+    base : array, shape (R, n)
+        Orthonormal directions that parameters and initial states can follow.
+    left : array, shape (R,)
+        The rest of the error, each output in units of its deviation.
+    tasks : tuple of Task
+        Ports whose laws can be tried, sensors last.
+    odd : array, shape (R,), bool
+        Every second block.
+    """
+
+    bench: Workbench
+    runs: list[Run]
+    n_free: int
+    base: np.ndarray
+    left: np.ndarray
+    tasks: tuple[Task, ...]
+    odd: np.ndarray
+
+    @classmethod
+    def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
+        """Along some runs, for the laws that the data can speak to; only `at` one port where it is named."""
+        n_free = len(probe.free) - len(probe.ports)
+        short = [
+            replace(r, **{k: getattr(r, k)[w] for k in ("a", "b", "c", "d", "error", "z", "dz")})
+            for r, w in zip(runs, _windows(bench, runs), strict=True)
+        ]
+        error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
+        base = orthonormal(block_diagonal([_moved(bench, r, [], n_free) for r in short], n_free))
+        left = error - base @ (base.T @ error)
+        tasks = [t for t in _tasks(bench, probe, laws, runs, short) if at in ("", t.port.name)]
+        return cls(bench, short, n_free, base, left, tuple(tasks), folds(len(left), len(runs)))
+
+    def columns(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
+        """What the forces of a port's laws, each of unit size, change beside the base, and what their sizes were.
+
+        Shapes (R, n) and (n,), the shapes and strengths of one law after those of the other.
+        """
+        forces = np.hstack([trace(law, task.part, s).reshape(len(task.part.z), -1) for law, s in task.pairs])
+        forces[~(np.abs(forces) < 1e100)] = 0.0
+        size = lengths(forces) / np.sqrt(len(forces))
+        size = np.where(size > 0, size, 1.0)
+        forces /= size
+        blocks, at = [], 0
+        for r in self.runs:
+            now = slice(at, at + len(r.z))
+            blocks.append(_moved(self.bench, r, [(task.index, forces[now])], self.n_free)[:, -len(size) :])
+            at = now.stop
+        phi = np.concatenate(blocks) if len(blocks) > 1 else blocks[0]
+        size_before = lengths(phi)
+        phi -= self.base @ (self.base.T @ phi)
+        phi[:, lengths(phi) < 1e-6 * size_before] = 0.0  # what the simulator's own parameters follow entirely
+        return phi, size
+
+
+def _moved(bench: Workbench, r: Run, forces: list[tuple[int, np.ndarray]], n_free: int) -> np.ndarray:
+    """Changes of the stacked outputs in units of their deviation, by free parameters, initial state, and forces."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        y = propagate(r, forces, n_free)
+        y /= bench.scale[:, None]
+    y = y.reshape(-1, y.shape[2])
+    y[:, ~((y.max(axis=0) < HUGE) & (y.min(axis=0) > -HUGE))] = 0.0  # what grows without end says nothing
+    return y
+
+
+def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
+    """The stretch of each recording that is looked at: where the error is largest."""
+    share = max(MOST // len(runs) // len(bench.scale), 200)
+    out = []
+    for r, recording in zip(runs, bench.recordings, strict=True):
+        m, skip = len(r.error), recording.skip
+        if m - skip <= share:
+            out.append(slice(skip, m))
+            continue
+        energy = np.cumsum(np.append(0.0, np.sum((r.error / bench.scale) ** 2, axis=1)))
+        starts = np.arange(skip, m - share + 1, max(share // 8, 1))
+        at = int(starts[np.argmax(energy[starts + share] - energy[starts])])
+        out.append(slice(at, at + share))
+    return out
+
+
+def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]) -> list[Task]:
+    by_name = {port.name: port for port in bench.simulator.all_ports()}
+    out = []
+    for j, (name, local, part) in enumerate(
+        zip(probe.ports, locals_of(bench, runs), locals_of(bench, short), strict=True)
+    ):
+        port = by_name[name]
+        if not np.ptp(local.z) > 0 or name.removeprefix("equation:") in bench.simulator.kinematic:
+            continue
+        chosen = [law() for law in laws if ("series" if port.series else "parallel") in law.places]
+        pairs = [(law, list(law.shapes(local))) for law in chosen if usable(law, local)]
+        if pairs:
+            out.append(Task(j, port, local, part, pairs))
+    return sorted(out, key=lambda t: t.port.name.startswith("sensor:"))
+
+
+def usable(law: Law, local: Local) -> bool:
+    """Whether the data can speak to a law at a port."""
+    if "dz" in law.reads() and not np.any(local.dz):
+        return False
+    return not law.applies(local)
+
+
+def folds(length: int, recordings: int) -> np.ndarray:
+    """Every second block of the stacked record, as a mask."""
+    return (np.arange(length) * BLOCKS * recordings // max(length, 1)) % 2 == 1
+
+
+def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float] = (1e-6,)) -> float:
+    """Share of `left` that the columns explain on blocks they were not fitted to."""
+    size = lengths(phi)
+    if not np.any(size > 0):
+        return 0.0
+    phi = phi[:, size > 0] / size[size > 0]
+    best = 0.0
+    for ridge in ridges:
+        wrong = 0.0
+        for fold in (odd, ~odd):
+            a, b = phi[fold], left[fold]
+            c = np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ b)
+            wrong += float(np.sum((left[~fold] - phi[~fold] @ c) ** 2))
+        best = max(best, 1 - wrong / max(float(left @ left), 1e-300))
+    return best
+
+
+def block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
+    """Parameters shared by all recordings, an initial state for each."""
+    n_x = blocks[0].shape[1] - n_free
+    out = np.zeros((sum(map(len, blocks)), n_free + n_x * len(blocks)))
+    at = 0
+    for i, b in enumerate(blocks):
+        rows = slice(at, at + len(b))
+        out[rows, :n_free] = b[:, :n_free]
+        out[rows, n_free + i * n_x : n_free + (i + 1) * n_x] = b[:, n_free:]
+        at += len(b)
+    return out
+
+
+def lengths(columns: np.ndarray) -> np.ndarray:
+    """Length of each column."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->j", columns, columns)))
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of the columns' span."""
+    size = lengths(columns)
+    kept = columns[:, size > 0] / size[size > 0]
+    u, s, _ = np.linalg.svd(kept, full_matrices=False)
+    return u[:, s > 1e-9 * s.max(initial=1e-300)]

@@ -1,0 +1,123 @@
+"""What was accepted, looked at again: a closer law at its port, a finer form, and rivals beside a second effect.
+
+With the second effect in place, the first law is put up again against its rivals, and dropped where the second does as
+well alone.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..compiled import make_engine
+from ..laws import FINER
+from ..recording import InputError
+from ..simulator import Simulator
+from ..threads import side_by_side
+from .candidate import Candidate, attempt, judged
+from .explain import by_cost
+from .verdict import HINT, choose, imitates
+
+if TYPE_CHECKING:
+    from .search import Search
+
+FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
+RIVALS = 6  # of the first law, put up against it again
+
+
+def prefer_what_leaves_nothing(search: Search) -> None:
+    """Where the winner leaves what a flexible force explains, and a closer law at its port does not: take that."""
+    found = search.passes[-1]
+    assert found.choice is not None
+    winner = found.choice.winner
+    nearer = [c for c in found.candidates if c.port == winner.port and c.error < 0.95 * winner.error]
+    closer = [c for c in nearer if not imitates(c, winner, search.floor2)]
+    still = search.flexible(search.base).get(winner.port, 0.0) if closer else 0.0
+    if still < HINT:
+        return
+    rival = search.polished(min(closer, key=lambda c: c.error))
+    if rival is not None and search.flexible(rival.fitted).get(winner.port, 0.0) < 0.5 * still:
+        search.base = rival.fitted
+        margin = winner.error / rival.error
+        choice = replace(found.choice, winner=rival, margin=min(margin, found.choice.margin), alike=())
+        search.passes[-1] = replace(found, choice=choice)
+
+
+def put_more_finely(search: Search) -> None:
+    """The named law in a finer form, where there is one that fits better."""
+    found = search.passes[-1]
+    assert found.choice is not None
+    winner = found.choice.winner
+    element = search.base.simulator.elements[-1]
+    bare = search.base.simulator.without_last_element()
+    local = next((s.local for s in found.scored if s.port == winner.port), None)
+    for kind in FINER.get(type(winner.law), ()):
+        if local is None:
+            return
+        began = time.perf_counter()
+        total = float(np.sum(search.base.values[f"{element.prefix}w"]))
+        shapes = [{**shape, **dict.fromkeys(kind.strength, total)} for shape in kind().shapes(local)]
+        law = kind().at(shapes[0], kind().bounds(local))
+        own = [{f"{element.prefix}{k}": v for k, v in shape.items()} for shape in shapes]
+        starts = [{**search.base.values, **values} for values in own]
+        placed = bare.with_element(element.port, law)
+        model = search.bench.model(placed)
+        engine = make_engine(model, search.bench.engine)
+        nearest = by_cost(search.bench, model, engine, starts, search.base)[:1]
+        try:
+            finer = search.bench.fit(placed, nearest, states=search.base.begin, model=model, engine=engine)
+        except InputError:
+            continue
+        if finer.cost < FINER_BY * search.base.cost:
+            search.base = finer
+            size = law.size({k: finer.values[f"{element.prefix}{k}"] for k in law.parameters()})
+            head, tail = judged(search.bench, finer)
+            better = replace(winner, law=law, fitted=finer, head=head, tail=tail, full=finer.cost, size=size)
+            search.passes[-1] = replace(found, choice=replace(found.choice, winner=better))
+        search.timed("finer form", began)
+
+
+def look_back(search: Search) -> None:
+    """With the second effect in place: its rivals in the first's place, and the second alone."""
+    began = time.perf_counter()
+    first, second = search.passes[-2], search.passes[-1]
+    assert first.choice is not None
+    assert second.choice is not None
+    kept = search.base.simulator.elements[-1]
+    bare = search.bench.simulator
+    alone = attempt(
+        search.bench, bare.with_element(kept.port, kept.law), [search.base.values], states=search.base.begin
+    )
+    near = alone is not None and alone.error < 1.1 * second.choice.winner.error
+    alone = search.polished(alone) if alone is not None and near else None
+    if alone is not None:
+        search.base = alone.fitted
+        search.passes[-2:] = [replace(second, choice=replace(second.choice, winner=alone))]
+        search.timed("look back", began)
+        return
+    winner, others = first.choice.winner, list[tuple[Candidate, Simulator, dict[str, Any]]]()
+    for c in first.candidates:
+        if c.port != winner.port or type(c.law) is type(winner.law) or len(others) >= RIVALS:
+            continue
+        own = c.fitted.simulator.elements[-1]
+        placed = bare.with_element(own.port, own.law).with_element(kept.port, kept.law)
+        values = {k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}
+        others.append((c, placed, {**search.base.values, **values}))
+    tasks = [(placed, values, search.base.begin) for _, placed, values in others]
+    tasks.append((search.base.simulator, search.base.values, search.base.initial))
+    *found, own_now = side_by_side(lambda t: attempt(search.bench, t[0], [t[1]], states=t[2]), tasks, search.workers)
+    pairs = [(c, again) for (c, *_), again in zip(others, found, strict=True) if again is not None]
+    rivals = [replace(again, port=c.port, law=c.fitted.simulator.elements[-1].law, size=c.size) for c, again in pairs]
+    if own_now is not None and rivals:
+        stay = replace(own_now, port=winner.port, law=winner.law, size=winner.size)
+        again = choose([stay, *rivals], first.before, search.floor2, search.effective_samples([stay, *rivals]))
+        other = None if again is None or again.winner is stay else search.polished(again.winner)
+        if again is not None and (again.winner is stay or other is not None):
+            search.base = search.base if other is None else other.fitted
+            alike = tuple(c for c in again.alike if c.port == winner.port)
+            better = replace(first.choice, winner=again.winner, alike=alike, margin=again.margin)
+            search.passes[-2] = replace(first, choice=better)
+    search.timed("look back", began)

@@ -1,0 +1,197 @@
+"""Tight bounds on the spectral radius: smooth rows where eigenvalues meet, and minima in the feasible set."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.constraints import stable
+from pilfr_casadi.lifted import Lifted, rotated
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.schur import below_blocks, bounded_rows, paired_schur
+from pilfr_casadi.solution import Status
+from problems.constrained import radius, three_plays
+
+PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
+FINE = pilfr.GaussNewton(tolerance=1e-9, max_iterations=500)
+DEMO = "pilfr_casadi/demo_data/train.csv"
+
+
+@pytest.fixture(scope="module")
+def record():
+    return three_plays(0, 1200)
+
+
+@pytest.fixture(scope="module")
+def demo(request):
+    path = request.config.rootpath / DEMO
+    return pilfr.read_csv(path, inputs="u", outputs="x2", initial="zero")
+
+
+@given(st.integers(0, 10**6), st.integers(1, 7), st.booleans())
+def test_a_schur_form_with_pairs_in_blocks(seed, n, symmetric):
+    m = np.random.default_rng(seed).normal(size=(n, n))
+    m = m + m.T if symmetric else m
+    q, t = paired_schur(m)
+    np.testing.assert_allclose(q @ t @ q.T, m, atol=1e-10)
+    np.testing.assert_allclose(q @ q.T, np.eye(n), atol=1e-12)
+    assert not np.any(t[below_blocks(n)])
+
+
+@given(st.integers(0, 10**6), st.integers(1, 7), st.sampled_from([0.5, 0.999, 1.001, 2.0]))
+def test_the_rows_hold_where_the_radius_does(seed, n, share):
+    m = np.random.default_rng(seed).normal(size=(n, n))
+    t = paired_schur(m)[1]
+    held, low = bounded_rows(n)(share * t / np.max(np.abs(np.linalg.eigvals(m))), 0)
+    assert (np.min(np.asarray(held)) >= 0) == (share < 1)
+    assert not np.any(np.asarray(low))
+    assert np.array_equal(np.asarray(held), np.asarray(bounded_rows(n, False)(ca.DM(t) * share / radius_of(m), [])[0]))
+
+
+def radius_of(m):
+    return np.max(np.abs(np.linalg.eigvals(m)))
+
+
+@given(st.integers(0, 10**6), st.integers(2, 6))
+def test_rows_with_unknowns_have_the_eigenvalues_of_the_blocks(seed, n):
+    """F = S⁻¹ M S for any X; where the rows below the blocks vanish, the blocks tell the radius."""
+    rng = np.random.default_rng(seed)
+    t = np.where(below_blocks(n), 0.0, rng.normal(size=(n, n)))
+    t /= 1.01 * radius_of(t)
+    step = np.eye(n) + np.where(below_blocks(n), rng.normal(size=(n, n)), 0.0)
+    held, low = bounded_rows(n)(step @ t @ np.linalg.inv(step), (step - np.eye(n)).T[below_blocks(n).T])
+    assert np.min(np.asarray(held)) >= 0
+    np.testing.assert_allclose(np.asarray(low), 0, atol=1e-8 * np.linalg.cond(step))
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_derivatives_of_the_rows(record, known):
+    fit = pilfr.fit(pilfr.PILFR(3, PLAYS), record, starts=1)
+    full = stable(0.7, lambda p: p["A"] + p["B_w"] @ ca.diag(ca.sum2(p["w"])) @ p["C_z"], exact=True)
+    problem = Problem(fit.model, record, constraints=(stable(0.7, exact=True), full, pilfr.ordered("r")))
+    theta = problem.start
+    if not known:
+        problem, theta = rotated(problem, theta)
+    lifted = Lifted(problem, theta, 1e-6, triangular=not known)
+    rng = np.random.default_rng(0)
+    x = lifted.start + 1e-3 * rng.normal(size=lifted.size)
+    slope = lifted.constraint_jacobian(x)
+    for _ in range(5):
+        d = rng.normal(size=lifted.size)
+        central = (lifted.constraint(x + 1e-6 * d) - lifted.constraint(x - 1e-6 * d)) / 2e-6
+        np.testing.assert_allclose(slope @ d, central, rtol=1e-5, atol=1e-6)
+    assert lifted.cost(x) == problem.cost(x[: problem.size])
+
+
+def test_free_coordinates_are_turned_and_known_ones_are_not(record):
+    fit = pilfr.fit(pilfr.PILFR(2, PLAYS), record.slice(100, 1000).with_(initial="estimate"), starts=1)
+    problem = Problem(fit.model, record.slice(100, 1000).with_(initial="estimate"), constraints=(stable(exact=True),))
+    theta = problem.start + 0.01
+    held, there = rotated(problem, theta)
+    assert held.cost(there) == pytest.approx(problem.cost(theta), rel=1e-9)
+    assert not np.any(held.model.parameters.unpack(held.parameters(there))["A"][below_blocks(2)])
+    for change in ({"B_u": {"prior": (1.0, 0.1)}}, {"C_z": {"bounds": (-2.0, 9.0)}}, {"C_y": {"fixed": True}}):
+        other = fit.model.with_parameters(fit.model.parameters.change(**change))
+        assert rotated(Problem(other, problem.recordings, constraints=problem.constraints), theta) is None
+    seen = pilfr.Constraint(lambda p: p["A"][0, 1], upper=9.0)
+    assert rotated(Problem(fit.model, problem.recordings, constraints=(seen,)), theta) is None
+
+
+@pytest.mark.parametrize("bound", [0.79, 0.6, 0.3])
+def test_no_feasible_point_nearby_is_better(record, bound):
+    """SLSQP, which knows the bound by trace and determinant alone, finds nothing better from there, nor by chance."""
+    fit = pilfr.fit(pilfr.PILFR(2), record, stable=bound, solver=FINE)
+    assert fit.status.converged and radius_of(fit.parameters["A"]) <= bound
+    problem = Problem(fit.model, record)
+    where = [problem.labels.index(f"A[{i},{j}]") for i in range(2) for j in range(2)]
+    size = np.maximum(np.abs(problem.start), 1e-2)
+
+    def room(x):
+        a, b, c, d = (x * size)[where] / bound
+        return np.array([1 - (a * d - b * c), 1 - (a + d) + a * d - b * c, 1 + (a + d) + a * d - b * c])
+
+    best, rng = problem.cost(problem.start), np.random.default_rng(0)
+    for step in (0.0, 1e-3, 1e-2):
+        begin = problem.start / size + step * rng.normal(size=problem.size)
+        options = {"method": "SLSQP", "options": {"maxiter": 300, "ftol": 1e-12}}
+        found = minimize(
+            lambda x: problem.cost(x * size) / best,
+            begin,
+            jac=lambda x: problem.normal(x * size)[1] * size / best,
+            constraints=[{"type": "ineq", "fun": room}],
+            **options,
+        )
+        assert np.min(room(found.x)) > -1e-9 and np.max(np.abs(found.x - begin)) < 10
+        assert found.fun >= 1 - 2e-5
+    steps = 10.0 ** rng.uniform(-5, -1, size=(3000, 1)) * rng.normal(size=(3000, problem.size))
+    near = [x for x in problem.start / size + steps if np.min(room(x)) >= 0]
+    assert len(near) > 100 and min(problem.cost(x * size) for x in near) >= best * (1 - 1e-6)
+
+
+@pytest.mark.parametrize("bound, reached", [(0.95, 0.2950), (0.8, 0.3955), (0.5, 0.5310)])
+def test_poles_that_meet_on_the_bound(demo, bound, reached):
+    """Two pairs and a real pole, or five equal ones, at the bound; the figures come from Schur coordinates alone."""
+    fit = pilfr.fit(pilfr.PILFR(5), demo, stable=bound)
+    assert fit.status.converged and fit.train_nrmse[0] < reached
+    assert radius_of(fit.parameters["A"]) <= bound
+
+
+def test_a_tight_bound_on_a_model_with_plays(demo):
+    fit = pilfr.fit(pilfr.PILFR(5, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), demo, starts=1, stable=0.95)
+    assert radius(fit) <= 0.95 and fit.status.converged
+    assert fit.train_nrmse[0] < 0.035
+
+
+def test_more_starts_are_never_worse(record):
+    errors = [pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=n, stable=0.5).train_nrmse[0] for n in (1, 3)]
+    assert errors[1] <= errors[0] * 1.0001
+
+
+def test_what_grows_in_the_data_does_not_grow_in_the_model():
+    u = np.random.default_rng(0).standard_normal(800)
+    x, y = 0.0, []
+    for value in u:
+        y.append(x)
+        x = 1.001 * x + 0.1 * value
+    record = pilfr.Recording(u, np.array(y), dt=0.1, initial="zero")
+    free, held = (pilfr.fit(pilfr.PILFR(1), record, stable=s) for s in (False, True))
+    assert radius_of(free.parameters["A"]) > 1.0005
+    assert 1 - 1e-5 < radius_of(held.parameters["A"]) <= 1
+    assert held.limits[0].active and held.limits[0].multiplier > 0
+
+
+def test_a_double_integrator_is_let_be_one():
+    u = np.random.default_rng(1).standard_normal(500)
+    y = np.cumsum(np.cumsum(u)) * 1e-2
+    record = pilfr.Recording(u, np.concatenate([[0.0, 0.0], y[:-2]]), dt=0.1, initial="zero")
+    fit = pilfr.fit(pilfr.PILFR(2), record)
+    assert radius_of(fit.parameters["A"]) <= 1 and fit.train_nrmse[0] < 1e-3
+
+
+def test_a_limit_shows_the_radius_and_its_bound(record):
+    fit = pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=1, stable=0.75)
+    limits = [limit for limit in fit.limits if limit.kind == "constraint"]
+    assert max(limit.value for limit in limits) == radius(fit) and all(limit.upper == 0.75 for limit in limits)
+    held = next(limit for limit in limits if limit.active)
+    assert f"{held.name}: {held.value:.9g}, active, multiplier" in str(fit) and held.value <= 0.75
+    # the multiplier is the slope of the objective over the radius
+    given = {"stable": 0.751, "solver": FINE}
+    fits = [pilfr.fit(fit, record, **{**given, "stable": bound}) for bound in (0.75, 0.751)]
+    slope = (fits[0].solution.cost - fits[1].solution.cost) / 0.001
+    force = sum(limit.multiplier for limit in fits[0].limits if limit.kind == "constraint")
+    assert force == pytest.approx(slope, rel=0.1)
+
+
+def test_a_bound_where_a_is_known(record):
+    structure = pilfr.PILFR(2, PLAYS, fixed={"A": [[0.5, 0.1], [np.nan, np.nan]]})
+    fit = pilfr.fit(structure, record, starts=1, stable=0.7)
+    assert radius(fit) <= 0.7 and fit.parameters["A"][0].tolist() == [0.5, 0.1]
+    assert fit.status is not Status.INFEASIBLE
+
+
+def test_the_seed_of_starts_that_are_not_drawn(record):
+    few, more = (pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=n) for n in (2, 3))
+    assert "the seed changes nothing" in str(few) and "the seed changes nothing" not in str(more)
