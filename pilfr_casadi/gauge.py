@@ -19,11 +19,13 @@ from __future__ import annotations
 import numpy as np
 
 from .lfr import PILFR
+from .magnitude import Neighbours
 from .orbit import generators
 from .problem import Problem
 from .residual_noise import gradient_covariance
 
 Array = np.ndarray
+FADED = 1e-30  # share of its matrix's largest sensitivity below which an entry counts as not seen
 
 
 def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, held: Array) -> Array:
@@ -137,8 +139,13 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     _, _, hessian = problem.normal(theta)
     if not np.all(np.isfinite(hessian)):
         return np.diag(np.full(problem.size, np.inf)), np.zeros(problem.size, dtype=bool)
+    given = theta.copy()
+    held = _snap_to_bounds(problem, theta, np.sqrt(np.diag(hessian)))
+    if np.any(theta != given):  # a threshold on its bound may slip where it stuck
+        _, _, hessian = problem.normal(theta)
     sensitivity = np.sqrt(np.diag(hessian))
-    held = _snap_to_bounds(problem, theta, sensitivity)
+    # what only a transient showed that has long faded: its derivative is a number, and says nothing
+    sensitivity = np.where(sensitivity > FADED * Neighbours(problem.labels).largest(sensitivity), sensitivity, 0.0)
     tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, held)
     slopes = problem.constraint_jacobian(theta)[problem.active_constraints(theta)]
     # a gauge direction that an active constraint forbids is no freedom; a constraint on a spectral radius or a gain
