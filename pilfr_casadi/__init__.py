@@ -46,6 +46,7 @@ _EXPORTS = {
     "Status": "solution",
     "Stop": "operators",
     "as_recordings": "recording",
+    "campaign": "runs",
     "close_loop": "model",
     "exported": "export",
     "do_mpc_controller": "feedback",

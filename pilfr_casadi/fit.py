@@ -27,7 +27,7 @@ from .known_blocks import in_known_coordinates, known_entries
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
-from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability
+from .multistart import KEEP, POLISH, STARTS, Candidate, Search, search_starts, stability
 from .outcome import with_solution
 from .penalty import check_penalty
 from .problem import Problem
@@ -78,9 +78,9 @@ def fit(
     starts, seed : int
         Number of starts and the seed of all of them. With `start="grid"` the first two have the element at the output
         and at the input, whatever the seed; more are drawn. More starts with the same seed hold those of fewer.
-    start : {"grid", "paper"}
+    start : {"grid", "paper", "plain"}
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
-        solved and re-gridded.
+        solved and re-gridded, or, "plain", solved and no more, as in the paper.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
         exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one, nothing grows.
@@ -115,8 +115,8 @@ def fit(
     """
     solver = solver or POLISH
     _check_options(model, solver, starts, seed, workers, progress)
-    if start not in ("grid", "paper"):
-        raise InputError(f"The start {start!r} is unknown; use 'grid' or 'paper'.")
+    if start not in STARTS:
+        raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper' or 'plain'.")
     own = executor is None and workers > 1
     if own and getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(1)  # a spawned worker that runs the script again; the first process says what to do
@@ -177,7 +177,7 @@ def _fit(
     if model.element is None:
         bounded = Problem(linear, job.recordings, engine=problem.engine, constraints=job.limits)
         more = model.fixed or model.bounds or model.priors or job.limits[1:] or solution.status is Status.INFEASIBLE
-        if not (more or beyond(bounded, solution.theta)) and job.solver is POLISH:
+        if not (more or beyond(bounded, solution.theta)) and job.solver == POLISH:
             return job.result(linear, model, bounded, solution)  # nothing that the linear model has not seen
         return _linear(model, fitted, job)
     return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
@@ -261,7 +261,7 @@ def _from_starts(
     try:
         if stopped:
             latest = interrupted(*latest)
-        elif start != "paper" or beyond(problem, best.theta):
+        elif start == "grid" or beyond(problem, best.theta):
             latest = model, problem, job.solve(problem, "solve", best.theta), note
         if structure.priors and not stopped:
             problem, result = job.settled(problem, latest[2], "solve")

@@ -10,7 +10,8 @@
    A last run without the prior shows what the prior costs.
 4. The smallest training error wins; with the prior wins over without when it is within `margin` of it.
 
-With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start.
+With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start. With
+the plain one, the paper's own protocol, through 2 alone.
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
 """
@@ -44,6 +45,7 @@ from .tightening import at_bounds, within_bounds
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
 PLACES = ("output", "input")  # of the element in the first starts; in all others it is anywhere
+STARTS = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
 PRIOR = "weights held near a smooth density by a weak prior"
 
@@ -115,7 +117,7 @@ def _with_element(p: Any) -> Any:
 
 @one_blas_thread
 def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Candidate:
-    """One start, run until it has shown what it is worth; with the paper's start to the end, polish included.
+    """One start, run until it has shown what it is worth; with the paper's start to the end, polish included or not.
 
     The paper's start draws thresholds far smaller than z, which end in clusters and beyond the visited range: a solver
     alone does not bring them back.
@@ -123,7 +125,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     rng = np.random.default_rng(sequence)
     inputs = [r.u for r in search.recordings]
     scaled, states = unit_states(search.linear, inputs, search.coordinates)
-    if search.start == "paper":
+    if search.start != "grid":
         values, solver = paper_start(search.structure, scaled, rng), search.solver
     else:
         place = PLACES[seed] if seed < len(PLACES) else "random"
@@ -149,7 +151,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
 def _drawn(search: Search, seed: int) -> bool:
     """Whether a start has anything random in it: with the grid, the direction of z where it is free."""
     fixed = {k for k, v in search.structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))}
-    return search.start == "paper" or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
+    return search.start != "grid" or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
 
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:
@@ -282,7 +284,7 @@ def search_starts(
         raise InputError(
             "No start gave a finite simulation; check units and the initial state, or choose another order."
         )
-    if search.start == "paper" or stopped:
+    if search.start != "grid" or stopped:
         return found, usable[0], stopped
     chosen = usable[:keep]
     if any(_held(search, c) for c in usable):

@@ -26,6 +26,7 @@ LAYERS = {
         "magnitude",
         "threads",
         "progress",
+        "hand",
     ),
     1: ("operators", "elements", "laws"),
     2: ("model", "simulator", "integration", "substeps"),
