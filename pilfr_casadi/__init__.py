@@ -66,6 +66,7 @@ _EXPORTS = {
     "inverse_element": "feedback",
     "kalman_filter": "feedback",
     "load": "export",
+    "modal": "modal",
     "multisine": "signals",
     "normalise": "normal_form",
     "nrmse": "metrics",

@@ -8,6 +8,7 @@ would be in the way.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from .constraints import Constraint
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .lti import propagate
+from .modal import in_modal_coordinates, is_modal
 from .model import Model
 from .problem import Problem
 from .recording import InputError, Recording
@@ -43,7 +45,8 @@ def linear_model(
     recordings : sequence of Recording
         Training data.
     structure : PILFR
-        Gives the order and whether there is an offset; its element and what it fixes are left aside.
+        Gives the order, whether there is an offset, and whether `A` is in modal coordinates (`modal`); its element and
+        what else it fixes are left aside.
     engine, constraints
         As for `Problem`.
     solver : GaussNewton
@@ -70,13 +73,10 @@ def linear_model(
     else:
         a, b, c, d = matrices_of(given, structure.nx, first)
     offset = _offset(recordings, a, b, c, d) if structure.offset else np.zeros(first.n_y)
-    model = structure.linear().model(
-        first.n_u,
-        first.n_y,
-        {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset},
-        inputs=first.inputs,
-        outputs=first.outputs,
-    )
+    blocks, form = {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset}, structure.linear()
+    if is_modal(structure.fixed, structure.nx):
+        blocks, form = in_modal_coordinates(blocks, tuple(recordings)), replace(form, fixed={"A": structure.fixed["A"]})
+    model = form.model(first.n_u, first.n_y, blocks, inputs=first.inputs, outputs=first.outputs)
     problem = Problem(model, recordings, engine=engine, constraints=constraints)
     if given is not None and structure.element is not None:
         cost = problem.cost(problem.start)

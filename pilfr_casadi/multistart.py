@@ -31,6 +31,7 @@ import numpy as np
 from .compiled import make_engine
 from .constraints import Constraint, loosened, stable
 from .elements import PrandtlIshlinskii, StaticNetwork
+from .envelopes import enveloped, has_networks
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .model import Model
@@ -131,6 +132,8 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     elif search.start == "grid":
         place = PLACES[seed] if seed < len(PLACES) else "random"
         values = grid_start(search.structure, scaled, inputs, states, rng, place)
+        if has_networks(search.structure):
+            values = enveloped(search.structure, scaled, values, search.recordings, states, place)
     else:
         values = paper_start(search.structure, scaled, rng)
     model = search.model(values)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from .elements import Element, PrandtlIshlinskii, StaticNetwork
+from .envelopes import reach
 from .lfr import PILFR
 
 Blocks = dict[str, np.ndarray]
@@ -91,8 +92,8 @@ def grid_start(
     """
     element = _layer(structure)
     blocks, z = _placed(structure, element, linear, inputs, states, rng, place)
-    reach = np.max(np.abs(z), axis=0)
-    blocks["r"] = 0.9 * reach[:, None] * np.arange(element.n) / element.n
+    widest = np.max(np.abs(z), axis=0)
+    blocks["r"] = 0.9 * widest[:, None] * np.arange(element.n) / element.n
     blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
     return blocks
 
@@ -160,7 +161,7 @@ def _placed(
     size = np.where(size > 0, size, 1.0)
     if not {"C_z", "D_zu", "D_yw"} & set(fixed):
         blocks["C_z"], blocks["D_zu"], z = blocks["C_z"] / size[:, None], blocks["D_zu"] / size[:, None], z / size
-    if place != "random" and not {*blocks, "w", "r"} & set(structure.fixed):
+    if place != "random" and not {*blocks, "w", "r"} & set(fixed):
         blocks |= _halved(linear, size, at_output if place == "output" else at_input, place == "output")
     return blocks, z
 
@@ -243,8 +244,9 @@ def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def regridded(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3) -> dict[str, Any]:
     """The values with every channel's thresholds and weights placed anew; z (M, n_w) is the fitted model's signal."""
+    reaches = [reach(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
     rows = [
-        regrid(r, w, float(np.max(np.abs(z_i))), beyond=beyond) if w.sum() > 0 and np.max(np.abs(z_i)) > 0 else (r, w)
-        for r, w, z_i in zip(values["r"], values["w"], z.T, strict=True)
+        regrid(r, w, most, beyond=beyond) if w.sum() > 0 and most > 0 else (r, w)
+        for r, w, most in zip(values["r"], values["w"], reaches, strict=True)
     ]
     return {**values, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}

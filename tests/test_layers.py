@@ -53,6 +53,8 @@ LAYERS = {
         "gauge",
         "normal_form",
         "start",
+        "envelopes",
+        "modal",
         "problem",
         "layout",
         "nlp",
