@@ -135,12 +135,21 @@ def _parser() -> argparse.ArgumentParser:
         help="execute a run file: identifications with all they depend on, skipped where done",
         allow_abbrev=False,
     )
-    run.add_argument("run_file", metavar="RUN.toml", help="what to do (.toml, or .py that sets `run`)")
-    run.add_argument("--out", metavar="DIR", help="folder of the results (default: as the file says, else RUN-run)")
-    run.add_argument(
-        "--workers", type=int, help="processes; the numbers do not depend on it (default: as the file says)"
+    campaign = commands.add_parser(
+        "campaign",
+        help="execute all jobs of a run file side by side: Monte-Carlo studies, grids, cross-validation",
+        allow_abbrev=False,
     )
-    run.add_argument("--overwrite", action="store_true", help="compute everything again, whatever is in the folder")
+    for parser_of, name in ((run, "run"), (campaign, "campaign")):
+        add = parser_of.add_argument
+        add("run_file", metavar="RUN.toml", help="what to do (.toml, or .py that sets `run`)")
+        add("--out", metavar="DIR", help=f"folder of the results (default: as the file says, else RUN-{name})")
+        add("--workers", type=int, help="processes; the numbers do not depend on it (default: as the file says)")
+        add("--overwrite", action="store_true", help="compute everything again, whatever is in the folder")
+    campaign.add_argument("--dask", metavar="ADDRESS", help="run the jobs on the Dask cluster of that scheduler")
+    campaign.add_argument(
+        "--time-limit", type=float, metavar="SECONDS", help="end a job then (default: as the file says, else none)"
+    )
 
     simulate = commands.add_parser(
         "simulate", help="simulate a saved model on a recording's inputs", allow_abbrev=False

@@ -147,6 +147,13 @@ def run(options: argparse.Namespace) -> int:
     return run_command(options)
 
 
+def campaign(options: argparse.Namespace) -> int:
+    """Execute the jobs of a run file side by side."""
+    from .runs.command import campaign_command
+
+    return campaign_command(options)
+
+
 def demo(options: argparse.Namespace) -> int:
     """Identify the rig whose recordings come with the package."""
     from .demo import run_demo

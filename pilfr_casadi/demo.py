@@ -1,7 +1,7 @@
 """The demonstration, on recordings that come with the package: a rig identified, and a simulator diagnosed.
 
 The first recordings are the benchmark of Krikelis et al. (2024), Sec. 6, simulated exactly: a training multisine, a
-multisine test and a sine-sweep test, 50 dB signal-to-noise ratio. `python -m problems.masing_rig --write-demo` writes
+multisine test and a sine-sweep test, 50 dB signal-to-noise ratio. `python -m problems.masing_data` writes
 them. The others are of a rig of which the simulator `demo_data/rig.py` leaves something out; what it is stands in
 `python -m problems.demo_rig`, which writes them, and nowhere in the package.
 """

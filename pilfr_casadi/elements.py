@@ -2,7 +2,7 @@
 
 An element is anything with `channels`, `memory`, `parameters()` and `step(z, s, p) -> (w, s_next)`; `close_loop` puts
 it into a model's port. `PrandtlIshlinskii` is the layer of Krikelis et al. (2024), Eq. 16: `w_i(k) = Σ_j w_ij
-H_rij[z_i](k)`.
+H_rij[z_i](k)`. `StaticNetwork` is its counterpart without memory.
 """
 
 from __future__ import annotations
@@ -65,12 +65,7 @@ class PrandtlIshlinskii:
         operator = self.operator() if isinstance(self.operator, type) else self.operator
         if not isinstance(operator, Play | Stop | GeneralizedPlay):
             raise InputError(f"The operator {self.operator!r} is unknown; use Play, Stop or GeneralizedPlay.")
-        for count in (self.n, self.channels):
-            if count < 1 or int(count) != count:
-                raise InputError(
-                    f"A Prandtl-Ishlinskii element needs whole numbers n >= 1 and channels >= 1; "
-                    f"{self.n} and {self.channels} were given."
-                )
+        _check_counts("A Prandtl-Ishlinskii element", n=self.n, channels=self.channels)
         object.__setattr__(self, "operator", operator)
 
     @property
@@ -119,3 +114,66 @@ class PrandtlIshlinskii:
         z = z[:, None]
         largest = np.minimum(r, 2 * z) if isinstance(self.operator, Stop) else np.maximum(z - r, 0.0)
         return np.asarray(np.sum(w * np.where(w > 0, largest + rest, 0.0), axis=1))
+
+
+@dataclass(frozen=True)
+class StaticNetwork:
+    """A one-hidden-layer network a channel, without memory: `w_i = Σ_j gain_ij tanh(slope_ij z_i + bias_ij)`.
+
+    In the port of a linear model it makes a nonlinear LFR (Schoukens and Tóth 2020); with one neuron a channel and the
+    gains and slopes held at one it is a layer of neurons whose weights are the linear blocks (`baselines.ssnn`). It is
+    bounded, so every simulation of an LFR with a stable `A` is.
+
+    Parameters
+    ----------
+    hidden : int
+        Neurons a channel.
+    channels : int
+        Number of signals, each with neurons of its own.
+
+    Raises
+    ------
+    InputError
+        If a number is not whole or less than one.
+    """
+
+    hidden: int = 10
+    channels: int = 1
+    kind: str = field(init=False, default="static_network")
+
+    def __post_init__(self) -> None:
+        _check_counts("A static network", hidden=self.hidden, channels=self.channels)
+
+    @property
+    def memory(self) -> int:
+        """None."""
+        return 0
+
+    def parameters(self) -> ParameterSet:
+        """`gain`, `slope`, `bias`, each (channels, hidden)."""
+        shape = (self.channels, self.hidden)
+        bias = np.tile(np.linspace(-1.0, 1.0, self.hidden) if self.hidden > 1 else np.zeros(1), (self.channels, 1))
+        return ParameterSet(
+            {"gain": Parameter(np.ones(shape)), "slope": Parameter(np.ones(shape)), "bias": Parameter(bias)}
+        )
+
+    def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
+        """One step; s is empty."""
+        neurons = ca.tanh(p["slope"] * ca.repmat(z, 1, self.hidden) + p["bias"])
+        return ca.sum2(p["gain"] * neurons), s
+
+    def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
+        """Largest |w| of each channel for any z, (channels,)."""
+        return np.asarray(np.sum(np.abs(np.asarray(p["gain"], dtype=float)), axis=1))
+
+
+def _check_counts(what: str, **counts: Any) -> None:
+    for count in counts.values():
+        if (
+            isinstance(count, bool)
+            or not isinstance(count, int | float | np.number)
+            or count < 1
+            or int(count) != count
+        ):
+            names, given = " and ".join(f"{k} >= 1" for k in counts), " and ".join(map(repr, counts.values()))
+            raise InputError(f"{what} needs whole numbers {names}; {given} were given.")

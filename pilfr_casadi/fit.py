@@ -18,17 +18,19 @@ from typing import Any
 
 import numpy as np
 
+from .baselines import NARX, NOE
 from .checks import numbers
 from .constraints import Constraint, loosened
-from .elements import PrandtlIshlinskii
+from .elements import PrandtlIshlinskii, StaticNetwork
 from .exactness import beyond
 from .fitted import Fit, Progress, fingerprint
 from .job import Job, interrupted, penalised, rms_error
 from .known_blocks import in_known_coordinates, known_entries
+from .lagged_fit import fit_lagged
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
-from .multistart import KEEP, POLISH, Candidate, Search, search_starts, stability
+from .multistart import KEEP, POLISH, STARTS, Candidate, Search, search_starts, stability
 from .outcome import with_solution
 from .penalty import check_penalty
 from .problem import Problem
@@ -48,13 +50,14 @@ NO_GUARD = (
 
 
 def fit(
-    model: PILFR | Model | Fit,
+    model: PILFR | NARX | NOE | Model | Fit,
     train: Recording | Sequence[Recording],
     *,
     solver: Any = None,
     starts: int = 8,
     seed: int = 0,
     start: str | Mapping[str, Any] = "grid",
+    linear: Any = None,
     stable: bool | float = True,
     constraints: Sequence[Constraint] = (),
     l1: dict[str, float] | None = None,
@@ -69,9 +72,8 @@ def fit(
 
     Parameters
     ----------
-    model : PILFR, Model or Fit
-        A PI-LFR structure (start values are found), a closed model of your own, or an earlier fit (started at its
-        values).
+    model : PILFR, NARX, NOE, Model or Fit
+        A structure (start values are found), a closed model of your own, or an earlier fit (started at its values).
     train : Recording or sequence of Recording
         Training data; nothing else is used.
     solver : GaussNewton or Ipopt
@@ -80,9 +82,13 @@ def fit(
     starts, seed : int
         Number of starts and the seed of all of them. With `start="grid"` the first two have the element at the output
         and at the input, whatever the seed; more are drawn. More starts with the same seed hold those of fewer.
-    start : {"grid", "paper"} or mapping
+    start : {"grid", "paper", "plain"} or mapping
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
-        solved and re-gridded. A mapping of values by parameter name is the one start of a PI-LFR with any element.
+        solved and re-gridded, or, "plain", solved and no more, as in the paper.
+        A mapping of values by parameter name is the one start of a PI-LFR with any element.
+    linear : control.StateSpace, optional
+        Linear model that the search for a PI-LFR begins with, such as `frequency_subspace` of a BLA, which is the
+        paper's; by default subspace identification refined by output error.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
         exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one, nothing grows.
@@ -121,9 +127,9 @@ def fit(
     """
     solver = solver or POLISH
     _check_options(model, solver, starts, seed, workers, progress)
-    if not isinstance(start, Mapping) and start not in ("grid", "paper"):
-        raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper', or a mapping of values by name.")
-    search = isinstance(model, PILFR) and not isinstance(start, Mapping)
+    if not isinstance(start, Mapping) and start not in STARTS:
+        raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper' or 'plain', or values by name.")
+    search = not isinstance(model, Model | Fit) and not isinstance(start, Mapping)
     if weights is not None and search:
         raise InputError("Weights are for a fit from values; give a Model, a Fit, or start={name: value}.")
     own = executor is None and workers > 1
@@ -142,7 +148,7 @@ def fit(
     with shown as report:
         job = Job((), solver, further, dict(l1 or {}), noise, engine, report, weights, 1 if search else workers)
         try:
-            return _fit(model, train, job, stable, starts, seed, start, executor or pool)
+            return _fit(model, train, job, stable, starts, seed, start, executor or pool, linear)
         except BrokenProcessPool:
             spawned = pool is not None and multiprocessing.get_start_method() != "fork"
             raise InputError(NO_GUARD if spawned else DEAD_WORKER) from None
@@ -153,7 +159,7 @@ def fit(
 
 @one_blas_thread
 def _fit(
-    model: PILFR | Model | Fit,
+    model: PILFR | NARX | NOE | Model | Fit,
     train: Recording | Sequence[Recording],
     job: Job,
     stable: bool | float,
@@ -161,7 +167,14 @@ def _fit(
     seed: int,
     start: str | Mapping[str, Any],
     executor: Executor | None,
+    given: Any,
 ) -> Fit:
+    if given is not None and not isinstance(model, PILFR):
+        raise InputError("A linear model to begin with goes with a PILFR; any other model has its own values.")
+    if isinstance(start, Mapping) and not isinstance(model, PILFR):
+        raise InputError("Values to start from go with a PILFR; a Model and a Fit have their own.")
+    if isinstance(model, NARX | NOE):
+        return fit_lagged(model, train, job, starts, seed, executor)
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
     limits = stability_limits(structure, stable) if structure else ()
     job = replace(job, limits=(*limits, *job.limits))
@@ -171,9 +184,9 @@ def _fit(
         given = model.model if isinstance(model, Fit) else model
         job = replace(job, recordings=check_for_identification(train, int(given.parameters.free.sum()) + 2))
         return _from_values(given, structure, job, model if isinstance(model, Fit) else None)
-    if not isinstance(model.element, PrandtlIshlinskii | None):
+    if not isinstance(model.element, PrandtlIshlinskii | StaticNetwork | None):
         raise InputError(
-            "A start is found for a PrandtlIshlinskii element; for any other give start={name: value} or a Model."
+            "A start is found for PrandtlIshlinskii and StaticNetwork; for others give start={name: value} or a Model."
         )
     first = as_recordings(train)[0]
     shape = model.model(first.n_u, first.n_y).parameters
@@ -183,7 +196,7 @@ def _fit(
     fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
     job = replace(job, recordings=check_for_identification(train, fewest))
     linear, problem, solution = linear_model(
-        job.recordings, model, engine=job.engine, constraints=loosened(limits[:1]), progress=job.progress
+        job.recordings, model, engine=job.engine, constraints=loosened(limits[:1]), progress=job.progress, given=given
     )
     if solution.status is Status.INTERRUPTED:
         return job.result(linear, model.linear(), problem, solution)
@@ -191,7 +204,7 @@ def _fit(
     if model.element is None:
         bounded = Problem(linear, job.recordings, engine=problem.engine, constraints=job.limits)
         more = model.fixed or model.bounds or model.priors or job.limits[1:] or solution.status is Status.INFEASIBLE
-        if not (more or beyond(bounded, solution.theta)) and job.solver is POLISH:
+        if not (more or beyond(bounded, solution.theta)) and job.solver == POLISH:
             return job.result(linear, model, bounded, solution)  # nothing that the linear model has not seen
         return _linear(model, fitted, job)
     return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
@@ -291,7 +304,7 @@ def _from_starts(
     try:
         if stopped:
             latest = interrupted(*latest)
-        elif start != "paper" or beyond(problem, best.theta):
+        elif start == "grid" or beyond(problem, best.theta):
             latest = model, problem, job.solve(problem, "solve", best.theta), note
         if structure.priors and not stopped:
             problem, result = job.settled(problem, latest[2], "solve")
@@ -306,8 +319,10 @@ def _from_starts(
 
 def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:
     """Refuse what cannot be used before any long work."""
-    if not isinstance(model, PILFR | Model | Fit):
-        raise InputError(f"The model is a {type(model).__name__}; give a PILFR, a closed Model or a Fit.")
+    if not isinstance(model, PILFR | NARX | NOE | Model | Fit):
+        raise InputError(
+            f"The model is a {type(model).__name__}; give a PILFR, a NARX, a NOE, a closed Model or a Fit."
+        )
     if isinstance(solver, type) or not hasattr(solver, "solve"):
         raise InputError(f"The solver is {solver!r}; give an object such as GaussNewton() or Ipopt().")
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):

@@ -19,11 +19,13 @@ from __future__ import annotations
 import numpy as np
 
 from .lfr import PILFR
+from .magnitude import Neighbours
 from .orbit import generators
 from .problem import Problem
 from .residual_noise import gradient_covariance
 
 Array = np.ndarray
+FADED = 1e-30  # share of its matrix's largest sensitivity below which an entry counts as not seen
 
 
 def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, held: Array) -> Array:
@@ -137,8 +139,13 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     _, _, hessian = problem.normal(theta)
     if not np.all(np.isfinite(hessian)):
         return np.diag(np.full(problem.size, np.inf)), np.zeros(problem.size, dtype=bool)
+    given = theta.copy()
+    held = _snap_to_bounds(problem, theta, np.sqrt(np.diag(hessian)))
+    if np.any(theta != given):  # a threshold on its bound may slip where it stuck
+        _, _, hessian = problem.normal(theta)
     sensitivity = np.sqrt(np.diag(hessian))
-    held = _snap_to_bounds(problem, theta, sensitivity)
+    # what only a transient showed that has long faded: its derivative is a number, and says nothing
+    sensitivity = np.where(sensitivity > FADED * Neighbours(problem.labels).largest(sensitivity), sensitivity, 0.0)
     tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, held)
     slopes = problem.constraint_jacobian(theta)[problem.active_constraints(theta)]
     # a gauge direction that an active constraint forbids is no freedom; a constraint on a spectral radius or a gain
@@ -170,13 +177,19 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
 def _snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, tolerance: float = 1e-9) -> Array:
     """Move variables that are within rounding of a bound onto it, in place; returns which (size,), bool.
 
-    Within rounding means that the move changes the normalised outputs by less than `tolerance`.
+    Within rounding means that the move changes the normalised outputs by less than `tolerance`, by the sensitivity at
+    either end: what hardly counts where it is, such as the slope of a saturated neuron, may count at a bound far away.
     """
-    held = np.zeros(problem.size, dtype=bool)
+    given, held = theta.copy(), np.zeros(problem.size, dtype=bool)
     for bound in (problem.lower, problem.upper):
         near = np.isfinite(bound) & (sensitivity > 0)
         near[near] = np.abs(theta - bound)[near] * sensitivity[near] <= tolerance
         near |= theta == bound
         theta[near] = bound[near]
         held |= near
+    if np.any(theta != given):
+        there = np.sqrt(np.diag(problem.normal(theta)[2]))
+        far = ~(np.abs(theta - given) * there <= tolerance)
+        theta[far] = given[far]
+        held &= ~far
     return held

@@ -15,6 +15,7 @@ their tangent violates them.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -31,6 +32,7 @@ from .recording import InputError
 from .solution import Iteration, Progress, Solution, Status
 
 FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
+Watch = Callable[[np.ndarray], bool]
 NOTHING = 1e-24  # a cost that is rounding: outputs are off by 1e-12 of their size
 
 
@@ -69,10 +71,14 @@ class GaussNewton:
             raise InputError(f"The QP solver {self.qp!r} is not there; use 'daqp', or another conic plugin of CasADi.")
 
     def solve(
-        self, problem: Problem | Lifted, start: np.ndarray | None = None, progress: Progress | None = None
+        self,
+        problem: Problem | Lifted,
+        start: np.ndarray | None = None,
+        progress: Progress | None = None,
+        watch: Watch | None = None,
     ) -> Solution:
-        """Minimise from `start` (n,), by default the problem's own."""
-        return _Run(self, problem, problem.start if start is None else start, progress).run()
+        """Minimise from `start` (n,), by default the problem's own; `watch` is given every point and may end it."""
+        return _Run(self, problem, problem.start if start is None else start, progress, watch).run()
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +94,14 @@ class _Run:
     """One solve: the point, its derivatives and the damping; constraints, limits and multipliers of them are scaled."""
 
     def __init__(
-        self, options: GaussNewton, problem: Problem | Lifted, start: np.ndarray, progress: Progress | None
+        self,
+        options: GaussNewton,
+        problem: Problem | Lifted,
+        start: np.ndarray,
+        progress: Progress | None,
+        watch: Watch | None = None,
     ) -> None:
-        self.options, self.problem, self.progress = options, problem, progress
+        self.options, self.problem, self.progress, self.watch = options, problem, progress, watch
         self.theta = np.clip(np.asarray(start, dtype=float), problem.lower, problem.upper)
         self.n_g = len(problem.g_lower)
         self.unit, self.known = np.ones(self.n_g), np.zeros(self.n_g, dtype=bool)
@@ -147,6 +158,8 @@ class _Run:
                 recent.append((self.cost, violation))
                 if self.progress:
                     self.progress(self.history[-1] if self.history else Iteration(0, self.cost, 0.0))
+                if self.watch and self.watch(self.theta):
+                    return Status.STOPPED_EARLY
                 if self._calm(recent):
                     return Status.CONVERGED if violation <= FEASIBLE else Status.INFEASIBLE
             step = self._step(hessian + self.damping * np.diag(floor), gradient, slope)

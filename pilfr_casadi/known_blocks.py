@@ -19,6 +19,7 @@ import numpy as np
 
 from .job import Job
 from .lfr import PILFR
+from .modal import is_modal
 from .model import Model
 from .outcome import with_solution
 from .start import states_of
@@ -36,8 +37,8 @@ def known_entries(structure: PILFR) -> dict[str, np.ndarray]:
 def in_known_coordinates(structure: PILFR, linear: Model, job: Job) -> Model:
     """The linear model in the basis in which what the structure knows holds; as it is where nothing is known."""
     known = known_entries(structure)
-    if not known or not structure.nx:
-        return linear
+    if not known or not structure.nx or (set(known) == {"A"} and is_modal(known, structure.nx)):
+        return linear  # which is in modal coordinates already
     blocks = {k: p.value for k, p in linear.parameters.items()}
     blocks = nearest_basis(_scaled(blocks, np.concatenate([r.u for r in job.recordings])), known)
     alone = replace(structure.linear(), fixed=known)

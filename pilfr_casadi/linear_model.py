@@ -8,6 +8,8 @@ would be in the way.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +17,10 @@ from .constraints import Constraint
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .lti import propagate
+from .modal import in_modal_coordinates, is_modal
 from .model import Model
 from .problem import Problem
-from .recording import Recording
+from .recording import InputError, Recording
 from .solution import Iteration, Solution, Status
 from .subspace import subspace_matrices
 
@@ -33,19 +36,24 @@ def linear_model(
     constraints: tuple[Constraint, ...] = (),
     solver: GaussNewton | None = None,
     progress: Progress | None = None,
+    given: Any = None,
 ) -> tuple[Model, Problem, Solution]:
-    """A linear state-space model: subspace identification refined by output error.
+    """A linear state-space model: subspace identification refined by output error, or one that is given.
 
     Parameters
     ----------
     recordings : sequence of Recording
         Training data.
     structure : PILFR
-        Gives the order and whether there is an offset; its element and what it fixes are left aside.
+        Gives the order, whether there is an offset, and whether `A` is in modal coordinates (`modal`); its element and
+        what else it fixes are left aside.
     engine, constraints
         As for `Problem`.
     solver : GaussNewton
         By default `GaussNewton(tolerance=1e-4)`.
+    given : control.StateSpace
+        A linear model in discrete time to take in place of the subspace's. In the search for an element it stays as it
+        is: at the minimum of the linear error the slope of half of the parameters has vanished, and starts get stuck.
     progress : callable
         Called with ("subspace" or "linear model", done, total, smallest error so far).
 
@@ -57,19 +65,23 @@ def linear_model(
     Raises
     ------
     InputError
-        If the recordings are too short for the order.
+        If the recordings are too short for the order, or the model given does not fit them.
     """
     first, solver = recordings[0], solver or GaussNewton(tolerance=1e-4)
-    a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset, progress=progress)
+    if given is None:
+        a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset, progress=progress)
+    else:
+        a, b, c, d = matrices_of(given, structure.nx, first)
     offset = _offset(recordings, a, b, c, d) if structure.offset else np.zeros(first.n_y)
-    model = structure.linear().model(
-        first.n_u,
-        first.n_y,
-        {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset},
-        inputs=first.inputs,
-        outputs=first.outputs,
-    )
+    blocks, form = {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset}, structure.linear()
+    if is_modal(structure.fixed, structure.nx):
+        blocks, form = in_modal_coordinates(blocks, tuple(recordings)), replace(form, fixed={"A": structure.fixed["A"]})
+    model = form.model(first.n_u, first.n_y, blocks, inputs=first.inputs, outputs=first.outputs)
     problem = Problem(model, recordings, engine=engine, constraints=constraints)
+    if given is not None and structure.element is not None:
+        cost = problem.cost(problem.start)
+        status = Status.CONVERGED if np.isfinite(cost) else Status.DIVERGED_START
+        return model, problem, Solution(problem.start, cost, status, 0, 0.0)
     report = iterations(progress, "linear model", solver.max_iterations)
     if not constraints:
         return model, problem, solver.solve(problem, progress=report)
@@ -81,6 +93,30 @@ def linear_model(
     if found[0].status is not Status.INTERRUPTED and np.any(limits):
         found.append(solver.solve(problem, progress=report))
     return model, problem, min(found, key=lambda s: (s.status is Status.INFEASIBLE, s.cost))
+
+
+def matrices_of(given: Any, nx: int, recording: Recording) -> tuple[Array, Array, Array, Array]:
+    """The matrices of a `control.StateSpace` that is to begin with.
+
+    Raises
+    ------
+    InputError
+        If it is none, or has other sizes or another step than wanted.
+    """
+    if not all(hasattr(given, name) for name in ("A", "B", "C", "D", "dt")):
+        raise InputError(f"A {type(given).__name__} was given as linear model; give a control.StateSpace.")
+    a, b, c, d = (np.asarray(getattr(given, name), dtype=float) for name in "ABCD")
+    found, wanted = (len(a), b.shape[1], len(c)), (nx, recording.n_u, recording.n_y)
+    if found != wanted:
+        raise InputError(
+            f"The linear model given has {found[0]} states, {found[1]} inputs and {found[2]} outputs; "
+            f"expected {wanted[0]}, {wanted[1]} and {wanted[2]}."
+        )
+    if given.dt not in (None, True) and not np.isclose(float(given.dt), recording.dt, rtol=1e-4):
+        raise InputError(
+            f"The linear model's step is {given.dt} s, the recording's {recording.dt:g} s; sample it anew."
+        )
+    return a, b, c, d
 
 
 def _offset(recordings: Sequence[Recording], a: Array, b: Array, c: Array, d: Array) -> Array:

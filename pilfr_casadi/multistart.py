@@ -11,6 +11,8 @@
 4. The smallest training error wins; with the prior wins over without when it is within `margin` of it.
 
 With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start.
+With "plain" it goes through 2 alone, which is the paper's protocol to the letter. Elements without memory have their
+own start values (`start.network_start`) and nothing to re-grid; with either of these each start is run to the end.
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
 """
@@ -28,7 +30,8 @@ import numpy as np
 
 from .compiled import make_engine
 from .constraints import Constraint, loosened, stable
-from .elements import PrandtlIshlinskii
+from .elements import PrandtlIshlinskii, StaticNetwork
+from .envelopes import enveloped, has_networks
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .model import Model
@@ -36,13 +39,14 @@ from .problem import Problem
 from .recording import InputError, Recording
 from .sensitivities import Engine
 from .solution import Solution, Status
-from .start import Blocks, grid_start, paper_start, regridded, unit_states
+from .start import Blocks, grid_start, network_start, paper_start, regridded, unit_states
 from .threads import one_blas_thread
 from .tightening import at_bounds, within_bounds
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
 PLACES = ("output", "input")  # of the element in the first starts; in all others it is anywhere
+STARTS = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
 PRIOR = "weights held near a smooth density by a weak prior"
 
@@ -114,7 +118,7 @@ def _with_element(p: Any) -> Any:
 
 @one_blas_thread
 def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Candidate:
-    """One start, run until it has shown what it is worth; with the paper's start to the end, polish included.
+    """One start, run until it has shown what it is worth; with the paper's start to the end, polish included or not.
 
     The paper's start draws thresholds far smaller than z, which end in clusters and beyond the visited range: a solver
     alone does not bring them back.
@@ -122,11 +126,16 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     rng = np.random.default_rng(sequence)
     inputs = [r.u for r in search.recordings]
     scaled, states = unit_states(search.linear, inputs, search.coordinates)
-    if search.start == "paper":
-        values, solver = paper_start(search.structure, scaled, rng), search.solver
-    else:
+    solver = EXPLORE if search.start == "grid" else search.solver
+    if isinstance(search.structure.element, StaticNetwork):
+        values = network_start(search.structure, scaled, inputs, states, rng)
+    elif search.start == "grid":
         place = PLACES[seed] if seed < len(PLACES) else "random"
-        values, solver = grid_start(search.structure, scaled, inputs, states, rng, place), EXPLORE
+        values = grid_start(search.structure, scaled, inputs, states, rng, place)
+        if has_networks(search.structure):
+            values = enveloped(search.structure, scaled, values, search.recordings, states, place)
+    else:
+        values = paper_start(search.structure, scaled, rng)
     model = search.model(values)
     problem = search.problem(model)
     candidate = _candidate(seed, model, problem, within_bounds(problem, None, solver.solve))
@@ -146,7 +155,8 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
 def _drawn(search: Search, seed: int) -> bool:
     """Whether a start has anything random in it: with the grid, the direction of z where it is free."""
     fixed = {k for k, v in search.structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))}
-    return search.start == "paper" or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
+    network = isinstance(search.structure.element, StaticNetwork)
+    return search.start != "grid" or network or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
 
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:
@@ -162,7 +172,8 @@ def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candida
     The one with the prior (its `note` says so) is returned where its training error is within `margin` of the smallest.
     """
     parameters = candidate.model.parameters
-    if not np.all(np.concatenate([parameters.free[parameters.position(name)] for name in ("r", "w")])):
+    regular = isinstance(search.structure.element, PrandtlIshlinskii)
+    if not regular or not np.all(np.concatenate([parameters.free[parameters.position(name)] for name in ("r", "w")])):
         return candidate
     engine = make_engine(candidate.model, search.engine)
     n_free = int(parameters.free.sum())
@@ -279,7 +290,7 @@ def search_starts(
         raise InputError(
             "No start gave a finite simulation; check units and the initial state, or choose another order."
         )
-    if search.start == "paper" or stopped:
+    if search.start != "grid" or stopped:
         return found, usable[0], stopped
     chosen = usable[:keep]
     if any(_held(search, c) for c in usable):

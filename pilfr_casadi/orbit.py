@@ -7,6 +7,7 @@ The outputs of a PI-LFR do not change under
   generalized play has two here: the scale of z, which the envelopes take up, and that of the operators' output;
 - a scaling of the weights, `w_i -> μ w_i` with `(B_w, D_yw)_i -> (...)/μ`;
 - for a play with `r_ij = 0` (it passes z on), a shift of `w_ij` that the linear blocks take up;
+- for a static network, the scalings of its signals, `slope_i -> slope_i/α` and `gain_i -> μ gain_i`;
 - for generalized plays, a shift of all `r_i` against the two envelopes, and one of the output that `y_0`, the envelopes
   and the initial state make up for.
 
@@ -20,7 +21,7 @@ from functools import partial
 
 import numpy as np
 
-from .elements import PrandtlIshlinskii
+from .elements import PrandtlIshlinskii, StaticNetwork
 from .lfr import PILFR
 from .operators import GeneralizedPlay, Play
 
@@ -47,6 +48,13 @@ def generators(structure: PILFR, values: Mapping[str, Array]) -> Iterator[Genera
                 yield from _pass_through(element, values, channel)
             if isinstance(element.operator, GeneralizedPlay) and element.operator.networks:
                 yield from _offsets(element, values, channel, nx)
+    if isinstance(element, StaticNetwork):
+        for channel in range(element.channels):
+            here = (np.arange(element.channels) == channel) * 1.0
+            into = {name: values[name] * here[:, None] for name in ("C_z", "D_zu")}
+            yield {**into, "slope": -values["slope"] * here[:, None]}, np.zeros_like
+            out = {name: -values[name] * here for name in ("B_w", "D_yw")}
+            yield {**out, "gain": values["gain"] * here[:, None]}, np.zeros_like
 
 
 def _turn(e: Array, state: Array) -> Array:

@@ -14,6 +14,7 @@ class Status(Enum):
 
     CONVERGED = "Converged: no admissible step improves the fit noticeably."
     SMALL_STEP = "Converged: the last steps were too small to matter."
+    STOPPED_EARLY = "Stopped early: the error on the data held back was smallest here."
     MAX_ITERATIONS = "Not converged: the iteration limit was reached; the best point so far is returned."
     TIME_LIMIT = "Not converged: the time limit was reached; the best point so far is returned."
     INTERRUPTED = "Not converged: interrupted; the best point so far is returned."
@@ -24,8 +25,8 @@ class Status(Enum):
 
     @property
     def converged(self) -> bool:
-        """Whether the result is a minimum."""
-        return self in (Status.CONVERGED, Status.SMALL_STEP)
+        """Whether the result is what was looked for: a minimum, or the best point on data held back."""
+        return self in (Status.CONVERGED, Status.SMALL_STEP, Status.STOPPED_EARLY)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ matter, or takes the linear model's output or input for z, and spreads the thres
 instead of drawing them from `U(0, R)`: idle or identical thresholds hardly separate again. `regrid` takes a fitted
 element, smooths its density of weights, and places the thresholds anew so that each stands for an equal share of
 `density^0.4` (the knots of a good piecewise-linear approximation of the loading curve). It continues the tail of the
-density beyond the visited range, where data alone says nothing.
+density beyond the visited range, where data alone says nothing. `network_start` is for elements without memory.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from .elements import PrandtlIshlinskii
+from .elements import Element, PrandtlIshlinskii, StaticNetwork
+from .envelopes import reach
 from .lfr import PILFR
 
 Blocks = dict[str, np.ndarray]
 LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
+FLAT = 0.3  # deviation of the signals of neurons of slope one at the start
 
 
 def states_of(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:
@@ -53,14 +55,17 @@ def paper_start(
 ) -> Blocks:
     """Start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)`, R = `spread`, `B_w = D_yw = 0`."""
     element = _layer(structure)
-    n_x, n_u = linear["B_u"].shape
     shape = (element.channels, element.n)
-    blocks = {name: linear[name] for name in LINEAR}
-    blocks["C_z"], blocks["D_zu"] = (
-        rng.uniform(-1, 1, (element.channels, n_x)),
-        rng.uniform(-1, 1, (element.channels, n_u)),
-    )
+    blocks = _directions(element, linear, rng)
     blocks["w"], blocks["r"] = rng.uniform(0, 1 / element.n, shape), rng.uniform(0, spread, shape)
+    return blocks
+
+
+def _directions(element: Element, linear: Mapping[str, np.ndarray], rng: np.random.Generator) -> Blocks:
+    """The linear blocks with a random direction of z, Eq. 22 and 23."""
+    blocks = {name: linear[name] for name in LINEAR}
+    for name, of in (("C_z", 0), ("D_zu", 1)):
+        blocks[name] = rng.uniform(-1, 1, (element.channels, linear["B_u"].shape[of]))
     return blocks
 
 
@@ -86,7 +91,56 @@ def grid_start(
     others, "output" and "input" give the direction of z alone.
     """
     element = _layer(structure)
-    blocks = paper_start(structure, linear, rng)
+    blocks, z = _placed(structure, element, linear, inputs, states, rng, place)
+    widest = np.max(np.abs(z), axis=0)
+    blocks["r"] = 0.9 * widest[:, None] * np.arange(element.n) / element.n
+    blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
+    return blocks
+
+
+def network_start(
+    structure: PILFR,
+    linear: Mapping[str, np.ndarray],
+    inputs: list[np.ndarray],
+    states: list[np.ndarray],
+    rng: np.random.Generator,
+) -> Blocks:
+    """Random directions of z of unit deviation, neurons that bend somewhere in its range, `B_w = D_yw = 0`.
+
+    As in Schoukens (2021), the network does nothing at first: the model begins as the linear one. Where slopes are held
+    at one, z has the deviation `FLAT`: neurons that are nearly linear at first end in better minima.
+    """
+    element = structure.element
+    if not isinstance(element, StaticNetwork):
+        raise TypeError("these start values are made for a static network")
+    blocks, z = _placed(structure, element, linear, inputs, states, rng, "random")
+    if "slope" in structure.fixed and not {"C_z", "D_zu"} & set(structure.fixed):
+        blocks, z = blocks | {k: FLAT * blocks[k] for k in ("C_z", "D_zu")}, FLAT * z
+    return blocks | neurons_over(structure, element, z, rng)
+
+
+def neurons_over(structure: PILFR, element: StaticNetwork, z: np.ndarray, rng: np.random.Generator) -> Blocks:
+    """Gains, slopes and biases of neurons that bend within 1.5 deviations of the mean of z (M, channels)."""
+    shape = (element.channels, element.hidden)
+    size = np.std(z, axis=0)
+    size = np.where(size > 0, size, 1.0)[:, None]
+    slope = rng.uniform(1, 3, shape) / size
+    slope = np.broadcast_to(np.asarray(structure.fixed.get("slope", slope), dtype=float), shape)
+    middle = np.mean(z, axis=0)[:, None] + rng.uniform(-1.5, 1.5, shape) * size
+    return {"gain": rng.uniform(-1, 1, shape), "slope": slope, "bias": -slope * middle}
+
+
+def _placed(
+    structure: PILFR,
+    element: Element,
+    linear: Mapping[str, np.ndarray],
+    inputs: list[np.ndarray],
+    states: list[np.ndarray],
+    rng: np.random.Generator,
+    place: str,
+) -> tuple[Blocks, np.ndarray]:
+    """The linear blocks with the element at its place (see `grid_start`), and the signal z (M, channels)."""
+    blocks = _directions(element, linear, rng)
     u, x = np.concatenate(inputs), np.concatenate(states)
     fixed = {k: v for k, v in structure.fixed.items() if not np.any(np.isnan(v))}
     spread = np.std(u, axis=0)
@@ -107,12 +161,9 @@ def grid_start(
     size = np.where(size > 0, size, 1.0)
     if not {"C_z", "D_zu", "D_yw"} & set(fixed):
         blocks["C_z"], blocks["D_zu"], z = blocks["C_z"] / size[:, None], blocks["D_zu"] / size[:, None], z / size
-    reach = np.max(np.abs(z), axis=0)
-    blocks["r"] = 0.9 * reach[:, None] * np.arange(element.n) / element.n
-    blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
-    if place != "random" and not set(blocks) & set(structure.fixed):
+    if place != "random" and not {*blocks, "w", "r"} & set(fixed):
         blocks |= _halved(linear, size, at_output if place == "output" else at_input, place == "output")
-    return blocks
+    return blocks, z
 
 
 def _halved(linear: Mapping[str, np.ndarray], size: np.ndarray, at: np.ndarray, output: bool) -> Blocks:
@@ -193,8 +244,9 @@ def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def regridded(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3) -> dict[str, Any]:
     """The values with every channel's thresholds and weights placed anew; z (M, n_w) is the fitted model's signal."""
+    reaches = [reach(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
     rows = [
-        regrid(r, w, float(np.max(np.abs(z_i))), beyond=beyond) if w.sum() > 0 and np.max(np.abs(z_i)) > 0 else (r, w)
-        for r, w, z_i in zip(values["r"], values["w"], z.T, strict=True)
+        regrid(r, w, most, beyond=beyond) if w.sum() > 0 and most > 0 else (r, w)
+        for r, w, most in zip(values["r"], values["w"], reaches, strict=True)
     ]
     return {**values, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}

@@ -2,9 +2,12 @@ r"""Recordings of the rig of `masing`, with the truth behind them.
 
 Source: Krikelis et al. (2024), Sec. 6.2: Tukey-windowed multisines to train and to test, a sine sweep to test, each
 output ``y = x2 + e`` with white noise of the variance ``var(x2) 10^(-SNR / 10)``, SNR = 50 dB.
+
+    python -m problems.masing_data         writes the recordings that `pilfr demo` uses
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -18,6 +21,7 @@ FS = 120.0  # Hz
 F_MAX = 30.0  # Hz
 N_PERIOD = 1024
 N_REALIZATIONS = 3
+DEMO_SEED = 2024
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,3 +103,15 @@ def benchmark(
 def records(seed: int) -> dict[str, Recording]:
     """Training, multisine test and sweep test record of one seed; see :func:`benchmark`."""
     return benchmark(seed).records
+
+
+def write_demo(folder: Path) -> None:
+    """Write the demonstration's recordings as CSV, with seven digits."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, r in records(DEMO_SEED).items():
+        rows = (f"{t:.9g},{u:.7g},{y:.7g}" for t, u, y in zip(r.t, r.u[:, 0], r.y[:, 0], strict=True))
+        (folder / f"{name}.csv").write_text("t,u,x2\n" + "\n".join(rows) + "\n")
+
+
+if __name__ == "__main__":
+    write_demo(Path(__file__).parents[1] / "pilfr_casadi" / "demo_data")

@@ -30,16 +30,26 @@ def copy_demo_data(folder):
             shutil.copy(path, folder)
 
 
-def test_run_file_of_the_readme(tmp_path):
+RUN_FILES = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+
+
+@pytest.mark.parametrize(
+    "command, text, files",
+    [
+        ("run", RUN_FILES[0], {"report.html"}),
+        ("campaign", RUN_FILES[1].replace("count = 100", "count = 1"), {"summary.csv", "spread.png", "report.html"}),
+    ],
+)
+def test_run_files_of_the_readme(tmp_path, command, text, files):
     copy_demo_data(tmp_path)
-    (text,) = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
     (tmp_path / "rig.toml").write_text(text)
     code = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", code, "run", "rig.toml"]
-    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
+    arguments = [sys.executable, "-c", code, command, "rig.toml", "--workers", "2"]
+    done = subprocess.run(arguments, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    written = {path.name for path in (tmp_path / "rig-run").iterdir()}
-    assert {"manifest.json", "results.csv", "model.json", "report.html", "jobs"} <= written
+    written = {path.name for path in (tmp_path / f"rig-{command}").iterdir()}
+    assert {"manifest.json", "results.csv", "model.json", "jobs", *files} <= written
+    assert len(RUN_FILES) == 2 and "count = 100" not in text
 
 
 def test_snippets_of_the_readme(tmp_path):

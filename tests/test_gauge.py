@@ -1,5 +1,7 @@
 """Gauge freedoms: tangents, the normal form, and standard errors checked by Monte Carlo."""
 
+from types import SimpleNamespace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from random_models import OPERATORS, envelope, random_input, random_lfr, referen
 
 from pilfr_casadi.constraints import Constraint
 from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.gauge import covariance, gauge_tangents, standard_errors, variance
+from pilfr_casadi.gauge import _snap_to_bounds, covariance, gauge_tangents, standard_errors, variance
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.lfr import PILFR, hammerstein, wiener
 from pilfr_casadi.model import open_model
@@ -458,6 +460,19 @@ def test_bounds_and_fixed_entries_have_no_error():
     theta[0] += 1e-14  # within rounding of the bound
     assert np.isnan(standard_errors(problem, theta)["k"])
     assert np.all(covariance(problem, theta)[0] == 0)
+
+
+def test_what_hardly_counts_is_not_moved_to_a_bound_where_it_counts():
+    """The slope of a neuron that bends where only a faded transient was: blind where it is, not so at zero."""
+
+    def normal(theta):
+        return 0.0, np.zeros(3), np.diag([1.0, 1e-40, 1.0]) if theta[1] else np.diag([1.0, 1e-14, 1.0])
+
+    problem = SimpleNamespace(size=3, lower=np.zeros(3), upper=np.full(3, np.inf), normal=normal)
+    theta = np.array([1e-12, 70.0, 3.0])
+    held = _snap_to_bounds(problem, theta, np.array([1.0, 1e-20, 1.0]))
+    np.testing.assert_array_equal(held, [True, False, False])
+    np.testing.assert_array_equal(theta, [0.0, 70.0, 3.0])
 
 
 def test_an_active_constraint_is_projected_out():

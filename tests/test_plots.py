@@ -391,7 +391,7 @@ def test_studies(fitted):
     groups = {"5": np.linspace(0.01, 0.1, 21), "20": [0.01, 0.02, np.inf, np.nan]}
     ax = plots.spread(groups, published={"5": 0.03}, floor=0.0032, source="published")
     assert legend_of(ax) == ["median; box: quartiles", "published", "noise floor"]
-    assert [t.get_text() for t in ax.texts] == ["2 ran\naway"]
+    assert [t.get_text() for t in ax.texts] == ["2\nfailed"]
     figure = plots.compared_spread(
         {"training": groups, "test": groups}, published={"training": {"5": 0.03}}, floor=0.0032
     )

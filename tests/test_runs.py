@@ -158,7 +158,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(folder, kind):
 
 
 def test_ending_between_a_file_and_its_manifest_is_no_tampering(folder, monkeypatch):
-    from pilfr_casadi.runs import execute as module
+    from pilfr_casadi.runs import manifest as module
 
     changed(folder, "[0, 1, 2]", "[0]")
     out, real, calls = folder / "rig-run", module.Manifest.write, []
@@ -378,7 +378,7 @@ def test_regularization_in_a_run(folder):
     text = TEXT.replace("[0, 1, 2]", "0").replace("operators = 3", "operators = 6")
     (folder / "rig.toml").write_text(text + "\n[regularization]\npath = [1e-4, 1e-3]\n")
     sparse = pilfr.run(folder / "rig.toml")
-    assert 1 <= sparse.manifest["jobs"]["seed-0"]["operators"] <= 3
+    assert 1 <= sparse.manifest["jobs"]["seed-0"]["operators_used"] <= 3
     write_csv(folder / "test.csv", seed=5, m=400)
     assert pilfr.run(folder / "rig.toml").done == ()  # a path never looks at the test
     write_csv(folder / "held.csv", seed=6, m=400)

@@ -2,13 +2,20 @@
 
 import numpy as np
 import pytest
+from random_models import random_input, random_lfr
 
+from pilfr_casadi.baselines import NARX, network_lfr, ssnn
+from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.fit import fit
+from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.lfr import PILFR, hammerstein, wiener
+from pilfr_casadi.multistart import stability
 from pilfr_casadi.operators import Play
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.start import grid_start, regrid, unit_states
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi.start import grid_start, network_start, paper_start, regrid, unit_states
+from pilfr_casadi.subspace import time_subspace
 
 NX, N = 2, 5
 LINEAR = {
@@ -136,3 +143,86 @@ def test_the_tail_goes_on_beyond_what_was_visited():
     density = mass[-12:] / np.gradient(placed)[-12:] / 100
     expected = np.exp(-2.0 * placed[-12:])
     np.testing.assert_allclose(density, expected, rtol=0.15)
+
+
+# ---- the paper's protocol ----
+
+
+def test_the_papers_start_to_the_letter():
+    """Eq. 22-24: the linear model, states of unit variance, no B_w, D_yw; C_z, D_zu in (-1, 1); w < 1/N, r < 0.1."""
+    u = np.random.default_rng(3).normal(size=(400, 2))
+    blocks, (x,) = unit_states(LINEAR, [u])
+    np.testing.assert_allclose(np.sqrt(np.mean(x**2, axis=0)), 1.0)
+    drawn = [paper_start(PILFR(NX, PrandtlIshlinskii(Play, N)), blocks, np.random.default_rng(k)) for k in range(400)]
+    for name, (low, high) in {"C_z": (-1, 1), "D_zu": (-1, 1), "w": (0, 1 / N), "r": (0, 0.1)}.items():
+        values = np.array([d[name] for d in drawn])
+        assert low <= values.min() < low + 0.01 * (high - low)
+        assert high - 0.01 * (high - low) < values.max() <= high
+        np.testing.assert_allclose(values.mean(), (low + high) / 2, atol=0.05 * (high - low))
+    model = PILFR(NX, PrandtlIshlinskii(Play, N)).model(2, 2, drawn[0])
+    for name in ("B_w", "D_yw"):
+        assert not model.parameters[name].value.any()
+    for name in ("A", "B_u", "C_y", "D_yu"):
+        np.testing.assert_array_equal(model.parameters[name].value, blocks[name])
+
+
+def hysteretic_record():
+    u = random_input(1, 500)
+    structure, values = random_lfr(2, nx=2, n=3)
+    model = structure.model(1, 1, values)
+    y = make_engine(model, "vm").simulate(u, model.parameters.start, np.zeros(model.n_x + model.n_s))[0]
+    return Recording(u, y, 0.1, initial="zero")
+
+
+def test_plain_starts_are_solved_once_from_the_linear_model_that_is_given():
+    record, structure = hysteretic_record(), PILFR(2, PrandtlIshlinskii(Play, 3))
+    given = time_subspace([record], 2)
+    result = fit(structure, record, start="plain", starts=3, seed=5, linear=given)
+    blocks = {
+        "A": given.A,
+        "B_u": given.B,
+        "C_y": given.C,
+        "D_yu": given.D,
+        "y_0": result.linear.parameters["y_0"].value,
+    }
+    for name in ("A", "B_u", "C_y", "D_yu"):
+        np.testing.assert_array_equal(result.linear.parameters[name].value, blocks[name])
+    scaled, _ = unit_states(blocks, [record.u])
+    sequence = np.random.SeedSequence(5).spawn(3)[1]
+    model = structure.model(1, 1, paper_start(structure, scaled, np.random.default_rng(sequence)))
+    problem = Problem(model, record, constraints=stability(structure))
+    alone = GaussNewton(max_iterations=200, tolerance=1e-4).solve(problem)
+    np.testing.assert_allclose(result.candidates[1].theta, alone.theta, rtol=1e-5, atol=1e-7)
+    best = min(result.candidates, key=lambda c: c.error)
+    np.testing.assert_array_equal(result.solution.theta, best.theta)
+
+
+def test_a_linear_model_that_does_not_fit_is_refused():
+    record, structure = hysteretic_record(), PILFR(2, PrandtlIshlinskii(Play, 3))
+    good = time_subspace([record], 2)
+    for model, given, words in (
+        (structure, time_subspace([record], 3), "has 3 states"),
+        (structure, "linear", "A str was given as linear model"),
+        (structure, type(good)(good.A, good.B, good.C, good.D, 0.2), "step is 0.2 s"),
+        (NARX(2), good, "goes with a PILFR"),
+    ):
+        with pytest.raises(InputError, match=words):
+            fit(model, record, linear=given)
+    with pytest.raises(InputError, match="'grid', 'paper' or 'plain'"):
+        fit(structure, record, start="letter")
+    one, two = (fit(PILFR(2), record, linear=linear).train_nrmse[0] for linear in (good, None))
+    assert one == pytest.approx(two, rel=1e-3)  # refined, where there is nothing else to fit
+
+
+@pytest.mark.parametrize("structure", [ssnn(NX, 3), network_lfr(NX, 4)])
+def test_a_network_begins_as_the_linear_model(structure):
+    u = np.random.default_rng(3).normal(size=(400, 2)) * [1.0, 4.0]
+    blocks, states = unit_states(LINEAR, [u])
+    values = network_start(structure, blocks, [u], states, np.random.default_rng(0))
+    model = structure.model(2, 2, values)
+    assert not model.parameters["B_w"].value.any() and not model.parameters["D_yw"].value.any()
+    z = states[0] @ values["C_z"].T + u @ values["D_zu"].T
+    bent = -values["bias"] / values["slope"]  # where the neurons bend, in deviations of z
+    assert np.all(np.abs(bent - z.mean(axis=0)[:, None]) <= 1.5 * z.std(axis=0)[:, None] + 1e-9)
+    again = network_start(structure, blocks, [u], states, np.random.default_rng(0))
+    np.testing.assert_array_equal(again["bias"], values["bias"])

@@ -7,7 +7,7 @@ from math import comb
 from typing import Any
 
 from ..combined import Combined, Part
-from ..elements import Element, PrandtlIshlinskii
+from ..elements import Element, PrandtlIshlinskii, StaticNetwork
 from ..envelope import Envelope
 from ..operators import GeneralizedPlay, Play, Stop
 from ..products import Products
@@ -23,6 +23,7 @@ def element_of(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, 
     kind = str(table.get("kind"))
     build = {
         "prandtl_ishlinskii": _layer,
+        "static_network": _network,
         "envelope": _envelope,
         "products": _products,
         "combined": _combined if not prefix else None,
@@ -58,6 +59,13 @@ def _layer(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, Any]
             _value(file, parameters, f"{prefix}gamma_l_{key}", (channels, neurons))
         operator = GeneralizedPlay(neurons)
     return PrandtlIshlinskii(operator, n, channels, file.entry(table, "rounded", bool, "true or false"))
+
+
+def _network(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, Any], prefix: str) -> StaticNetwork:
+    hidden, channels = file.count(table, "hidden"), file.count(table, "channels")
+    for key in ("gain", "slope", "bias"):
+        _value(file, parameters, prefix + key, (channels, hidden))
+    return StaticNetwork(hidden, channels)
 
 
 def _envelope(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, Any], prefix: str) -> Envelope:

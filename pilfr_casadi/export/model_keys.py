@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 EACH = "*"  # every entry of a list or a table
 SOLVE = ("iterations", "cost", "violation", "seconds")
-ELEMENT = ("kind", "operator", "n", "channels", "rounded", "neurons", "expressions", "degrees")
+ELEMENT = ("kind", "operator", "n", "channels", "rounded", "neurons", "expressions", "degrees", "hidden")
 KEYS: dict[tuple[str, ...], tuple[str, ...]] = {
     (): ("format", "version", "written_by", "model", "structure", "parameters", "linear", "initial_states", "training"),
     ("written_by",): ("pilfr_casadi", "casadi"),

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from ..combined import Combined
-from ..elements import PrandtlIshlinskii
+from ..elements import PrandtlIshlinskii, StaticNetwork
 from ..envelope import Envelope
 from ..operators import GeneralizedPlay
 from ..products import Products
@@ -146,6 +146,8 @@ def _element(element: Any) -> dict[str, Any]:
         return {"kind": element.kind, "channels": element.channels}
     if isinstance(element, Products):
         return {"kind": element.kind, "channels": element.channels, "degrees": list(element.degrees)}
+    if isinstance(element, StaticNetwork):
+        return {"kind": element.kind, "hidden": element.hidden, "channels": element.channels}
     if not isinstance(element, PrandtlIshlinskii):
         return {"kind": type(element).__name__}
     operator = element.operator

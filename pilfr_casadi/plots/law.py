@@ -32,12 +32,13 @@ def loop(fit: Fit, recording: Recording, *, channel: int = 0, bare: bool = False
     signals, index = fit.signals(recording), _index(fit, channel)
     first = as_scored(fit, recording).skip
     z, w = (signals[key][first:, channel] for key in "zw")
-    what, title = f"w{index}", "loop"
+    what, title = f"w{index}", "loop" if fit.model.n_s else "curve"
     if bare:
         slope = float(z @ w / (z @ z)) if np.any(z) else 0.0
         w, what, title = w - slope * z, f"w{index} − {slope:.3g} z{index}", "loop without its slope"
     ax = axes_or_new(ax)
-    ax.plot(z, w, color=BLUE, linewidth=0.7, rasterized=True)
+    order = slice(None) if fit.model.n_s else np.argsort(z)
+    ax.plot(z[order], w[order], color=BLUE, linewidth=0.7, rasterized=True)
     across, up = _label(fit, "z", channel), _label(fit, "w", channel, what)
     return finish(ax, across, up, ", ".join(filter(None, (title, recording.name))))
 

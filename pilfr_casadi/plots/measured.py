@@ -5,7 +5,7 @@ Krikelis et al. (2024), Fig. 3 (operators), 7 (loops), 8 and 13 (best linear app
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -135,7 +135,7 @@ def spread(
     Parameters
     ----------
     errors : mapping
-        Label of the group to its errors; infinite ones (simulations that ran away) are counted, not drawn.
+        Label of the group to its errors; infinite ones (no model, or one that ran away) are counted, not drawn.
     y, x, title : str
         Axis labels and title.
     published : mapping, optional
@@ -172,17 +172,24 @@ def spread(
         ax.axhline(floor, color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
     ax.set_yscale("log")
     ax.set_xticks(range(len(groups)), [plain(name) for name in errors])
-    for k, (group, drawn) in enumerate(zip(groups, finite, strict=True)):
-        if len(drawn) < len(group):
-            ax.annotate(
-                f"{len(group) - len(drawn)} ran\naway",
-                (k, 0.01),
-                xycoords=("data", "axes fraction"),
-                ha="center",
-                va="bottom",
-                fontsize=9,
-            )
+    if _crowded(errors):
+        ax.set_xticks(range(len(groups)), [plain(", ".join(name.split("\n"))) for name in errors], rotation=90)
+    lost = {k: len(group) - len(drawn) for k, (group, drawn) in enumerate(zip(groups, finite, strict=True))}
+    if any(lost.values()):  # room above the boxes
+        low, high = ax.get_ylim()
+        most = max([*(float(np.max(g)) for g in finite if len(g)), *(published or {}).values(), low])
+        ax.set_ylim(low, max(high, most * (most / low) ** 0.16))
+    for k, n in lost.items():
+        if n:
+            at_top = ("data", "axes fraction")
+            ax.annotate(f"{n}\nfailed", (k, 0.99), xycoords=at_top, ha="center", va="top", fontsize=9)
     return finish(ax, x, y, title, 3)
+
+
+def _crowded(labels: Iterable[str]) -> bool:
+    """Whether labels side by side, half an inch each, would overlap."""
+    longest = [max(map(len, label.split("\n"))) for label in labels]
+    return len(longest) > 3 and max(longest, default=0) > 6
 
 
 def operators_demo(r: float = 1.0, amplitude: float = 4.0, samples: int = 2000) -> Figure:
@@ -222,7 +229,9 @@ def compared_spread(
     y: str = "NRMSE",
 ) -> Figure:
     """Box plots of several data sets on one scale, one `spread` each; keys are titles, then groups."""
-    figure = new_figure(3.6 * max(len(sets), 1) + 0.6, 4.0)
+    widest = max((len(groups) for groups in sets.values()), default=0)
+    upright = max((len(label) for groups in sets.values() if _crowded(groups) for label in groups), default=0)
+    figure = new_figure(max(3.6, 0.5 * widest) * max(len(sets), 1) + 0.6, 4.0 + 0.08 * upright)
     first: Axes | None = None
     for k, (title, errors) in enumerate(sets.items()):
         ax = figure.add_subplot(1, len(sets), k + 1, sharey=first)

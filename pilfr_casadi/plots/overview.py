@@ -24,6 +24,8 @@ def plot_fit(
 ) -> Figure:
     """One figure: time and spectrum of every output; loop and loading curve of every channel, and a layer's weights.
 
+    Without hysteresis, the way to the fit, beside the curve of an element of one channel.
+
     Parameters
     ----------
     fit : Fit
@@ -45,7 +47,7 @@ def plot_fit(
     """
     records = as_recordings(recordings)
     rows = [(r, i) for r in records for i in range(r.n_y)]
-    channels = fit.model.n_w
+    channels, curve = fit.model.n_w if fit.model.n_s else 0, fit.model.n_w == 1 and not fit.model.n_s
     figure = new_figure(11.0, 3.4 * (len(rows) + channels + (not channels)))
     grid = figure.add_gridspec(len(rows) + max(channels, 1), 6)
     for k, (r, i) in enumerate(rows):
@@ -58,7 +60,9 @@ def plot_fit(
         if {"w", "r"} <= set(fit.parameters):
             weights(fit, records, channel=c, ax=figure.add_subplot(grid[row, 4:]))
     if not channels:
-        convergence(fit, ax=figure.add_subplot(grid[len(rows), :]))
+        convergence(fit, ax=figure.add_subplot(grid[len(rows), 2 * curve :]))
+    if curve:
+        loop(fit, records[0], ax=figure.add_subplot(grid[len(rows), :2]))
     return figure
 
 

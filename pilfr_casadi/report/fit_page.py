@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import plots
 from ..bla import robust_bla
+from ..elements import StaticNetwork
 from ..fit import Fit
 from ..local_polynomial import plain_bla
 from ..metrics import rmse_per_output
@@ -38,7 +39,8 @@ def fit_page(
     shown = [recording for recording, role in named if role == "test"] or [named[0][0]]
     sections = [
         Section("How well it fits", [Text(_verdict(rows)), _error_table(rows), *_pictures(fit, shown)]),
-        *([Section("The hysteresis it found", _hysteresis(fit, shown))] if fit.model.n_w else []),
+        *([Section("The hysteresis it found", _hysteresis(fit, shown))] if fit.model.n_s else []),
+        *([Section("The curve it found", _curve(fit, shown[0]))] if fit.model.n_w == 1 and not fit.model.n_s else []),
         Section("The linear part", _linear(fit, used)),
         Section("What holds it", limit_blocks(fit)),
         Section("How it was found", _search(fit)),
@@ -171,6 +173,8 @@ def _subtitle(fit: Fit) -> str:
     if element is not None and operator is not None:
         channels = f", {element.channels} channels" if element.channels > 1 else ""
         parts.append(f"{getattr(element, 'n', '')} {operator.name.replace('_', ' ')} operators{channels}")
+    elif isinstance(element, StaticNetwork):
+        parts.append(f"{element.hidden * element.channels} neurons")
     elif element is not None:
         parts.append(type(element).__name__)
     return ", ".join([*parts, f"step {fit.dt:.4g} s ({1 / fit.dt:.4g} Hz)"])
@@ -221,6 +225,11 @@ def _pictures_of(fit: Fit, r: Recording, i: int) -> list[Block]:
             f"Amplitude densities of output and residuals of {name}.",
         ),
     ]
+
+
+def _curve(fit: Fit, recording: Recording) -> list[Block]:
+    drawn = plots.loop(fit, recording).figure
+    return [Picture(drawn, "The element has no memory: w is a curve over z.", "Curve of the element, w over z.")]
 
 
 def _hysteresis(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:

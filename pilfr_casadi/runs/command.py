@@ -1,8 +1,10 @@
-"""`pilfr run`: a run file on the command line, with progress, and a sentence for everything that can go wrong."""
+"""`pilfr run` and `pilfr campaign`: a run file on the command line, and a sentence for everything that can go wrong."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,24 +13,18 @@ from ..commands import make_folder
 from ..interrupts import insistent, worker_pool
 from ..progress import progress_bar
 from ..recording import InputError
-from .described import ROLES, read_run
-from .execute import ConstraintsNotMet, RunInterrupted, run
-from .folder import check_own
+from .campaign import campaign
+from .described import ROLES, Run, read_run
+from .execute import ConstraintsNotMet, RunInterrupted, RunResult, run
+from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own
+from .side_by_side import AHEAD
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Execute a run file; returns the exit status: 1 where no job meets its constraints or explains anything."""
-    given = read_run(options.run_file)
-    if options.out is not None:
-        check_own(Path(options.out), given.file, options.overwrite)
-        given = replace(given, out=make_folder(options.out))
-    if options.workers is not None:
-        if options.workers < 1:
-            raise InputError(f"--workers {options.workers} was given; give 1 or more.")
-        given = replace(given, workers=options.workers)
-    print(
-        f"run: {given.file}, {len(given.seeds)} job{'s' * (len(given.seeds) > 1)}, results in {given.out}", flush=True
-    )
+    given = _given(options, "run")
+    count = len(given.seeds) * len(given.cells)
+    print(f"run: {given.file}, {count} job{'s' * (count > 1)}, results in {given.out}", flush=True)
     try:
         with worker_pool(given.workers) as pool, progress_bar() as bar, insistent(bar) as progress:
             result = run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=_tell)
@@ -36,14 +32,88 @@ def run_command(options: argparse.Namespace) -> int:
         return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
     except ConstraintsNotMet as missed:
         return say(str(missed), NO_RESULT)
+    return _told(given, result, TABLE, MODEL)
+
+
+def campaign_command(options: argparse.Namespace) -> int:
+    """Execute the jobs of a run file side by side; returns the exit status."""
+    given = _given(options, "campaign")
+    if options.time_limit is not None:
+        if not 0 < options.time_limit < float("inf"):
+            raise InputError(f"--time-limit {options.time_limit:g} was given; give a number of seconds above zero.")
+        given = replace(given, time_limit=options.time_limit)
+    if options.dask and options.workers is not None:
+        raise InputError("--workers and --dask were given; the cluster has its own workers, so leave one of them out.")
+    folds = f" x {given.folds} folds" if given.folds else ""
+    size = f"{len(given.cells)} cells x {len(given.seeds)} seeds{folds}"
+    try:
+        with contextlib.ExitStack() as stack:
+            executor: Executor | None = None
+            workers, ahead = given.workers, AHEAD
+            if options.dask:
+                from .cluster import dask_executor
+
+                executor, workers, ahead = stack.enter_context(dask_executor(options.dask))
+            print(f"campaign: {given.file}, {size}, {workers} workers, results in {given.out}", flush=True)
+            progress = stack.enter_context(insistent(stack.enter_context(progress_bar())))
+            result = campaign(
+                given,
+                overwrite=options.overwrite,
+                executor=executor,
+                ahead=ahead,
+                progress=progress,
+                tell=_tell,
+            )
+    except RunInterrupted as stop:
+        return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
+    except ConstraintsNotMet as missed:
+        return say(str(missed), NO_RESULT)
+    _print_summary(result)
+    return _told(given, result, TABLE, SUMMARY, PICTURE, MODEL)
+
+
+def _given(options: argparse.Namespace, kind: str) -> Run:
+    given = read_run(options.run_file, kind)
+    if options.out is not None:
+        check_own(Path(options.out), given.file, options.overwrite)
+        given = replace(given, out=make_folder(options.out))
+    if options.workers is not None:
+        if options.workers < 1:
+            raise InputError(f"--workers {options.workers} was given; give 1 or more.")
+        given = replace(given, workers=options.workers)
+    return given
+
+
+def _print_summary(result: RunResult) -> None:
+    """Quartiles of every cell, and the structure that is recommended."""
+    from rich.console import Console
+    from rich.table import Table
+
+    keys = list(result.summary[0].cell)
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for name in ("recording", *keys, "jobs", "failed", "25 %", "median", "75 %", "s a job"):
+        table.add_column(name, justify="left" if name == "recording" else "right", no_wrap=True)
+    for s in result.summary:
+        quartiles = [f"{q:.4f}" for q in s.quartiles[1:4]]
+        cell = [str(s.cell[k]) for k in keys]
+        counts = [str(s.jobs), f"{100 * s.failure_rate:.0f} %"]
+        table.add_row(f"{s.recording} ({s.role})", *cell, *counts, *quartiles, f"{s.seconds:.1f}")
+    Console(highlight=False).print(table)
+    if result.selection is not None:
+        print(result.selection)
+
+
+def _told(given: Run, result: RunResult, *files: str) -> int:
+    """Errors of the model chosen, and where everything is; the exit status."""
     for role in ROLES:
         for s in result.scores:
             if s.role == role and s.job == result.chosen:
                 print(f"NRMSE on {s.recording} ({role}): {s.nrmse:.4f}")
-    print(f"chosen: {result.chosen}; {len(result.done)} jobs done now, {len(result.skipped)} before")
+    failed = f", {len(result.failed)} of them without a model" if result.failed else ""
+    print(f"chosen: {result.chosen}; {len(result.done)} jobs done now, {len(result.skipped)} before{failed}")
     if len(given.seeds) > 1 and result.fit.candidates and not any(c.drawn for c in result.fit.candidates):
         print("no start is drawn where there are so few: every seed gives the same model; use one seed, or more starts")
-    for name in ("results.csv", "model.json", *(["report.html"] if given.report else []), "manifest.json"):
+    for name in (*files, *([PAGE] if given.report else []), "manifest.json"):
         print(result.folder / name)
     useless = min(result.fit.train_nrmse) >= 1.0
     return say("The model explains nothing of the training recording.", NO_RESULT) if useless else DONE

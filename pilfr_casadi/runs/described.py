@@ -1,4 +1,4 @@
-"""What a run file says, checked: data, model, solver, constraints, seeds and the folder of the results.
+"""What a run file says, checked: data, model, solver, constraints, grid, seeds and the folder of the results.
 
 A run file is TOML, or a Python file that sets `run` to such a table, in which the model may be a `PILFR` or a closed
 `Model`, the solver an object, and `own` a list of constraints under `constraints`. Paths are relative to the file.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,12 @@ from ..known import dc_gain, ordered
 from ..lfr import PILFR
 from ..load_simulator import user_variable
 from ..model import Model
-from ..multistart import POLISH
+from ..multistart import POLISH, STARTS
 from ..recording import InputError
 from ..structures import OPERATORS, STRUCTURES, named_structure
 from .folder import check_inside
-from .tables import Table, shown
+from .grid import Cell, cells_of, seeds_of
+from .tables import Table, as_plain, shown
 
 ROLES = ("train", "validation", "test")
 OPTIONS = {"period": int, "hold": str, "skip": int, "dt": float, "time_tolerance": float, "initial": str}
@@ -45,16 +46,19 @@ class Run:
         Recordings by role (`train`, `validation`, `test`), as they are named in the file.
     reading : dict
         How they are read: `inputs`, `outputs`, `columns` and fields of `Recording`.
-    model : PILFR or Model
+    cells : tuple of Cell
+        The models of the grid with their searches; one where there is no grid.
     solver : GaussNewton or Ipopt, or one of the user's own
-    search : dict
-        `starts` and `start`.
     stable : bool or float
     constraints : tuple of Constraint
     l1, prune, path, margin
         Of the regularization: a weight, whether to fit again after pruning, strengths of a path (None: no path; empty:
         the usual ones).
     seeds : tuple of int
+    folds : int
+        Of the cross-validation that chooses among the cells; 0 for none.
+    time_limit, retries
+        Seconds a job of a campaign may take (None: no limit), and how often one whose worker has died is tried again.
     workers : int
     engine : str
     report : bool
@@ -67,9 +71,8 @@ class Run:
     own: bool
     files: dict[str, tuple[str, ...]]
     reading: dict[str, Any]
-    model: PILFR | Model
+    cells: tuple[Cell, ...]
     solver: Any = POLISH
-    search: dict[str, Any] = field(default_factory=dict)
     stable: bool | float = True
     constraints: tuple[Constraint, ...] = ()
     l1: float | None = None
@@ -77,6 +80,9 @@ class Run:
     path: tuple[float, ...] | None = None
     margin: float = 0.05
     seeds: tuple[int, ...] = (0,)
+    folds: int = 0
+    time_limit: float | None = None
+    retries: int = 2
     workers: int = 1
     engine: str = "auto"
     report: bool = True
@@ -86,8 +92,8 @@ class Run:
         return self.file.parent / name
 
 
-def read_run(path: Any) -> Run:
-    """Read a run file, `.toml` or `.py`.
+def read_run(path: Any, kind: str = "run") -> Run:
+    """Read a run file, `.toml` or `.py`; `kind` ends the name of the folder of the results where the file gives none.
 
     Raises
     ------
@@ -104,33 +110,29 @@ def read_run(path: Any) -> Run:
             raise InputError(f"The run file {file} cannot be read ({error.strerror}); check its name.") from None
         except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
             raise InputError(f"{file} is not a TOML file ({error}); correct it.") from None
-    return _checked(file, content)
+    return _checked(file, content, kind)
 
 
-def _checked(file: Path, content: Any) -> Run:
+def _checked(file: Path, content: Any, kind: str) -> Run:
     top = Table(file, "", content)
-    said = {k: content.get(k) for k in ("model", "solver", "constraints", "regularization")}
-    plain, own = _plain(said)
+    said = {k: content.get(k) for k in ("model", "grid", "solver", "constraints", "regularization")}
+    plain, own = as_plain(said)
     data = top.table("data")
     files = {role: data.names(role, required=role == "train") for role in ROLES}
     reading = _reading(data)
     data.done()
     _check_files(top, files)
-    model = top.any("model", {})
-    model = model if isinstance(model, PILFR | Model) else _model(Table(file, "model", model))
-    solver, search = _solver(top.table("solver"))
-    stable, constraints = _constraints(top.table("constraints"), model)
+    cells, solver = cells_of(top, _model, _solver)
+    stable, constraints = _constraints(top.table("constraints"), cells[0].model)
     regularization = _regularization(top.table("regularization"), files)
-    seeds = top.any("seeds", [0])
-    seeds = [seeds] if isinstance(seeds, int) else seeds
-    usable = isinstance(seeds, list | tuple | range) and all(type(s) is int and s >= 0 for s in seeds)
-    if not usable or not seeds or len(set(seeds)) < len(seeds):
-        top.fail(f"'seeds' is {shown(seeds)}; give different whole numbers of 0 or more")
-    out = top.take("out", str, f"{file.stem}-run")
+    out = top.take("out", str, f"{file.stem}-{kind}")
     wrong = check_inside(file, out)
     if wrong:
         top.fail(wrong)
     more = {
+        "seeds": seeds_of(top),
+        "folds": top.number("folds", 0, 2, whole=True),
+        **_campaign(top.table("campaign")),
         "workers": top.number("workers", 1, 1, whole=True),
         "engine": top.choice("engine", ("auto", "c", "vm"), "auto"),
         "report": top.take("report", bool, True),
@@ -143,30 +145,13 @@ def _checked(file: Path, content: Any) -> Run:
         own,
         files,
         reading,
-        model,
+        cells,
         solver,
-        search,
         stable,
         constraints,
-        seeds=tuple(seeds),
         **regularization,
         **more,
     )
-
-
-def _plain(value: Any) -> tuple[Any, bool]:
-    """A value as JSON knows it, objects by a mark; and whether there are any."""
-    if isinstance(value, Mapping):
-        parts = {str(k): _plain(v) for k, v in sorted(value.items(), key=lambda kv: str(kv[0]))}
-        return {k: v for k, (v, _) in parts.items()}, any(o for _, o in parts.values())
-    if isinstance(value, list | tuple | range):
-        items = [_plain(v) for v in value]
-        return [v for v, _ in items], any(o for _, o in items)
-    if isinstance(value, float):
-        return repr(value), False  # inf and nan too
-    if value is None or isinstance(value, bool | int | str):
-        return value, False
-    return f"object {type(value).__name__}", True
 
 
 def _reading(data: Table) -> dict[str, Any]:
@@ -221,7 +206,7 @@ def _model(table: Table) -> PILFR:
 def _solver(table: Table) -> tuple[Any, dict[str, Any]]:
     search = {
         "starts": table.number("starts", 8, 1, whole=True),
-        "start": table.choice("start", ("grid", "paper"), "grid"),
+        "start": table.choice("start", STARTS, "grid"),
     }
     name = table.any("name", "gauss-newton")
     if not isinstance(name, str):
@@ -268,6 +253,12 @@ def _constraints(table: Table, model: PILFR | Model) -> tuple[bool | float, tupl
     if found and isinstance(model, Model):
         table.fail("dc_gain and ordered_thresholds are for a PI-LFR, and the model is your own; use 'own'")
     return stable if isinstance(stable, bool) else float(stable), (*found, *own)
+
+
+def _campaign(table: Table) -> dict[str, Any]:
+    limit, retries = table.number("time_limit", None, 0.01), table.number("retries", 2, 0, whole=True)
+    table.done()
+    return {"time_limit": limit, "retries": retries}
 
 
 def _regularization(table: Table, files: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:

@@ -3,32 +3,41 @@
 After every job its model is written, then the manifest, each atomically: wherever a run ends, by Ctrl-C, `kill -9` or a
 power cut, the next one goes on with the first job that is not complete, and the results are those of a run that was
 never interrupted. Executed twice on a machine, a run gives the same bytes in every file but `times.json`.
+
+`run` does the jobs one after the other, `campaign` (in its own file) many side by side; all else is the same.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..export import load, made
-from ..export.saving import model_text
 from ..fitted import Fit
+from ..interrupts import deferred_interrupt
 from ..model import Model
 from ..readers import read
 from ..recording import InputError, Recording
 from ..solution import Status
-from ..sparse import operators_used
 from .described import ROLES, Run, read_run
-from .folder import MODEL, PAGE, TABLE, check_own, note_time, read_times, sweep
-from .jobs import RunJob, execute, input_digests, jobs_of, timeless
-from .manifest import Manifest, alone, digest, versions
-from .results import Score, chosen, scored, table
+from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own, read_times, sweep
+from .folds import fold
+from .jobs import Outcome, Recordings, RunJob, input_digests, jobs_of, outcome
+from .manifest import alone, digest
+from .results import Score, chosen, table
+from .selection import Selection, select
+from .store import Store
+from .summary import CellSummary, box_plots, summarised, summary_table
 
 Progress = Callable[[str, int, int, float], None]
+Tell = Callable[[str], None]
+Perform = Callable[[Run, Recordings, Sequence[RunJob]], Iterator[list[tuple[RunJob, Outcome]]]]
 
 
 class RunInterrupted(KeyboardInterrupt):
@@ -50,27 +59,35 @@ class RunResult:
     Attributes
     ----------
     folder : Path
-        With `manifest.json`, `results.csv`, `jobs/ID/model.json`, and `model.json`, `report.html` of the job chosen;
-        `times.json` says how long each job took.
-    done, skipped : tuple of str
-        Ids of the jobs that were executed now, and of those that had been before.
+        With `manifest.json`, `results.csv`, `jobs/ID/model.json`, and `model.json`, `report.html` of the job chosen; of
+        a campaign with `summary.csv` and `spread.png` too. `times.json` says how long each job took.
+    done, skipped, failed : tuple of str
+        Ids of the jobs that were executed now, of those that had been before, and of those among both without a model.
     chosen : str
-        Id of the job of the smallest error on the validation recordings, without any on the training.
+        Id of the job of the smallest error on the validation recordings, without any on the training; where a structure
+        is selected, among its jobs.
     scores : tuple of Score
         Errors of every job on every recording.
     fit : Fit
         The model that is chosen.
     manifest : dict
         What `manifest.json` says.
+    summary : tuple of CellSummary
+        Quartiles and failures of every cell of the grid on every recording.
+    selection : Selection or None
+        The structure that is recommended, where there are several and recordings or folds to judge them by.
     """
 
     folder: Path
     done: tuple[str, ...]
     skipped: tuple[str, ...]
+    failed: tuple[str, ...]
     chosen: str
     scores: tuple[Score, ...]
     fit: Fit
     manifest: dict[str, Any]
+    summary: tuple[CellSummary, ...] = ()
+    selection: Selection | None = None
 
 
 def run(
@@ -81,7 +98,7 @@ def run(
     engine: str | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-    tell: Callable[[str], None] | None = None,
+    tell: Tell | None = None,
 ) -> RunResult:
     """Execute a run file.
 
@@ -115,16 +132,35 @@ def run(
         On Ctrl-C; what is complete stays.
     """
     given = path if isinstance(path, Run) else read_run(path)
-    tell = tell or (lambda line: None)
     given = given if engine is None else replace(given, engine=engine)
+
+    def in_turn(given: Run, recordings: Recordings, jobs: Sequence[RunJob]) -> Iterator[list[tuple[RunJob, Outcome]]]:
+        for job in jobs:
+            yield [(job, outcome(given, recordings, job, executor=executor, progress=progress))]
+
+    return carried_out(given, in_turn, out, overwrite, progress, tell)
+
+
+def carried_out(
+    given: Run,
+    perform: Perform,
+    out: Any,
+    overwrite: bool,
+    progress: Progress | None,
+    tell: Tell | None,
+    *,
+    campaign: bool = False,
+) -> RunResult:
+    """Execute a run whose jobs `perform` does, in any order; a campaign's tables can be read while it is at work."""
     folder = Path(out if out is not None else given.out)
     try:
         check_own(folder, given.file, overwrite)
     except OSError as error:
         raise InputError(f"The folder {folder} cannot be read ({error.strerror}); give another one.") from None
     inputs = input_digests(given)
-    jobs = jobs_of(given, inputs)
     recordings = {role: tuple(_read(given, name) for name in given.files[role]) for role in ROLES}
+    if given.folds:
+        fold(recordings["train"], 0, given.folds)  # refuses recordings that are too short for it
     made(folder)
     with contextlib.ExitStack() as stack:
         try:
@@ -132,111 +168,100 @@ def run(
             sweep(folder)
         except OSError as error:
             raise InputError(f"The folder {folder} cannot be written ({error.strerror}); give another one.") from None
-        return _run(given, folder, inputs, jobs, recordings, overwrite, executor, progress, tell)
+        place = Store(folder, given, inputs, recordings, overwrite, campaign)
+        return _Execution(place, perform, progress or (lambda *_: None), tell or (lambda line: None)).carry_out()
 
 
-def _run(
-    given: Run,
-    folder: Path,
-    inputs: dict[str, str],
-    jobs: tuple[RunJob, ...],
-    recordings: Mapping[str, tuple[Recording, ...]],
-    overwrite: bool,
-    executor: Executor | None,
-    progress: Progress | None,
-    tell: Callable[[str], None],
-) -> RunResult:
-    manifest = _manifest(folder, overwrite)
-    entries = manifest.content["jobs"]
-    ready = [j.id for j in jobs if _complete(manifest, j)]
-    manifest.content |= {"run": {"file": given.file.name, "said": given.said}, "versions": versions(), "inputs": inputs}
-    manifest.write()
-    done: list[str] = []
-    try:
-        for job in jobs:
-            if job.id in ready:
-                tell(f"{job.id}: done before")
-                continue
-            fit = execute(given, job, recordings, executor=executor, progress=progress)
-            if fit.status is Status.INTERRUPTED:
-                raise KeyboardInterrupt
-            entries[job.id] = _entry(job, fit)
-            if fit.status is not Status.INFEASIBLE:
-                manifest.put(job.model_file, model_text(timeless(fit)))
-            manifest.write()
-            note_time(folder, job.id, fit.seconds)
-            done.append(job.id)
-            tell(f"{job.id}: {entries[job.id]['sentence']}")
-        return _finished(given, manifest, jobs, recordings, tuple(done), tuple(ready), tell)
-    except KeyboardInterrupt:
-        raise RunInterrupted(len(done) + len(ready), len(jobs)) from None
+class _Execution:
+    """The jobs of a run in a folder: those of the cross-validation first, then those on all of the training."""
 
+    def __init__(self, place: Store, perform: Perform, progress: Progress, tell: Tell) -> None:
+        self.place, self.perform, self.progress, self.tell = place, perform, progress, tell
+        self.done: list[str] = []
+        self.skipped: list[str] = []
 
-def _manifest(folder: Path, overwrite: bool) -> Manifest:
-    """The folder's manifest, its results checked, or an empty one."""
-    if overwrite:
-        return Manifest.fresh(folder)
-    manifest = Manifest.found(folder)
-    if manifest is None:
-        return Manifest.fresh(folder)
-    for name in (TABLE, MODEL, PAGE):
-        manifest.holds(name)
-    return manifest
+    def carry_out(self) -> RunResult:
+        place, given = self.place, self.place.run
+        held: tuple[RunJob, ...] = ()
+        selection = None
+        jobs = jobs_of(given, place.inputs)
+        if given.folds:
+            held = jobs_of(given, place.inputs, folds=True)
+            self._all(held)
+            selection = select(place, held)
+            jobs = tuple(j for j in jobs if j.cell == selection.cell)
+        self._all(jobs, held)
+        if not given.folds and given.files["validation"] and len(given.cells) > 1:
+            selection = select(place, jobs)
+        return self._finished((*held, *jobs), selection)
 
+    def _all(self, jobs: Sequence[RunJob], before: Sequence[RunJob] = ()) -> None:
+        """Do those jobs that are not complete."""
+        place, total = self.place, len(before) + len(jobs)
+        ready = [j for j in jobs if place.complete(j)]
+        self.skipped += [j.id for j in ready]
+        if place.campaign and ready:
+            self.tell(f"{len(ready)} jobs done before")
+        for job in () if place.campaign else ready:
+            self.tell(f"{job.id}: done before")
+        place.write_table((*before, *ready))
+        try:
+            for batch in self.perform(place.run, place.recordings, [j for j in jobs if j not in ready]):
+                with deferred_interrupt():  # what has been done is not to be lost
+                    place.note(batch)
+                for job, found in batch:
+                    ready.append(job)
+                    self.done.append(job.id)
+                    self.tell(f"{job.id}: {found.entry['sentence']}")
+                place.write_table((*before, *ready))
+                best = min(place.entries[j.id].get("train", np.inf) for j in ready)
+                self.progress("jobs", len(before) + len(ready), total, best)
+        except KeyboardInterrupt:
+            raise RunInterrupted(len(self.done) + len(self.skipped), total) from None
 
-def _complete(manifest: Manifest, job: RunJob) -> bool:
-    """Whether a job has been done from the same inputs, and its model is there as it was written."""
-    entry = manifest.content["jobs"].get(job.id, {})
-    if entry.get("key") != job.key:
-        return False
-    return entry.get("status") == Status.INFEASIBLE.name or manifest.holds(job.model_file)
+    def _finished(self, jobs: Sequence[RunJob], selection: Selection | None) -> RunResult:
+        """Errors, tables, and model and page of the job that is chosen."""
+        place, given = self.place, self.place.run
+        manifest, entries = place.manifest, place.entries
+        whole = [j for j in jobs if j.fold is None and (selection is None or j.cell == selection.cell)]
+        usable = [j for j in whole if place.has_model(j)]
+        if not usable:
+            first, met = whole[0].id, entries[whole[0].id]["status"] == Status.INFEASIBLE.name
+            about = f"{first}: {entries[first]['sentence']}"
+            if met:
+                raise ConstraintsNotMet(f"{given.file}: no job meets its constraints; {about}")
+            raise InputError(f"{given.file}: no job gave a model; {about}")
+        scores = place.scores(jobs)
+        best = chosen(scores, [j.id for j in usable])
+        job = next(j for j in usable if j.id == best)
+        times = read_times(place.path)
+        fit = replace(self._model(job), engine=given.engine)
+        summary = summarised(given, jobs, scores, times)
+        manifest.content["chosen"] = best
+        manifest.put(TABLE, table(scores, jobs, entries, best))
+        manifest.put(MODEL, (place.path / job.model_file).read_text(encoding="utf-8"))
+        if place.campaign:
+            manifest.put(SUMMARY, summary_table(given, summary))
+            manifest.put(PICTURE, box_plots(given, jobs, scores))
+        key = digest([manifest.content["files"][MODEL], place.inputs, given.files, str(given.reading)])
+        if given.report and (manifest.content.get("report") != key or not manifest.holds(PAGE)):
+            from ..report.fit_page import fit_page
 
+            self.tell("writing the report")
+            recordings = place.recordings
+            judged = recordings["validation"] + recordings["test"]
+            manifest.put(PAGE, fit_page(fit, recordings["train"], judged, model_file=MODEL).html())
+            manifest.content["report"] = key
+        manifest.content.pop("writing", None)
+        manifest.write()
+        failed = tuple(j.id for j in jobs if not place.ended_well(j))
+        fit = replace(fit, seconds=times.get(best, 0.0))
+        parts = tuple(self.done), tuple(self.skipped), failed
+        return RunResult(place.path, *parts, best, tuple(scores), fit, manifest.content, summary, selection)
 
-def _entry(job: RunJob, fit: Fit) -> dict[str, Any]:
-    missed = [str(limit) for limit in fit.limits if not limit.met]
-    error = ", ".join(f"{e:.4f}" for e in fit.train_nrmse)
-    infeasible = fit.status is Status.INFEASIBLE
-    sentence = (
-        f"{fit.status.value} ({'; '.join(missed)})" if infeasible else f"NRMSE on training {error}. {fit.status.value}"
-    )
-    about = {"key": job.key, "status": fit.status.name, "sentence": sentence, "operators": operators_used(fit)}
-    return {**job.parameters, **about}
-
-
-def _finished(
-    given: Run,
-    manifest: Manifest,
-    jobs: tuple[RunJob, ...],
-    recordings: Mapping[str, tuple[Recording, ...]],
-    done: tuple[str, ...],
-    skipped: tuple[str, ...],
-    tell: Callable[[str], None],
-) -> RunResult:
-    """Errors, the table, and model and page of the job that is chosen."""
-    folder, entries = manifest.folder, manifest.content["jobs"]
-    usable = [j for j in jobs if entries[j.id]["status"] != Status.INFEASIBLE.name]
-    if not usable:
-        first = f"{jobs[0].id}: {entries[jobs[0].id]['sentence']}"
-        raise ConstraintsNotMet(f"{given.file}: no job meets its constraints; {first}")
-    equations = given.model if isinstance(given.model, Model) else None
-    fits = {j.id: replace(load(folder / j.model_file, model=equations), engine=given.engine) for j in usable}
-    scores = [s for j in usable for s in scored(manifest, given, j, fits[j.id], recordings)]
-    best = chosen(scores)
-    manifest.content["chosen"] = best
-    manifest.put(TABLE, table(scores, usable, entries, best))
-    manifest.put(MODEL, (folder / f"jobs/{best}" / MODEL).read_text(encoding="utf-8"))
-    key = digest([manifest.content["files"][MODEL], manifest.content["inputs"], given.files, str(given.reading)])
-    if given.report and (manifest.content.get("report") != key or not manifest.holds(PAGE)):
-        from ..report.fit_page import fit_page
-
-        tell("writing the report")
-        judged = recordings["validation"] + recordings["test"]
-        manifest.put(PAGE, fit_page(fits[best], recordings["train"], judged, model_file=MODEL).html())
-        manifest.content["report"] = key
-    manifest.content.pop("writing", None)
-    manifest.write()
-    fit = replace(fits[best], seconds=read_times(folder).get(best, 0.0))
-    return RunResult(folder, done, skipped, best, tuple(scores), fit, manifest.content)
+    def _model(self, job: RunJob) -> Fit:
+        own = self.place.run.cells[job.cell].model
+        return load(self.place.path / job.model_file, model=own if isinstance(own, Model) else None)
 
 
 def _read(given: Run, name: str) -> Recording:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 from ..checks import listed
@@ -16,7 +17,8 @@ from ..recording import InputError
 from .manifest import NAME
 
 TABLE, PAGE, MODEL, TIMES, JOBS, LOCK = "results.csv", "report.html", "model.json", "times.json", "jobs", ".lock"
-OWN = (NAME, TABLE, PAGE, MODEL, TIMES, JOBS)
+SUMMARY, PICTURE = "summary.csv", "spread.png"  # of a campaign
+OWN = (NAME, TABLE, PAGE, MODEL, SUMMARY, PICTURE, TIMES, JOBS)
 
 
 def check_inside(file: Path, out: str) -> str | None:
@@ -76,7 +78,7 @@ def read_times(folder: Path) -> dict[str, float]:
         return {}
 
 
-def note_time(folder: Path, job: str, seconds: float) -> None:
-    """Add a job's seconds to those of the others."""
-    times = {**read_times(folder), job: round(seconds, 3)}
+def note_times(folder: Path, seconds: Mapping[str, float]) -> None:
+    """Add the seconds of some jobs to those of the others."""
+    times = {**read_times(folder), **{job: round(value, 3) for job, value in seconds.items()}}
     write_atomically(folder / TIMES, json.dumps(times, indent=1, sort_keys=True) + "\n")

@@ -9,25 +9,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
+from ..export.saving import model_text
 from ..fit import fit as identify
 from ..fitted import Fit
 from ..lfr import PILFR
-from ..recording import Recording
+from ..recording import InputError, Recording
 from ..solution import Solution, Status
-from ..sparse import prune, regularization_path
+from ..sparse import operators_used, prune, regularization_path
 from .described import Run
+from .folds import fold
 from .manifest import digest, file_digest, versions
+
+Recordings = Mapping[str, tuple[Recording, ...]]
+# how a job of a campaign may end besides a solver's status
+FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"
 
 
 @dataclass(frozen=True, eq=False)
 class RunJob:
-    """One identification: what sets it apart, and what it depends on."""
+    """One identification: what sets it apart, what it depends on, and its place in the grid."""
 
     parameters: Mapping[str, Any]
     key: str
+    cell: int = 0
 
     @property
     def id(self) -> str:
@@ -35,9 +44,24 @@ class RunJob:
         return "_".join(f"{name}-{value}" for name, value in self.parameters.items())
 
     @property
+    def fold(self) -> int | None:
+        """Which part of the training it holds out; None where none."""
+        return self.parameters.get("fold")
+
+    @property
     def model_file(self) -> str:
         """Its model, below the folder of the run."""
         return f"jobs/{self.id}/model.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a job amounts to: its line of the manifest, the time it took, its model file, its NRMSE by recording."""
+
+    entry: dict[str, Any]
+    seconds: float = 0.0
+    model: str | None = None
+    errors: Mapping[str, float | None] = field(default_factory=dict)
 
 
 def input_digests(run: Run) -> dict[str, str]:
@@ -45,31 +69,101 @@ def input_digests(run: Run) -> dict[str, str]:
     return {name: file_digest(run.located(name)) for names in run.files.values() for name in names}
 
 
-def jobs_of(run: Run, inputs: Mapping[str, str]) -> tuple[RunJob, ...]:
-    """One job a seed.
+def jobs_of(run: Run, inputs: Mapping[str, str], folds: bool = False) -> tuple[RunJob, ...]:
+    """One job a cell and seed.
 
     Parameters
     ----------
     run : Run
     inputs : mapping
         SHA-256 by file name, from `input_digests`.
+    folds : bool
+        Those of the cross-validation: one a cell, seed and fold, whose models hold one fold out.
     """
     read = run.files["train"] + (run.files["validation"] if run.path is not None else ())
     common = {
-        "said": run.said,
         "program": file_digest(run.file) if run.own else None,
         "reading": {k: list(v) if isinstance(v, tuple) else v for k, v in run.reading.items()},
         "data": [[name, inputs[name]] for name in read],
         "engine": run.engine,
         "versions": versions(),
     }
-    return tuple(RunJob({"seed": seed}, digest({**common, "seed": seed})) for seed in run.seeds)
+    jobs = []
+    for number, cell in enumerate(run.cells):
+        said = {"said": {**run.said, "grid": None, **cell.said}}
+        for part in range(run.folds) if folds else (None,):
+            own = {} if part is None else {"fold": part}
+            for seed in run.seeds:
+                key = digest({**common, **said, "seed": seed, **({**own, "folds": run.folds} if own else {})})
+                jobs.append(RunJob({**cell.values, **own, "seed": seed}, key, number))
+    return tuple(jobs)
+
+
+def outcome(
+    run: Run,
+    recordings: Recordings,
+    job: RunJob,
+    *,
+    executor: Executor | None = None,
+    progress: Callable[[str, int, int, float], None] | None = None,
+) -> Outcome:
+    """Do a job: identify its model and judge it.
+
+    Raises
+    ------
+    InputError
+        If the model cannot be identified.
+    KeyboardInterrupt
+        On Ctrl-C.
+    """
+    fit = timeless(found := execute(run, job, recordings, executor=executor, progress=progress))
+    if fit.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    missed = [str(limit) for limit in fit.limits if not limit.met]
+    infeasible = fit.status is Status.INFEASIBLE
+    training = f"NRMSE on training {', '.join(f'{e:.4f}' for e in fit.train_nrmse)}."
+    about = {
+        "status": fit.status.name,
+        "sentence": f"{fit.status.value} ({'; '.join(missed)})" if infeasible else f"{training} {fit.status.value}",
+        "train": float(np.mean(fit.train_nrmse)),
+        "operators_used": operators_used(fit),
+    }
+    if infeasible:
+        return Outcome(about, found.seconds)
+    if job.fold is not None:
+        return Outcome({**about, "held": fit.nrmse(fold(recordings["train"], job.fold, run.folds)[1])}, found.seconds)
+    pairs = ((name, r) for role, names in run.files.items() for name, r in zip(names, recordings[role], strict=True))
+    errors = {name: error_of(fit, recording) for name, recording in pairs}
+    return Outcome(about, found.seconds, model_text(fit), errors)
+
+
+def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:
+    """A job of a campaign: `outcome`, where one that cannot be done is an outcome too."""
+    try:
+        return outcome(run, recordings, job)
+    except Exception as error:
+        text = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        return unfinished(FAILED, f"Failed: {text}")
+
+
+def unfinished(status: str, sentence: str, **more: Any) -> Outcome:
+    """The outcome of a job without a model."""
+    return Outcome({"status": status, "sentence": sentence, "operators_used": "", **more})
+
+
+def error_of(fit: Fit, recording: Recording) -> float | None:
+    """NRMSE (Krikelis et al. 2024, Eq. 27) on a recording; None where it cannot be told."""
+    try:
+        error = fit.nrmse(recording)
+    except InputError:
+        return None
+    return error if np.isfinite(error) else None
 
 
 def execute(
     run: Run,
     job: RunJob,
-    recordings: Mapping[str, tuple[Recording, ...]],
+    recordings: Recordings,
     *,
     executor: Executor | None = None,
     progress: Callable[[str, int, int, float], None] | None = None,
@@ -87,14 +181,15 @@ def execute(
         "constraints": run.constraints,
         "engine": run.engine,
     }
+    cell = run.cells[job.cell]
     search = (
-        {**run.search, "seed": int(job.parameters["seed"]), "executor": executor}
-        if isinstance(run.model, PILFR)
+        {**cell.search, "seed": int(job.parameters["seed"]), "executor": executor}
+        if isinstance(cell.model, PILFR)
         else {}
     )
-    train = recordings["train"]
+    train = recordings["train"] if job.fold is None else fold(recordings["train"], job.fold, run.folds)[0]
     l1 = {"w": run.l1} if run.l1 else None
-    found = identify(run.model, train, **options, **search, l1=l1, progress=progress)
+    found = identify(cell.model, train, **options, **search, l1=l1, progress=progress)
     if found.status is Status.INTERRUPTED:
         return found
     if l1 and run.prune and found.structure is not None:

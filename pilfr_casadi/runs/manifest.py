@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -118,20 +118,31 @@ class Manifest:
             )
         return True
 
-    def put(self, name: str, text: str) -> None:
-        """Write a file of the run and note its digest, in the manifest too."""
-        target = self.folder / name
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"The folder {target.parent} cannot be made ({error.strerror}); give another.") from None
-        found = digest(text.encode())
-        if self.content["files"].get(name) == found and self.holds(name):
-            return
-        self.content["writing"] = {name: found}
+    def put(self, name: str, content: str | bytes) -> None:
+        """Write a file of the run and note its digest, in the manifest too where it has changed."""
+        data = content.encode() if isinstance(content, str) else content
+        if self.content["files"].get(name) != digest(data) or not self.holds(name):
+            self.put_all({name: data})
+
+    def put_all(self, contents: Mapping[str, str | bytes], jobs: Mapping[str, Any] | None = None) -> None:
+        """Write files of the run, then the manifest with their digests, and with what is known of the jobs they end."""
+        data = {name: c.encode() if isinstance(c, str) else c for name, c in contents.items()}
+        found = {name: digest(content) for name, content in data.items()}
+        if data:
+            self.content["writing"] = found
+            self.write()
+        for name, content in data.items():
+            target = self.folder / name
+            try:
+                target.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(
+                    f"The folder {target.parent} cannot be made ({error.strerror}); give another."
+                ) from None
+            write_atomically(target, content)
+        self.content["files"] |= found
+        self.content["jobs"] |= jobs or {}
         self.write()
-        write_atomically(target, text)
-        self.content["files"][name] = found
 
 
 @contextlib.contextmanager

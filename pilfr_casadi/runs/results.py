@@ -1,22 +1,18 @@
-"""What a run amounts to: errors of every model on every recording, the one that is chosen, a table and a page."""
+"""What a run amounts to: errors of every model on every recording, the one that is chosen, and a table."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..fitted import Fit
-from ..recording import InputError, Recording
+from ..recording import Recording
 from .described import ROLES, Run
-from .jobs import RunJob
-from .manifest import Manifest, digest
-
-COLUMNS = ("job", "seed", "chosen", "status", "operators", "role", "recording", "nrmse")
+from .jobs import Recordings, RunJob
 
 
 @dataclass(frozen=True)
@@ -29,48 +25,35 @@ class Score:
     nrmse: float
 
 
-def scored(
-    manifest: Manifest, run: Run, job: RunJob, fit: Fit, recordings: Mapping[str, tuple[Recording, ...]]
-) -> list[Score]:
-    """Errors of a job's model, those that the manifest has already taken from there."""
-    out, known = [], manifest.content["scores"]
-    model, reading = manifest.content["files"][job.model_file], {k: str(v) for k, v in run.reading.items()}
+def scored_files(run: Run, recordings: Recordings) -> Iterator[tuple[str, str, Recording]]:
+    """Role, name and recording of every file of a run."""
     for role in ROLES:
         for name, recording in zip(run.files[role], recordings[role], strict=True):
-            key = digest({"model": model, "data": manifest.content["inputs"][name], "reading": reading})
-            if key not in known:
-                known[key] = _error(fit, recording)
-            value = known[key]
-            out.append(Score(job.id, role, name, np.nan if value is None else float(value)))
-    return out
+            yield role, name, recording
 
 
-def _error(fit: Fit, recording: Recording) -> float | None:
-    try:
-        error = fit.nrmse(recording)
-    except InputError:
-        return None
-    return error if np.isfinite(error) else None
-
-
-def chosen(scores: Sequence[Score]) -> str:
-    """The job of the smallest validation error, of the smallest training error where there is no validation."""
+def chosen(scores: Sequence[Score], jobs: Sequence[str]) -> str:
+    """Of these jobs the one of the smallest validation error, of the smallest training error without validation."""
     judge = "validation" if any(s.role == "validation" for s in scores) else "train"
     errors: dict[str, list[float]] = {}
     for s in scores:
-        if s.role == judge:
+        if s.role == judge and s.job in jobs:
             errors.setdefault(s.job, []).append(s.nrmse if np.isfinite(s.nrmse) else np.inf)
     return min(errors, key=lambda job: (float(np.mean(errors[job])), list(errors).index(job)))
 
 
 def table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapping[str, Any], best: str) -> str:
-    """results.csv: one row a job and recording, numbers to the last digit."""
+    """results.csv: one row a job and recording, numbers to the last digit; one row for a job without a model."""
+    keys = list(dict.fromkeys(k for job in jobs for k in job.parameters if k != "seed"))
+    by_job: dict[str, list[Score]] = {}
+    for s in scores:
+        by_job.setdefault(s.job, []).append(s)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer.writerow(["job", "seed", "chosen", *keys, "status", "operators_used", "role", "recording", "nrmse"])
     for job in jobs:
         entry = entries[job.id]
-        for s in (s for s in scores if s.job == job.id):
-            about = [job.id, job.parameters.get("seed", ""), int(job.id == best), entry["status"], entry["operators"]]
-            writer.writerow([*about, s.role, s.recording, repr(s.nrmse)])
+        about = [job.id, job.parameters["seed"], int(job.id == best), *(job.parameters.get(k, "") for k in keys)]
+        for s in by_job.get(job.id, [Score(job.id, "", "", np.nan)]):
+            writer.writerow([*about, entry["status"], entry["operators_used"], s.role, s.recording, repr(s.nrmse)])
     return text.getvalue()

@@ -102,3 +102,18 @@ def shown(value: Any) -> str:
     """A value in a sentence."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def as_plain(value: Any) -> tuple[Any, bool]:
+    """A value as JSON knows it, objects by a mark; and whether there are any."""
+    if isinstance(value, Mapping):
+        parts = {str(k): as_plain(v) for k, v in sorted(value.items(), key=lambda kv: str(kv[0]))}
+        return {k: v for k, (v, _) in parts.items()}, any(o for _, o in parts.values())
+    if isinstance(value, list | tuple | range):
+        items = [as_plain(v) for v in value]
+        return [v for v, _ in items], any(o for _, o in items)
+    if isinstance(value, float):
+        return repr(value), False  # inf and nan too
+    if value is None or isinstance(value, bool | int | str):
+        return value, False
+    return f"object {type(value).__name__}", True

@@ -1,0 +1,141 @@
+"""Fits of NARX and NOE models, which are trained another way than they are used, or with data held back.
+
+A NARX is trained to predict one step, reading the measured outputs. A NOE begins so and then reads a smaller and
+smaller share of them, down to none: simulation errors over a long record have many minima, and a model that is led by
+the data passes most of them by. What both are judged and chosen by is the simulation error over the training data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .baselines import NARX, NOE, lagged_start, reading_output
+from .compiled import make_engine
+from .early_stopping import held_problem, hold_back, solve_watched
+from .fitted import Fit, first_state
+from .gauss_newton import GaussNewton
+from .job import Job
+from .lfr import PILFR
+from .model import Model
+from .multistart import EXPLORE, Candidate, run_tasks
+from .outcome import with_solution
+from .problem import Problem
+from .recording import InputError, Recording, as_recordings, check_for_identification
+from .sensitivities import Engine
+from .solution import Solution, Status
+from .threads import one_blas_thread
+
+SHARES = (1.0, 0.3, 0.1, 0.0)  # of the measured output that a NOE reads while it is trained, stage by stage
+
+
+@dataclass(frozen=True, eq=False)
+class LaggedSearch:
+    """All that the starts of one identification share."""
+
+    wanted: NARX | NOE
+    structure: PILFR
+    job: Job
+    kept: tuple[Recording, ...]
+    held: tuple[Recording, ...]
+
+    def problem(self, model: Model, engine: Engine | None) -> Problem:
+        """The error of a model over what is trained on."""
+        return replace(self.job, recordings=self.kept).problem(model, engine=engine or self.job.engine)
+
+
+def fit_lagged(
+    wanted: NARX | NOE,
+    train: Recording | Sequence[Recording],
+    job: Job,
+    starts: int,
+    seed: int,
+    executor: Executor | None,
+) -> Fit:
+    """The fit of a NARX or NOE: every start to its end, the smallest simulation error over the training data.
+
+    Raises
+    ------
+    InputError
+        If the recordings hold too little, no start gives a finite simulation, or an option is unfit.
+    """
+    if job.l1:
+        raise InputError("An L1 penalty is for the weights of an element; leave l1 out, or give a PILFR.")
+    if not isinstance(job.solver, GaussNewton) and wanted.validation:
+        raise InputError("Early stopping needs the solver GaussNewton(); give that, or validation=0.")
+    first = as_recordings(train)[0]
+    structure = wanted.structure(first.n_u, first.n_y)
+    unknown = int(structure.model(first.n_u, first.n_y).parameters.free.sum())
+    job = replace(job, recordings=check_for_identification(train, unknown + 2))
+    split = hold_back(job.recordings, wanted.validation) if wanted.validation else (job.recordings, ())
+    search = LaggedSearch(wanted, structure, replace(job, progress=None), *split)
+    seen: list[float] = []
+
+    def report(candidate: Candidate) -> None:
+        seen.append(candidate.error)
+        if job.progress:
+            job.progress("starts", len(seen), starts, min(seen))
+
+    sequences = np.random.SeedSequence(seed).spawn(starts)
+    found, stopped = run_tasks(explore_lagged, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
+    usable = [c for c in found if np.isfinite(c.error)]
+    if not usable and stopped:
+        raise KeyboardInterrupt
+    if not usable:
+        raise InputError(
+            "No start gave a finite simulation in free run; try more starts, fewer neurons or lags, or a NOE."
+        )
+    best = min(usable, key=lambda c: c.error)
+    solution = replace(best.solution, status=Status.INTERRUPTED) if stopped else best.solution
+    result = job.result(best.model, search.structure, job.problem(best.model), solution, candidates=tuple(found))
+    return replace(result, errors={})  # theirs are those of a minimum of the simulation error, which this need not be
+
+
+@one_blas_thread
+def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequence) -> Candidate:
+    """One start, run to its end."""
+    first = search.kept[0]
+    values = lagged_start(search.wanted, search.structure, search.kept, np.random.default_rng(sequence))
+    names = {"inputs": first.inputs, "outputs": first.outputs}
+    model = search.structure.model(first.n_u, first.n_y, values, **names)
+    solution, engine = None, None
+    shares = SHARES[:1] if isinstance(search.wanted, NARX) else SHARES
+    for share in shares:
+        trained = reading_output(model, share) if share else model
+        problem = search.problem(trained, engine if share else None)
+        engine = problem.engine
+        begin = problem.start if solution is None else solution.theta
+        if solution is not None and not np.isfinite(problem.cost(begin)):
+            break
+        if share != shares[-1]:
+            solution = EXPLORE.solve(problem, begin)
+        elif search.held:
+            solution = solve_watched(search.job.solver, problem, held_problem(trained, search.held, problem), begin)
+        else:
+            solution = search.job.solver.solve(problem, begin)
+        if solution.status is Status.INTERRUPTED:
+            break
+    assert solution is not None
+    return _candidate(search, seed, model, solution)
+
+
+def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution) -> Candidate:
+    """What a start has led to, judged in free run over all the training data."""
+    engine = make_engine(model, search.job.engine)
+    problem = Problem(model, search.job.recordings, engine=engine)
+    theta = solution.theta
+    if problem.size > len(theta):  # the initial states of the recordings held back
+        fitted = with_solution(model, problem, solution)
+        others = [r for r in search.job.recordings[len(search.kept) :] if isinstance(r.initial, str)]
+        theta = np.concatenate([theta, *(first_state(fitted, engine, r) for r in others if r.initial == "estimate")])
+        more = np.zeros(len(theta) - len(solution.theta))
+        multipliers = np.insert(solution.multipliers, len(solution.theta), more)
+        solution = replace(solution, multipliers=multipliers)
+    with np.errstate(over="ignore", invalid="ignore"):
+        e = problem.residual(theta)
+        error = float(np.sqrt(np.mean(e**2)))
+    error = error if np.isfinite(error) else np.inf
+    return Candidate(seed, model, theta, error, replace(solution, theta=theta))

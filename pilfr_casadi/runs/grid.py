@@ -1,0 +1,101 @@
+"""The grid of a run file: every combination of the values listed in `[grid]` is a cell, and every seed a job in it.
+
+A run without a grid has one cell. Keys of the grid are those of `[model]` and `[solver]` that a study varies; what it
+does not list is as these tables say.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..lfr import PILFR
+from ..model import Model
+from .tables import Table, as_plain, shown
+
+MODEL_KEYS = ("structure", "nx", "operator", "operators", "channels", "neurons")
+SOLVER_KEYS = ("start", "starts")
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One model of a study.
+
+    Attributes
+    ----------
+    values : dict
+        Key of the grid -> value; empty where there is no grid.
+    model : PILFR or Model
+    search : dict
+        `starts` and `start`.
+    said : dict
+        What the jobs of the cell depend on, as plain numbers and texts: `model` and `solver` with the cell's values.
+    """
+
+    values: Mapping[str, Any]
+    model: PILFR | Model
+    search: dict[str, Any]
+    said: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The cell's values in a few words."""
+        return ", ".join(f"{key} {value}" for key, value in self.values.items())
+
+
+def cells_of(
+    top: Table, model_of: Callable[[Table], PILFR], solver_of: Callable[[Table], tuple[Any, dict[str, Any]]]
+) -> tuple[tuple[Cell, ...], Any]:
+    """The cells of a run, in the order of the grid's keys with the last varying fastest; and the solver of all."""
+    model, solver = top.any("model", {}), top.any("solver", {})
+    if isinstance(model, PILFR | Model):
+        if top.has("grid"):
+            top.fail("[grid] varies a [model] table, and the model is an object; leave one of them out")
+        found, search = solver_of(Table(top.file, "solver", solver))
+        return (Cell({}, model, search, as_plain({"model": model, "solver": solver})[0]),), found
+    axes = _axes(top.table("grid"))
+    base = {"model": Table(top.file, "model", model).content, "solver": Table(top.file, "solver", solver).content}
+    cells: list[Cell] = []
+    for values in itertools.product(*axes.values()):
+        cell = dict(zip(axes, values, strict=True))
+        said = {
+            "model": base["model"] | {k: v for k, v in cell.items() if k in MODEL_KEYS},
+            "solver": base["solver"] | {k: v for k, v in cell.items() if k in SOLVER_KEYS},
+        }
+        if "operator" in axes and cell["operator"] != "generalized_play" and "neurons" not in axes:
+            said["model"].pop("neurons", None)
+        found, search = solver_of(Table(top.file, "solver", said["solver"]))
+        cells.append(Cell(cell, model_of(Table(top.file, "model", said["model"])), search, as_plain(said)[0]))
+    return tuple(cells), found
+
+
+def _axes(table: Table) -> dict[str, list[Any]]:
+    axes = {}
+    for key in (*MODEL_KEYS, *SOLVER_KEYS):
+        if not table.has(key):
+            table.known.append(key)
+            continue
+        values = table.any(key)
+        usable = isinstance(values, list | tuple) and values and all(isinstance(v, int | str) for v in values)
+        if not usable or len(set(values)) < len(values):
+            table.fail(f"{table.where(key)} is {shown(values)}; give a list of different values")
+        axes[key] = list(values)
+    table.done()
+    return axes
+
+
+def seeds_of(top: Table) -> tuple[int, ...]:
+    """The seeds: a number, a list, or a table of `first` and `count`."""
+    seeds = top.any("seeds", [0])
+    if isinstance(seeds, Mapping):
+        table = Table(top.file, "seeds", seeds)
+        first, count = table.number("first", 0, 0, whole=True), table.number("count", 1, 1, whole=True)
+        table.done()
+        return tuple(range(first, first + count))
+    seeds = [seeds] if isinstance(seeds, int) else seeds
+    usable = isinstance(seeds, list | tuple | range) and all(type(s) is int and s >= 0 for s in seeds)
+    if not usable or not seeds or len(set(seeds)) < len(seeds):
+        top.fail(f"'seeds' is {shown(seeds)}; give different whole numbers of 0 or more, or first and count")
+    return tuple(seeds)

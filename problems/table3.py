@@ -1,0 +1,165 @@
+"""Table 3 and Figs. 13-15 of Krikelis et al. (2024), Sec. 7, on a stand-in and on a real piezo stack.
+
+    python -m problems.table3
+
+The paper's recordings are confidential. `problems.piezo_platform` measures a documented platform the same way: ten
+multisines of 8192 samples at 10 kHz, five steady periods each, 0-3000 Hz for the linear analysis and 0-800 Hz for the
+models, nine to train and one to test, averaged over the periods. The noise is the paper's share of the output, the
+other figures are of their own, so rows are to be compared within a column.
+
+Every row goes the same way: starts and polish on the first realization, then all nine. State matrices are in modal
+coordinates (`pilfr_casadi.modal`), the same model class with a tenth of the work. The real stack is that of
+`problems.piezo_stack`: its record of growing and shrinking amplitude, first half to train, second half to test (its
+memory is that of the first half, which is run before it); at 1 Hz there is no room for more than two states.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi.fit import Fit, fit
+from pilfr_casadi.lfr import PILFR, hammerstein
+from pilfr_casadi.modal import modal
+from pilfr_casadi.operators import Play
+from pilfr_casadi.recording import Recording
+
+from .measured_data import measured
+from .piezo_platform import measure
+from .piezo_stack import recordings as stack_recordings
+
+EXPLORED = 1  # realizations on which starts are tried
+SLOWEST = (
+    0.9997  # spectral radius: a lag of 0.3 s; slower ones look constant in a period, and settle over dozens of them
+)
+PUBLISHED_FLOOR = 0.0884
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table.
+
+    Attributes
+    ----------
+    model : PILFR, or anything else that `fit` takes
+        What is fitted.
+    published : tuple of float, optional
+        NRMSE on training and test in the paper.
+    """
+
+    model: Any
+    published: tuple[float, float] | None = None
+
+
+def lti(nx: int) -> PILFR:
+    """A linear model."""
+    return PILFR(nx, None, {"A": modal(nx)})
+
+
+def pi_lfr(nx: int, n: int) -> PILFR:
+    """A PI-LFR with n plays."""
+    return PILFR(nx, PrandtlIshlinskii(Play, n), {"A": modal(nx)})
+
+
+def pi_hammerstein(nx: int, n: int) -> PILFR:
+    """A PI-Hammerstein model with n plays."""
+    form = hammerstein(nx, PrandtlIshlinskii(Play, n))
+    return PILFR(nx, form.element, {**form.fixed, "A": modal(nx)})
+
+
+def rows() -> dict[str, Row]:
+    """The rows of Table 3, and a linear model of the larger order beside them."""
+    published = {
+        ("PI-Hamm", 8, 10): (0.1820, 0.1860),
+        ("PI-Hamm", 8, 20): (0.1827, 0.1863),
+        ("PI-Hamm", 15, 10): (0.1060, 0.1072),
+        ("PI-Hamm", 15, 20): (0.1073, 0.1098),
+        ("PI-LFR", 8, 10): (0.1862, 0.1871),
+        ("PI-LFR", 8, 20): (0.1856, 0.1868),
+        ("PI-LFR", 15, 10): (0.1056, 0.1052),
+        ("PI-LFR", 15, 20): (0.1057, 0.1044),
+    }
+    build = {"PI-Hamm": pi_hammerstein, "PI-LFR": pi_lfr}
+    found = {"LTI nx=8": Row(lti(8), (0.2104, 0.2084)), "LTI nx=15": Row(lti(15))}
+    return found | {f"{k} nx={nx} N={n}": Row(build[k](nx, n), e) for (k, nx, n), e in published.items()}
+
+
+def stack_rows() -> dict[str, Row]:
+    """The same kinds of models for the real stack."""
+    found = {f"LTI nx={nx}": Row(lti(nx)) for nx in (1, 2)}
+    for name, build in (("PI-Hamm", pi_hammerstein), ("PI-LFR", pi_lfr)):
+        found |= {f"{name} nx={nx} N={n}": Row(build(nx, n)) for nx in (1, 2) for n in (10, 20)}
+    return found
+
+
+def identify(row: Row, train: Sequence[Recording], explored: int = EXPLORED, **options: Any) -> Fit:
+    """The fit of a row to the training recordings, started on the first few; its `seconds` are processor time."""
+    began = time.process_time()
+    if isinstance(row.model, PILFR) and row.model.element is None:
+        found = fit(row.model, train, **options)
+    else:
+        found = fit(row.model, train[:explored], **options)
+        found = fit(found, train, **options) if len(train) > explored else found
+    return replace(found, seconds=time.process_time() - began)
+
+
+def table(
+    wanted: Mapping[str, Row],
+    train: Sequence[Recording],
+    test: Recording,
+    floor: float | None,
+    executor: Executor,
+    **options: Any,
+) -> dict[str, Fit]:
+    """Fit every row and print its NRMSE, next to the noise floor and the published one."""
+    print(f"{'NRMSE':<20}{'train':>9}{'test':>9}{'test/floor':>12}   published         processor")
+    jobs = {name: executor.submit(identify, row, train, **options) for name, row in wanted.items()}
+    fits: dict[str, Fit] = {}
+    for name, job in jobs.items():
+        fits[name] = one = job.result()
+        a, b = one.nrmse(train), one.nrmse(test)
+        share = f"{b / floor:12.3f}" if floor else " " * 12
+        published = wanted[name].published
+        reference = "({:.4f} {:.4f})".format(*published) if published else " " * 15
+        print(f"{name:<20}{a:9.4f}{b:9.4f}{share} {reference} {one.seconds:6.1f} s", flush=True)
+    return fits
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print both tables and draw the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=0, help="recordings (default 0)")
+    parser.add_argument("--starts", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("runs/table3"), help="folder for the figures")
+    parser.add_argument("--no-figures", action="store_true")
+    options = parser.parse_args(arguments)
+    began, folder = time.perf_counter(), measured("piezo_dbo")
+    with ProcessPoolExecutor(options.workers) as pool:
+        wide = pool.submit(measure, 3000.0, options.seed)
+        data = measure(800.0, options.seed)
+        averaged, floor = data.averaged(), data.floor()
+        print(f"stand-in for the piezo platform, noise floor {floor:.4f} (published {PUBLISHED_FLOOR})")
+        fits = table(rows(), averaged[:-1], averaged[-1], floor, pool, starts=options.starts, stable=SLOWEST)
+        if folder is None:
+            print("the recordings of the real piezo stack are not here (see problems.piezo_stack)")
+        else:
+            stack = stack_recordings(folder)
+            half = len(stack["first half"])
+            print("real piezo stack, first half -> second half of the varying amplitude")
+            table(stack_rows(), [stack["first half"]], stack["varying"].with_(skip=half), None, pool, starts=4)
+        print(f"{time.perf_counter() - began:.0f} s in all")
+    if not options.no_figures:
+        from .table3_figures import draw
+
+        print(f"figures: {draw(wide.result(), data, fits, options.out)}")
+
+
+if __name__ == "__main__":
+    main()

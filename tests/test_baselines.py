@@ -1,0 +1,280 @@
+"""Black-box baselines: each recovers a system of its own class, and is a model like any other."""
+
+import json
+import subprocess
+
+import numpy as np
+import pytest
+from random_models import random_input
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.baselines import lagged_states, reading_output
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.early_stopping import hold_back, solve_watched
+from pilfr_casadi.export.digests import ordered_digest
+from pilfr_casadi.gauge import gauge_tangents
+from pilfr_casadi.problem import Problem
+
+NOISE = 0.01
+rng = np.random.default_rng(5)
+LINEAR = {"A": [[0.8, 0.2], [-0.2, 0.7]], "B_u": [[0.5], [0.3]], "C_y": [[1.0, 0.4]], "y_0": [0.3]}
+STRUCTURES = {
+    "ssnn": (pilfr.ssnn(2, 2), {"B_w": rng.normal(size=(2, 4)) / 3, "D_yw": rng.normal(size=(1, 4)) / 3}),
+    "network_lfr": (pilfr.network_lfr(2, 3), {"B_w": [[0.6], [-0.5]], "D_yw": [[0.2]]}),
+    "NARX": (pilfr.NARX(2, 3).structure(1, 1), {}),
+    "wide": (pilfr.NARX(2, 3, input_lags=3).structure(2, 2), {}),
+}
+
+
+def truth(name):
+    """A closed model of a class with random numbers, stable by its bounded neurons and a stable A."""
+    structure, more = STRUCTURES[name]
+    draw, n_io = np.random.default_rng(7), 2 if name == "wide" else 1
+    model = structure.model(n_io, n_io)
+    values = {}
+    for key, p in model.parameters.items():
+        value = np.where(p.fixed, p.value, draw.normal(size=p.value.shape))
+        scale = {"A": 0.1, "B_u": 0.4, "C_z": 0.8, "B_w": 0.5}.get(key, 1.0)
+        values[key] = np.where(p.fixed, value, scale * value)
+    if name in ("ssnn", "network_lfr"):
+        values |= {k: np.array(v) for k, v in {**LINEAR, **more}.items()}
+        values["D_yw"] = np.where(model.parameters["D_yw"].fixed, 0.0, values["D_yw"])
+        values["B_w"] = np.where(model.parameters["B_w"].fixed, 0.0, values["B_w"])
+    elif name == "NARX":
+        values["A"][0] = [1.2, -0.5, 0.1]
+    return model.with_parameters(model.parameters.change(**{k: {"value": v} for k, v in values.items()}))
+
+
+def recordings(model, noise=NOISE, length=1200, process=0.0):
+    """A training and a test recording from rest, with white noise on the output, or on the predicted one."""
+    found = []
+    for seed in (1, 2):
+        u = random_input(seed, length, len(model.inputs))
+        draw = np.random.default_rng(10 + seed)
+        y = make_engine(model, "vm").simulate(u, model.parameters.start, np.zeros(model.n_x))[0]
+        size = np.std(y, axis=0)
+        if process:
+            y = disturbed(model, u, process * size * draw.normal(size=y.shape))
+        y = y + noise * size * draw.normal(size=y.shape)
+        found.append(pilfr.Recording(u, y, 0.01, initial="zero", hold="zero"))
+    return found
+
+
+def disturbed(model, u, e):
+    """Outputs of a NARX, each with an error that the following ones see."""
+    x, p, y = np.zeros(model.n_x), model.parameters.start, np.empty_like(e)
+    for k, u_k in enumerate(u):
+        y[k] = np.asarray(model.closed(x, u_k, p)[1]).ravel() + e[k]
+        x[: e.shape[1]] = y[k] - model.parameters["y_0"].value
+        x = np.asarray(model.closed(x, u_k, p)[0]).ravel()
+    return y
+
+
+def floor(recording):
+    return NOISE / np.sqrt(1 + NOISE**2)
+
+
+@pytest.mark.parametrize("name", ["ssnn", "network_lfr"])
+def test_a_network_recovers_its_own_class(name):
+    train, test = recordings(truth(name))
+    fit = pilfr.fit(STRUCTURES[name][0], train, starts=6, seed=0)
+    assert fit.status.converged
+    assert fit.nrmse(test) < 1.1 * floor(test)
+    assert fit.linear_nrmse[0] > 5 * fit.train_nrmse[0]
+
+
+@pytest.mark.parametrize("build", [pilfr.hammerstein, pilfr.wiener])
+def test_hysteresis_before_or_behind_a_linear_model_is_recovered(build):
+    structure = build(2, pilfr.PrandtlIshlinskii(pilfr.Play, 3))
+    values = {"A": LINEAR["A"], "w": [[0.5, 0.4, 0.3]], "r": [[0.1, 0.5, 1.0]]}
+    inside = {"B_w": [[0.5], [0.3]], "C_y": [[1.0, 0.4]], "B_u": [[0.5], [0.3]], "C_z": [[1.0, 0.4]]}
+    values |= {k: v for k, v in inside.items() if k not in structure.fixed}
+    model = structure.model(1, 1, values)
+    found = []
+    for seed in (1, 2):
+        u = random_input(seed, 1200)
+        y = make_engine(model, "vm").simulate(u, model.parameters.start, np.zeros(model.n_x + model.n_s))[0]
+        y = y + NOISE * np.std(y) * np.random.default_rng(seed).normal(size=y.shape)
+        found.append(pilfr.Recording(u, y, 0.01, initial="zero"))
+    fit = pilfr.fit(structure, found[0], starts=3)
+    assert fit.nrmse(found[1]) < 1.15 * floor(found[1])
+
+
+def test_a_narx_predicts_to_the_noise_where_the_noise_enters_its_equation():
+    model = truth("NARX")
+    train, test = recordings(model, noise=0.0, process=0.05)
+    fit = pilfr.fit(pilfr.NARX(2, 3), train, starts=4, seed=0)
+    e = pilfr.one_step(fit, test) - test.y
+    simulated = make_engine(model, "vm").simulate(test.u, model.parameters.start, np.zeros(model.n_x))[0]
+    assert np.std(e) < 1.05 * 0.05 * np.std(simulated)
+    assert fit.nrmse(test) > 1.5 * np.std(e) / np.std(test.y)  # in free run errors add up
+
+
+def test_a_noe_simulates_to_the_noise_of_the_output_and_a_narx_does_not():
+    train, test = recordings(truth("NARX"), noise=0.1)
+    narx = pilfr.fit(pilfr.NARX(2, 3), train, starts=2, seed=0)
+    noe = pilfr.fit(pilfr.NOE(2, 3), train, starts=4, seed=0)
+    level = 0.1 / np.sqrt(1.01)
+    assert noe.nrmse(test) < 1.05 * level < narx.nrmse(test)
+    size = np.std(train.y)
+    one, other = (np.sqrt(np.mean((pilfr.one_step(f, train) - train.y) ** 2)) / size for f in (narx, noe))
+    assert one < other
+
+
+@pytest.mark.parametrize("share", [None, 1.0, 0.3])
+@pytest.mark.parametrize("name", list(STRUCTURES))
+def test_derivatives(name, share):
+    if share is not None and name not in ("NARX", "wide"):
+        return
+    model = truth(name)
+    train = recordings(model, length=60)[0].with_(initial="estimate")
+    if share is not None:
+        model = reading_output(model, share)
+    engines = [Problem(model, train, engine=engine) for engine in ("vm", "auto")]
+    theta = engines[0].start + 0.05 * np.random.default_rng(1).normal(size=engines[0].size)
+    jac, again = (p.jacobian(theta) for p in engines)
+    np.testing.assert_allclose(again, jac, rtol=1e-9, atol=1e-10)
+    step = 1e-6
+    columns = [
+        (engines[0].residual(theta + d) - engines[0].residual(theta - d)) / (2 * step)
+        for d in step * np.eye(len(theta))
+    ]
+    np.testing.assert_allclose(jac, np.array(columns).T, rtol=1e-5, atol=1e-6)
+
+
+def test_reading_the_output_is_a_regression():
+    model = truth("wide")
+    train = recordings(model, length=50)[0]
+    known = {k: p.value for k, p in model.parameters.items()}
+    states = lagged_states(pilfr.NARX(2, 3, input_lags=3), train, known["y_0"])
+    z = states @ known["C_z"].T + train.u @ known["D_zu"].T
+    following = states @ known["A"].T + train.u @ known["B_u"].T
+    following += np.tanh(z + known["bias"].ravel()) @ known["B_w"].T
+    read = reading_output(model)
+    y = make_engine(read, "vm").simulate(read.drive(train), read.parameters.start, np.zeros(read.n_x))[0]
+    np.testing.assert_allclose(y[1:], following[:-1, :2] + known["y_0"], atol=1e-12)
+    free = reading_output(model, 0.0)
+    one, two = (
+        make_engine(m, "vm").simulate(m.drive(train), m.parameters.start, np.zeros(m.n_x))[0] for m in (model, free)
+    )
+    np.testing.assert_array_equal(one, two)
+
+
+@pytest.mark.parametrize("name", ["ssnn", "network_lfr"])
+def test_gauge_directions_of_networks_change_no_output(name):
+    structure, _ = STRUCTURES[name]
+    model = truth(name)
+    train = recordings(model, length=120)[0].with_(initial="estimate")
+    problem = Problem(model, train, engine="vm")
+    tangents = gauge_tangents(problem, problem.start, structure, np.zeros(problem.size, dtype=bool))
+    assert tangents.shape[1] == {"ssnn": 4, "network_lfr": 6}[name]  # the basis of two states; scales of z and of w
+    np.testing.assert_allclose(problem.jacobian(problem.start) @ tangents, 0.0, atol=1e-9)
+
+
+def fitted(name):
+    train, test = recordings(truth(name), length=300)
+    models = {"NARX": pilfr.NARX(2, 3), "wide": pilfr.NOE(2, 3, input_lags=3)}
+    return pilfr.fit(models.get(name, STRUCTURES[name][0]), train, starts=1), test
+
+
+@pytest.mark.parametrize("name", list(STRUCTURES))
+def test_saved_and_exported(name, tmp_path):
+    fit, test = fitted(name)
+    fit.save(tmp_path / "model.json")
+    again = pilfr.load(tmp_path / "model.json")
+    np.testing.assert_array_equal(again.simulate(test), fit.simulate(test))
+    assert again.structure.element == fit.structure.element
+    step, x, y = again.to_casadi(), np.zeros(again.model.n_x), []
+    for u in test.u[:50]:
+        x, y_k = step(x, u)
+        y.append(np.asarray(y_k).ravel())
+    np.testing.assert_allclose(y, fit.simulate(test)[:50], rtol=1e-9, atol=1e-12)
+    c_file, _ = again.export(name="rig").to_c(tmp_path)
+    assert not subprocess.run(["cc", "-c", str(c_file), "-o", str(tmp_path / "rig.o")]).returncode
+    assert fit.plot(test).axes
+
+
+def test_a_damaged_network_is_refused(tmp_path):
+    fit, _ = fitted("network_lfr")
+    fit.save(tmp_path / "model.json")
+    content = json.loads((tmp_path / "model.json").read_text())
+    del content["sha256"]
+    for hidden, words in ((3_000_000, "expected"), (0, "whole numbers|expected"), ("three", "hidden")):
+        content["structure"]["element"]["hidden"] = hidden
+        text = json.dumps({**content, "sha256": ordered_digest(content)})
+        (tmp_path / "model.json").write_text(text)
+        with pytest.raises(pilfr.InputError, match=words):
+            pilfr.load(tmp_path / "model.json")
+
+
+def test_the_seed_decides_and_workers_do_not():
+    train = recordings(truth("NARX"), length=300)[0]
+    one = pilfr.fit(pilfr.NARX(2, 3), train, starts=2, seed=3)
+    two = pilfr.fit(pilfr.NARX(2, 3), train, starts=2, seed=3, workers=2)
+    other = pilfr.fit(pilfr.NARX(2, 3), train, starts=2, seed=4)
+    np.testing.assert_array_equal(one.solution.theta, two.solution.theta)
+    assert not np.array_equal(one.solution.theta, other.solution.theta)
+
+
+def test_bad_input():
+    train = recordings(truth("NARX"), length=300)[0]
+    narx = pilfr.fit(pilfr.NARX(1, 1), train, starts=1)
+    linear = pilfr.fit(pilfr.PILFR(2), train)
+    for wrong, words in (
+        (lambda: pilfr.NARX(0), "lags = 0"),
+        (lambda: pilfr.NARX(2, 2.5), "hidden = 2.5"),
+        (lambda: pilfr.NOE(2, input_lags=-1), "input_lags = -1"),
+        (lambda: pilfr.NOE(2, validation=1.0), "validation = 1.0"),
+        (lambda: pilfr.ssnn(2, 0), "whole numbers"),
+        (lambda: pilfr.StaticNetwork(3, True), "whole numbers"),
+        (lambda: pilfr.one_step(linear, train), "Only a NARX or NOE"),
+        (lambda: pilfr.one_step(narx, train.y), "give a Recording"),
+        (lambda: pilfr.fit(pilfr.NOE(2), train, solver=pilfr.Ipopt()), "Early stopping needs"),
+        (lambda: pilfr.fit(pilfr.NARX(200, 5), train), "at least"),
+        (lambda: pilfr.fit(pilfr.NARX(2, 5), train, l1={"gain": 1e-3}), "An L1 penalty"),
+    ):
+        with pytest.raises(pilfr.InputError, match=words):
+            wrong()
+
+
+# ---- early stopping ----
+
+
+def test_early_stopping_takes_the_best_point_on_what_is_held_back():
+    train, _ = recordings(truth("network_lfr"), noise=0.3, length=160)
+    structure = pilfr.network_lfr(2, 6)
+    model = pilfr.fit(structure, train, starts=1, start="plain", solver=pilfr.GaussNewton(max_iterations=1)).model
+    (kept,), (held,) = hold_back([train], 0.4)
+    problem, judged = Problem(model, kept, engine="vm"), Problem(model, held, engine="vm")
+    seen = []
+    free = pilfr.GaussNewton().solve(problem, watch=lambda theta: seen.append(judged.cost(theta)) or False)
+    found = solve_watched(pilfr.GaussNewton(), problem, judged, problem.start)
+    assert judged.cost(found.theta) <= min(seen) * (1 + 1e-12)
+    assert judged.cost(found.theta) < judged.cost(free.theta)
+    assert found.status is pilfr.Status.STOPPED_EARLY and found.status.converged
+    assert found.cost == pytest.approx(problem.cost(found.theta))
+
+
+def test_what_is_held_back():
+    one = pilfr.Recording(np.arange(100.0), np.arange(100.0), 0.1, initial="zero", skip=20)
+    (kept,), (held,) = hold_back([one], 0.25)
+    assert (len(kept), len(held), held.skip) == (80, 100, 80)
+    periodic = one.with_(initial="periodic", period=30, skip=0)
+    (kept,), (held,) = hold_back([periodic], 0.25)
+    assert (len(kept), held.skip) == (60, 60)
+    with pytest.raises(pilfr.InputError, match="one period only"):
+        hold_back([periodic.with_(period=60)], 0.25)
+    several = [one.with_(name=str(k), initial="estimate") for k in range(4)]
+    kept, held = hold_back(several, 0.25)
+    assert [r.name for r in kept] == ["0", "1", "2"] and [r.name for r in held] == ["3"]
+    assert held[0].initial == "zero" and held[0].skip == 20
+
+
+def test_a_noe_of_several_recordings_has_a_state_for_each(tmp_path):
+    records = [r.slice(100, 400) for r in recordings(truth("NARX"))]
+    fit = pilfr.fit(pilfr.NOE(2, 3), records, starts=1)
+    assert len(fit.initial) == 2 and len(fit.solution.theta) == len(fit.labels)
+    assert fit.train_nrmse[0] < 0.05 and fit.train_nrmse[1] < 0.5
+    fit.save(tmp_path / "model.json")
+    again = pilfr.load(tmp_path / "model.json")
+    np.testing.assert_array_equal(again.simulate(records[1]), fit.simulate(records[1]))

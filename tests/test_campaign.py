@@ -1,0 +1,297 @@
+"""Campaigns: the same numbers over any executor, nothing lost or doubled when workers or the driver are killed."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import write_csv
+from test_runs import PYTHON, contents
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import hand
+from pilfr_casadi.cli import main
+from pilfr_casadi.recording import InputError
+from pilfr_casadi.runs.folds import fold
+from pilfr_casadi.runs.manifest import Manifest
+
+TEXT = """
+seeds = { first = 0, count = 4 }
+report = false
+workers = 2
+
+[data]
+inputs = "u"
+outputs = "y"
+initial = "zero"
+train = "train.csv"
+test = "test.csv"
+
+[model]
+structure = "hammerstein"
+nx = 1
+
+[grid]
+operators = [1, 3]
+
+[solver]
+start = "plain"
+starts = 1
+"""
+SLOW = """
+import os, pathlib, time, tomllib
+from pilfr_casadi.multistart import POLISH
+
+class Slow:
+    def __init__(self, folder):
+        self.folder = folder
+
+    def solve(self, problem, start=None, report=None):
+        if problem.model.element is not None and problem.model.element.n == 3:
+            try:
+                os.mkdir(f"{self.folder}/taken")  # by the first of all jobs with three operators
+            except FileExistsError:
+                pass
+            else:
+                TROUBLE
+        return POLISH.solve(problem, start)
+
+run = tomllib.loads(pathlib.Path("FOLDER/rig.toml").read_text())
+run["solver"]["name"] = Slow("FOLDER")
+run["campaign"] = {"time_limit": 10.0}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for seed, name in enumerate(("train", "test")):
+        write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
+    (tmp_path / "rig.toml").write_text(TEXT)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A scheduler and two worker processes of one thread."""
+    from distributed import LocalCluster
+
+    with LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=":0") as local:
+        yield local
+
+
+def changed(folder, *changes):
+    text = TEXT
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "rig.toml").write_text(text)
+    return folder / "rig.toml"
+
+
+def rows(out):
+    with (out / "results.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def compared(out):
+    """Every model and the table of errors: what a run and a campaign have in common."""
+    return {k: v for k, v in contents(out).items() if k not in ("manifest.json", "summary.csv", "spread.png")}
+
+
+def command(folder, *more):
+    """The command in a process of its own."""
+    code = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(pilfr.__file__).parent.parent)}
+    arguments = [sys.executable, "-c", code, "campaign", "rig.toml", *more]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(arguments, cwd=folder, env=environment, **pipes)
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory):
+    """What `pilfr run` makes of the same file, one job after the other in one process."""
+    place = tmp_path_factory.mktemp("serial")
+    for seed, name in enumerate(("train", "test")):
+        write_csv(place / f"{name}.csv", seed=seed, m=400)
+    (place / "rig.toml").write_text(TEXT)
+    return compared(pilfr.run(place / "rig.toml").folder)
+
+
+def test_the_numbers_do_not_depend_on_the_executor(folder, serial, cluster):
+    found = {"processes": pilfr.campaign(folder / "rig.toml", out=folder / "a").folder}
+    with ProcessPoolExecutor(2) as pool:
+        found["pool"] = pilfr.campaign(folder / "rig.toml", out=folder / "c", executor=pool).folder
+    with cluster.get_client() as client:
+        found["dask"] = pilfr.campaign(folder / "rig.toml", out=folder / "d", executor=client.get_executor()).folder
+    hand.close_hands()
+    for name, out in found.items():
+        assert compared(out) == serial, name
+        assert contents(out) == contents(found["processes"]), name
+        assert (out / "spread.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_what_a_campaign_tells(folder, capsys):
+    few = ("count = 4", "count = 3")
+    assert main(["campaign", str(changed(folder, few))]) == 0
+    said = capsys.readouterr().out
+    assert "2 cells x 3 seeds" in said and "median" in said and "6 jobs done now" in said
+    table = rows(folder / "rig-campaign")
+    with (folder / "rig-campaign" / "summary.csv").open() as file:
+        summary = {(r["recording"], r["operators"]): r for r in csv.DictReader(file)}
+    for n in "13":
+        errors = [float(r["nrmse"]) for r in table if r["operators"] == n and r["role"] == "test"]
+        row = summary["test.csv", n]
+        assert len(errors) == 3 and row["failed"] == "0" and float(row["median"]) == np.median(errors)
+        assert float(row["upper_quartile"]) == np.percentile(errors, 75)
+    more = pilfr.campaign(changed(folder, few, ("[1, 3]", "[1, 2, 3]")))  # a grid that grows
+    assert len(more.done) == 3 and len(more.skipped) == 6
+
+
+def test_a_worker_and_the_driver_are_killed(folder, serial, cluster):
+    out, first = folder / "rig-campaign", command(folder, "--dask", cluster.scheduler_address)
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
+    os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 3)
+    wait_for((out / "results.csv").exists)
+    first.kill()
+    first.communicate()
+    assert len(rows(out)) in range(2, 17, 2)  # it can be read at any time, and is never half there
+    second = command(folder, "--dask", cluster.scheduler_address)
+    _, err = second.communicate(timeout=60)
+    assert second.returncode == 0, err
+    assert compared(out) == serial
+    jobs = [(r["job"], r["recording"]) for r in rows(out)]
+    assert len(jobs) == len(set(jobs)) == 16
+
+
+def children(pid):
+    done = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
+    return [int(p) for p in done.stdout.split()]
+
+
+def alive(pid):
+    status = Path(f"/proc/{pid}/stat")
+    return status.exists() and status.read_text().split()[2] != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_processes_are_killed_and_none_is_left_behind(folder, serial):
+    out, driver = folder / "rig-campaign", command(folder)
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
+    hands = children(driver.pid)
+    assert hands
+    os.kill(hands[0], signal.SIGKILL)  # its job is done again by another
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 3)
+    hands = children(driver.pid)
+    driver.kill()
+    driver.communicate()
+    wait_for(lambda: not any(map(alive, hands)))
+    assert pilfr.campaign(folder / "rig.toml").done
+    assert compared(out) == serial
+
+
+def test_an_interrupted_campaign_goes_on(folder, serial, capsys):
+    out, driver = folder / "rig-campaign", command(folder)
+    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
+    driver.send_signal(signal.SIGINT)
+    _, err = driver.communicate(timeout=30)
+    assert driver.returncode == 130 and "goes on" in err and err.count("\n") == 1, err
+    assert main(["campaign", str(folder / "rig.toml")]) == 0
+    assert "jobs done before" in capsys.readouterr().out
+    assert compared(out) == serial
+
+
+@pytest.mark.parametrize(
+    "what, status",
+    [
+        ("time.sleep(600)", "TIMED_OUT"),
+        ("os.kill(os.getpid(), 9)", ""),
+        ("os.rmdir(f'{self.folder}/taken'); os.kill(os.getpid(), 9)", "LOST"),
+        ("raise ValueError(7)", "FAILED"),
+    ],
+)
+def test_a_job_that_hangs_dies_or_fails_does_not_stop_the_others(folder, what, status):
+    (folder / "mine.py").write_text(SLOW.replace("TROUBLE", what).replace("FOLDER", str(folder)))
+    result = pilfr.campaign(folder / "mine.py")
+    failed = [k for k, e in result.manifest["jobs"].items() if e["status"] == status]
+    assert sorted(result.failed) == sorted(failed) and len(result.done) == 8
+    assert len(failed) == {"": 0, "LOST": 4}.get(status, 1)  # what dies is tried again, three times in all
+    if status in ("TIMED_OUT", "FAILED"):
+        assert sum(r["nrmse"] == "nan" for r in rows(result.folder)) == 1
+        assert max(s.failure_rate for s in result.summary) == 0.25
+        assert pilfr.campaign(folder / "mine.py").done == ()
+
+
+def test_more_time_or_another_worker_tries_again(folder):
+    few = ("count = 4", "count = 2")
+    first = pilfr.campaign(changed(folder, few))
+    manifest = Manifest.found(first.folder)
+    entries = manifest.content["jobs"]
+    a, b = first.done[:2]
+    entries[a] |= {"status": "TIMED_OUT", "time_limit": 20.0}
+    entries[b] |= {"status": "LOST"}
+    manifest.write()
+    limited = changed(folder, few, ("[grid]", "[campaign]\ntime_limit = 20.0\n[grid]"))
+    assert pilfr.campaign(limited).done == (b,)
+    longer = changed(folder, few, ("[grid]", "[campaign]\ntime_limit = 50\n[grid]"))
+    assert pilfr.campaign(longer).done == (a,)
+
+
+def test_cross_validation_recommends_a_structure(folder):
+    path = changed(
+        folder, ("count = 4", "count = 1"), ("report = false", "folds = 2\nreport = false"), ("[1, 3]", "[0, 2, 5]")
+    )
+    result = pilfr.campaign(path)
+    chosen = result.selection
+    assert chosen.names[chosen.cell] == "operators 2" and "recommended" in repr(chosen)
+    assert chosen.errors[0] > 3 * chosen.errors[1]  # a linear model cannot follow
+    assert len(result.done) == 3 * 2 + 1 and result.chosen.startswith("operators-2_seed")
+    held = [s for s in result.summary if s.role == "held"]
+    assert [s.jobs for s in held] == [2, 2, 2] and pilfr.campaign(path).done == ()
+    assert pilfr.run(path, out=folder / "run").selection.errors == chosen.errors
+
+
+def test_a_validation_recording_recommends_one_too(folder):
+    write_csv(folder / "held.csv", seed=7, m=400)
+    result = pilfr.campaign(changed(folder, ('test = "test.csv"', 'validation = "held.csv"'), ("[1, 3]", "[0, 2, 6]")))
+    assert result.selection.names[result.selection.cell] == "operators 2"
+    assert result.chosen.startswith("operators-2")
+
+
+def test_folds_hold_out_every_sample_once(folder):
+    r = pilfr.read(folder / "train.csv", "u", "y", initial="zero")
+    seen = []
+    for k in range(4):
+        train, held = fold([r], k, 4)
+        assert sum(map(len, train)) + sum(map(len, held)) == len(r)
+        assert all(np.isin(part.u[0], r.u).all() for part in train) and train[0].initial == (
+            "zero" if k else "estimate"
+        )
+        seen.append(held[0].u)
+    assert np.array_equal(np.concatenate(seen), r.u)
+    three = [r.with_(name=str(k)) for k in range(3)]
+    assert [[part.name for part in fold(three, k, 2)[1]] for k in range(2)] == [["0", "2"], ["1"]]
+    with pytest.raises(InputError, match="too few for 30 folds"):
+        fold([r], 0, 30)
+
+
+def test_objects_of_a_python_file_are_sent(folder, monkeypatch):
+    path = folder / "mine.py"
+    path.write_text(PYTHON.replace("report=False", "report=False, workers=2"))
+    assert compared(pilfr.campaign(path).folder) == compared(pilfr.run(path).folder)
+    monkeypatch.setitem(sys.modules, "cloudpickle", None)
+    with pytest.raises(InputError, match="cannot be sent to other processes"):
+        pilfr.campaign(path, overwrite=True)

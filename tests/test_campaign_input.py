@@ -1,0 +1,103 @@
+"""What is wrong with a campaign's file, folder, cluster or workers is said in one sentence."""
+
+import contextlib
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+
+import pytest
+from test_campaign import TEXT
+from test_cli import write_csv
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import hand
+from pilfr_casadi.cli import main
+from pilfr_casadi.recording import InputError
+from pilfr_casadi.runs import cluster, side_by_side
+from pilfr_casadi.runs.manifest import Manifest
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for seed, name in enumerate(("train", "test")):
+        write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
+    (tmp_path / "rig.toml").write_text(TEXT)
+    return tmp_path
+
+
+def changed(folder, *changes):
+    text = TEXT
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "rig.toml").write_text(text)
+    return folder / "rig.toml"
+
+
+def refused(capsys, *arguments, says):
+    """Status 2, one sentence on stderr."""
+    assert main(["campaign", *map(str, arguments)]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err
+    for word in (says,) if isinstance(says, str) else says:
+        assert word in err, err
+
+
+@pytest.mark.parametrize(
+    "old, new, says",
+    [
+        ("[grid]", "[grid]\nnodes = [1, 2]", ("unknown key 'nodes'", "operators")),
+        ("[1, 3]", "3", "'operators' in [grid] is 3; give a list of different values"),
+        ("[1, 3]", "[3, 3]", "different values"),
+        ("[1, 3]", "[3, 'many']", "'operators' in [model] is 'many'"),
+        ("[1, 3]", "[]", "list of different values"),
+        ("count = 4", "number = 4", "unknown key 'number'"),
+        ("count = 4", "count = 0", "'count' in [seeds] is 0"),
+        ("[grid]", "[campaign]\nlimit = 3\n[grid]", "unknown key 'limit'"),
+        ("[grid]", "[campaign]\ntime_limit = -3\n[grid]", "'time_limit' in [campaign] is -3"),
+        ("report = false", "folds = 1", "'folds' is 1"),
+        ("report = false", "folds = 90", "too few for 90 folds"),
+        ('"plain"', '"grid"', "4 seeds with starts = 1 would give one model"),
+        ("nx = 1", "nx = 1\nfix = { A = 0.5 }\nbounds = { A = [0.6, 0.7] }", ("no job gave a model", "outside")),
+    ],
+)
+def test_bad_input_gets_one_sentence(capsys, folder, old, new, says):
+    refused(capsys, changed(folder, (old, new), ("workers = 2", "workers = 1")), says=says)
+
+
+def test_bad_folders_and_places_get_one_sentence(capsys, folder, monkeypatch):
+    path = folder / "rig.toml"
+    monkeypatch.setattr(cluster, "PATIENCE", 2.0)
+    refused(capsys, path, "--out", folder / "train.csv", says="train.csv")
+    refused(capsys, path, "--out", "/proc/nowhere", says="cannot be written")
+    refused(capsys, path, "--dask", "tcp://127.0.0.1:1", says=("No Dask scheduler", "127.0.0.1:1"))
+    refused(capsys, path, "--dask", "nonsense://", says="No Dask scheduler")
+    refused(capsys, path, "--dask", "tcp://127.0.0.1:1", "--workers", "2", says="leave one of them out")
+    refused(capsys, path, "--time-limit", "0", says="--time-limit 0")
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    refused(capsys, path, "--dask", "tcp://127.0.0.1:1", says="pilfr-casadi[dask]")
+
+
+def test_results_of_another_version_get_one_sentence(capsys, folder):
+    out = pilfr.campaign(changed(folder, ("count = 4", "count = 1"))).folder
+    manifest = Manifest.found(out)
+    manifest.content["versions"]["pilfr_casadi"] = "0.0.1"
+    manifest.write()
+    refused(capsys, folder / "rig.toml", says=("results of pilfr_casadi 0.0.1", "--overwrite"))
+    (out / "manifest.json").write_text('{"format": "pilfr_casadi run", "version": 7}')
+    refused(capsys, folder / "rig.toml", says=("manifest", "--overwrite"))
+    assert main(["campaign", str(changed(folder, ("count = 4", "count = 1"))), "--overwrite"]) == 0
+
+
+def test_unfit_workers_get_one_sentence(folder, monkeypatch):
+    with ProcessPoolExecutor(1) as pool, contextlib.suppress(Exception):
+        pool.submit(os._exit, 1).result()
+    with pytest.raises(InputError, match="The executor has stopped"):
+        pilfr.campaign(folder / "rig.toml", executor=pool)
+    real = side_by_side.versions
+    monkeypatch.setattr(side_by_side, "versions", lambda: {**real(), "casadi": "9.9"})
+    with pytest.raises(InputError, match=r"A worker has casadi 3.* and this process 9\.9"):
+        pilfr.campaign(folder / "rig.toml")
+    monkeypatch.setattr(hand.sys, "executable", "/bin/false")
+    with pytest.raises(InputError, match="The workers cannot begin a job"):
+        pilfr.campaign(folder / "rig.toml")

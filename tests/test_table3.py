@@ -1,0 +1,89 @@
+"""The stand-in for the piezo platform, and the rows of Table 3 on a small one."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from problems.measured_data import measured
+from problems.piezo_platform import PERIODS, Platform, measure
+from problems.piezo_stack import recordings
+from problems.table3 import Row, identify, lti, main, pi_hammerstein, pi_lfr, rows, stack_rows, table
+from problems.table3_figures import quietened
+
+SMALL = Platform(
+    modes=((404.0, 0.02, 0.2, 0.3), (1618.0, 0.02, 0.8, 0.7)),
+    creep=((0.05, 0.01),),
+    elements=40,
+    coupling=0.7,
+    noise=0.05,
+)
+
+
+def small(realizations=3, **options):
+    return measure(800.0, realizations=realizations, n_period=1024, **{"platform": SMALL, **options})
+
+
+def test_the_platform_is_in_steady_state_and_hysteretic():
+    u = np.array([10 * np.sin(2 * np.pi * np.arange(512) / 512)])
+    one, two = (SMALL.steady(u, settle=n) for n in (6, 8))
+    assert np.max(np.abs(one - two)) < 1e-6 * np.ptp(two)
+    quarter = 512 // 4
+    up, down = two[0, 0], two[0, 2 * quarter]  # at zero voltage on the way up and down
+    assert down - up > 0.05 * np.ptp(two)
+    half = SMALL.steady(u / 2, settle=6)
+    assert np.ptp(half) < 0.99 * np.ptp(two) / 2  # softer for larger swings
+    finer = SMALL.steady(u, substeps=32, settle=6)
+    assert np.max(np.abs(one - finer)) < 2e-3 * np.ptp(two)
+
+
+def test_the_noise_floor_is_what_averaging_leaves():
+    data = small()
+    expected = SMALL.noise / np.sqrt(PERIODS) / np.sqrt(np.mean([np.var(r.y) for r in data.averaged()]))
+    assert data.floor() == pytest.approx(expected, rel=0.05)
+    loud = np.std(data.recordings[0].y.reshape(PERIODS, -1), axis=0, ddof=1).mean()
+    quiet = np.std(quietened(data.recordings[:1])[0].y.reshape(PERIODS, -1), axis=0, ddof=1).mean()
+    assert quiet == pytest.approx(loud / np.sqrt(PERIODS))
+
+
+def test_rows_of_a_small_platform_come_in_the_paper_s_order(capsys):
+    data = small()
+    averaged, floor = data.averaged(), data.floor()
+    wanted = {"LTI": Row(lti(6)), "PI-Hamm": Row(pi_hammerstein(6, 8)), "PI-LFR": Row(pi_lfr(6, 8), (0.1, 0.1))}
+    with ThreadPoolExecutor(1) as pool:
+        fits = table(wanted, averaged[:-1], averaged[-1], floor, pool, explored=1)
+    error = {name: one.nrmse(averaged[-1]) for name, one in fits.items()}
+    assert error["PI-LFR"] < 1.1 * floor
+    assert error["PI-LFR"] < error["PI-Hamm"] < error["LTI"]
+    assert error["LTI"] > 2 * floor
+    out = capsys.readouterr().out
+    assert "(0.1000 0.1000)" in out and f"{error['PI-LFR']:.4f}" in out
+
+
+def test_the_table_has_every_row_of_the_paper():
+    names = set(rows())
+    assert {f"{k} nx={nx} N={n}" for k in ("PI-Hamm", "PI-LFR") for nx in (8, 15) for n in (10, 20)} < names
+    assert "LTI nx=8" in names
+
+
+PIEZO = measured("piezo_dbo")
+
+
+@pytest.mark.skipif(PIEZO is None, reason="the piezo recordings are not beside the repository")
+def test_plays_beat_a_linear_model_on_the_real_stack():
+    data, wanted = recordings(PIEZO), stack_rows()
+    second = data["varying"].with_(skip=len(data["first half"]))
+    error = {
+        name: identify(wanted[name], [data["first half"]], starts=2).nrmse(second)
+        for name in ("LTI nx=1", "PI-LFR nx=1 N=10")
+    }
+    assert error["PI-LFR nx=1 N=10"] < 0.75 * error["LTI nx=1"]
+
+
+@pytest.mark.slow
+def test_the_whole_table(capsys, tmp_path):
+    main(["--out", str(tmp_path)])
+    out = capsys.readouterr().out
+    best = next(line for line in out.splitlines() if line.startswith("PI-LFR nx=15 N=20"))
+    assert float(best.split()[5]) <= 1.1
+    assert {p.name for p in tmp_path.iterdir()} == {"fig13_linear.png", "fig14_test.png", "fig15_hysteresis.png"}
