@@ -11,7 +11,7 @@ from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.gates import Gate
 from pilfr_casadi.diagnose.search import Search, _imitated
 from pilfr_casadi.diagnose.timing import timing
-from pilfr_casadi.diagnose.verdict import choose
+from pilfr_casadi.diagnose.verdict import choose, strained
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.parameters import Parameter
 from pilfr_casadi.recording import Recording
@@ -119,3 +119,12 @@ def test_a_clock_between_the_rates_looked_at_is_found_and_is_that_of_both_output
     assert [(g.channel, g.finding) for g in gates] == [("pos, vel", "clock")] and isinstance(gates[0], Gate)
     assert gates[0].value == pytest.approx(-3.36e-3, rel=0.02)
     assert found.cost**0.5 < 0.02
+
+
+@pytest.mark.parametrize(("bounds", "halved"), [((20, 500), False), ((101.0, 500), True)])
+def test_a_name_that_takes_a_parameter_at_its_bound_is_less_sure(bounds, halved):
+    simulator = spring().with_parameters({"k": Parameter(120.0, bounds=bounds), "d": Parameter(0.0, bounds=(0, 20))})
+    bench = Workbench.of(simulator, [shaken("zero")], "zero")
+    assert strained(bench.fit(simulator)) is halved
+    simulator = spring().with_parameters({"k": Parameter(100.0), "d": Parameter(0.0, bounds=(-1.0, 0.0))})
+    assert not strained(bench.fit(simulator)), "a damper that is none"

@@ -20,6 +20,7 @@ from .gates import Gate
 
 if TYPE_CHECKING:
     from .search import Search
+    from .workbench import Fitted
 
 AT_FLOOR = 1.15  # times the floor that counts as being at it
 QUANTISED, SOMEWHAT, COLOURED = 2.0, 4.0, 9.0  # times a measured floor, and an estimated one, that noise may be
@@ -30,6 +31,7 @@ PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name t
 LITTLE = 0.02  # of the excess left, with rivals near and a force that explains most of it
 MAINLY = 0.6  # of it explainable: whatever the rivals, the name is wrong or incomplete
 CLEAR = 1.5  # times the winner's error that every rival's is, for a name that only comes near to be given all the same
+DRIVEN = 0.5  # share of a name's confidence where it takes a parameter at its bound
 UNSURE = 0.5  # confidence below which a name is called likely
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
@@ -238,7 +240,8 @@ def confidence(choice: Choice, search: Search) -> float:
     """How sure the law's name is: from the margin over true rivals, lowered by what stays unexplained.
 
     At the noise floor a small margin over thousands of samples says more than the same margin where model error rules.
-    A tie between ports does not lower it, a tie between laws does.
+    A tie between ports does not lower it, a tie between laws does, and so does a parameter of the simulator that a law
+    has driven to one of its bounds (other than zero, where a damper is that friction has replaced).
     """
     remains, still = left_open(search)
     error2 = max(choice.winner.error**2, 1e-300)
@@ -247,4 +250,15 @@ def confidence(choice: Choice, search: Search) -> float:
     still *= min(1.0, remains / 0.03)  # of next to nothing, all may be explainable
     doubt = 1 / (1 + (remains / 0.15) ** 2) / (1 + (still / 0.3) ** 2)
     others = len({c.law.id for c in choice.alike} - {choice.winner.law.id})
-    return float(np.clip(lead * doubt / (1 + others), 0.0, 0.99))
+    driven = DRIVEN if strained(search.base) else 1.0
+    return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99))
+
+
+def strained(fitted: Fitted) -> bool:
+    """Whether one of the simulator's own free parameters stands at a bound other than zero."""
+    for name, p in fitted.simulator.parameters.items():
+        value = np.asarray(fitted.values[name])
+        held = ((value <= p.bounds[0]) | (value >= p.bounds[1])) & (value != 0)
+        if np.any(held & ~p.fixed):
+            return True
+    return False
