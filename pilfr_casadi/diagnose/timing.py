@@ -25,6 +25,7 @@ WHOLE = 0.12  # samples within which a shift counts as whole
 LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
 FAR = 0.04  # mean square error of a refit that may have gone astray
 PROMISING = 0.7  # share of the remainder that a shift or clock rate worth a refit leaves
+NOTHING = 0.02  # share of the mean square that a late channel which is all that is wrong leaves at most
 DROP = 0.3  # share of the mean square that has to be left at most
 
 Trial = tuple[float, str, str, float, str, tuple[int, ...]]  # share left, channel, what, value, "u" or "y", columns
@@ -81,6 +82,8 @@ def timing(bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0) ->
     if best is None or best[0] > DROP * plain.cost:
         return bench, plain, []
     relative, name, what, value, other, found, change = best
+    if what == "alignment" and value > 0 and relative > max(NOTHING * plain.cost, 9 * noise2):
+        return bench, plain, []  # what comes late, next to something else that is wrong, may be physics
     gate = _gate(name, what, value, dt, plain.cost, relative, change, part)
     return (other, found, [gate]) if gate else (bench, plain, [])
 
