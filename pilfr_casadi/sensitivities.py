@@ -100,6 +100,8 @@ class Engine(Protocol):
     u has a row a step, `Model.substeps` of them a sample; outputs, derivatives and signals have one row a sample.
     """
 
+    linear: Linearization
+
     def simulate(
         self, u: np.ndarray, p: np.ndarray, state: np.ndarray, signals: bool = False
     ) -> tuple[np.ndarray, ...]:

@@ -20,18 +20,42 @@ from .sensitivities import Engine
 
 Array = np.ndarray
 SETTLED = 1e-10  # change over a period, next to the largest entry of the state, that is none
-MOST = 200  # periods
+NEARLY = 1e-6  # the same where it has to do
+MOST, WAIT = 200, 10  # periods, and periods before each leap
+CHUNK = 512  # samples of a period whose slopes are held at a time
 
 
 def settled(engine: Engine, period: Array, p: Array, state: Array, tolerance: float = SETTLED) -> Array:
-    """State at the beginning of a steady period, by running periods from a state; not finite where it diverges."""
+    """State at the beginning of a steady period, not finite where none is reached.
+
+    Periods are run from a state; where that takes long, for slow poles, Newton's rule on `x = Φ(x)` leaps ahead.
+    """
+    change, size = np.inf, 1.0
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(MOST):
+        for k in range(1, MOST + 1):
             before, state = state, engine.simulate(period, p, state)[1]
-            change, size = np.max(np.abs(state - before), initial=0.0), np.max(np.abs(state), initial=0.0)
-            if not np.isfinite(change) or change <= tolerance * max(size, 1e-300):
-                break
-    return state
+            change, size = np.max(np.abs(state - before), initial=0.0), np.max(np.abs(state), initial=1e-300)
+            if not np.isfinite(change) or change <= tolerance * size:
+                return state
+            if k % WAIT == 0:
+                state = _leap(engine, period, p, state)
+    return state if change <= NEARLY * size else np.full_like(state, np.nan)
+
+
+def _leap(engine: Engine, period: Array, p: Array, state: Array) -> Array:
+    """One step of Newton's rule towards the fixed point of a period, where it brings it nearer; else one period."""
+    after, slope = state, np.eye(len(state))
+    rows = CHUNK * engine.linear.substeps
+    for a in range(0, len(period), rows):
+        _, _, after, slope = engine.sensitivity(period[a : a + rows], p, after, slope, np.full(len(p), -1))
+    if not np.all(np.isfinite(slope)):
+        return after
+    try:
+        there = state + steady_slope(np.hstack([(after - state)[:, None], slope]), 1)[:, 0]
+    except np.linalg.LinAlgError:
+        return after
+    behind = engine.simulate(period, p, there)[1]
+    return there if np.max(np.abs(behind - there)) < np.max(np.abs(after - state)) else after
 
 
 def steady_slope(after: Array, n: int) -> Array:

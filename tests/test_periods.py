@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr
 
+from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.operators import Play, Stop
 from pilfr_casadi.periods import mean_period, noise_weights, period_noise
 from pilfr_casadi.problem import Problem
@@ -86,3 +87,30 @@ def test_weights_scale_residuals_and_threads_change_nothing():
         np.testing.assert_array_equal(a, b)
     with pytest.raises(InputError, match="2 weights"):
         Problem(model, records, weights=[1.0, 1.0])
+
+
+@pytest.mark.parametrize("pole", [0.999, 0.9999, 0.99999, -0.9999])
+def test_slow_poles_settle(pole):
+    """The periodic state in closed form: `x = (1 - a^N)^-1 Σ a^(N-1-k) (1 - a) u_k`."""
+    n = 256
+    u = np.random.default_rng(0).normal(size=n) + 1
+    forced = 0.0
+    for v in u:
+        forced = pole * forced + (1 - pole) * v
+    x, y = forced / (1 - pole**n), []
+    for v in u:
+        y.append(x + 0.01 * v)
+        x = pole * x + (1 - pole) * v
+    model = PILFR(1, offset=False).model(1, 1, {"A": [[pole]], "B_u": [[1 - pole]], "C_y": [[1.0]], "D_yu": [[0.01]]})
+    problem = Problem(model, [Recording(np.tile(u, 2), np.tile(y, 2), 0.1, period=n, initial="periodic")])
+    assert problem.cost(problem.start) < 1e-16
+    theta, h = problem.start + 1e-7, np.array([1e-9, 0, 0, 0])
+    slope = (problem.residual(theta + h) - problem.residual(theta - h)) / 2e-9
+    np.testing.assert_allclose(problem.jacobian(theta)[:, 0], slope, rtol=1e-4, atol=1e-4 * np.abs(slope).max())
+
+
+def test_without_a_steady_state_the_cost_is_infinite():
+    u = np.random.default_rng(0).normal(size=64) + 1
+    model = PILFR(1, offset=False).model(1, 1, {"A": [[1.0]], "B_u": [[1.0]], "C_y": [[1.0]], "D_yu": [[0.0]]})
+    problem = Problem(model, [Recording(np.tile(u, 2), np.tile(u, 2), 0.1, period=64, initial="periodic")])
+    assert problem.cost(problem.start) == np.inf

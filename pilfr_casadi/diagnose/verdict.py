@@ -241,7 +241,8 @@ def confidence(choice: Choice, search: Search) -> float:
 
     At the noise floor a small margin over thousands of samples says more than the same margin where model error rules.
     A tie between ports does not lower it, a tie between laws does, and so does a parameter of the simulator that a law
-    has driven to one of its bounds (other than zero, where a damper is that friction has replaced).
+    has driven to one of its bounds (other than zero, where a damper is that friction has replaced) without coming down
+    to the noise.
     """
     remains, still = left_open(search)
     error2 = max(choice.winner.error**2, 1e-300)
@@ -250,14 +251,15 @@ def confidence(choice: Choice, search: Search) -> float:
     still *= min(1.0, remains / 0.03)  # of next to nothing, all may be explainable
     doubt = 1 / (1 + (remains / 0.15) ** 2) / (1 + (still / 0.3) ** 2)
     others = len({c.law.id for c in choice.alike} - {choice.winner.law.id})
-    driven = DRIVEN if strained(search.base) else 1.0
+    above_noise = search.base.cost > AT_FLOOR**2 * search.floor2
+    driven = DRIVEN if above_noise and strained(search.base) else 1.0
     return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99))
 
 
 def strained(fitted: Fitted) -> bool:
     """Whether one of the simulator's own free parameters stands at a bound other than zero."""
     for name, p in fitted.simulator.parameters.items():
-        value = np.asarray(fitted.values[name])
+        value = np.asarray(fitted.values.get(name, p.value))
         held = ((value <= p.bounds[0]) | (value >= p.bounds[1])) & (value != 0)
         if np.any(held & ~p.fixed):
             return True
