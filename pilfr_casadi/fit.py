@@ -91,8 +91,9 @@ def fit(
         paper's; by default subspace identification refined by output error.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
-        exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one, nothing grows.
-        A number below 1 is a least rate of decay; False is no bound.
+        exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one. A number below
+        1 is a least rate of decay; False is no bound. The slope is that of plays and stops, `Σ w`: the envelopes of
+        generalized plays and other elements are not looked at, of which the linear part alone is bounded.
     constraints
         See `Problem`.
     noise : float, optional
