@@ -326,10 +326,15 @@ def test_the_package_runs_no_text_but_the_users_own_program():
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 assert node.func.id not in ("eval", "exec", "compile", "__import__") or path.name == "load_simulator.py"
             if isinstance(node, ast.Attribute):
-                assert node.attr not in ("loads", "Unpickler", "external") or ast.unparse(node) in (
-                    "json.loads",
-                    "tomllib.loads",
-                ) or path.name == "hand.py", path  # between a process and its own child
+                assert (
+                    node.attr not in ("loads", "Unpickler", "external")
+                    or ast.unparse(node)
+                    in (
+                        "json.loads",
+                        "tomllib.loads",
+                    )
+                    or path.name == "hand.py"
+                ), path  # between a process and its own child
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "np.load":
                 assert any(k.arg == "allow_pickle" and k.value.value is False for k in node.keywords), path
 
