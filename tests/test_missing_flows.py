@@ -163,7 +163,7 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
         passes=[found],
         floor2=1e-6,
         floor=SimpleNamespace(source="estimated"),
-        base=SimpleNamespace(cost=0.2, simulator=SimpleNamespace(parameters={})),
+        base=SimpleNamespace(cost=0.2, simulator=SimpleNamespace(parameters={}, elements=())),
         without=SimpleNamespace(cost=1.0),
         open_before={"guide": 0.9},
         open_after={"guide": 0.5},

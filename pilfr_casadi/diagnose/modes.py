@@ -16,6 +16,7 @@ import numpy as np
 from ..recording import InputError
 
 FAST = 0.9  # eigenvalues closer to the Nyquist frequency than this share have no continuous counterpart to trust
+POOR = 1e5  # condition of a pair's eigenvectors
 Array = np.ndarray
 
 
@@ -102,15 +103,29 @@ def modes(a: Array, b: Array, c: Array) -> list[Mode]:
             scale = _unit(np.real(into[None, :]))
             out.append(Mode(complex(value.real), np.real(into[None, :]) / scale, np.real(seen[:, None]) * scale))
             continue
-        # contribution 2 Re(seen s), s' = value s + into u; q and v = q' span (Re s, Im s): q = 2 Re(m s) for any m
-        turn = np.conj(into[np.argmax(np.abs(into))])
-        m = turn / (1j * abs(turn)) if abs(turn) else 1.0 + 0j  # the strongest input enters v alone
-        basis = np.array([[m, np.conj(m)], [m * value, np.conj(m * value)]])  # (q, v) = basis (s, s*)
-        entering = np.real(basis @ np.array([into, np.conj(into)]))
-        output = np.real(np.column_stack([seen, np.conj(seen)]) @ np.linalg.inv(basis))
-        scale = _unit(entering[1:])
-        out.append(Mode(complex(value), entering / scale, output * scale))
+        pair = [k, int(np.argmin(np.abs(values - np.conj(value))))]
+        others = np.setdiff1d(np.arange(len(values)), pair)
+        # a pair that is all but a double eigenvalue has no eigenvectors to trust; what the others leave it has
+        poor = np.linalg.cond(right[:, pair]) > POOR
+        part = np.eye(len(a)) - right[:, others] @ left[others] if poor else right[:, pair] @ left[pair]
+        out.append(_pair(np.real(part), complex(value), a, b, c))
     return sorted(_together(out), key=lambda mode: abs(mode.value))
+
+
+def _pair(part: Array, value: complex, a: Array, b: Array, c: Array) -> Mode:
+    """A pair as displacement and rate, `q' = v`, `v' = -|value|² q + 2 Re(value) v + u`, in its part of the state.
+
+    The strongest input enters v alone: v stands for `b`, and q for `A b - 2 Re(value) b`, its part each.
+    """
+    force = part @ b
+    size = np.linalg.norm(force, axis=0)
+    if not np.any(size > 0):
+        force, size = part, np.linalg.norm(part, axis=0)  # no input enters: any direction will do
+    strongest = force[:, np.argmax(size)]
+    basis = np.column_stack([a @ strongest - 2 * value.real * strongest, strongest])
+    entering = np.linalg.lstsq(basis, part @ b, rcond=None)[0]
+    scale = _unit(entering[1:])
+    return Mode(value, entering / scale, c @ basis * scale)
 
 
 def _together(found: list[Mode]) -> list[Mode]:

@@ -107,6 +107,13 @@ def _identified(
     return float(np.mean(errors)), simulator
 
 
+def _free(mode: Mode, slow: float) -> Mode:
+    """A mode, one too slow to swing in a recording as a mass with next to no spring."""
+    if not mode.second_order or mode.spring or abs(mode.value) > slow:
+        return mode
+    return replace(mode, spring=(abs(mode.value) ** 2, -2 * mode.value.real))
+
+
 def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, like: Recording) -> Simulator:
     """A simulator in modes, with the names of a recording.
 
@@ -117,8 +124,9 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
     offset : array, shape (n_y,)
         Constants of the outputs.
     """
-    found = modes(*matrices[:3])
-    names = _distinct([mode.label(0.05 / (len(like) * like.dt)) for mode in found])
+    slow = 0.05 / (len(like) * like.dt)
+    found = [_free(mode, slow) for mode in modes(*matrices[:3])]
+    names = _distinct([mode.label(slow) for mode in found])
     parameters: dict[str, Parameter] = {}
     states: list[str] = []
     inputs, outputs = like.inputs, like.outputs
