@@ -29,6 +29,21 @@ def full(record):
     return pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), record, starts=2)
 
 
+def coupled_plays(seed, samples=800):
+    """Two plays that read a mode's position and push it, with noise of a hundredth of the output."""
+    rng = np.random.default_rng(seed)
+    u = pilfr.multisine(samples, f_max=8, fs=100, rng=rng)
+    A, r, x, q, y = np.array([[0.96, 0.18], [-0.18, 0.96]]) * 0.985, np.array([0.1, 0.5]), np.zeros(2), np.zeros(2), []
+    for value in u:
+        z = value + 0.5 * x[0]
+        q = np.maximum(z - r, np.minimum(z + r, q))
+        w = q @ [0.4, 0.3]
+        y.append(x[0] + 0.1 * w)
+        x = A @ x + np.array([0.05, 0.1]) * value + np.array([0.03, -0.08]) * w
+    measured = np.array(y) + 0.01 * np.std(y) * rng.standard_normal(samples)
+    return pilfr.Recording(u, measured, 0.01, initial="zero")
+
+
 @pytest.mark.parametrize("bound", [0.9, 0.8, 0.79, 0.6, 0.3])
 def test_a_bound_on_the_radius_holds_to_the_last_digit(record, bound):
     fit = pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=1, stable=bound)
@@ -114,6 +129,15 @@ def test_a_known_gain_and_its_multiplier(record):
     # the multiplier is the slope of the objective over the limit
     slope = (fits[1].solution.cost - fits[0].solution.cost) / (0.001 * wanted)
     assert limit.multiplier == pytest.approx(slope, rel=0.1)
+
+
+def test_a_second_fit_under_the_same_constraint_is_never_worse():
+    record, gain = coupled_plays(5), [dc_gain(1.0)]
+    first = pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=2, constraints=gain)
+    second = pilfr.fit(first, record, constraints=gain)
+    assert first.status.converged and second.status.converged
+    assert second.train_nrmse[0] <= first.train_nrmse[0]
+    assert second.solution.violation <= 1e-6
 
 
 def test_a_gain_within_limits_is_exact(record):

@@ -74,6 +74,8 @@ LAYERS = {
         "scaling",
         "solution",
         "exactness",
+        "feasible",
+        "exact_penalty",
         "tightening",
         "lifted",
         "schur",
