@@ -17,9 +17,9 @@ from .lfr import PILFR
 from .limits import Limit
 from .metrics import nrmse, rmse_per_output
 from .model import Model
-from .multistart import Candidate
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings
+from .search import Candidate
 from .sensitivities import Engine
 from .slopes import settled
 from .solution import Solution, Status

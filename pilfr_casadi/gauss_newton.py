@@ -56,7 +56,8 @@ class GaussNewton:
     damping : float
         First λ.
     time_limit : float
-        Seconds.
+        Seconds of a solve, at a bound on a spectral radius with all its repetitions (`tightening`). A fit makes several
+        solves.
     qp : str
         CasADi conic plugin.
 

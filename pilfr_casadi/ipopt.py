@@ -70,7 +70,7 @@ class Ipopt:
     damping : float
         First λ.
     time_limit : float
-        Seconds.
+        Seconds of a solve; see `GaussNewton`.
     options : mapping
         Further options of IPOPT by name, for example `{"print_level": 5}`.
 

@@ -10,9 +10,10 @@ from .gauge import standard_errors
 from .lfr import PILFR
 from .limits import limits_of
 from .model import Model
-from .multistart import PRIOR, Candidate
+from .multistart import PRIOR
 from .problem import Problem
 from .recording import Recording
+from .search import Candidate
 from .solution import Solution
 
 

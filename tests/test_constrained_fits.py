@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.constraints import BeyondRadius, Constraint, stable
@@ -27,21 +28,6 @@ def record():
 @pytest.fixture(scope="module")
 def full(record):
     return pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), record, starts=2)
-
-
-def coupled_plays(seed, samples=800):
-    """Two plays that read a mode's position and push it, with noise of a hundredth of the output."""
-    rng = np.random.default_rng(seed)
-    u = pilfr.multisine(samples, f_max=8, fs=100, rng=rng)
-    A, r, x, q, y = np.array([[0.96, 0.18], [-0.18, 0.96]]) * 0.985, np.array([0.1, 0.5]), np.zeros(2), np.zeros(2), []
-    for value in u:
-        z = value + 0.5 * x[0]
-        q = np.maximum(z - r, np.minimum(z + r, q))
-        w = q @ [0.4, 0.3]
-        y.append(x[0] + 0.1 * w)
-        x = A @ x + np.array([0.05, 0.1]) * value + np.array([0.03, -0.08]) * w
-    measured = np.array(y) + 0.01 * np.std(y) * rng.standard_normal(samples)
-    return pilfr.Recording(u, measured, 0.01, initial="zero")
 
 
 @pytest.mark.parametrize("bound", [0.9, 0.8, 0.79, 0.6, 0.3])

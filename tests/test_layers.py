@@ -63,6 +63,7 @@ LAYERS = {
         "nlp",
         "constraints",
         "known",
+        "stability",
         "baselines",
     ),
     5: (
@@ -76,6 +77,7 @@ LAYERS = {
         "exactness",
         "feasible",
         "exact_penalty",
+        "told",
         "tightening",
         "lifted",
         "schur",
@@ -96,6 +98,7 @@ LAYERS = {
         "structures",
         "known_blocks",
         "multistart",
+        "search",
         "export",
         "feedback",
         "plots",
