@@ -84,9 +84,14 @@ class GaussNewton:
         start: np.ndarray | None = None,
         progress: Progress | None = None,
         watch: Watch | None = None,
+        unfinished: bool = False,
     ) -> Solution:
-        """Minimise from `start` (n,), by default the problem's own; `watch` is given every point and may end it."""
-        return _Run(self, problem, problem.start if start is None else start, progress, watch).run()
+        """Minimise from `start` (n,), by default the problem's own.
+
+        `watch` is given every point and may end it. What a limit ends is the best feasible point, or, `unfinished`,
+        where the run is, feasible or not, from which another one can go on.
+        """
+        return _Run(self, problem, problem.start if start is None else start, progress, watch).run(unfinished)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +125,7 @@ class _Run:
         self.interrupted = False
         self.began = time.perf_counter()
 
-    def run(self) -> Solution:
+    def run(self, unfinished: bool) -> Solution:
         status = Status.MAX_ITERATIONS
         self.cost = self.problem.cost(self.theta)
         if not np.isfinite(self.cost):
@@ -137,7 +142,8 @@ class _Run:
                     status = self._iterate()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
-        if self.best.better(self.cost, self.penalty.violation(self.theta)):
+        limited = status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
+        if self.best.better(self.cost, self.penalty.violation(self.theta)) and not (limited and unfinished):
             status = Status.SOLVER_FAILED if self._strayed(status) else status
             self._back()
         return self._finish(status)

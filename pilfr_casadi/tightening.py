@@ -218,7 +218,7 @@ def _at_bound(
     turned = rotated(problem, theta) if coordinates else None
     held, begin = turned or (problem, theta)
     lifted = Lifted(held, begin, inside, triangular=turned is not None)
-    found = solver.solve(lifted, lifted.start, progress)
+    found = solver.solve(lifted, lifted.start, progress, unfinished=True)
     there = lifted.theta(found.theta)
     force = lifted.multipliers(found.theta, found.multipliers)
     multipliers = np.zeros(problem.size + len(problem.g_lower))

@@ -169,6 +169,8 @@ def test_no_limit_ends_a_run_worse_than_a_feasible_point_it_has_seen(most):
     seen = [x for x in strays.points if 0.3 * x - np.cos(x) <= 0]
     assert found.violation <= 1e-6 and found.cost <= min(strays.cost(np.array([x])) for x in seen)
     assert found.status in (Status.MAX_ITERATIONS, Status.CONVERGED)
+    there = GaussNewton(max_iterations=most).solve(strays, unfinished=True)
+    assert there.status is Status.MAX_ITERATIONS and there.theta[0] > 5 and there.cost < found.cost
 
 
 def test_what_only_damping_makes_small_is_no_minimum():

@@ -230,10 +230,10 @@ def test_a_limit_on_time_holds_for_all_solves_at_a_bound(record, monkeypatch):
     linear, limits = pilfr.fit(pilfr.PILFR(2), record), []
     solve = pilfr.GaussNewton.solve
 
-    def slow(solver, *args):
+    def slow(solver, *args, **more):
         limits.append(solver.time_limit)
         time.sleep(0.02)
-        return solve(solver, *args)
+        return solve(solver, *args, **more)
 
     monkeypatch.setattr(pilfr.GaussNewton, "solve", slow)
     solver = pilfr.GaussNewton(time_limit=0.1)
