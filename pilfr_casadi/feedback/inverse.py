@@ -83,8 +83,8 @@ def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, 
     Raises
     ------
     InputError
-        If the element has no inverse: its slope right after a reversal or along its loading curve is zero, or the two have
-        not one sign.
+        If the element has no inverse: its slope right after a reversal or along its loading curve is zero or
+        changes its sign.
     """
     kind = operator() if isinstance(operator, type) else operator
     r, w = numbers(r, "The thresholds").ravel(), numbers(w, "The weights").ravel()
@@ -107,7 +107,8 @@ def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, 
     if np.any(sign * slope[first - 1 :] <= 1e-12 * np.max(np.abs(slope))):
         raise InputError(
             f"This element has no inverse: its slope is {slope[first - 1]:.4g} right after a reversal and "
-            f"{slope[-1]:.4g} once everything slips, and all slopes must be above zero, or all below; add a linear part with gain=."
+            f"{slope[-1]:.4g} once everything slips, and all slopes must be above zero, or all below; add a linear "
+            "part with gain=."
         )
     own = np.zeros(len(r))
     own[0] = 1 / slope[first - 1]
