@@ -245,8 +245,8 @@ def unknown_sentences(errors: Mapping[str, np.ndarray]) -> list[str]:
     out = [f"the data alone says nothing about {', '.join(others)}"] if others else []
     if turned:
         out.append(
-            f"entries of {', '.join(turned)} have no standard error of their own: others, as in other coordinates of the "
-            "states, give the same outputs; judge poles, zeros and responses instead"
+            f"entries of {', '.join(turned)} have no standard error of their own: others, as in other coordinates of "
+            "the states, give the same outputs; judge poles, zeros and responses instead"
         )
     return out
 

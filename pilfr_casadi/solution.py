@@ -38,7 +38,7 @@ ADVICE = {
     Status.MAX_ITERATIONS: "Judge it by its error on a test recording; to go on, give a solver more iterations, as in "
     "solver=GaussNewton(max_iterations=1000).",
     Status.TIME_LIMIT: "Judge it by its error on a test recording; to go on, give more time.",
-    Status.SOLVER_FAILED: "Judge it by its error on a test recording; to go on, fit again from it, or from more starts.",
+    Status.SOLVER_FAILED: "Judge it by its error on a test recording; to go on, fit again from it or from more starts.",
 }
 
 

@@ -59,6 +59,7 @@ LAYERS = {
         "modal",
         "problem",
         "layout",
+        "penalties",
         "slopes",
         "nlp",
         "constraints",
