@@ -71,6 +71,7 @@ LAYERS = {
         "gauss_newton",
         "quadratic_program",
         "ipopt",
+        "ipopt_settings",
         "callback",
         "damping",
         "scaling",
