@@ -91,6 +91,7 @@ LAYERS = {
         "fitted",
         "job",
         "outcome",
+        "open_memory",
         "linear_model",
         "lagged_fit",
         "early_stopping",
