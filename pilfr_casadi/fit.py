@@ -115,7 +115,8 @@ def fit(
         A fit from values runs as many recordings side by side.
         Where processes are spawned, the call belongs below `if __name__ == "__main__":`.
     progress : bool or callable
-        True for a bar on the terminal; a callable gets (stage, done, total, smallest training error so far).
+        True for a bar on the terminal; a callable gets (stage, done, total, smallest training error so far). The stage
+        "steps" is the solve of a start at work, its error where it is; of starts in other processes it is not heard.
 
     Returns
     -------
