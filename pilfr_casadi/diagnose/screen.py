@@ -17,8 +17,8 @@ from ..laws import Law
 from ..laws.base import Local
 from ..laws.trace import columns
 from ..threads import side_by_side
-from .linearise import linearised, observer_gain, run
-from .remainder import Remainder, Task, held_out
+from .linearise import Run, linearised, observer_gain, run
+from .remainder import HUGE, Remainder, Task, held_out
 from .workbench import Fitted, Workbench
 
 
@@ -57,7 +57,7 @@ def screen(
     gain = observer_gain(probe, runs, noise)
     signs = {name: int(s) for name, s in zip(probe.ports, runs[0].sign, strict=True)}
     led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
-    if not all(np.all(np.isfinite(values)) for r in led for values in (r.a, r.b, r.z, r.dz, r.error)):
+    if not all(_holds(r, bench.scale) for r in led):
         led = []
     ways = [("simulation", Remainder.of(bench, probe, runs, laws))]
     if led:
@@ -66,6 +66,12 @@ def screen(
     found = [scored for one in side_by_side(lambda task: _score(*task), tasks, workers) for scored in one]
     seen = any(s.source == "observer" for s in found)
     return sorted(found, key=lambda s: -s.share), signs, gain if seen else None
+
+
+def _holds(r: Run, scale: np.ndarray) -> bool:
+    """Whether an observer has kept a simulator in its range, and has not let it grow without end."""
+    finite = all(np.all(np.isfinite(values)) for values in (r.a, r.b, r.z, r.dz))
+    return finite and bool(np.all(np.abs(r.error) < HUGE * scale))
 
 
 def _score(rest: Remainder, task: Task, source: str, keep: int) -> list[Scored]:
