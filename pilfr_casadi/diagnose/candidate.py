@@ -59,8 +59,7 @@ class Candidate:
     def at_bound(self) -> bool:
         """Whether a parameter of the law is held back by one of its bounds."""
         prefix = self.fitted.simulator.elements[-1].prefix
-        bounds = {k: p.bounds for k, p in self.fitted.model.parameters.items() if k.startswith(prefix)}
-        return any(np.any((self.fitted.values[k] <= a) | (self.fitted.values[k] >= b)) for k, (a, b) in bounds.items())
+        return any(np.any(self.fitted.at_bound(k)) for k in self.fitted.model.parameters if k.startswith(prefix))
 
 
 def heads(recordings: Sequence[Recording], share: float = HEAD) -> tuple[Recording, ...]:

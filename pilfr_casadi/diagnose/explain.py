@@ -19,7 +19,7 @@ from ..laws import Law
 from ..simulator import Simulator
 from .candidate import Candidate, attempt, heads
 from .screen import Scored
-from .workbench import Fitted, Workbench
+from .workbench import Fitted, Workbench, started
 
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
 REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first
@@ -130,18 +130,13 @@ def by_cost(
     bench: Workbench, model: Any, engine: Any, starts: Sequence[Mapping[str, Any]], without: Fitted
 ) -> list[Mapping[str, Any]]:
     """Starts in the order of their error as they stand on the first parts, from the initial states of a fit."""
-    part, parameters = bench.on(heads(bench.recordings)), model.parameters
+    part = bench.on(heads(bench.recordings))
+    initial = [np.append(state, np.zeros(model.n_state - len(state))) for state in without.begin]
 
     def cost(start: Mapping[str, Any]) -> float:
-        known = {k: v for k, v in start.items() if k in parameters}
-        vector, total = np.clip(parameters.pack(known), parameters.lower, parameters.upper), 0.0
-        for r, state in zip(part.recordings, without.begin, strict=True):
-            full = np.zeros(model.n_state)
-            full[: len(state)] = state
-            with np.errstate(over="ignore", invalid="ignore"):
-                y = engine.simulate(model.drive(r), vector, full)[0]
-                total += float(np.sum(((y - r.y) / part.scale)[r.skip :] ** 2))
-        return total if np.isfinite(total) else np.inf
+        values = model.parameters.unpack(started(model, start))
+        found = part.result(without.simulator, values, initial, engine, model).cost
+        return found if np.isfinite(found) else np.inf
 
     return sorted(starts, key=cost)
 

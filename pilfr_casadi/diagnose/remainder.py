@@ -5,7 +5,7 @@ With base the orthonormal directions in which these can change the stacked outpu
     e' = e - base baseᵀ e,    φ' = φ - base baseᵀ φ
 
 where φ holds the outputs' changes by a small dose of each law at a port, a column for each of its shapes and strengths.
-One port is looked at after the other: its columns are the largest arrays of a diagnosis.
+Each port is looked at by itself: its columns are the largest arrays of a diagnosis.
 """
 
 from __future__ import annotations

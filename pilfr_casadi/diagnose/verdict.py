@@ -260,10 +260,7 @@ def strained(fitted: Fitted) -> bool:
     """Whether one of the simulator's own free parameters stands at a bound other than zero."""
     prefixes = tuple(e.prefix for e in fitted.simulator.elements)
     for name, p in fitted.simulator.parameters.items():
-        if name.startswith(prefixes):
-            continue
-        value = np.asarray(fitted.values.get(name, p.value))
-        held = ((value <= p.bounds[0]) | (value >= p.bounds[1])) & (value != 0)
-        if np.any(held & ~p.fixed):
+        own = not name.startswith(prefixes)
+        if own and np.any(fitted.at_bound(name) & (fitted.values[name] != 0) & ~p.fixed):
             return True
     return False

@@ -62,6 +62,11 @@ class Fitted:
         p, at = self.model.parameters, self.vector
         return float(np.mean(((at <= p.lower) | (at >= p.upper))[p.free])) if np.any(p.free) else 0.0
 
+    def at_bound(self, name: str) -> np.ndarray:
+        """Which entries of a parameter came out at one of its bounds."""
+        (low, high), value = self.model.parameters[name].bounds, self.values[name]
+        return np.asarray((value <= low) | (value >= high))
+
     @property
     def begin(self) -> list[np.ndarray]:
         """The simulator's own states at each recording's first sample, without those of laws."""
@@ -177,10 +182,7 @@ class Workbench:
 
     def _lost(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
         """Where a run from rest leaves every bound, in words."""
-        parameters = model.parameters
-        vector = np.clip(
-            parameters.pack({k: v for k, v in start.items() if k in parameters}), parameters.lower, parameters.upper
-        )
+        vector = started(model, start)
         for r in self.recordings:
             with np.errstate(all="ignore"):
                 y = engine.simulate(model.drive(r), vector, np.zeros(model.n_state))[0]
@@ -211,8 +213,7 @@ class Workbench:
         solver: GaussNewton,
     ) -> tuple[float, np.ndarray, Problem] | None:
         parameters = model.parameters
-        known = {k: v for k, v in start.items() if k in parameters}
-        vector = np.clip(parameters.pack(known), parameters.lower, parameters.upper)
+        vector = started(model, start)
         states = self._unknown(guess, model.n_state) if len(guess) else None
         problem: Problem | None = None
         for gamma in (*path, 0.0):
@@ -266,6 +267,12 @@ class Workbench:
             scored = [(e / self.scale)[r.skip :] for e, r in zip(residual, self.recordings, strict=True)]
             cost = float(np.mean(np.concatenate(scored) ** 2))
         return Fitted(simulator, model, engine, values, initial, residual, cost)
+
+
+def started(model: Model, start: Mapping[str, Any]) -> np.ndarray:
+    """Parameter vector at start values by name, inside the bounds; what the model does not know is left out."""
+    p = model.parameters
+    return np.asarray(np.clip(p.pack({k: v for k, v in start.items() if k in p}), p.lower, p.upper))
 
 
 def arranged(simulator: Simulator, recording: Recording) -> Recording:
