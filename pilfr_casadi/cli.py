@@ -52,7 +52,7 @@ def _run(options: argparse.Namespace) -> int:
             return say(in_options(str(error)), BAD_INPUT)
 
 
-def _warn(message: Warning | str, *_: Any) -> None:
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
     """A warning is a sentence too, without the place in the code that Python adds."""
     say(f"warning: {message}", DONE)
 
