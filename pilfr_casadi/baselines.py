@@ -71,7 +71,33 @@ def network_lfr(nx: int, hidden: int = 15, channels: int = 1, offset: bool = Tru
 
 
 @dataclass(frozen=True)
-class NARX:
+class Lagged:
+    """A model of past outputs and inputs: what `NARX` and `NOE` share."""
+
+    lags: int
+    hidden: int = 10
+    input_lags: int | None = None
+    validation: float = 0.0
+    linear: bool = True
+
+    def __post_init__(self) -> None:
+        numbers = {"lags": self.lags, "hidden": self.hidden, "input_lags": self.input_lags}
+        if self.input_lags is None:
+            del numbers["input_lags"]
+        for name, value in numbers.items():
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise InputError(f"{name} = {value!r} was given; give a whole number, 1 or more.")
+        share = self.validation
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
+            raise InputError(f"validation = {share!r} was given; give the share to hold back, 0 or more and below 1.")
+
+    def structure(self, n_u: int, n_y: int) -> PILFR:
+        """The LFR for n_u inputs and n_y outputs."""
+        return lagged(self.lags, self.input_lags or self.lags, self.hidden, n_u, n_y, self.linear)
+
+
+@dataclass(frozen=True)
+class NARX(Lagged):
     """Nonlinear autoregressive model, trained to predict one step ahead and used in free run.
 
     Parameters
@@ -94,22 +120,9 @@ class NARX:
         If a number is not whole or too small, or the share is not in [0, 1).
     """
 
-    lags: int
-    hidden: int = 10
-    input_lags: int | None = None
-    validation: float = 0.0
-    linear: bool = True
-
-    def __post_init__(self) -> None:
-        _check_lags(self)
-
-    def structure(self, n_u: int, n_y: int) -> PILFR:
-        """The LFR for n_u inputs and n_y outputs."""
-        return lagged(self.lags, self.input_lags or self.lags, self.hidden, n_u, n_y, self.linear)
-
 
 @dataclass(frozen=True)
-class NOE:
+class NOE(Lagged):
     """Nonlinear output-error model: a NARX trained in simulation, with early stopping.
 
     Every start is a NARX first, and then reads less and less of the measured output until it reads its own.
@@ -128,30 +141,7 @@ class NOE:
         As for `NARX`.
     """
 
-    lags: int
-    hidden: int = 10
-    input_lags: int | None = None
     validation: float = 0.25
-    linear: bool = True
-
-    def __post_init__(self) -> None:
-        _check_lags(self)
-
-    def structure(self, n_u: int, n_y: int) -> PILFR:
-        """The LFR for n_u inputs and n_y outputs."""
-        return lagged(self.lags, self.input_lags or self.lags, self.hidden, n_u, n_y, self.linear)
-
-
-def _check_lags(model: NARX | NOE) -> None:
-    for name in ("lags", "hidden", "input_lags"):
-        value = getattr(model, name)
-        if name == "input_lags" and value is None:
-            continue
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise InputError(f"{name} = {value!r} was given; give a whole number, 1 or more.")
-    share = model.validation
-    if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
-        raise InputError(f"validation = {share!r} was given; give the share to hold back, 0 or more and below 1.")
 
 
 def lagged(n_a: int, n_b: int, hidden: int, n_u: int, n_y: int, linear: bool = True) -> PILFR:
@@ -168,7 +158,7 @@ def lagged(n_a: int, n_b: int, hidden: int, n_u: int, n_y: int, linear: bool = T
     return PILFR(nx, StaticNetwork(1, hidden), {**fixed, **NEURONS})
 
 
-def lagged_states(model: NARX | NOE, recording: Recording, level: Array) -> Array:
+def lagged_states(model: Lagged, recording: Recording, level: Array) -> Array:
     """The states (M, nx) along a recording, outputs as measured less their level (n_y,); zero before its start."""
     m, past = len(recording), [(recording.y - level, k) for k in range(model.lags)]
     past += [(recording.u, k) for k in range(1, model.input_lags or model.lags)]
@@ -176,7 +166,7 @@ def lagged_states(model: NARX | NOE, recording: Recording, level: Array) -> Arra
 
 
 def lagged_start(
-    model: NARX | NOE, structure: PILFR, recordings: Sequence[Recording], rng: np.random.Generator
+    model: Lagged, structure: PILFR, recordings: Sequence[Recording], rng: np.random.Generator
 ) -> dict[str, Array]:
     """A linear one-step predictor by least squares, and neurons that do nothing yet, in random directions of the past.
 

@@ -1,8 +1,7 @@
 """`fit`: the verb that takes a model and recordings and returns one immutable result.
 
-Three ways lead to it: from an earlier fit or a closed model of one's own (`_from_values`), to a linear model
-(`_linear`), and from nothing to a PI-LFR (`_from_starts`; `multistart` says how). What they share stands in `job`.
-Where an L1 penalty is asked for, a last solve follows (`penalty`).
+It refuses what cannot be used, finds the linear model that a search begins with, and leaves the rest to one of the
+`ways`.
 """
 
 from __future__ import annotations
@@ -18,25 +17,26 @@ from typing import Any
 
 import numpy as np
 
-from .baselines import NARX, NOE
-from .checks import numbers
+from .baselines import Lagged
 from .constraints import Constraint, loosened
 from .elements import PrandtlIshlinskii, StaticNetwork
 from .exactness import beyond
-from .fitted import Fit, Progress, fingerprint
-from .job import Job, interrupted, penalised, rms_error
-from .known_blocks import in_known_coordinates, known_entries
+from .fitted import Fit, fingerprint
+from .interrupts import Progress
+from .job import Job
+from .known_blocks import in_known_coordinates
 from .lagged_fit import fit_lagged
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
-from .multistart import KEEP, POLISH, STARTS, Candidate, Search, search_starts, stability
+from .multistart import POLISH, STARTS, stability
 from .outcome import with_solution
 from .penalty import check_penalty
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings, check_for_identification
-from .solution import Solution, Status
+from .solution import Status
 from .threads import one_blas_thread
+from .ways import at_values, from_starts, from_values, linear_only
 
 __all__ = ["Fit", "Progress", "fingerprint", "fit"]
 DEAD_WORKER = (
@@ -50,7 +50,7 @@ NO_GUARD = (
 
 
 def fit(
-    model: PILFR | NARX | NOE | Model | Fit,
+    model: PILFR | Lagged | Model | Fit,
     train: Recording | Sequence[Recording],
     *,
     solver: Any = None,
@@ -160,7 +160,7 @@ def fit(
 
 @one_blas_thread
 def _fit(
-    model: PILFR | NARX | NOE | Model | Fit,
+    model: PILFR | Lagged | Model | Fit,
     train: Recording | Sequence[Recording],
     job: Job,
     stable: bool | float,
@@ -174,17 +174,17 @@ def _fit(
         raise InputError("A linear model to begin with goes with a PILFR; any other model has its own values.")
     if isinstance(start, Mapping) and not isinstance(model, PILFR):
         raise InputError("Values to start from go with a PILFR; a Model and a Fit have their own.")
-    if isinstance(model, NARX | NOE):
+    if isinstance(model, Lagged):
         return fit_lagged(model, train, job, starts, seed, executor)
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
     limits = stability_limits(structure, stable) if structure else ()
     job = replace(job, limits=(*limits, *job.limits))
     if isinstance(model, PILFR) and isinstance(start, Mapping):
-        model = _at_values(model, as_recordings(train)[0], start)
+        model = at_values(model, as_recordings(train)[0], start)
     if not isinstance(model, PILFR):
         given = model.model if isinstance(model, Fit) else model
         job = replace(job, recordings=check_for_identification(train, int(given.parameters.free.sum()) + 2))
-        return _from_values(given, structure, job, model if isinstance(model, Fit) else None)
+        return from_values(given, structure, job, model if isinstance(model, Fit) else None)
     if not isinstance(model.element, PrandtlIshlinskii | StaticNetwork | None):
         raise InputError(
             "A start is found for PrandtlIshlinskii and StaticNetwork; for others give start={name: value} or a Model."
@@ -207,120 +207,13 @@ def _fit(
         more = model.fixed or model.bounds or model.priors or job.limits[1:] or solution.status is Status.INFEASIBLE
         if not (more or beyond(bounded, solution.theta)) and job.solver == POLISH:
             return job.result(linear, model, bounded, solution)  # nothing that the linear model has not seen
-        return _linear(model, fitted, job)
-    return _from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
-
-
-def _at_values(structure: PILFR, first: Recording, values: Mapping[str, Any]) -> Model:
-    """The model of a structure at values given by name, with a recording's names of inputs and outputs."""
-    model = structure.model(first.n_u, first.n_y, inputs=first.inputs, outputs=first.outputs)
-    unknown = sorted(set(values) - set(model.parameters))
-    if unknown:
-        raise InputError(
-            f"The start has a value for {unknown[0]!r}, which the model lacks; it has {', '.join(model.parameters)}."
-        )
-    changes = {}
-    for name, value in values.items():
-        p = model.parameters[name]
-        given = numbers(value, f"The start of {name!r}", p.value.shape)
-        changes[name] = {"value": np.where(p.fixed & (name in structure.fixed), p.value, np.clip(given, *p.bounds))}
-    return model.with_parameters(model.parameters.change(**changes))
-
-
-def _from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit | None) -> Fit:
-    """A closed model or an earlier fit, from its values, and from the initial states that the fit has or estimates."""
-    if job.l1:
-        check_penalty(job.l1, model.parameters, structure is not None and structure.element is None)
-    options: dict[str, Any] = {"l1": {} if structure else job.l1}
-    problem = job.problem(model, **options)
-    if not np.isfinite(problem.cost(problem.start)):
-        raise InputError("The simulation diverges at the start values; start from a stable model.")
-    start = problem.start
-    if earlier is not None:
-        estimated = [r for r in job.recordings if isinstance(r.initial, str) and r.initial == "estimate"]
-        begin = np.concatenate([start[: int(problem.free.sum())], *(earlier.initial_state(r) for r in estimated)])
-        start = begin if problem.cost(begin) < problem.cost(start) else start
-    latest = model, problem, job.solve(problem, "solve", start), ""
-    try:
-        problem, solution = job.settled(problem, latest[2], "solve", **options)
-        latest = model, problem, solution, ""
-        if job.l1 and structure:
-            latest = penalised(model, problem, solution, job, problem.noise)
-    except KeyboardInterrupt:
-        latest = interrupted(*latest)
-    model, problem, solution, note = latest
-    return job.result(model, structure, problem, solution, note=note)
-
-
-def _linear(structure: PILFR, fitted: Model, job: Job) -> Fit:
-    """A linear model with the structure's bounds and fixed blocks, from the one without."""
-    values = {k: p.value for k, p in fitted.parameters.items()}
-    first = job.recordings[0]
-    model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
-    problem = job.problem(model)
-    latest = problem, job.solve(problem, "solve")
-    try:
-        latest = job.settled(*latest, "solve")
-    except KeyboardInterrupt:
-        latest = problem, replace(latest[1], status=Status.INTERRUPTED)
-    return job.result(model, structure, *latest)
-
-
-def _from_starts(
-    structure: PILFR,
-    linear: Model,
-    problem: Problem,
-    solution: Solution,
-    job: Job,
-    starts: int,
-    seed: int,
-    start: str,
-    executor: Executor | None,
-) -> Fit:
-    """A PI-LFR from many starts; `problem` and `solution` are those of the linear model."""
-    blocks = {k: p.value for k, p in linear.parameters.items()}
-    options: dict[str, Any] = {"engine": job.engine, "start": start, "noise": job.noise}
-    options |= {"level": rms_error(problem, solution), "coordinates": not known_entries(structure)}
-    search = Search(structure, job.recordings, blocks, job.solver, job.limits, **options)
-    seen: list[float] = []
-
-    def report(candidate: Candidate) -> None:
-        seen.append(candidate.error)
-        if job.progress:
-            polishing = len(seen) > starts
-            stage, total = ("polish", min(starts, KEEP)) if polishing else ("starts", starts)
-            job.progress(stage, len(seen) - starts * polishing, total, min(seen))
-
-    candidates, best, stopped = search_starts(search, starts, seed, executor, report)
-    if best is None:
-        ended = replace(solution, status=Status.INTERRUPTED)
-        return job.result(linear, structure.linear(), problem, ended)
-    compared: dict[str, Any] = {"linear": linear, "linear_nrmse": tuple(problem.nrmse(solution.theta))}
-    model, note, l1 = best.model, best.note, job.l1 and not stopped
-    if l1:  # the penalty and a prior towards a smooth density contradict each other
-        asked = {name: {"prior": structure.priors.get(name)} for name in ("w", "r")}
-        model, note = model.with_parameters(model.parameters.change(**asked)), ""
-    problem = job.problem(model, best.error)
-    latest = model, problem, best.solution, note
-    try:
-        if stopped:
-            latest = interrupted(*latest)
-        elif start == "grid" or beyond(problem, best.theta):
-            latest = model, problem, job.solve(problem, "solve", best.theta), note
-        if structure.priors and not stopped:
-            problem, result = job.settled(problem, latest[2], "solve")
-            latest = model, problem, result, note
-        if l1:
-            latest = penalised(model, problem, latest[2], job, problem.noise)
-    except KeyboardInterrupt:
-        latest = interrupted(*latest)
-    model, problem, result, note = latest
-    return job.result(model, structure, problem, result, candidates=tuple(candidates), note=note, **compared)
+        return linear_only(model, fitted, job)
+    return from_starts(model, fitted, problem, solution, job, starts, seed, start, executor)
 
 
 def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:
     """Refuse what cannot be used before any long work."""
-    if not isinstance(model, PILFR | NARX | NOE | Model | Fit):
+    if not isinstance(model, PILFR | Lagged | Model | Fit):
         raise InputError(
             f"The model is a {type(model).__name__}; give a PILFR, a NARX, a NOE, a closed Model or a Fit."
         )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .baselines import NARX, NOE, lagged_start, reading_output
+from .baselines import NARX, Lagged, lagged_start, reading_output
 from .compiled import make_engine
 from .early_stopping import held_problem, hold_back, solve_watched
 from .fitted import Fit, first_state
@@ -36,7 +36,7 @@ SHARES = (1.0, 0.3, 0.1, 0.0)  # of the measured output that a NOE reads while i
 class LaggedSearch:
     """All that the starts of one identification share."""
 
-    wanted: NARX | NOE
+    wanted: Lagged
     structure: PILFR
     job: Job
     kept: tuple[Recording, ...]
@@ -48,7 +48,7 @@ class LaggedSearch:
 
 
 def fit_lagged(
-    wanted: NARX | NOE,
+    wanted: Lagged,
     train: Recording | Sequence[Recording],
     job: Job,
     starts: int,

@@ -15,6 +15,7 @@ import numpy as np
 
 from .constraints import Constraint
 from .gauss_newton import GaussNewton
+from .interrupts import Progress
 from .lfr import PILFR
 from .lti import propagate
 from .modal import in_modal_coordinates, is_modal
@@ -25,7 +26,6 @@ from .solution import Iteration, Solution, Status
 from .subspace import subspace_matrices
 
 Array = np.ndarray
-Progress = Callable[[str, int, int, float], None]
 
 
 def linear_model(

@@ -81,6 +81,7 @@ LAYERS = {
     ),
     6: (
         "fit",
+        "ways",
         "fitted",
         "job",
         "outcome",

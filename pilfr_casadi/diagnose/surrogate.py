@@ -10,7 +10,7 @@ a real eigenvalue `-r` the equation `q' = -r q + b u`. Frequencies, dampings and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from ..expressions import Named
 from ..fit import fit
+from ..interrupts import Progress
 from ..lfr import PILFR
 from ..metrics import nrmse
 from ..parameters import Parameter
@@ -32,7 +33,6 @@ EXACT = 1e-3  # NRMSE at which no higher order is looked for
 HIGHEST = 8
 SMALL = 1e-3  # share of an output below which a coefficient is held
 Array = np.ndarray
-Progress = Callable[[str, int, int, float], None]
 
 
 def surrogate(

@@ -1,0 +1,134 @@
+"""The ways to a fit: from values, to a linear model alone, and from starts; what they share stands in `job`.
+
+A fit from values is that of an earlier fit, of a closed model of one's own, or of a structure with values by name.
+`multistart` says how one from starts goes. Where an L1 penalty is asked for, a last solve follows (`penalty`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from .checks import numbers
+from .exactness import beyond
+from .fitted import Fit
+from .job import Job, interrupted, penalised, rms_error
+from .known_blocks import known_entries
+from .lfr import PILFR
+from .model import Model
+from .multistart import KEEP, Candidate, Search, search_starts
+from .penalty import check_penalty
+from .problem import Problem
+from .recording import InputError, Recording
+from .solution import Solution, Status
+
+
+def at_values(structure: PILFR, first: Recording, values: Mapping[str, Any]) -> Model:
+    """The model of a structure at values given by name, with a recording's names of inputs and outputs."""
+    model = structure.model(first.n_u, first.n_y, inputs=first.inputs, outputs=first.outputs)
+    unknown = sorted(set(values) - set(model.parameters))
+    if unknown:
+        raise InputError(
+            f"The start has a value for {unknown[0]!r}, which the model lacks; it has {', '.join(model.parameters)}."
+        )
+    changes = {}
+    for name, value in values.items():
+        p = model.parameters[name]
+        given = numbers(value, f"The start of {name!r}", p.value.shape)
+        changes[name] = {"value": np.where(p.fixed & (name in structure.fixed), p.value, np.clip(given, *p.bounds))}
+    return model.with_parameters(model.parameters.change(**changes))
+
+
+def from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit | None) -> Fit:
+    """A closed model or an earlier fit, from its values, and from the initial states that the fit has or estimates."""
+    if job.l1:
+        check_penalty(job.l1, model.parameters, structure is not None and structure.element is None)
+    options: dict[str, Any] = {"l1": {} if structure else job.l1}
+    problem = job.problem(model, **options)
+    if not np.isfinite(problem.cost(problem.start)):
+        raise InputError("The simulation diverges at the start values; start from a stable model.")
+    start = problem.start
+    if earlier is not None:
+        estimated = [r for r in job.recordings if isinstance(r.initial, str) and r.initial == "estimate"]
+        begin = np.concatenate([start[: int(problem.free.sum())], *(earlier.initial_state(r) for r in estimated)])
+        start = begin if problem.cost(begin) < problem.cost(start) else start
+    latest = model, problem, job.solve(problem, "solve", start), ""
+    try:
+        problem, solution = job.settled(problem, latest[2], "solve", **options)
+        latest = model, problem, solution, ""
+        if job.l1 and structure:
+            latest = penalised(model, problem, solution, job, problem.noise)
+    except KeyboardInterrupt:
+        latest = interrupted(*latest)
+    model, problem, solution, note = latest
+    return job.result(model, structure, problem, solution, note=note)
+
+
+def linear_only(structure: PILFR, fitted: Model, job: Job) -> Fit:
+    """A linear model with the structure's bounds and fixed blocks, from the one without."""
+    values = {k: p.value for k, p in fitted.parameters.items()}
+    first = job.recordings[0]
+    model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
+    problem = job.problem(model)
+    latest = problem, job.solve(problem, "solve")
+    try:
+        latest = job.settled(*latest, "solve")
+    except KeyboardInterrupt:
+        latest = problem, replace(latest[1], status=Status.INTERRUPTED)
+    return job.result(model, structure, *latest)
+
+
+def from_starts(
+    structure: PILFR,
+    linear: Model,
+    problem: Problem,
+    solution: Solution,
+    job: Job,
+    starts: int,
+    seed: int,
+    start: str,
+    executor: Executor | None,
+) -> Fit:
+    """A PI-LFR from many starts; `problem` and `solution` are those of the linear model."""
+    blocks = {k: p.value for k, p in linear.parameters.items()}
+    options: dict[str, Any] = {"engine": job.engine, "start": start, "noise": job.noise}
+    options |= {"level": rms_error(problem, solution), "coordinates": not known_entries(structure)}
+    search = Search(structure, job.recordings, blocks, job.solver, job.limits, **options)
+    seen: list[float] = []
+
+    def report(candidate: Candidate) -> None:
+        seen.append(candidate.error)
+        if job.progress:
+            polishing = len(seen) > starts
+            stage, total = ("polish", min(starts, KEEP)) if polishing else ("starts", starts)
+            job.progress(stage, len(seen) - starts * polishing, total, min(seen))
+
+    candidates, best, stopped = search_starts(search, starts, seed, executor, report)
+    if best is None:
+        ended = replace(solution, status=Status.INTERRUPTED)
+        return job.result(linear, structure.linear(), problem, ended)
+    compared: dict[str, Any] = {"linear": linear, "linear_nrmse": tuple(problem.nrmse(solution.theta))}
+    model, note, l1 = best.model, best.note, job.l1 and not stopped
+    if l1:  # the penalty and a prior towards a smooth density contradict each other
+        asked = {name: {"prior": structure.priors.get(name)} for name in ("w", "r")}
+        model, note = model.with_parameters(model.parameters.change(**asked)), ""
+    problem = job.problem(model, best.error)
+    latest = model, problem, best.solution, note
+    try:
+        if stopped:
+            latest = interrupted(*latest)
+        elif start == "grid" or beyond(problem, best.theta):
+            latest = model, problem, job.solve(problem, "solve", best.theta), note
+        if structure.priors and not stopped:
+            problem, result = job.settled(problem, latest[2], "solve")
+            latest = model, problem, result, note
+        if l1:
+            latest = penalised(model, problem, latest[2], job, problem.noise)
+    except KeyboardInterrupt:
+        latest = interrupted(*latest)
+    model, problem, result, note = latest
+    return job.result(model, structure, problem, result, candidates=tuple(candidates), note=note, **compared)
