@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from pilfr_casadi.metrics import nrmse
 from pilfr_casadi.recording import InputError
-from problems.masing import MasingRig, MasingSpring, simulate, stop_density, stop_elements
+from problems.masing import MasingRig, simulate
 from problems.masing_data import FS, benchmark, records
+from problems.masing_spring import MasingSpring, stop_density, stop_elements
 
 RIG = MasingRig()
 K, R_U = RIG.K, RIG.r_u

@@ -13,6 +13,7 @@ from ..interrupts import Progress
 from ..laws import CATALOGUE, Law, readable_unit
 from ..recording import InputError, Recording, as_recordings, check_for_identification
 from ..threads import one_blas_thread, processors
+from .arranged import arranged
 from .candidate import Candidate
 from .clipping import clipped_input
 from .experiment import next_experiment, placebo
@@ -24,7 +25,7 @@ from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import MISHELD, Pass, Search
 from .verdict import UNSURE, confidence, judge
-from .workbench import Fitted, arranged
+from .workbench import Fitted
 
 
 @one_blas_thread

@@ -20,6 +20,7 @@ from ..sensitivities import Engine
 from ..simulator import Simulator
 from ..substeps import MOST, REACH, choose_substeps, fastest, wanted_substeps
 from ..threads import one_at_a_time
+from .arranged import arranged
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 HUGE, ENDLESS = 1e6, 1e20  # times the largest measured value, and mean square error, of what grows without end
@@ -273,33 +274,3 @@ def started(model: Model, start: Mapping[str, Any]) -> np.ndarray:
     """Parameter vector at start values by name, inside the bounds; what the model does not know is left out."""
     p = model.parameters
     return np.asarray(np.clip(p.pack({k: v for k, v in start.items() if k in p}), p.lower, p.upper))
-
-
-def arranged(simulator: Simulator, recording: Recording) -> Recording:
-    """A recording with its columns in the simulator's order.
-
-    Raises
-    ------
-    InputError
-        If a column is missing.
-    """
-    changes: dict[str, Any] = {}
-    for names, own, letter in (
-        (simulator.inputs, recording.inputs, "u"),
-        (simulator.output_names, recording.outputs, "y"),
-    ):
-        kind = {"u": "input", "y": "output"}[letter]
-        for name in names:
-            if name not in own:
-                raise InputError(
-                    f"The recording {recording.label} has no {kind} {name!r}, which the simulator has; "
-                    f"it has {', '.join(own) or 'none'}. Map a column to it by name."
-                )
-        if tuple(own) != tuple(names):
-            order = [own.index(name) for name in names]
-            values = getattr(recording, letter)[:, order]
-            changes |= {letter: values, f"{kind}s": tuple(names)}
-    if changes:
-        kept = {*changes.get("inputs", recording.inputs), *changes.get("outputs", recording.outputs)}
-        changes["units"] = {k: v for k, v in recording.units.items() if k in kept}
-    return recording.with_(**changes) if changes else recording
