@@ -13,9 +13,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike
-
 
 class Branch(NamedTuple):
     """The curve the spring moves on, ``f0 - gain * expm1(rate * (x - x0))``, until x passes `close`."""
@@ -88,33 +85,3 @@ class MasingSpring:
         while spring.turns and spring.direction * (spring.x - spring.branch.close) >= 0.0:
             spring = replace(spring, turns=spring.turns[:-2])
         return spring
-
-
-def stop_density(r: ArrayLike, K: float, r_u: float) -> np.ndarray:
-    """Density w(r) of the stops that make up the spring, ``(K^2 / r_u) exp(-K r / r_u)``, N/m^2, at thresholds r, m."""
-    return np.asarray(K**2 / r_u * np.exp(-K / r_u * np.asarray(r, float)))
-
-
-def stop_elements(n: int, x_max: float, K: float, r_u: float) -> tuple[np.ndarray, np.ndarray]:
-    """Discretise the spring into n stops of equally spaced thresholds.
-
-    The virgin curve of these stops is the chord polygon of the spring's on [0, x_max]; it errs by at most
-    ``(K^2 / r_u) (x_max / n)^2 / 8``, and any branch by at most twice that.
-
-    Parameters
-    ----------
-    n : int
-        Number of stops.
-    x_max : float
-        Largest elongation, m, that the polygon has to cover.
-    K, r_u : float
-        Stiffness, N/m, and strength, N, of the spring.
-
-    Returns
-    -------
-    r, w : array, (n,)
-        Thresholds, m, and weights, N/m.
-    """
-    r = np.linspace(0.0, x_max, n + 1)
-    slopes = np.diff(-r_u * np.expm1(-K / r_u * r)) / np.diff(r)
-    return r[1:], slopes - np.append(slopes[1:], 0.0)
