@@ -22,19 +22,21 @@ from .screen import Scored
 from .workbench import Fitted, Workbench, started
 
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
+BEST = 10  # pairs of each list that are fitted, besides the best of each port
 REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first
+AGAIN = 3  # starts that a pair is fitted from again
 SAME = 1.02  # times the mean square error of fits that came to the same place
 BEHIND = 3.0  # times the best error of a pair that is not worth more starts
 
 
-def survivors(scored: Sequence[Scored], keep: int = 10) -> list[tuple[str, type[Law], list[Scored]]]:
+def survivors(scored: Sequence[Scored]) -> list[tuple[str, type[Law], list[Scored]]]:
     """Pairs worth a full fit: the best of both lists and the best of each port."""
     chosen: dict[tuple[str, type[Law]], list[Scored]] = {}
     for source in ("simulation", "observer"):
         ranked = [s for s in scored if s.source == source]
         ports: set[str] = set()
         for i, s in enumerate(ranked):
-            if i < keep or s.port not in ports:
+            if i < BEST or s.port not in ports:
                 chosen.setdefault((s.port, type(s.law)), [])
             ports.add(s.port)
     for s in scored:
@@ -92,9 +94,9 @@ def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: 
     return _Pair(placed, model, engine, ranked, without.begin, brief)
 
 
-def ways(pair: _Pair, led: bool, runs: int = 3) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
+def ways(pair: _Pair, led: bool) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
     """Starts that a pair is fitted from again, each with the observer's gains on its way: led first, where it is."""
-    starts = pair.starts[:runs]
+    starts = pair.starts[:AGAIN]
     if pair.candidate is not None:
         starts = [pair.candidate.fitted.values, *starts[1:]]
     return [(start, (1.0, 0.1)) for start in pair.starts[: int(led)]] + [(start, ()) for start in starts]

@@ -31,6 +31,7 @@ from .workbench import FINER, Fitted, Workbench
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
 BLOCK = 256  # samples propagated at a time
+FEW = 60  # samples of a run at which the user's equations are looked at
 
 
 class Constant(Law):
@@ -179,13 +180,13 @@ def linearised(bench: Workbench, fitted: Fitted) -> tuple[Probe, list[Run]]:
     return probe, [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
 
 
-def along(bench: Workbench, fitted: Fitted, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Some states of the user's equations (count, n_x) and inputs (count, n_u) along the longest fitted run."""
+def along(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """Some states of the user's equations (n, n_x) and inputs (n, n_u) along the longest fitted run."""
     i = int(np.argmax([len(r) for r in bench.recordings]))
     r, model, n_x = bench.recordings[i], fitted.model, len(bench.simulator.states)
     short = r.slice(0, min(len(r), 3000))
     states = states_along(model, model.drive(short), fitted.vector, fitted.initial[i])[:: model.substeps, :n_x]
-    step = max(len(states) // count, 1)
+    step = max(len(states) // FEW, 1)
     return states[::step], short.u[::step]
 
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from ..expressions import Named
 from ..fit import fit
-from ..interrupts import Progress
 from ..lfr import PILFR
 from ..metrics import nrmse
 from ..parameters import Parameter
@@ -35,9 +34,7 @@ SMALL = 1e-3  # share of an output below which a coefficient is held
 Array = np.ndarray
 
 
-def surrogate(
-    recordings: Recording | Sequence[Recording], *, nx: int | None = None, progress: Progress | None = None
-) -> tuple[Simulator, float]:
+def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = None) -> tuple[Simulator, float]:
     """Identify a linear simulator from what a simulation was given and what it answered.
 
     Parameters
@@ -46,8 +43,6 @@ def surrogate(
         Inputs and outputs of the simulation.
     nx : int, optional
         States; chosen on the recordings where left out.
-    progress : callable, optional
-        Called with (stage, done, total, smallest error so far).
 
     Returns
     -------
@@ -67,7 +62,7 @@ def surrogate(
     records = tuple(r if r.period else r.with_(initial="estimate") for r in records)
     found: list[tuple[float, Simulator]] = []
     for n in range(HIGHEST + 1) if nx is None else (nx,):  # a simulation has no noise: its order shows by itself
-        one = _identified(records, n, hold, progress)
+        one = _identified(records, n, hold)
         found += [one] if one is not None else []
         if found and found[-1][0] < EXACT:
             break
@@ -81,11 +76,9 @@ def surrogate(
     return simulator, error
 
 
-def _identified(
-    records: Sequence[Recording], n: int, hold: str | None, progress: Progress | None
-) -> tuple[float, Simulator] | None:
+def _identified(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:
     try:
-        found = fit(PILFR(n), records, progress=progress)
+        found = fit(PILFR(n), records)
     except InputError:
         return None
     p = found.parameters
