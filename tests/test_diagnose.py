@@ -33,6 +33,8 @@ IDS = {
     "drift",
     "periodic_force",
     "extra_mode",
+    "linear_stiffness",
+    "viscous_damping",
 }
 
 

@@ -49,9 +49,12 @@ FLEXIBLE: dict[str, float] = {
 }
 # a law -> what it has as special cases: it always does as well, and is no rival of theirs
 CONTAINS = {
-    "hysteresis": ("backlash", "coulomb_friction"),
+    "hysteresis": ("backlash", "coulomb_friction", "linear_stiffness"),
     "stribeck_friction": ("coulomb_friction",),
-    "clearance": ("piecewise_stiffness",),  # one side of which is never touched
+    "clearance": ("piecewise_stiffness", "linear_stiffness"),  # one side of which is never touched; no gap
+    "piecewise_stiffness": ("linear_stiffness",),
+    "creep": ("linear_stiffness", "viscous_damping"),  # that takes longer than the record, or no time
+    "extra_mode": ("linear_stiffness", "viscous_damping"),  # above every frequency that is seen
 }
 # a law and one that it can imitate by its freedom alone -> how much nearer it has to come above the floor
 IMITATES = {
