@@ -87,13 +87,14 @@ def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
             scores.append((drop / total, shape, -strength / size[cols], cols))
         at += width * len(shapes)
         scores.sort(key=lambda s: -s[0])
-        starts = tuple(_start(law, shape, c) for _, shape, c, _ in scores[:KEPT])
+        starts = tuple(start_values(law, shape, c) for _, shape, c, _ in scores[:KEPT])
         share = held_out(phi[:, scores[0][3]], rest.left, rest.odd)
         out.append(Scored(task.port.name, law, share, starts, task.local, source))
     return out
 
 
-def _start(law: Law, shape: dict[str, Any], strength: np.ndarray) -> dict[str, Any]:
+def start_values(law: Law, shape: dict[str, Any], strength: np.ndarray) -> dict[str, Any]:
+    """Start values of a law: its shape, and its strengths one entry a column."""
     values, at, p = dict(shape), 0, law.at(shape).parameters()
     for name in law.strength:
         size = p[name].size
