@@ -58,8 +58,17 @@ class Candidate:
     @property
     def at_bound(self) -> bool:
         """Whether a parameter of the law is held back by one of its bounds."""
+        return any(np.any(self.fitted.at_bound(k)) for k in self._own)
+
+    @property
+    def held_back(self) -> bool:
+        """The same, but for bounds at zero: what is nothing is held back by none."""
+        return any(np.any(self.fitted.at_bound(k) & (self.fitted.values[k] != 0)) for k in self._own)
+
+    @property
+    def _own(self) -> list[str]:
         prefix = self.fitted.simulator.elements[-1].prefix
-        return any(np.any(self.fitted.at_bound(k)) for k in self.fitted.model.parameters if k.startswith(prefix))
+        return [k for k in self.fitted.model.parameters if k.startswith(prefix)]
 
 
 def heads(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
