@@ -62,8 +62,9 @@ class Candidate:
 
     @property
     def held_back(self) -> bool:
-        """The same, but for bounds at zero: what is nothing is held back by none."""
-        return any(np.any(self.fitted.at_bound(k) & (self.fitted.values[k] != 0)) for k in self._own)
+        """Whether an upper bound holds one back: at a lower one it is as sharp or as small as the data can tell."""
+        p, values = self.fitted.model.parameters, self.fitted.values
+        return any(np.any(values[k] >= p[k].bounds[1]) for k in self._own)
 
     @property
     def _own(self) -> list[str]:
