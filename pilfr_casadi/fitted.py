@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -24,7 +24,6 @@ from .sensitivities import Engine
 from .slopes import settled
 from .solution import Solution, Status
 
-Progress = Callable[[str, int, int, float], None]
 STATES = ("A", "B_u", "B_w", "C_y", "C_z")  # blocks that a change of coordinates of the states changes
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from .constraints import Constraint, loosened
 from .gauss_newton import GaussNewton
+from .interrupts import Progress
 from .lfr import PILFR
 from .model import Model
 from .problem import Problem
@@ -19,7 +20,7 @@ from .recording import InputError, Recording
 from .sensitivities import Engine
 from .solution import Solution, Status
 from .start import Blocks
-from .told import Progress, solve_inside
+from .told import solve_inside
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from .gauss_newton import GaussNewton
+from .interrupts import Progress
 from .ipopt import Ipopt
 from .problem import Problem
 from .solution import Iteration, Solution
 from .tightening import STEP, within_bounds
-
-Progress = Callable[[str, int, int, float], None]
 
 
 def solve_inside(

@@ -101,3 +101,12 @@ def coupled_plays(seed, samples=800):
         x = A @ x + np.array([0.05, 0.1]) * value + np.array([0.03, -0.08]) * w
     measured = np.array(y) + 0.01 * np.std(y) * rng.standard_normal(samples)
     return Recording(u, measured, 0.01, initial="zero")
+
+
+def simulate_lti(system, u, x=None):
+    """Output (M, n_y) of a control.StateSpace, sample by sample, from a state or from rest."""
+    x, out = np.zeros(system.nstates) if x is None else x, []
+    for u_k in u:
+        out.append(system.C @ x + system.D @ u_k)
+        x = system.A @ x + system.B @ u_k
+    return np.array(out)

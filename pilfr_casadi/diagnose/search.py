@@ -8,12 +8,13 @@ explain it. It is accepted at another port when it removes most of what is left.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..interrupts import Progress
 from ..laws import Law
 from ..recording import InputError
 from .candidate import Candidate, heads, judged, polish
@@ -40,7 +41,6 @@ IMITATED = 3  # simpler laws put up against one that can imitate others
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
 Seen = tuple[list[Scored], dict[str, int], np.ndarray | None]
-Say = Callable[[str, int, int, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Search:
     floor: Floor
     laws: Sequence[type[Law]]
     workers: int
-    say: Say
+    say: Progress
     hold_said: bool = True
     misheld: float = 1.0
     base: Fitted = field(init=False)

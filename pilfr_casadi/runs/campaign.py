@@ -13,14 +13,13 @@ from dataclasses import replace
 from typing import Any
 
 from ..hand import close_hands
+from ..interrupts import Progress
 from ..lfr import PILFR
 from ..recording import InputError
 from .described import Run, read_run
 from .execute import RunResult, carried_out
-from .jobs import Recordings, RunJob, attempt
-from .side_by_side import AHEAD, Batch, Sent, side_by_side
-
-Progress = Callable[[str, int, int, float], None]
+from .jobs import Batch, Recordings, RunJob, attempt
+from .side_by_side import AHEAD, Sent, side_by_side
 
 
 def campaign(
