@@ -17,7 +17,7 @@ import numpy as np
 from ..export.saving import model_text
 from ..fit import fit as identify
 from ..fitted import Fit
-from ..lfr import PILFR
+from ..model import Model
 from ..recording import InputError, Recording
 from ..solution import Solution, Status
 from ..sparse import operators_used, prune, regularization_path
@@ -184,7 +184,7 @@ def execute(
     cell = run.cells[job.cell]
     search = (
         {**cell.search, "seed": int(job.parameters["seed"]), "executor": executor}
-        if isinstance(cell.model, PILFR)
+        if not isinstance(cell.model, Model)
         else {}
     )
     train = recordings["train"] if job.fold is None else fold(recordings["train"], job.fold, run.folds)[0]
