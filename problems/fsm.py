@@ -9,6 +9,10 @@ One model for all levels that is told nothing but the input. The last realizatio
 reported is its relative error, RMSE / std(y), averaged over outputs and periods. The means of the recordings are zero,
 where the mirror rests and creeps is not in them: the models have no offset (`y_0 = 0`), and what mean their own
 hysteresis makes counts as an error.
+
+What the combined model is made of was chosen on realization 4, fitted to 1 and 5: second envelopes and ways of their own
+for the input plays take 8 % off after as many iterations, stops beside the envelopes and a scale of the damping that is
+halved each step nothing; from 16 to 26 iterations the error falls by another 9 %.
 """
 
 from __future__ import annotations
@@ -39,7 +43,7 @@ PERIOD, TRAINING, HELD = 8192, (0, 1, 2, 3, 4), 5
 LARGEST, SETTLING = 2.0, 20  # V; periods
 RADIUS = 0.998  # the largest spectral radius of the linear part: a guarantee for amplitudes that were not seen
 NOISY = 0.02  # relative noise of one period above which a realization is said to be noisy
-ITERATIONS = (8, 36, 16)  # PI-LFR and envelope; the combined model on some realizations, then on all
+ITERATIONS = (8, 48, 24)  # PI-LFR and envelope; the combined model on some realizations, then on all
 PURE, COMBINED = "PI-LFR: stops in the feedback and at inputs", "combined: envelope, products, input plays"
 MODELS = {PURE: "pi_lfr", "envelope alone": "envelope", COMBINED: "combined"}  # with the names of their files
 PUBLISHED = (

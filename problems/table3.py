@@ -125,13 +125,13 @@ def stack_rows() -> dict[str, Row]:
 def identify(row: Row, train: Sequence[Recording], explored: int = EXPLORED, **options: Any) -> Fit:
     """The fit of a row to the training recordings, started on the first few; its `seconds` are processor time."""
     began = time.process_time()
-    first, last = ({"solver": GaussNewton(max_iterations=n, tolerance=1e-4)} for n in row.iterations or (200, 200))
+    first, last = (GaussNewton(max_iterations=n, tolerance=1e-4) for n in row.iterations or (200, 200))
     if isinstance(row.model, PILFR) and row.model.element is None:
         return replace(fit(row.model, train, **options), seconds=time.process_time() - began)
     if isinstance(row.model, Lagged):  # one realization more, to stop early; its state is the past
         explored, options = explored + 1, {**options, "stable": False}
-    found = fit(row.model, train[:explored], **options, **first)
-    found = fit(found, train, **options, **last) if len(train) > explored else found
+    found = fit(row.model, train[:explored], solver=first, **options)
+    found = fit(found, train, solver=last, **options) if len(train) > explored else found
     return replace(found, seconds=time.process_time() - began)
 
 
