@@ -44,7 +44,7 @@ LARGEST, SETTLING = 2.0, 20  # V; periods
 RADIUS = 0.998  # the largest spectral radius of the linear part: a guarantee for amplitudes that were not seen
 NOISY = 0.02  # relative noise of one period above which a realization is said to be noisy
 ITERATIONS = (8, 48, 24)  # PI-LFR and envelope; the combined model on some realizations, then on all
-PURE, COMBINED = "PI-LFR: stops in the feedback and at inputs", "combined: envelope, products, input plays"
+PURE, COMBINED = "PI-LFR: stops in the feedback and at inputs", "combined: envelopes, products, input plays"
 MODELS = {PURE: "pi_lfr", "envelope alone": "envelope", COMBINED: "combined"}  # with the names of their files
 PUBLISHED = (
     ("published: linear, one a level", (8.38, 7.95, 5.63)),

@@ -137,7 +137,7 @@ def combined(family: Levels, theta: Array, signals: list[Array], deviation: Arra
 
 
 def envelope_alone(structure: PILFR, values: Values) -> tuple[PILFR, Values]:
-    """The combined model with the first envelopes alone; the difference is what the rest is worth."""
+    """The combined model with the first envelopes alone: the difference is what the rest is worth."""
     n = structure.nx
     silent = {name: np.zeros_like(values[name]) for name in ("further_gain", "input_w")}
     silent |= {name: values[name] for name in ("second_rate", "second_knee", "input_r")}

@@ -37,7 +37,7 @@ from .piezo_platform import measure
 from .piezo_stack import recordings as stack_recordings
 
 EXPLORED = 1  # realizations on which starts are tried
-LIMITED = (60, 10)  # iterations of networks
+LIMITED = (50, 8)  # iterations of networks
 SLOWEST = (
     0.9997  # spectral radius: a lag of 0.3 s; slower ones look constant in a period, and settle over dozens of them
 )
