@@ -10,7 +10,9 @@ import argparse
 import os
 import re
 import sys
+import warnings
 from collections.abc import Sequence
+from typing import Any
 
 DONE, NO_RESULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 # keyword arguments of Python that the package's messages name, and that are options here under the same name
@@ -42,10 +44,17 @@ def _run(options: argparse.Namespace) -> int:
     with deferred_interrupt():  # an import is not to be torn apart
         from . import commands
         from .checks import InputError
-    try:
-        return int(getattr(commands, options.command)(options))
-    except InputError as error:
-        return say(in_options(str(error)), BAD_INPUT)
+    with warnings.catch_warnings():
+        warnings.showwarning = _warn
+        try:
+            return int(getattr(commands, options.command)(options))
+        except InputError as error:
+            return say(in_options(str(error)), BAD_INPUT)
+
+
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    """A warning is a sentence too, without the place in the code that Python adds."""
+    say(f"warning: {message}", DONE)
 
 
 def say(sentence: str, status: int) -> int:

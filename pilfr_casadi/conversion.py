@@ -24,7 +24,6 @@ import numpy as np
 
 from .elements import PrandtlIshlinskii
 from .lfr import PILFR
-from .model import Model
 from .operators import Play, Stop
 from .recording import InputError
 
@@ -74,26 +73,6 @@ def to_stops(structure: PILFR, values: Mapping[str, Any]) -> tuple[PILFR, dict[s
 def to_plays(structure: PILFR, values: Mapping[str, Any]) -> tuple[PILFR, dict[str, Array]]:
     """Structure and values with plays for stops; see `to_stops`."""
     return _convert(structure, values, Play())
-
-
-def convert_model(structure: PILFR, model: Model, operator: Play | Stop) -> tuple[PILFR, Model]:
-    """A model of a structure with its operators converted; outputs, states and memory are the same at every sample.
-
-    The element's parameters keep their bounds, priors and fixed entries; the blocks' follow from the structure.
-
-    Raises
-    ------
-    InputError
-        As `to_stops`.
-    """
-    values = {name: p.value for name, p in model.parameters.items()}
-    new_structure, new_values = _convert(structure, values, operator)
-    new = new_structure.model(model.n_u, model.n_y, new_values, inputs=model.inputs, outputs=model.outputs)
-    own = _layer(structure).parameters()
-    kept = {
-        k: {"bounds": p.bounds, "fixed": p.fixed, "prior": p.prior} for k, p in model.parameters.items() if k in own
-    }
-    return new_structure, new.with_parameters(new.parameters.change(**kept))
 
 
 def _layer(structure: PILFR) -> PrandtlIshlinskii:

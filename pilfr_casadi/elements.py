@@ -18,8 +18,6 @@ from .operators import GeneralizedPlay, Play, Stop
 from .parameters import Parameter, ParameterSet
 from .recording import InputError
 
-Operator = Play | Stop | GeneralizedPlay
-
 
 class Element(Protocol):
     """What `close_loop` needs of an element."""

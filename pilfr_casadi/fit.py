@@ -21,7 +21,8 @@ from .baselines import Lagged
 from .constraints import Constraint, loosened
 from .elements import PrandtlIshlinskii, StaticNetwork
 from .exactness import beyond
-from .fitted import Fit, Progress, fingerprint
+from .fitted import Fit, fingerprint
+from .interrupts import Progress
 from .job import Job
 from .known_blocks import in_known_coordinates
 from .lagged_fit import fit_lagged

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -23,8 +23,6 @@ from .recording import InputError, Recording, as_recordings
 from .sensitivities import Engine
 from .slopes import settled
 from .solution import Solution, Status
-
-Progress = Callable[[str, int, int, float], None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ of several stages, of which nearly none is ever zero, are written out term by te
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,13 +98,11 @@ def source_code(linear: Linearization) -> str:
         n = sizes[target]
         terms: list[list[str]] = [[] for _ in range(n)]
         directly: list[list[str]] = [[] for _ in range(n)]
-        for source in TARGETS[target]:
-            pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
-            for i, j, value in zip(*pattern.get_triplet(), code.entries[target, source], strict=True):
-                if source == "p":
-                    directly[i].append(f"{{{j},{value}}}")
-                else:
-                    terms[i].append(f"{{{_SOURCES[source]},{j},{value}}}")
+        for source, i, j, value in _entries(linear, code, target):
+            if source == "p":
+                directly[i].append(f"{{{j},{value}}}")
+            else:
+                terms[i].append(f"{{{_SOURCES[source]},{j},{value}}}")
         lines += [*_table(f"term_{target}", "term_t", f"row_{target}", terms)]
         lines += [*_table(f"direct_{target}", "direct_t", f"direct_row_{target}", directly)]
         most = max(most, sum(map(len, terms)))
@@ -125,6 +124,14 @@ def source_code(linear: Linearization) -> str:
     return "\n".join([generator.dump(), _text("_kernel.h"), *lines, f"const model_t pilfr_model = {{{model}}};\n"])
 
 
+def _entries(linear: Linearization, code: _Code, target: str) -> Iterator[tuple[str, int, int, int]]:
+    """(source, row, column, where its value is) of the slopes of a target."""
+    for source in TARGETS[target]:
+        pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
+        for i, j, value in zip(*pattern.get_triplet(), code.entries[target, source], strict=True):
+            yield source, i, j, value
+
+
 def _written(linear: Linearization, code: _Code) -> tuple[list[str], list[str], int]:
     """C code of the slopes of all rows, its direct entries {row, parameter, value}, and how many rows these have.
 
@@ -135,18 +142,16 @@ def _written(linear: Linearization, code: _Code) -> tuple[list[str], list[str], 
     rows = {target: [list[str]() for _ in range(sizes[target])] for target in TARGETS}
     own: dict[tuple[str, int], int] = {}
     direct = list[str]()
-    for target, sources in TARGETS.items():
-        for source in sources:
-            pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
-            for i, j, value in zip(*pattern.get_triplet(), code.entries[target, source], strict=True):
-                if source != "p":
-                    factor = repr(code.constants[value]) if value < code.at["p"] else f"v[{value}]"
-                    rows[target][i].append(f"{source}{j}" if factor == "1.0" else f"{factor} * {source}{j}")
-                    continue
-                if (target, i) not in own:
-                    own[target, i] = len(own)
-                    rows[target][i].append(f"AT(direct, {own[target, i]})")
-                direct.append(f"{{{own[target, i]},{j},{value}}}")
+    for target in TARGETS:
+        for source, i, j, value in _entries(linear, code, target):
+            if source != "p":
+                factor = repr(code.constants[value]) if value < code.at["p"] else f"v[{value}]"
+                rows[target][i].append(f"{source}{j}" if factor == "1.0" else f"{factor} * {source}{j}")
+                continue
+            if (target, i) not in own:
+                own[target, i] = len(own)
+                rows[target][i].append(f"AT(direct, {own[target, i]})")
+            direct.append(f"{{{own[target, i]},{j},{value}}}")
     lines = [f"const lane_t {source}{j} = AT({source}, {j});" for source in ("x", "s") for j in range(sizes[source])]
     for target, name in (("z", "z"), ("w", "w"), ("s", "s_"), ("c", "c"), ("x", "x_"), ("y", "y_")):
         lines += [f"const lane_t {name}{i} = {' + '.join(row) or 'NONE'};" for i, row in enumerate(rows[target])]

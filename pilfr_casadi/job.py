@@ -11,9 +11,9 @@ import numpy as np
 
 from .constraints import Constraint
 from .exactness import exactly
-from .fitted import Fit, Progress
+from .fitted import Fit
 from .gauss_newton import GaussNewton
-from .interrupts import deferred_interrupt
+from .interrupts import Progress, deferred_interrupt
 from .ipopt import Ipopt
 from .lfr import PILFR
 from .linear_model import iterations

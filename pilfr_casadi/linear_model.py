@@ -15,6 +15,7 @@ import numpy as np
 
 from .constraints import Constraint
 from .gauss_newton import GaussNewton
+from .interrupts import Progress
 from .lfr import PILFR
 from .lti import propagate
 from .modal import in_modal_coordinates, is_modal
@@ -25,7 +26,6 @@ from .solution import Iteration, Solution, Status
 from .subspace import subspace_matrices
 
 Array = np.ndarray
-Progress = Callable[[str, int, int, float], None]
 
 
 def linear_model(
@@ -34,7 +34,6 @@ def linear_model(
     *,
     engine: str = "auto",
     constraints: tuple[Constraint, ...] = (),
-    solver: GaussNewton | None = None,
     progress: Progress | None = None,
     given: Any = None,
 ) -> tuple[Model, Problem, Solution]:
@@ -49,8 +48,6 @@ def linear_model(
         what else it fixes are left aside.
     engine, constraints
         As for `Problem`.
-    solver : GaussNewton
-        By default `GaussNewton(tolerance=1e-4)`.
     given : control.StateSpace
         A linear model in discrete time to take in place of the subspace's. In the search for an element it stays as it
         is: at the minimum of the linear error the slope of half of the parameters has vanished, and starts get stuck.
@@ -67,7 +64,7 @@ def linear_model(
     InputError
         If the recordings are too short for the order, or the model given does not fit them.
     """
-    first, solver = recordings[0], solver or GaussNewton(tolerance=1e-4)
+    first, solver = recordings[0], GaussNewton(tolerance=1e-4)
     if given is None:
         a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset, progress=progress)
     else:

@@ -1,23 +1,19 @@
-r"""Discrete linear state-space models: response, simulation, scaling of the states, reflection of the poles.
+r"""Discrete linear state-space models: response, states over time, reflection of the poles.
 
 .. math:: x(k+1) = A x(k) + B u(k), \qquad y(k) = C x(k) + D u(k), \qquad G(z) = C (z I - A)^{-1} B + D
 
-The states scaled to unit variance are those of Krikelis et al. (2024), Sec. 5.3. The response takes one complex Schur
-form of `A` for all frequencies; the simulation cuts the record into pieces that run side by side, joined by powers of
-`A`; both in plain NumPy, for any number of samples and lines.
+The response takes one complex Schur form of `A` for all frequencies; the states are found in pieces of the record that
+run side by side, joined by powers of `A`; both in plain NumPy, for any number of samples and lines.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .recording import InputError
-
 if TYPE_CHECKING:
-    import control
+    pass
 
 Array = np.ndarray
 
@@ -40,93 +36,6 @@ def frequency_response(system: Any, frequency: Array) -> Array:
     z = np.exp(2j * np.pi * np.asarray(frequency) * system.dt)
     with np.errstate(divide="ignore", invalid="ignore"):
         return resolvent(np.asarray(system.A), np.asarray(system.C), z) @ np.asarray(system.B) + np.asarray(system.D)
-
-
-def simulate_states(system: Any, u: Array, x0: Array | None = None) -> Array:
-    """State trajectory of a discrete state-space model.
-
-    Parameters
-    ----------
-    system : control.StateSpace
-        Or anything with `A` (nx, nx) and `B` (nx, n_u).
-    u : array, (M, n_u)
-        Inputs.
-    x0 : array, (nx,), optional
-        State at the first sample; zero if left out.
-
-    Returns
-    -------
-    array, (M, nx)
-
-    Raises
-    ------
-    InputError
-        When the shapes of `u` or `x0` do not fit the model.
-    """
-    A, B = np.asarray(system.A, dtype=float), np.asarray(system.B, dtype=float)
-    u = np.asarray(u, dtype=float)
-    if u.ndim != 2 or u.shape[1] != B.shape[1]:
-        raise InputError(f"u has the shape {u.shape}; the model needs (samples, {B.shape[1]}).")
-    start = np.zeros(len(A)) if x0 is None else np.asarray(x0, dtype=float)
-    if start.shape != (len(A),):
-        raise InputError(f"x0 has the shape {start.shape}; the model has {len(A)} states.")
-    return propagate(A.T, (u @ B.T)[None], start[None])[0][0]
-
-
-def simulate_lti(system: Any, u: Array, x0: Array | None = None) -> Array:
-    """Output of a discrete state-space model.
-
-    Parameters
-    ----------
-    system : control.StateSpace
-        Or anything with `A`, `B`, `C` and `D`.
-    u : array, (M, n_u)
-        Inputs.
-    x0 : array, (nx,), optional
-        State at the first sample; zero if left out.
-
-    Returns
-    -------
-    array, (M, n_y)
-
-    Raises
-    ------
-    InputError
-        When the shapes of `u` or `x0` do not fit the model.
-    """
-    return simulate_states(system, u, x0) @ np.asarray(system.C).T + np.asarray(u) @ np.asarray(system.D).T
-
-
-def unit_variance(system: Any, u: Array | Sequence[Array]) -> control.StateSpace:
-    """Scale the states so that each has unit variance under an input, Krikelis et al. (2024), Sec. 5.3.
-
-    Parameters
-    ----------
-    system : control.StateSpace
-        Discrete model.
-    u : array, (M, n_u), or several of them
-        Inputs of one or several runs, each from the zero state on.
-
-    Returns
-    -------
-    control.StateSpace
-        The same model in other coordinates. A state that the inputs do not move keeps its scale.
-
-    Raises
-    ------
-    InputError
-        When `u` does not fit the model, or the states grow without bound under it.
-    """
-    import control
-
-    with np.errstate(over="ignore", invalid="ignore"):
-        x = np.concatenate([simulate_states(system, run) for run in ([u] if isinstance(u, np.ndarray) else u)])
-        std = np.std(x, axis=0)
-    if not np.all(np.isfinite(std)):
-        raise InputError("the states of the model grow without bound under this input; give a stable model.")
-    std[std <= 1e-12 * np.max(np.abs(x), axis=0, initial=0.0)] = 1.0
-    A, B, C = (np.asarray(M) for M in (system.A, system.B, system.C))
-    return control.StateSpace(A * std / std[:, None], B / std[:, None], C * std, system.D, system.dt)
 
 
 def resolvent(A: Array, C: Array, z: Array) -> Array:

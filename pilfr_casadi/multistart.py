@@ -6,9 +6,8 @@
    steps. The first two have the element at the output and at the input, the others anywhere (`start.grid_start`).
 3. The best few are re-gridded (`start.regrid`) and run again: thresholds that have clustered or fallen asleep are
    spread along the density the fit has found. This is done twice, the second time with thresholds beyond the visited
-   range and a weak prior that holds the weights to the smoothed density, which decides what the data leaves open.
-   A last run without the prior shows what the prior costs.
-4. The smallest training error wins; with the prior wins over without when it is within `margin` of it.
+   range and a weak prior that holds the weights to the smoothed density, which decides what the data leaves open; a
+   last run without the prior shows what it costs. With the prior wins over without when it is within 10 %.
 
 With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start.
 With "plain" it goes through 2 alone, which is the paper's protocol to the letter. Elements without memory have their
@@ -48,6 +47,7 @@ POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
 PLACES = ("output", "input")  # of the element in the first starts; in all others it is anywhere
 STARTS = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
+MARGIN = 1.1  # times the smallest error, for the weights of a smooth density
 PRIOR = "weights held near a smooth density by a weak prior"
 
 
@@ -166,10 +166,10 @@ def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, no
 
 
 @one_blas_thread
-def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candidate:
+def polish(search: Search, candidate: Candidate) -> Candidate:
     """Re-grid a candidate and run it further, with and without a prior that holds the weights to a smooth density.
 
-    The one with the prior (its `note` says so) is returned where its training error is within `margin` of the smallest.
+    The one with the prior (its `note` says so) is returned where its training error is hardly above the smallest.
     """
     parameters = candidate.model.parameters
     regular = isinstance(search.structure.element, PrandtlIshlinskii)
@@ -204,7 +204,7 @@ def polish(search: Search, candidate: Candidate, margin: float = 1.1) -> Candida
         return _best_so_far(found)
     best = min(found, key=_merit)
     usable = _merit(smooth)[0] == _merit(best)[0]
-    return smooth if usable and smooth.error <= margin * best.error else best
+    return smooth if usable and smooth.error <= MARGIN * best.error else best
 
 
 def _held(search: Search, candidate: Candidate) -> bool:

@@ -6,7 +6,6 @@ file, the column and the line.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
 
@@ -14,73 +13,11 @@ import numpy as np
 
 from .array_files import mat_arrays, npz_arrays, samples
 from .csv_table import CsvTable, existing_file, read_table
-from .recording import InputError, Recording, listed
-from .timebase import TIME_NAMES, refuse_other_unit, step_of, time_column
+from .recording import InputError, Recording
+from .request import Names, Request, request_of
+from .timebase import TIME_NAMES, time_column
 
 PathLike = str | Path
-Names = Sequence[str] | str
-
-
-@dataclass(frozen=True)
-class _Request:
-    """What is wanted from a file."""
-
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    columns: Mapping[str, str]
-    dt: float | None
-    time_tolerance: float | None
-    options: Mapping[str, Any]
-
-    def __post_init__(self) -> None:
-        if not self.inputs:
-            raise InputError("a recording needs at least one input; name its column.")
-        known = {*self.inputs, *self.outputs, *TIME_NAMES}
-        for name in self.columns:
-            if name not in known:
-                raise InputError(
-                    f"a column is given for {name!r}, which is none of the inputs {listed(self.inputs)}, the "
-                    f"outputs {listed(self.outputs)}, or t; correct the name."
-                )
-        if self.dt is not None and not (np.isfinite(self.dt) and self.dt > 0):
-            raise InputError(f"dt={self.dt!r} was given; give the seconds from one sample to the next, above zero.")
-
-    def column(self, name: str) -> str:
-        return self.columns.get(name, name)
-
-    def found_in(self, names: Sequence[str]) -> int:
-        return sum(self.column(name) in names for name in (*self.inputs, *self.outputs))
-
-    def locate(self, names: Sequence[str], source: str) -> tuple[str | None, list[str]]:
-        """Return the time column, if any, and those of the inputs and outputs."""
-        mapped = [self.columns[name] for name in TIME_NAMES if name in self.columns]
-        time = time_column(names, mapped[0] if mapped else None, source)
-        wanted = [self.column(name) for name in (*self.inputs, *self.outputs)]
-        both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
-        if both:
-            raise InputError(f"{source}: column {both[0]!r} is taken both for an input and for an output; correct one.")
-        for role, column in zip((*self.inputs, *self.outputs), wanted, strict=True):
-            if column not in names:
-                hint = (
-                    f"map it, as in columns={{'{role}': 'COLUMN'}}" if len(names) > 1 else "separate columns by commas"
-                )
-                raise InputError(f"{source} has no column {column!r}; it has {listed(names)}: {hint}.")
-        for name in [*wanted, time] if time else wanted:
-            if list(names).count(name) > 1:
-                raise InputError(f"{source} has {list(names).count(name)} columns named {name!r}; rename all but one.")
-        if time is None and self.dt is None:
-            refuse_other_unit(names, source)
-            raise InputError(
-                f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in "
-                "seconds, or state the step with dt=STEP."
-            )
-        return time, wanted
-
-    def step(self, t: np.ndarray | None, time: str | None, source: str, place: Callable[[int], str]) -> float:
-        if t is None:
-            assert self.dt is not None
-            return float(self.dt)
-        return step_of(t, f"{source}: column {time!r}", place, dt=self.dt, tolerance=self.time_tolerance)
 
 
 @overload
@@ -127,7 +64,7 @@ def read_csv(
     InputError
         When a file, a column or a cell cannot be used.
     """
-    request = _request(inputs, outputs, columns=columns, dt=dt, time_tolerance=time_tolerance, **recording_options)
+    request = request_of(inputs, outputs, columns=columns, dt=dt, time_tolerance=time_tolerance, **recording_options)
     return _each(path, request, _from_csv)
 
 
@@ -143,7 +80,7 @@ def read_mat(
     Parameters, returned values and errors are those of :func:`read_csv`. A matrix with a row for each sample gives the
     channels ``name1, name2, ...``.
     """
-    request = _request(inputs, outputs, **options)
+    request = request_of(inputs, outputs, **options)
     return _each(path, request, lambda p, r: _from_arrays(p, mat_arrays(p), r))
 
 
@@ -159,7 +96,7 @@ def read_npz(
     Parameters, returned values and errors are those of :func:`read_csv`. A matrix with a row for each sample gives the
     channels ``name1, name2, ...``.
     """
-    request = _request(inputs, outputs, **options)
+    request = request_of(inputs, outputs, **options)
     return _each(path, request, lambda p, r: _from_arrays(p, npz_arrays(p), r))
 
 
@@ -232,28 +169,15 @@ _READERS: dict[str, Callable[..., Recording]] = {
 }
 
 
-def _request(
-    inputs: Names,
-    outputs: Names,
-    *,
-    columns: Mapping[str, str] | None = None,
-    dt: float | None = None,
-    time_tolerance: float | None = None,
-    **recording_options: Any,
-) -> _Request:
-    inputs, outputs = ((n,) if isinstance(n, str) else tuple(n) for n in (inputs, outputs))
-    return _Request(inputs, outputs, dict(columns or {}), dt, time_tolerance, recording_options)
-
-
 def _each(
-    path: PathLike | Iterable[PathLike], request: _Request, reader: Callable[[Path, _Request], Recording]
+    path: PathLike | Iterable[PathLike], request: Request, reader: Callable[[Path, Request], Recording]
 ) -> Recording | tuple[Recording, ...]:
     if isinstance(path, (str, Path)):
         return reader(Path(path), request)
     return tuple(reader(Path(p), request) for p in path)
 
 
-def _from_csv(path: Path, request: _Request) -> Recording:
+def _from_csv(path: Path, request: Request) -> Recording:
     table = read_table(path, request.found_in)
     time, wanted = request.locate(table.names, str(path))
     numbers = table.columns([*wanted, time] if time else wanted)
@@ -263,7 +187,7 @@ def _from_csv(path: Path, request: _Request) -> Recording:
     return _recording(path, request, numbers[:, :n_u], numbers[:, n_u:n], dt, request.inputs, request.outputs)
 
 
-def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray], request: _Request) -> Recording:
+def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray], request: Request) -> Recording:
     time, wanted = request.locate(list(arrays), str(path))
     parts = [samples(arrays[name], name, path) for name in wanted]
     lengths = {name: len(part) for name, part in zip(wanted, parts, strict=True)}
@@ -289,7 +213,7 @@ def _channel_names(names: Sequence[str], parts: Sequence[np.ndarray]) -> tuple[s
 
 def _recording(
     path: Path,
-    request: _Request,
+    request: Request,
     u: np.ndarray,
     y: np.ndarray,
     dt: float,

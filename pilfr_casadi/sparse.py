@@ -14,7 +14,7 @@ holds their weights; validation chooses here too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from .elements import PrandtlIshlinskii
 from .fit import constraint_list, stability_limits
 from .fit import fit as identify
 from .fitted import Fit, fingerprint
+from .interrupts import Progress
 from .job import Job
 from .multistart import POLISH, Candidate, Search, polish
 from .recording import InputError, Recording, as_recordings
@@ -181,7 +182,7 @@ def regularization_path(
     strengths: Sequence[float] | None = None,
     priors: Mapping[str, tuple[Any, Any]] | None = None,
     margin: float = 0.05,
-    progress: Callable[[str, int, int, float], None] | None = None,
+    progress: Progress | None = None,
     **options: Any,
 ) -> RegularizationPath:
     """Fit with a regularization of growing strength, and choose by validation.

@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .bla import BLA
+from .interrupts import Progress
 from .recording import Recording, as_recordings
 from .subspace_frequency import FrequencyProblem
-from .subspace_problem import Progress, checked_order
+from .subspace_problem import checked_order
 from .subspace_time import TimeProblem
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ Sources: McKelvey, Akçay & Ljung (1996) and Verhaegen (1994), in full in `subsp
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from .interrupts import Progress
 from .lti import reflected
 from .recording import InputError
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import control
 
 Array = np.ndarray
-Progress = Callable[[str, int, int, float], None]
 
 ROUNDING = 1e-8  # relative errors below are rounding
 LADDER = tuple(round(4 * 1.5**k) for k in range(12))  # numbers of block rows to try: 4, 6, 9, 14, 20, 30, ...

@@ -24,7 +24,7 @@ from pilfr_casadi.feedback import (
 from pilfr_casadi.fit import Fit
 from pilfr_casadi.recording import Recording
 
-from .controllers import ByDoMpc, Compensated, Given, Plant, Predictive, ProportionalIntegral
+from .controllers import ByDoMpc, Compensated, Controller, Given, Plant, Predictive, ProportionalIntegral
 
 Array = np.ndarray
 LINEAR, PI = "MPC, linear model", "PI control"
@@ -47,7 +47,7 @@ class Outcome:
 def run(
     name: str,
     plant: Plant,
-    controller: Any,
+    controller: Controller,
     reference: Array,
     noise: float,
     *,
@@ -113,7 +113,7 @@ class Task:
     skip: int = 50
     horizon: int = 20
 
-    def close(self, name: str, controller: Any) -> Outcome:
+    def close(self, name: str, controller: Controller) -> Outcome:
         """The loop with a controller."""
         return run(name, self.plant(), controller, self.reference, self.noise, outputs=self.outputs, skip=self.skip)
 

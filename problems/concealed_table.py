@@ -1,4 +1,20 @@
-"""Near-equivalent answers of the concealed cases, fixed before any result was seen, each with its physical argument."""
+"""Near-equivalent answers of the concealed cases, fixed before any result was seen, each with its physical argument.
+
+- commute: In a linear plant of one input and one output, linear time-invariant laws (delay, creep, extra_mode)
+  commute with it: at the actuator or at the sensor they give the same output.
+- static: In a device without states any law at the actuator is the same law at the sensor, scaled by the gain.
+- quasi-static: A stage driven well below its resonance is a gain: a law of rate-independent kind at the actuator and
+  at the sensor differ by a scale; in its equation it stands as a force of the displacement.
+- slow: A drift slower than the plant passes it as a gain; with one output, drift at actuator, sensor or as a force is
+  one and the same shape.
+- one-sided: A gap spring whose other side is never reached is a contact, and the contact is such a gap spring.
+- presliding: Friction with presliding (Dahl, LuGre, Maxwell slip) is a rate-independent hysteresis of small yield
+  displacement (Dahl 1968; Iwan 1966); both names state the same force.
+- short: A lag or resonance much faster than the excitation, and a short delay, are all 1 - jωτ; where the next term
+  (`bend`, at 2.5 times the characteristic frequency) lies below 3 times the noise, the data cannot tell them.
+- collocated: In a single-mass rig the force and the port's force enter the same equation, so a slow drift of the one
+  is a slow drift of the other.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +27,6 @@ from .concealed_truth import Effect
 
 Pair = tuple[str, str]
 LINEAR_LAWS = ("delay", "creep", "extra_mode")
-ARGUMENTS: Mapping[str, str] = {
-    "commute": "In a linear plant of one input and one output, linear time-invariant laws (delay, creep, extra_mode) "
-    "commute with it: at the actuator or at the sensor they give the same output.",
-    "static": "In a device without states any law at the actuator is the same law at the sensor, scaled by the gain.",
-    "quasi-static": "A stage driven well below its resonance is a gain: a law of rate-independent kind at the actuator "
-    "and at the sensor differ by a scale; in its equation it stands as a force of the displacement.",
-    "slow": "A drift slower than the plant passes it as a gain; with one output, drift at actuator, sensor or as a "
-    "force is one and the same shape.",
-    "one-sided": "A gap spring whose other side is never reached is a contact, and the contact is such a gap spring.",
-    "presliding": "Friction with presliding (Dahl, LuGre, Maxwell slip) is a rate-independent hysteresis of small "
-    "yield displacement (Dahl 1968; Iwan 1966); both names state the same force.",
-    "short": "A lag or resonance much faster than the excitation, and a short delay, are all 1 - jωτ; where the next "
-    "term (`bend`, at 2.5 times the characteristic frequency) lies below 3 times the noise, the data cannot tell them.",
-    "collocated": "In a single-mass rig the force and the port's force enter the same equation, so a slow drift of the "
-    "one is a slow drift of the other.",
-}
 
 
 def equivalents(

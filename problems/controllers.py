@@ -37,6 +37,18 @@ class Controller(Protocol):
         """Take notice of sample k."""
 
 
+class Tracked:
+    """The state that an observer holds to be true."""
+
+    def __init__(self, observer: KalmanFilter) -> None:
+        self.observer, self.x, self.p = observer, observer.x0, observer.Q
+
+    def hear(self, u: float, y: float) -> None:
+        """Filter."""
+        x, self.p, _ = self.observer.step(self.x, self.p, u, y)
+        self.x = np.asarray(x).ravel()
+
+
 @dataclass
 class Predictive:
     """Predictive control on the state of an observer."""
@@ -48,19 +60,19 @@ class Predictive:
     before: float = 0.0
 
     def __post_init__(self) -> None:
-        self.x, self.p = self.observer.x0, self.observer.Q
+        self.state = Tracked(self.observer)
 
     def decide(self, k: int) -> float:
         """First input of the plan."""
         ahead = np.minimum(k + np.arange(self.planner.horizon), len(self.reference) - 1)
-        plan = self.planner(self.x, self.reference[ahead], np.array([self.before]))
+        plan = self.planner(self.state.x, self.reference[ahead], np.array([self.before]))
         self.seconds.append(plan.seconds)
         return float(plan.u[0])
 
     def hear(self, u: float, y: float) -> None:
         """Filter."""
-        x, self.p, _ = self.observer.step(self.x, self.p, u, y)
-        self.x, self.before = np.asarray(x).ravel(), u
+        self.state.hear(u, y)
+        self.before = u
 
 
 @dataclass
@@ -72,21 +84,20 @@ class ByDoMpc:
     seconds: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.x, self.p = self.observer.x0, self.observer.Q
-        self.planner.x0, self.planner.u0 = self.x[:, None], np.zeros((1, 1))
+        self.state = Tracked(self.observer)
+        self.planner.x0, self.planner.u0 = self.state.x[:, None], np.zeros((1, 1))
         self.planner.set_initial_guess()
 
     def decide(self, k: int) -> float:
         """First input of the plan."""
         begin = perf_counter()
-        u = float(np.asarray(self.planner.make_step(self.x[:, None])).item())
+        u = float(np.asarray(self.planner.make_step(self.state.x[:, None])).item())
         self.seconds.append(perf_counter() - begin)
         return u
 
     def hear(self, u: float, y: float) -> None:
         """Filter."""
-        x, self.p, _ = self.observer.step(self.x, self.p, u, y)
-        self.x = np.asarray(x).ravel()
+        self.state.hear(u, y)
 
 
 @dataclass
@@ -96,19 +107,20 @@ class Compensated:
     inverse: Feedforward
     observer: KalmanFilter
     reference: Array
+    before: float = 0.0
 
     def __post_init__(self) -> None:
-        self.x, self.p, self.before = self.observer.x0, self.observer.Q, 0.0
+        self.state = Tracked(self.observer)
 
     def decide(self, k: int) -> float:
         """The input for what is wanted `ahead` samples later."""
         wanted = self.reference[min(k + self.inverse.ahead, len(self.reference) - 1)]
-        return float(self.inverse.step(self.x, self.before, wanted)[1])
+        return float(self.inverse.step(self.state.x, self.before, wanted)[1])
 
     def hear(self, u: float, y: float) -> None:
         """Filter."""
-        x, self.p, _ = self.observer.step(self.x, self.p, u, y)
-        self.x, self.before = np.asarray(x).ravel(), u
+        self.state.hear(u, y)
+        self.before = u
 
 
 @dataclass

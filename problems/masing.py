@@ -1,133 +1,23 @@
 r"""The paper's benchmark as an exact simulator: a two-mass rig on a hysteretic (extended Masing) spring.
 
-Source: Krikelis et al. (2024), Sec. 6: rig Eq. 25, spring Eq. 26 with n = 1, numbers Table 1.
+Source: Krikelis et al. (2024), Sec. 6: rig Eq. 25, numbers Table 1; the spring is in `masing_spring`.
 
-The spring. Eq. 26 integrates in closed form. Virgin loading follows the odd curve ``f(x) = r_u (1 - exp(-K x / r_u))``,
-x >= 0, and a branch that leaves a reversal point (x_r, f_r) is the same curve doubled, ``f_r + 2 f((x - x_r) / 2)``
-(Masing). A branch that comes back to the reversal point before its own closes a minor loop: both points are forgotten
-and the older branch goes on as if nothing had been (Madelung); one that leaves the first reversal point x_r rejoins the
-virgin curve at -x_r. The stack of open reversal points is the whole memory, and the force is exact for any path. The
-same spring is the Prandtl model ``int_0^inf w(r) S_r[x] dr`` of stops S_r with
-``w(r) = -f''(r) = (K^2 / r_u) exp(-K r / r_u)``.
-
-The rig. Between events (a reversal of x1, a loop that closes) the right-hand side is smooth, so a fixed Runge-Kutta
-step that stays on one branch is of fourth order; the few steps with an event inside are cut at it.
+Between events (a reversal of x1, a loop that closes) the right-hand side is smooth, so a fixed Runge-Kutta step that
+stays on one branch is of fourth order; the few steps with an event inside are cut at it.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pilfr_casadi.recording import InputError
 
+from .masing_spring import Branch, MasingSpring
+
 MAX_EVENTS = 20  # within one substep
-
-
-class Branch(NamedTuple):
-    """The curve the spring moves on, ``f0 - gain * expm1(rate * (x - x0))``, until x passes `close`."""
-
-    x0: float
-    f0: float
-    gain: float
-    rate: float
-    close: float
-
-    def force(self, x: float) -> float:
-        """Force on this curve at x."""
-        return self.f0 - self.gain * math.expm1(self.rate * (x - self.x0))
-
-
-@dataclass(frozen=True)
-class MasingSpring:
-    """Immutable state of the spring of Krikelis et al. (2024), Eq. 26, n = 1.
-
-    Attributes
-    ----------
-    K : float
-        Initial stiffness, N/m.
-    r_u : float
-        Ultimate strength, N.
-    x : float
-        Present elongation, m.
-    direction : int
-        Sign of the last movement; 1 for a spring that has not moved.
-    turns : tuple of (float, float)
-        Open reversal points (x, force), oldest first.
-    """
-
-    K: float
-    r_u: float
-    x: float = 0.0
-    direction: int = 1
-    turns: tuple[tuple[float, float], ...] = ()
-
-    @property
-    def branch(self) -> Branch:
-        """Curve of the next movement in the present direction, with the elongation that closes its loop."""
-        if not self.turns:
-            return Branch(
-                0.0, 0.0, self.direction * self.r_u, -self.direction * self.K / self.r_u, self.direction * math.inf
-            )
-        x0, f0 = self.turns[-1]
-        close = self.turns[-2][0] if len(self.turns) > 1 else -x0
-        return Branch(x0, f0, self.direction * 2.0 * self.r_u, -self.direction * self.K / (2.0 * self.r_u), close)
-
-    @property
-    def force(self) -> float:
-        """Spring force, N."""
-        return self.branch.force(self.x)
-
-    def turn(self) -> "MasingSpring":
-        """Reverse on the spot: the present point becomes a reversal point."""
-        turned = replace(self, direction=-self.direction, turns=(*self.turns, (self.x, self.force)))
-        return turned._wipe_out()
-
-    def move(self, x: float) -> "MasingSpring":
-        """Move monotonically to elongation x, m, however far, and forget the loops closed on the way."""
-        if x == self.x:
-            return self
-        spring = self if (x > self.x) == (self.direction > 0) else self.turn()
-        return replace(spring, x=x)._wipe_out()
-
-    def _wipe_out(self) -> "MasingSpring":
-        spring = self
-        while spring.turns and spring.direction * (spring.x - spring.branch.close) >= 0.0:
-            spring = replace(spring, turns=spring.turns[:-2])
-        return spring
-
-
-def stop_density(r: ArrayLike, K: float, r_u: float) -> np.ndarray:
-    """Density w(r) of the stops that make up the spring, ``(K^2 / r_u) exp(-K r / r_u)``, N/m^2, at thresholds r, m."""
-    return np.asarray(K**2 / r_u * np.exp(-K / r_u * np.asarray(r, float)))
-
-
-def stop_elements(n: int, x_max: float, K: float, r_u: float) -> tuple[np.ndarray, np.ndarray]:
-    """Discretise the spring into n stops of equally spaced thresholds.
-
-    The virgin curve of these stops is the chord polygon of the spring's on [0, x_max]; it errs by at most
-    ``(K^2 / r_u) (x_max / n)^2 / 8``, and any branch by at most twice that.
-
-    Parameters
-    ----------
-    n : int
-        Number of stops.
-    x_max : float
-        Largest elongation, m, that the polygon has to cover.
-    K, r_u : float
-        Stiffness, N/m, and strength, N, of the spring.
-
-    Returns
-    -------
-    r, w : array, (n,)
-        Thresholds, m, and weights, N/m.
-    """
-    r = np.linspace(0.0, x_max, n + 1)
-    slopes = np.diff(-r_u * np.expm1(-K / r_u * r)) / np.diff(r)
-    return r[1:], slopes - np.append(slopes[1:], 0.0)
 
 
 @dataclass(frozen=True)
@@ -184,7 +74,7 @@ State = tuple[float, float, float, float]
 Stepper = Callable[[State, float, float, float, Branch], State]
 
 
-def _stepper(rig: MasingRig) -> Stepper:
+def stepper(rig: MasingRig) -> Stepper:
     """Classical Runge-Kutta step of Eq. 25 along one branch; the force starts at u, N, and changes by du, N/s."""
     A, B, _, _ = rig.matrices(virgin_spring=False)
     (p1, p2, p3, p4), (q1, q2, q3, q4) = A[1].tolist(), A[3].tolist()
@@ -218,7 +108,7 @@ def _stepper(rig: MasingRig) -> Stepper:
     return step
 
 
-def _advance(
+def advance(
     step: Stepper, spring: MasingSpring, start: State, h: float, u: float, du: float
 ) -> tuple[MasingSpring, State]:
     """Go on for the time h, cutting the step at every reversal and at every loop that closes."""
@@ -302,7 +192,7 @@ def simulate(u: ArrayLike, fs: float, *, rig: MasingRig | None = None, substeps:
     if substeps < 1 or not fs > 0.0:
         raise InputError(f"{substeps} substeps at {fs} Hz cannot be simulated; both must be positive.")
     rig = rig or MasingRig()
-    step, spring, h = _stepper(rig), rig.spring, 1.0 / (fs * substeps)
+    step, spring, h = stepper(rig), rig.spring, 1.0 / (fs * substeps)
     rates = np.zeros(force.size) if hold == "zero" else np.append(np.diff(force), 0.0) * fs
     branch, sign = spring.branch, spring.direction
     state: State = (0.0, 0.0, 0.0, 0.0)
@@ -314,7 +204,7 @@ def simulate(u: ArrayLike, fs: float, *, rig: MasingRig | None = None, substeps:
                 u_i = u_k + i * h * du
                 end = step(state, h, u_i, du, branch)
                 if sign * end[1] < 0.0 or sign * (end[0] - branch.close) >= 0.0:
-                    spring, end = _advance(step, spring, state, h, u_i, du)
+                    spring, end = advance(step, spring, state, h, u_i, du)
                     branch, sign = spring.branch, spring.direction
                 state = end
     except OverflowError as error:

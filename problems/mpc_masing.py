@@ -16,7 +16,7 @@ from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.operators import Play
 
 from .closed_loop import Outcome, Task, compare, program
-from .masing import MasingRig, State, _advance, _stepper
+from .masing import MasingRig, State, advance, stepper
 from .masing_data import FS, records
 
 LIMIT, MARGIN, TOLERANCE = (
@@ -32,7 +32,7 @@ class RigInMotion:
 
     def __init__(self, rig: MasingRig | None = None, fs: float = FS, substeps: int = 8) -> None:
         rig = rig or MasingRig()
-        self._step, self._spring, self._h, self._n = _stepper(rig), rig.spring, 1.0 / (fs * substeps), substeps
+        self._step, self._spring, self._h, self._n = stepper(rig), rig.spring, 1.0 / (fs * substeps), substeps
         self._state: State = (0.0, 0.0, 0.0, 0.0)
 
     @property
@@ -43,7 +43,7 @@ class RigInMotion:
     def advance(self, u: float) -> None:
         """Hold the force u, N, for one sample."""
         for _ in range(self._n):
-            self._spring, self._state = _advance(self._step, self._spring, self._state, self._h, u, 0.0)
+            self._spring, self._state = advance(self._step, self._spring, self._state, self._h, u, 0.0)
 
 
 def reference(samples: int) -> np.ndarray:

@@ -1,9 +1,7 @@
 """A real piezo stack, voltage to displacement: nested hysteresis loops (`python -m problems.piezo_stack`).
 
 Recordings: PICMA P-885.91 driven by a 1 Hz sine, and by 1 Hz with growing and shrinking amplitude, 200 Hz; Aye & Ang
-(2018), MIT licence, data not included here. For comparison (rms error in % of the range of the varying-amplitude
-record): twelve plays fitted to the sine by least squares leave 2.3 %, the best linear gain 5.6 %; twelve plays fitted
-to the first 7000 samples 1.7 %.
+(2018), MIT licence, data not included here.
 
 A record at one frequency cannot tell a lag from hysteresis, so the model trained on the sine is static (nx = 0); the
 varying amplitude can carry a state. The first 20 samples of both records are a start transient and are not scored.
@@ -46,6 +44,11 @@ def share_of_range(result: Fit, recording: Recording, whole: Recording) -> float
     return 100.0 * float(np.sqrt(np.mean(error**2)) / np.ptp(whole.y[whole.skip :]))
 
 
+def identify(train: Recording, nx: int, n: int) -> Fit:
+    """A model with n plays, or with none."""
+    return fit(PILFR(nx, PrandtlIshlinskii(Play, n) if n else None), train, starts=4)
+
+
 def run(folder: Path) -> list[tuple[str, str, float, Fit]]:
     """Rows (model, trained on -> judged on, error in % of range, fit)."""
     data = recordings(folder)
@@ -54,7 +57,7 @@ def run(folder: Path) -> list[tuple[str, str, float, Fit]]:
         for nx, n in ((0, 0), (0, 12), (0, 20), (1, 20)):
             if nx and train == "sine":
                 continue
-            result = fit(PILFR(nx, PrandtlIshlinskii(Play, n) if n else None), data[train], starts=4)
+            result = identify(data[train], nx, n)
             name = f"{n} plays, nx = {nx}" if n else "linear gain"
             rows.append((name, f"{train} -> {test}", share_of_range(result, data[test], data["varying"]), result))
     return rows

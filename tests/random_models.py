@@ -84,3 +84,12 @@ def reference(operator, values, u, state):
 
 
 OPERATORS = (Play, Stop, GeneralizedPlay)
+
+
+def simulate_lti(system, u, x=None):
+    """Output (M, n_y) of a control.StateSpace, sample by sample, from a state or from rest."""
+    x, out = np.zeros(system.nstates) if x is None else x, []
+    for u_k in u:
+        out.append(system.C @ x + system.D @ u_k)
+        x = system.A @ x + system.B @ u_k
+    return np.array(out)

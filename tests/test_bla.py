@@ -3,10 +3,11 @@
 import control
 import numpy as np
 import pytest
+from random_models import simulate_lti
 
 from pilfr_casadi.bla import BLA, output_spectra, robust_bla
 from pilfr_casadi.local_polynomial import plain_bla
-from pilfr_casadi.lti import frequency_response, simulate_lti
+from pilfr_casadi.lti import frequency_response
 from pilfr_casadi.recording import InputError, Recording
 
 DT = 0.01

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from run_files import PYTHON, changed, command, contents, prepared
 from test_cli import write_csv
-from test_runs import PYTHON, contents
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import hand
@@ -21,29 +21,6 @@ from pilfr_casadi.recording import InputError
 from pilfr_casadi.runs.folds import fold
 from pilfr_casadi.runs.manifest import Manifest
 
-TEXT = """
-seeds = { first = 0, count = 4 }
-report = false
-workers = 2
-
-[data]
-inputs = "u"
-outputs = "y"
-initial = "zero"
-train = "train.csv"
-test = "test.csv"
-
-[model]
-structure = "hammerstein"
-nx = 1
-
-[grid]
-operators = [1, 3]
-
-[solver]
-start = "plain"
-starts = 1
-"""
 SLOW = """
 import os, pathlib, time, tomllib
 from pilfr_casadi.multistart import POLISH
@@ -70,10 +47,7 @@ run["campaign"] = {"time_limit": 10.0}
 
 @pytest.fixture
 def folder(tmp_path):
-    for seed, name in enumerate(("train", "test")):
-        write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
-    (tmp_path / "rig.toml").write_text(TEXT)
-    return tmp_path
+    return prepared(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -83,15 +57,6 @@ def cluster():
 
     with LocalCluster(2, threads_per_worker=1, processes=True, dashboard_address=":0") as local:
         yield local
-
-
-def changed(folder, *changes):
-    text = TEXT
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "rig.toml").write_text(text)
-    return folder / "rig.toml"
 
 
 def rows(out):
@@ -104,15 +69,6 @@ def compared(out):
     return {k: v for k, v in contents(out).items() if k not in ("manifest.json", "summary.csv", "spread.png")}
 
 
-def command(folder, *more):
-    """The command in a process of its own."""
-    code = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(pilfr.__file__).parent.parent)}
-    arguments = [sys.executable, "-c", code, "campaign", "rig.toml", *more]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(arguments, cwd=folder, env=environment, **pipes)
-
-
 def wait_for(condition, seconds=60):
     deadline = time.monotonic() + seconds
     while not condition():
@@ -123,11 +79,7 @@ def wait_for(condition, seconds=60):
 @pytest.fixture(scope="module")
 def serial(tmp_path_factory):
     """What `pilfr run` makes of the same file, one job after the other in one process."""
-    place = tmp_path_factory.mktemp("serial")
-    for seed, name in enumerate(("train", "test")):
-        write_csv(place / f"{name}.csv", seed=seed, m=400)
-    (place / "rig.toml").write_text(TEXT)
-    return compared(pilfr.run(place / "rig.toml").folder)
+    return compared(pilfr.run(prepared(tmp_path_factory.mktemp("serial")) / "rig.toml").folder)
 
 
 def test_the_numbers_do_not_depend_on_the_executor(folder, serial, cluster):
@@ -145,23 +97,30 @@ def test_the_numbers_do_not_depend_on_the_executor(folder, serial, cluster):
 
 def test_what_a_campaign_tells(folder, capsys):
     few = ("count = 4", "count = 3")
-    assert main(["campaign", str(changed(folder, few))]) == 0
+    long = f"{'long' * 25}.csv"
+    (folder / "test.csv").rename(folder / long)
+    names = ("test.csv", long)
+    assert main(["campaign", str(changed(folder, few, names))]) == 0
     said = capsys.readouterr().out
-    assert "2 cells x 3 seeds" in said and "median" in said and "6 jobs done now" in said
+    assert "2 cells x 3 seeds" in said and "6 jobs done now" in said
+    shown = {
+        tuple(line.split()[:3]): line.split()[7] for line in said.splitlines() if line.startswith(f"{long} (test)")
+    }
     table = rows(folder / "rig-campaign")
     with (folder / "rig-campaign" / "summary.csv").open() as file:
         summary = {(r["recording"], r["operators"]): r for r in csv.DictReader(file)}
     for n in "13":
         errors = [float(r["nrmse"]) for r in table if r["operators"] == n and r["role"] == "test"]
-        row = summary["test.csv", n]
+        row = summary[long, n]
         assert len(errors) == 3 and row["failed"] == "0" and float(row["median"]) == np.median(errors)
         assert float(row["upper_quartile"]) == np.percentile(errors, 75)
-    more = pilfr.campaign(changed(folder, few, ("[1, 3]", "[1, 2, 3]")))  # a grid that grows
+        assert shown[long, "(test)", n] == f"{np.median(errors):.4f}"  # nothing is cut off, however long the line
+    more = pilfr.campaign(changed(folder, few, names, ("[1, 3]", "[1, 2, 3]")))  # a grid that grows
     assert len(more.done) == 3 and len(more.skipped) == 6
 
 
 def test_a_worker_and_the_driver_are_killed(folder, serial, cluster):
-    out, first = folder / "rig-campaign", command(folder, "--dask", cluster.scheduler_address)
+    out, first = folder / "rig-campaign", command(folder, "campaign", "--dask", cluster.scheduler_address)
     wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
     os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
     wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 3)
@@ -169,7 +128,7 @@ def test_a_worker_and_the_driver_are_killed(folder, serial, cluster):
     first.kill()
     first.communicate()
     assert len(rows(out)) in range(2, 17, 2)  # it can be read at any time, and is never half there
-    second = command(folder, "--dask", cluster.scheduler_address)
+    second = command(folder, "campaign", "--dask", cluster.scheduler_address)
     _, err = second.communicate(timeout=60)
     assert second.returncode == 0, err
     assert compared(out) == serial
@@ -189,7 +148,7 @@ def alive(pid):
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_processes_are_killed_and_none_is_left_behind(folder, serial):
-    out, driver = folder / "rig-campaign", command(folder)
+    out, driver = folder / "rig-campaign", command(folder, "campaign")
     wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
     hands = children(driver.pid)
     assert hands
@@ -204,7 +163,7 @@ def test_processes_are_killed_and_none_is_left_behind(folder, serial):
 
 
 def test_an_interrupted_campaign_goes_on(folder, serial, capsys):
-    out, driver = folder / "rig-campaign", command(folder)
+    out, driver = folder / "rig-campaign", command(folder, "campaign")
     wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
     driver.send_signal(signal.SIGINT)
     _, err = driver.communicate(timeout=30)

@@ -6,8 +6,8 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 
 import pytest
-from test_campaign import TEXT
-from test_cli import write_csv
+from run_files import changed, prepared
+from test_cli import refused
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import hand
@@ -19,28 +19,7 @@ from pilfr_casadi.runs.manifest import Manifest
 
 @pytest.fixture
 def folder(tmp_path):
-    for seed, name in enumerate(("train", "test")):
-        write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
-    (tmp_path / "rig.toml").write_text(TEXT)
-    return tmp_path
-
-
-def changed(folder, *changes):
-    text = TEXT
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "rig.toml").write_text(text)
-    return folder / "rig.toml"
-
-
-def refused(capsys, *arguments, says):
-    """Status 2, one sentence on stderr."""
-    assert main(["campaign", *map(str, arguments)]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err
-    for word in (says,) if isinstance(says, str) else says:
-        assert word in err, err
+    return prepared(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -62,20 +41,20 @@ def refused(capsys, *arguments, says):
     ],
 )
 def test_bad_input_gets_one_sentence(capsys, folder, old, new, says):
-    refused(capsys, changed(folder, (old, new), ("workers = 2", "workers = 1")), says=says)
+    refused(capsys, "campaign", changed(folder, (old, new), ("workers = 2", "workers = 1")), says=says)
 
 
 def test_bad_folders_and_places_get_one_sentence(capsys, folder, monkeypatch):
     path = folder / "rig.toml"
     monkeypatch.setattr(cluster, "PATIENCE", 2.0)
-    refused(capsys, path, "--out", folder / "train.csv", says="train.csv")
-    refused(capsys, path, "--out", "/proc/nowhere", says="cannot be written")
-    refused(capsys, path, "--dask", "tcp://127.0.0.1:1", says=("No Dask scheduler", "127.0.0.1:1"))
-    refused(capsys, path, "--dask", "nonsense://", says="No Dask scheduler")
-    refused(capsys, path, "--dask", "tcp://127.0.0.1:1", "--workers", "2", says="leave one of them out")
-    refused(capsys, path, "--time-limit", "0", says="--time-limit 0")
+    refused(capsys, "campaign", path, "--out", folder / "train.csv", says="train.csv")
+    refused(capsys, "campaign", path, "--out", "/proc/nowhere", says="cannot be written")
+    refused(capsys, "campaign", path, "--dask", "tcp://127.0.0.1:1", says=("No Dask scheduler", "127.0.0.1:1"))
+    refused(capsys, "campaign", path, "--dask", "nonsense://", says="No Dask scheduler")
+    refused(capsys, "campaign", path, "--dask", "tcp://127.0.0.1:1", "--workers", "2", says="leave one of them out")
+    refused(capsys, "campaign", path, "--time-limit", "0", says="--time-limit 0")
     monkeypatch.setitem(sys.modules, "distributed", None)
-    refused(capsys, path, "--dask", "tcp://127.0.0.1:1", says="pilfr-casadi[dask]")
+    refused(capsys, "campaign", path, "--dask", "tcp://127.0.0.1:1", says="pilfr-casadi[dask]")
 
 
 def test_results_of_another_version_get_one_sentence(capsys, folder):
@@ -83,9 +62,9 @@ def test_results_of_another_version_get_one_sentence(capsys, folder):
     manifest = Manifest.found(out)
     manifest.content["versions"]["pilfr_casadi"] = "0.0.1"
     manifest.write()
-    refused(capsys, folder / "rig.toml", says=("results of pilfr_casadi 0.0.1", "--overwrite"))
+    refused(capsys, "campaign", folder / "rig.toml", says=("results of pilfr_casadi 0.0.1", "--overwrite"))
     (out / "manifest.json").write_text('{"format": "pilfr_casadi run", "version": 7}')
-    refused(capsys, folder / "rig.toml", says=("manifest", "--overwrite"))
+    refused(capsys, "campaign", folder / "rig.toml", says=("manifest", "--overwrite"))
     assert main(["campaign", str(changed(folder, ("count = 4", "count = 1"))), "--overwrite"]) == 0
 
 

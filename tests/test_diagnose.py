@@ -1,6 +1,7 @@
 """The diagnosis end to end on a rig whose truth is known, and its honest other answers."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.laws import CATALOGUE
 from pilfr_casadi.laws.dynamic import Delay
-from pilfr_casadi.laws.friction import CoulombFriction
+from pilfr_casadi.laws.friction import CoulombFriction, DirectionalDamping
 from pilfr_casadi.laws.hysteresis import Backlash
 from pilfr_casadi.laws.stiffness import CubicStiffness
 
@@ -33,6 +34,8 @@ IDS = {
     "drift",
     "periodic_force",
     "extra_mode",
+    "linear_stiffness",
+    "viscous_damping",
 }
 
 
@@ -138,3 +141,21 @@ def test_a_missing_column_is_said():
     train = [r.with_(outputs=("x3",)) for r in recordings()]
     with pytest.raises(pilfr.InputError, match="no output 'x2'"):
         pilfr.diagnose(rig(), train)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "hidden", "port", "name", "strength"),
+    [
+        ("d1", None, "ground-m1", "viscous_damping", {"c_1": 8.0}),
+        ("k1", None, "ground-m1", "linear_stiffness", {"k_1": 1100.0}),
+        ("d2", DirectionalDamping().at({"c_0": 2.0}), "m1-m2", "viscous_damping", {"c_1": 4.0, "c_0": 2.0}),
+    ],
+)
+def test_a_spring_or_damper_that_was_left_out_is_named(left_out, hidden, port, name, strength):
+    full = rig(OFF)
+    none = {left_out: replace(full.parameters[left_out], value=0.0, bounds=(0.0, 1.0), fixed=True)}
+    found = pilfr.diagnose(full.with_parameters({**full.parameters, **none}), recordings(hidden, port))
+    assert [(e.port, e.law) for e in found.effects] == [(port, name)]
+    assert found.effects[0].confidence > 0.8
+    for symbol, truth in strength.items():
+        assert found.effects[0].parameters[symbol]["value"] == pytest.approx(truth, rel=0.05)

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_baselines import STRUCTURES, truth
+from test_combined import machine
 from test_export import some_fit
 from test_laws import EVERY, dose
 from test_laws import simulator as mass_on_spring
@@ -16,6 +18,7 @@ from pilfr_casadi.integration import discretise
 from pilfr_casadi.laws import CubicStiffness, StopHysteresis
 from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.load_simulator import load_simulator
+from pilfr_casadi.modal import modal
 from pilfr_casadi.parameters import ParameterSet
 from pilfr_casadi.sensitivities import VirtualMachine
 from pilfr_casadi.substeps import fastest
@@ -35,9 +38,14 @@ def linear(n_u, n_y, nx, seed=0):
     return {"A": a, "B_u": rng.normal(size=(nx, n_u)), "C_y": rng.normal(size=(n_y, nx)), "y_0": rng.normal(size=n_y)}
 
 
-def lfr(operator, nx, n, channels=1, n_u=1, n_y=1, seed=0):
+def as_fit(model, structure=None, dt=0.01):
+    """A model as if it had been estimated."""
+    return replace(some_fit(), model=model, structure=structure, initial={}, units={}, dt=dt)
+
+
+def lfr(operator, nx, n, channels=1, n_u=1, n_y=1, seed=0, fixed=None):
     """A fit of a PI-LFR with such a linear part and an element that counts."""
-    structure = PILFR(nx, PrandtlIshlinskii(operator, n, channels))
+    structure = PILFR(nx, PrandtlIshlinskii(operator, n, channels), fixed or {})
     rng, base = np.random.default_rng(seed + 1), structure.model(n_u, n_y)
     values = linear(n_u, n_y, nx, seed) | {
         "B_w": 0.1 * rng.normal(size=(nx, channels)),
@@ -47,8 +55,20 @@ def lfr(operator, nx, n, channels=1, n_u=1, n_y=1, seed=0):
         "w": rng.uniform(0.1, 1.0, size=(channels, n)),
         "r": np.sort(rng.uniform(0.05, 2.0, size=(channels, n)), axis=1),
     }
-    model = structure.model(n_u, n_y, values, inputs=base.inputs, outputs=base.outputs)
-    return replace(some_fit(), model=model, structure=structure, initial={}, units={}, dt=0.01)
+    for name, known in structure.fixed.items():
+        values[name] = np.where(np.isnan(known), values[name], known)
+    return as_fit(structure.model(n_u, n_y, values, inputs=base.inputs, outputs=base.outputs), structure)
+
+
+def other_structures():
+    """Name -> fit of what stands beside the PI-LFR: modal coordinates, elements combined, networks."""
+    combined, values = machine()
+    networks = {f"network {name}": as_fit(truth(name), structure) for name, (structure, _) in STRUCTURES.items()}
+    return {
+        "modal coordinates": lfr(Play, 5, 4, fixed={"A": modal(5)}),
+        "combined": as_fit(combined.model(2, 2, values), combined),
+        **networks,  # a NOE is a NARX with other values
+    }
 
 
 def from_zoo(make):
@@ -59,9 +79,8 @@ def from_zoo(make):
         rng = np.random.default_rng(0)
         p = p.change(**{k: {"value": 0.05 * rng.normal(size=p[k].shape)} for k in ("B_w",) if not np.all(p[k].fixed)})
     model = case.model.with_parameters(p)
-    fitted = replace(some_fit(), model=model, structure=None, initial={}, units={}, dt=case.recordings[0].dt)
     r = case.recordings[0]
-    return fitted, r.slice(0, min(len(r), 2 * M)).with_(initial="zero", skip=0)
+    return as_fit(model, dt=r.dt), r.slice(0, min(len(r), 2 * M)).with_(initial="zero", skip=0)
 
 
 def from_rig(rig):
@@ -121,11 +140,13 @@ def everything():
         "static stack": lfr(Play, 0, 20),
         "stops, two channels": lfr(Stop, 2, 4, 2, 2, 3),
         "generalized plays": lfr(GeneralizedPlay(2), 2, 3, 2, 1, 2),
+        **other_structures(),
     }
     for name, fitted in fits.items():
         rng = np.random.default_rng(2)
         u = np.cumsum(rng.normal(size=(M, fitted.model.n_u)), axis=0) / 3
         x0 = rng.normal(size=fitted.model.n_x + fitted.model.n_s)
+        x0[fitted.model.n_x :] = np.abs(x0[fitted.model.n_x :])  # the mean squares of an envelope are not negative
         data = Recording(
             u, np.zeros((M, fitted.model.n_y)), 0.01, fitted.model.inputs, fitted.model.outputs, initial=x0
         )
@@ -134,9 +155,7 @@ def everything():
         fitted, data = from_zoo(make)
         out[f"zoo {name}"] = fitted, {}, data, replace(fitted, engine="vm").simulate(data)
     grey = mass_on_spring().with_element("ground", dose(StopHysteresis))  # a fit of a simulator's model
-    fitted = replace(
-        some_fit(), model=discretise(grey, 0.02, "linear", 3), structure=None, initial={}, units={}, dt=0.02
-    )
+    fitted = as_fit(discretise(grey, 0.02, "linear", 3), dt=0.02)
     data = wave(grey, 0.02, 3.0)
     out["fit with sub-steps"] = fitted, {}, data, replace(fitted, engine="vm").simulate(data)
     for name, (simulator, dt, hold, substeps) in simulators().items():
@@ -183,6 +202,8 @@ def test_there_are_all_models(models):
     assert len([name for name in models if name.startswith("law")]) == len(EVERY)
     assert len([name for name in models if name.startswith("zoo")]) == len(CASES)
     assert len([name for name in models if name.startswith("rig")]) == len(RIGS) > 5
+    assert len([name for name in models if name.startswith("network")]) == len(STRUCTURES) == 4
+    assert {"combined", "modal coordinates"} <= models.keys()
     for name, (model, _, _) in models.items():
         assert list(model.states.values()) == list(range(model.step.size1_in("x"))), name
         assert model.step.size1_in("u") == len(model.inputs) and model.step.size1_out("y") == len(model.outputs)

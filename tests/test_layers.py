@@ -19,6 +19,7 @@ LAYERS = {
         "metrics",
         "parameters",
         "readers",
+        "request",
         "csv_table",
         "array_files",
         "timebase",

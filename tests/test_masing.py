@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from pilfr_casadi.metrics import nrmse
 from pilfr_casadi.recording import InputError
-from problems.masing import MasingRig, MasingSpring, simulate, stop_density, stop_elements
+from problems.masing import MasingRig, simulate
 from problems.masing_data import FS, benchmark, records
+from problems.masing_spring import MasingSpring
 
 RIG = MasingRig()
 K, R_U = RIG.K, RIG.r_u
@@ -94,11 +95,26 @@ def test_minor_loops_between_equal_limits_are_congruent(path, other, width):
     assert loop([*path, -3e-3])[-1] == pytest.approx(0.0, abs=1e-12)
 
 
+def stop_density(r):
+    """Density w(r) of the stops that make up the spring, N/m^2, at thresholds r, m."""
+    return K**2 / R_U * np.exp(-K / R_U * np.asarray(r))
+
+
+def stop_elements(n, x_max):
+    """Thresholds and weights of n stops whose virgin curve is the chord polygon of the spring's on [0, x_max].
+
+    It errs by at most `(K^2 / r_u) (x_max / n)^2 / 8`, and any branch by at most twice that.
+    """
+    r = np.linspace(0.0, x_max, n + 1)
+    slopes = np.diff(-R_U * np.expm1(-K / R_U * r)) / np.diff(r)
+    return r[1:], slopes - np.append(slopes[1:], 0.0)
+
+
 @given(elongations)
 def test_spring_is_the_sum_of_its_stops(path):
     """The same force from many stops of Eq. 3, within the discretisation's bound."""
     n, x_max = 400, 4e-3
-    r, w = stop_elements(n, x_max, K, R_U)
+    r, w = stop_elements(n, x_max)
     bound = 2 * (K**2 / R_U) * (x_max / n) ** 2 / 8
     s, x_old, spring = np.zeros(n), 0.0, SPRING
     for x in path:
@@ -110,14 +126,14 @@ def test_stop_density_integrates_to_the_virgin_curve():
     from scipy.integrate import quad
 
     for x in (1e-5, 2e-4, 1e-3):
-        below = quad(lambda r: r * stop_density(r, K, R_U), 0.0, x)[0]
-        above = x * quad(lambda r: stop_density(r, K, R_U), x, 0.02)[0]
+        below = quad(lambda r: r * stop_density(r), 0.0, x)[0]
+        above = x * quad(lambda r: stop_density(r), x, 0.02)[0]
         assert below + above == pytest.approx(SPRING.move(x).force, rel=1e-9)
 
 
 def test_stop_weights_sample_the_density():
-    r, w = stop_elements(200, 2e-3, K, R_U)
-    np.testing.assert_allclose(w[:-1], stop_density(r[:-1], K, R_U) * (r[1] - r[0]), rtol=2e-4)
+    r, w = stop_elements(200, 2e-3)
+    np.testing.assert_allclose(w[:-1], stop_density(r[:-1]) * (r[1] - r[0]), rtol=2e-4)
     assert (w > 0).all()
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_models import OPERATORS, random_input, random_lfr, reference
 
-from pilfr_casadi.conversion import complement, convert_model, to_plays, to_stops
+from pilfr_casadi.conversion import complement, to_plays, to_stops
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.lfr import PILFR, hammerstein, wiener
 from pilfr_casadi.model import close_loop, open_model
@@ -186,18 +186,12 @@ def test_conversion_frees_the_blocks_that_take_up_the_slope(build, freed):
     )
 
 
-def test_a_converted_model_keeps_what_it_can():
+def test_a_converted_structure_keeps_what_it_can():
     structure, values = random_lfr(
         1, bounds={"B_w": (-1.0, 2.0), "A": (-5, 5), "w": (0, 3)}, priors={"D_yw": (0.5, 0.1)}, fixed={"y_0": 0.25}
     )
-    model = structure.model(1, 1, values, inputs=("force",))
-    model = model.with_parameters(
-        model.parameters.change(r={"fixed": [[True, False, False, True]], "prior": (0.5, 2.0)})
-    )
-    converted, stops = convert_model(structure, model, Stop())
-    assert stops.inputs == ("force",)
-    assert stops.parameters["r"].fixed.tolist() == [[True, False, False, True]]
-    assert stops.parameters["r"].prior == (0.5, 2.0)
+    converted, new = to_stops(structure, values)
+    stops = converted.model(1, 1, new)
     assert stops.parameters["w"].bounds[1][0, 0] == 3
     assert (stops.parameters["B_w"].bounds[0].min(), stops.parameters["B_w"].bounds[1].max()) == (-2.0, 1.0)
     assert stops.parameters["D_yw"].prior[0] == -0.5

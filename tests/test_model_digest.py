@@ -8,6 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_export import changed, leaves, one_sentence, signed, some_fit
 
+from pilfr_casadi.cli import main
 from pilfr_casadi.export import load, save
 from pilfr_casadi.limits import Limit
 from pilfr_casadi.recording import InputError
@@ -104,9 +105,22 @@ def test_the_order_of_the_variables_counts(written):
 
 def test_files_from_before_the_digest_are_read(written):
     content = changed(changed(json.loads(written.read_text()), ("sha256",), ...), ("version",), 1)
-    assert loads_the_same_or_refuses(written, json.dumps(content).encode())
+    says = r"carries no digest \(it has version 1 .*changes made to it .* cannot be noticed; save the model again"
+    with pytest.warns(UserWarning, match=says):
+        assert loads_the_same_or_refuses(written, json.dumps(content).encode())
     older = changed(changed(content, ("training", "limits"), ...), ("training", "linear_nrmse"), ...)
-    assert loads_the_same_or_refuses(written, json.dumps(older).encode())
+    with pytest.warns(UserWarning, match=says):
+        assert loads_the_same_or_refuses(written, json.dumps(older).encode())
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_command_warns_of_a_file_without_a_digest_in_one_line(written, capsys):
+    content = changed(changed(json.loads(written.read_text()), ("sha256",), ...), ("version",), 1)
+    path = written.with_name("older.json")
+    path.write_text(json.dumps(content))
+    assert main(["export", str(path), "--out", str(path.with_name("older.casadi"))]) == 0
+    said = capsys.readouterr().err
+    assert said.startswith("pilfr: warning: The file ") and "carries no digest" in said and said.count("\n") == 1
 
 
 @pytest.mark.parametrize("version", [True, 1.0, 2.0, "2", None, [2], {}, 3, 0, -1, 10**400])

@@ -1,16 +1,14 @@
 """Run files: the same numbers again, nothing done twice, interrupted runs go on, changes are noticed."""
 
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
-from test_cli import write_csv
+import run_files
+from run_files import PYTHON, RUN, command, contents
+from test_cli import refused, write_csv
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.cli import main
@@ -19,78 +17,15 @@ from pilfr_casadi.runs.described import read_run
 from pilfr_casadi.runs.jobs import input_digests, jobs_of
 from pilfr_casadi.solution import Status
 
-TEXT = """
-seeds = [0, 1, 2]
-report = false
-
-[data]
-inputs = "u"
-outputs = "y"
-initial = "zero"
-train = "train.csv"
-validation = ["held.csv"]
-test = "test.csv"
-
-[model]
-structure = "hammerstein"
-nx = 1
-operators = 3
-
-[solver]
-starts = 3
-"""
-PYTHON = """
-import pilfr_casadi as pilfr
-run = dict(
-    report=False,
-    data=dict(inputs="u", outputs="y", initial="zero", train="train.csv"),
-    model=pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 2)),
-    solver=dict(name=pilfr.GaussNewton(tolerance=1e-4), starts=1),
-    constraints=dict(own=[pilfr.Constraint(lambda p: p["A"], upper=0.79, name="pole", exact=True)]),
-)
-"""
-
 
 @pytest.fixture
 def folder(tmp_path):
-    for seed, name in enumerate(("train", "held", "test")):
-        write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
-    (tmp_path / "rig.toml").write_text(TEXT)
-    return tmp_path
+    return run_files.prepared(tmp_path, RUN, ("train", "held", "test"))
 
 
 def changed(folder, old, new):
     """The run file with one passage replaced."""
-    assert old in TEXT
-    (folder / "rig.toml").write_text(TEXT.replace(old, new))
-    return folder / "rig.toml"
-
-
-def contents(out):
-    """What is the same in every execution of a run."""
-    found = {str(p.relative_to(out)): p.read_bytes() for p in out.rglob("*") if p.is_file()}
-    assert json.loads(found.pop("times.json")).keys() == {p.name for p in out.glob("jobs/*")}
-    assert found.pop(".lock") == b"" and {"manifest.json", "model.json", "results.csv"} <= found.keys()
-    return found
-
-
-def command(folder, *more):
-    """The command in a process of its own."""
-    code = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(pilfr.__file__).parent.parent)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(
-        [sys.executable, "-c", code, "run", "rig.toml", *more], cwd=folder, env=environment, **pipes
-    )
-
-
-def refused(capsys, *arguments, says):
-    """Status 2, one sentence on stderr."""
-    assert main(["run", *map(str, arguments)]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err
-    for word in (says,) if isinstance(says, str) else says:
-        assert word in err, err
+    return run_files.changed(folder, (old, new), text=RUN)
 
 
 def test_a_run_gives_the_same_bytes_twice_and_skips_what_is_done(folder):
@@ -141,7 +76,7 @@ def test_the_numbers_do_not_depend_on_the_executor_or_on_other_seeds(folder):
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGINT])
 def test_an_interrupted_run_goes_on_and_ends_the_same(folder, kind):
     out = folder / "rig-run"
-    process = command(folder)
+    process = command(folder, "run")
     deadline = time.monotonic() + 60
     while not (out / "jobs" / "seed-0" / "model.json").exists() and time.monotonic() < deadline:
         time.sleep(0.002)
@@ -201,7 +136,7 @@ def test_a_changed_file_runs_again_just_what_depends_on_it(folder):
 
 def test_the_same_content_under_another_key_order_is_the_same_job(folder):
     run = read_run(folder / "rig.toml")
-    text = TEXT.replace('structure = "hammerstein"\nnx = 1\n', 'nx = 1\nstructure = "hammerstein"\n')
+    text = RUN.replace('structure = "hammerstein"\nnx = 1\n', 'nx = 1\nstructure = "hammerstein"\n')
     (folder / "rig.toml").write_text(text)
     other = read_run(folder / "rig.toml")
     keys = [[j.key for j in jobs_of(r, input_digests(r))] for r in (run, other)]
@@ -218,7 +153,7 @@ def test_tampering_is_noticed(capsys, folder, name):
     assert "0" in text
     (out / name).write_text(text.replace("0", "1", 1))
     before = (out / name).read_bytes()
-    refused(capsys, folder / "rig.toml", says=(name, "restore", "--overwrite"))
+    refused(capsys, "run", folder / "rig.toml", says=(name, "restore", "--overwrite"))
     assert (out / name).read_bytes() == before  # nothing is overwritten without being asked
     assert main(["run", str(folder / "rig.toml"), "--overwrite"]) == 0
 
@@ -262,16 +197,16 @@ def test_a_missing_model_is_made_again(folder):
     ],
 )
 def test_bad_input_gets_one_sentence(capsys, folder, old, new, says):
-    refused(capsys, changed(folder, old, new), says=says)
+    refused(capsys, "run", changed(folder, old, new), says=says)
     assert not (folder / "rig-run" / "results.csv").exists()
 
 
 def test_constraints_that_cannot_be_met_get_one_sentence(capsys, folder):
     text = "fix = { A = 0.95, B_u = 0.0, D_yu = 0.0, C_z = 0.0, D_zu = 1.0 }"
     more = f"operators = 3\n{text}\n[constraints]\nspectral_radius = 0.9"
-    refused(capsys, changed(folder, "operators = 3", more), says=("spectral radius <= 0.9", "infeasible"))
+    refused(capsys, "run", changed(folder, "operators = 3", more), says=("spectral radius <= 0.9", "infeasible"))
     gain = "[constraints]\nspectral_radius = 0.5\ndc_gain = { value = 1e9, within = 1.0 }\n[solver]"
-    text = TEXT.replace(
+    text = RUN.replace(
         "operators = 3", "operators = 3\nbounds = { w = [0, 1], B_w = [0, 1], C_y = [0, 1], D_yw = [0, 1] }"
     )
     (folder / "rig.toml").write_text(text.replace("[solver]", gain))
@@ -284,13 +219,13 @@ def test_constraints_that_cannot_be_met_get_one_sentence(capsys, folder):
 
 
 def test_other_bad_places(capsys, folder, tmp_path):
-    refused(capsys, folder / "none.toml", says="cannot be read")
-    refused(capsys, folder / "rig.toml", "--out", folder / "train.csv", says="train.csv")
+    refused(capsys, "run", folder / "none.toml", says="cannot be read")
+    refused(capsys, "run", folder / "rig.toml", "--out", folder / "train.csv", says="train.csv")
     (folder / "mine").mkdir()
     (folder / "mine" / "model.json").write_text("{}")
-    refused(capsys, folder / "rig.toml", "--out", folder / "mine", says=("model.json", "no manifest"))
+    refused(capsys, "run", folder / "rig.toml", "--out", folder / "mine", says=("model.json", "no manifest"))
     assert (folder / "mine" / "model.json").read_text() == "{}"
-    refused(capsys, folder / "rig.toml", "--workers", "0", says="--workers 0")
+    refused(capsys, "run", folder / "rig.toml", "--workers", "0", says="--workers 0")
 
 
 @pytest.mark.parametrize("out", ["..", "../..", ".", "", "/tmp", "x/../..", "../other", "a/../../other", "\\u0000"])
@@ -299,9 +234,9 @@ def test_a_run_file_writes_only_below_its_own_folder(capsys, folder, out):
     inner.mkdir()
     for name in ("train", "held", "test"):
         shutil.copy(folder / f"{name}.csv", inner)
-    (inner / "rig.toml").write_text(f'out = "{out}"\n' + TEXT)
+    (inner / "rig.toml").write_text(f'out = "{out}"\n' + RUN)
     before = sorted(folder.rglob("*"))
-    refused(capsys, inner / "rig.toml", says=("'out' is", "no folder below that of the run file", "--out"))
+    refused(capsys, "run", inner / "rig.toml", says=("'out' is", "no folder below that of the run file", "--out"))
     assert sorted(folder.rglob("*")) == before
 
 
@@ -312,8 +247,8 @@ def test_a_link_does_not_lead_out_of_the_folder(capsys, folder):
         shutil.copy(folder / f"{name}.csv", inner)
     (folder / "elsewhere").mkdir()
     (inner / "way").symlink_to(folder / "elsewhere")
-    (inner / "rig.toml").write_text('out = "way"\n' + TEXT)
-    refused(capsys, inner / "rig.toml", says="no folder below that of the run file")
+    (inner / "rig.toml").write_text('out = "way"\n' + RUN)
+    refused(capsys, "run", inner / "rig.toml", says="no folder below that of the run file")
     assert not list((folder / "elsewhere").iterdir())
 
 
@@ -322,10 +257,14 @@ def test_foreign_content_is_not_written_over(capsys, folder, more):
     (folder / "mine").mkdir()
     (folder / "mine" / "thesis.tex").write_text("years of work")
     (folder / "mine" / "model.json").write_text("{}")
-    refused(capsys, folder / "rig.toml", "--out", folder / "mine", *more, says=("thesis.tex", "no manifest of a run"))
+    refused(
+        capsys, "run", folder / "rig.toml", "--out", folder / "mine", *more, says=("thesis.tex", "no manifest of a run")
+    )
     assert sorted(p.name for p in (folder / "mine").iterdir()) == ["model.json", "thesis.tex"]
-    refused(capsys, folder / "rig.toml", "--out", folder, *more, says=("holds the run file", "a folder of their own"))
-    refused(capsys, folder / "rig.toml", "--out", folder.parent, *more, says="holds the run file")
+    refused(
+        capsys, "run", folder / "rig.toml", "--out", folder, *more, says=("holds the run file", "a folder of their own")
+    )
+    refused(capsys, "run", folder / "rig.toml", "--out", folder.parent, *more, says="holds the run file")
     assert not (folder / "manifest.json").exists() and not (folder.parent / "manifest.json").exists()
 
 
@@ -355,7 +294,7 @@ def test_two_runs_do_not_share_a_folder(capsys, folder):
 
     (folder / "rig-run").mkdir()
     with alone(folder / "rig-run"):
-        refused(capsys, folder / "rig.toml", says="Another run is at work")
+        refused(capsys, "run", folder / "rig.toml", says="Another run is at work")
 
 
 def test_a_python_file_does_the_same_with_objects(folder):
@@ -375,7 +314,7 @@ def test_a_python_file_does_the_same_with_objects(folder):
 
 
 def test_regularization_in_a_run(folder):
-    text = TEXT.replace("[0, 1, 2]", "0").replace("operators = 3", "operators = 6")
+    text = RUN.replace("[0, 1, 2]", "0").replace("operators = 3", "operators = 6")
     (folder / "rig.toml").write_text(text + "\n[regularization]\npath = [1e-4, 1e-3]\n")
     sparse = pilfr.run(folder / "rig.toml")
     assert 1 <= sparse.manifest["jobs"]["seed-0"]["operators_used"] <= 3

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_models import simulate_lti
 
 from pilfr_casadi.bla import BLA, robust_bla
 from pilfr_casadi.local_polynomial import plain_bla
-from pilfr_casadi.lti import frequency_response, simulate_lti, simulate_states, unit_variance
+from pilfr_casadi.lti import frequency_response, propagate
 from pilfr_casadi.order_selection import select_order
 from pilfr_casadi.recording import InputError, Recording
 from pilfr_casadi.subspace import (
@@ -262,15 +263,15 @@ def test_orders_too_high_for_the_data_are_left_out():
 
 @given(**SIZES, M=st.integers(1, 70))
 @settings(max_examples=30)
-def test_simulation_equals_the_plain_loop(nx, n_u, n_y, seed, M):
+def test_propagation_equals_the_plain_loop(nx, n_u, n_y, seed, M):
     rng = np.random.default_rng(seed)
     model = random_system(nx, n_u, n_y, rng)
     u, x = rng.standard_normal((M, n_u)), rng.standard_normal(nx)
-    states, y = simulate_states(model, u, x), simulate_lti(model, u, x)
+    states, last = propagate(model.A.T, (u @ model.B.T)[None], x[None])
     for k in range(M):
-        np.testing.assert_allclose(states[k], x, atol=1e-10)
-        np.testing.assert_allclose(y[k], model.C @ x + model.D @ u[k], atol=1e-10)
+        np.testing.assert_allclose(states[0, k], x, atol=1e-10)
         x = model.A @ x + model.B @ u[k]
+    np.testing.assert_allclose(last[0], x, atol=1e-10)
 
 
 def test_frequency_response_is_that_of_control():
@@ -279,27 +280,6 @@ def test_frequency_response_is_that_of_control():
     np.testing.assert_allclose(frequency_response(model, GRID), expected, atol=1e-12)
     integrator = control.StateSpace([[1.0]], [[1.0]], [[1.0]], [[0.0]], DT)
     assert not np.any(np.isfinite(frequency_response(integrator, np.array([0.0]))))
-
-
-def test_unit_variance_scales_states_and_keeps_the_model():
-    rng = np.random.default_rng(16)
-    model = random_system(4, 2, 2, rng)
-    u = rng.standard_normal((500, 2)) + 3.0
-    scaled = unit_variance(model, u)
-    np.testing.assert_allclose(np.std(simulate_states(scaled, u), axis=0), 1.0, rtol=1e-9)
-    assert response_error(scaled, model) < 1e-12
-    assert scaled.dt == DT
-    pieces = unit_variance(model, [u[:200], u[200:]])
-    states = np.concatenate([simulate_states(pieces, x) for x in (u[:200], u[200:])])
-    np.testing.assert_allclose(np.std(states, axis=0), 1.0, rtol=1e-9)
-
-
-def test_unit_variance_leaves_states_alone_that_do_not_move():
-    model = control.StateSpace(np.diag([0.5, 0.9]), [[2.0], [0.0]], [[1.0, 1.0]], [[0.0]], DT)
-    scaled = unit_variance(model, np.random.default_rng(0).standard_normal((100, 1)))
-    np.testing.assert_allclose(scaled.A, model.A)
-    np.testing.assert_allclose(scaled.C[0, 1], 1.0)
-    np.testing.assert_allclose(unit_variance(model, np.zeros((10, 1))).B, model.B)
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
@@ -334,16 +314,9 @@ def _bla(n=10, f_max=4.0, value=1.0):
         (lambda: select_order(_short(), [0, 1]), "order nx is 0"),
         (lambda: select_order(_short(), [1], margin=-1), "margin of -1"),
         (lambda: select_order(_short(), [50]), "too few for order 50"),
-        (lambda: simulate_lti(_model(), np.ones((5, 2))), r"u has the shape \(5, 2\); the model needs \(samples, 1\)"),
-        (lambda: simulate_lti(_model(), np.ones((5, 1)), np.ones(3)), "x0 has the shape"),
-        (lambda: unit_variance(_model(2.0), np.ones((5000, 1))), "grow without bound"),
     ],
 )
 def test_bad_input_gets_a_sentence(call, sentence):
     with pytest.raises(InputError, match=sentence) as caught:
         call()
     assert "\n" not in str(caught.value)
-
-
-def _model(pole=0.5):
-    return control.StateSpace([[pole]], [[1.0]], [[1.0]], [[0.0]], DT)

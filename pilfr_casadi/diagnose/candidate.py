@@ -59,16 +59,15 @@ class Candidate:
     def at_bound(self) -> bool:
         """Whether a parameter of the law is held back by one of its bounds."""
         prefix = self.fitted.simulator.elements[-1].prefix
-        bounds = {k: p.bounds for k, p in self.fitted.model.parameters.items() if k.startswith(prefix)}
-        return any(np.any((self.fitted.values[k] <= a) | (self.fitted.values[k] >= b)) for k, (a, b) in bounds.items())
+        return any(np.any(self.fitted.at_bound(k)) for k in self.fitted.model.parameters if k.startswith(prefix))
 
 
-def heads(recordings: Sequence[Recording], share: float = HEAD) -> tuple[Recording, ...]:
+def heads(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
     """First part of each recording."""
     total, out = sum(map(len, recordings)), []
     for r in recordings:
-        most = int(len(r) * min(1.0, LONG / (share * total)))
-        cut = max(int(share * most), min(len(r), r.skip + 20))
+        most = int(len(r) * min(1.0, LONG / (HEAD * total)))
+        cut = max(int(HEAD * most), min(len(r), r.skip + 20))
         part = r.slice(0, cut)
         out.append(
             part.with_(initial="estimate", period=None)

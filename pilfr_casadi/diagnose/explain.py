@@ -19,22 +19,24 @@ from ..laws import Law
 from ..simulator import Simulator
 from .candidate import Candidate, attempt, heads
 from .screen import Scored
-from .workbench import Fitted, Workbench
+from .workbench import Fitted, Workbench, started
 
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
+BEST = 10  # pairs of each list that are fitted, besides the best of each port
 REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first
+AGAIN = 3  # starts that a pair is fitted from again
 SAME = 1.02  # times the mean square error of fits that came to the same place
 BEHIND = 3.0  # times the best error of a pair that is not worth more starts
 
 
-def survivors(scored: Sequence[Scored], keep: int = 10) -> list[tuple[str, type[Law], list[Scored]]]:
+def survivors(scored: Sequence[Scored]) -> list[tuple[str, type[Law], list[Scored]]]:
     """Pairs worth a full fit: the best of both lists and the best of each port."""
     chosen: dict[tuple[str, type[Law]], list[Scored]] = {}
     for source in ("simulation", "observer"):
         ranked = [s for s in scored if s.source == source]
         ports: set[str] = set()
         for i, s in enumerate(ranked):
-            if i < keep or s.port not in ports:
+            if i < BEST or s.port not in ports:
                 chosen.setdefault((s.port, type(s.law)), [])
             ports.add(s.port)
     for s in scored:
@@ -92,9 +94,9 @@ def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: 
     return _Pair(placed, model, engine, ranked, without.begin, brief)
 
 
-def ways(pair: _Pair, led: bool, runs: int = 3) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
+def ways(pair: _Pair, led: bool) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
     """Starts that a pair is fitted from again, each with the observer's gains on its way: led first, where it is."""
-    starts = pair.starts[:runs]
+    starts = pair.starts[:AGAIN]
     if pair.candidate is not None:
         starts = [pair.candidate.fitted.values, *starts[1:]]
     return [(start, (1.0, 0.1)) for start in pair.starts[: int(led)]] + [(start, ()) for start in starts]
@@ -130,18 +132,13 @@ def by_cost(
     bench: Workbench, model: Any, engine: Any, starts: Sequence[Mapping[str, Any]], without: Fitted
 ) -> list[Mapping[str, Any]]:
     """Starts in the order of their error as they stand on the first parts, from the initial states of a fit."""
-    part, parameters = bench.on(heads(bench.recordings)), model.parameters
+    part = bench.on(heads(bench.recordings))
+    initial = [np.append(state, np.zeros(model.n_state - len(state))) for state in without.begin]
 
     def cost(start: Mapping[str, Any]) -> float:
-        known = {k: v for k, v in start.items() if k in parameters}
-        vector, total = np.clip(parameters.pack(known), parameters.lower, parameters.upper), 0.0
-        for r, state in zip(part.recordings, without.begin, strict=True):
-            full = np.zeros(model.n_state)
-            full[: len(state)] = state
-            with np.errstate(over="ignore", invalid="ignore"):
-                y = engine.simulate(model.drive(r), vector, full)[0]
-                total += float(np.sum(((y - r.y) / part.scale)[r.skip :] ** 2))
-        return total if np.isfinite(total) else np.inf
+        values = model.parameters.unpack(started(model, start))
+        found = part.result(without.simulator, values, initial, engine, model).cost
+        return found if np.isfinite(found) else np.inf
 
     return sorted(starts, key=cost)
 

@@ -15,6 +15,7 @@ import numpy as np
 from ..recording import Recording
 
 ALIKE, CHANCE = 0.5, 1e-4  # rank correlation, and its chance in noise, of a residual that swells with a signal
+LONGEST = 400  # samples over which a residual may be correlated
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +61,14 @@ def white_part(residuals: Sequence[np.ndarray]) -> np.ndarray:
     return np.asarray(np.min([np.sqrt(np.mean(np.diff(e, 3, axis=0) ** 2, axis=0) / 20) for e in residuals], axis=0))
 
 
-def effective_size(residuals: Sequence[np.ndarray], most: int = 400) -> float:
+def effective_size(residuals: Sequence[np.ndarray]) -> float:
     """Samples that count: all of them over the residuals' correlation time `1 + 2 Σ ρ²`."""
     total = 0.0
     for e in residuals:
         for column in (e - e.mean(axis=0)).T:
             n = len(column)
             spectrum = np.abs(np.fft.rfft(column, 2 * n)) ** 2
-            rho = np.fft.irfft(spectrum)[: min(most, n // 4)]
+            rho = np.fft.irfft(spectrum)[: min(LONGEST, n // 4)]
             rho = rho / rho[0] if rho[0] > 0 else np.zeros(1)
             total += n / (1 + 2 * float(np.sum(rho[1:] ** 2)))
     return total

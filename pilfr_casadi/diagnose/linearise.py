@@ -11,7 +11,7 @@ and along an observer with gain K, whose innovations are then looked at instead 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -31,6 +31,7 @@ from .workbench import FINER, Fitted, Workbench
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
 BLOCK = 256  # samples propagated at a time
+FEW = 60  # samples of a run at which the user's equations are looked at
 
 
 class Constant(Law):
@@ -127,6 +128,11 @@ class Run:
     lift: np.ndarray
     push: np.ndarray
 
+    @property
+    def n_free(self) -> int:
+        """Columns of b and d that belong to free parameters; those of the ports follow."""
+        return int(self.b.shape[2] - len(self.sign))
+
 
 @np.errstate(over="ignore", invalid="ignore")
 def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray | None = None) -> Run:
@@ -174,27 +180,28 @@ def linearised(bench: Workbench, fitted: Fitted) -> tuple[Probe, list[Run]]:
     return probe, [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
 
 
-def along(bench: Workbench, fitted: Fitted, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
-    """Some states of the user's equations (count, n_x) and inputs (count, n_u) along the longest fitted run."""
+def along(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """Some states of the user's equations (n, n_x) and inputs (n, n_u) along the longest fitted run."""
     i = int(np.argmax([len(r) for r in bench.recordings]))
     r, model, n_x = bench.recordings[i], fitted.model, len(bench.simulator.states)
     short = r.slice(0, min(len(r), 3000))
     states = states_along(model, model.drive(short), fitted.vector, fitted.initial[i])[:: model.substeps, :n_x]
-    step = max(len(states) // count, 1)
+    step = max(len(states) // FEW, 1)
     return states[::step], short.u[::step]
 
 
 def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarray:
     """Gain of an observer with process noise at every port, each strong enough to explain the residual alone."""
     a, b, c = runs[0].mean
-    ports = b[:, len(probe.free) - len(probe.ports) :]
+    ports = b[:, runs[0].n_free :]
     error = np.sqrt(np.mean(np.concatenate([r.error for r in runs]) ** 2, axis=0))
     q = np.zeros_like(a)
     for column in ports.T:
         x, total = column.copy(), 0.0
-        for _ in range(200):
-            total += float(np.sum((c @ x / error) ** 2))
-            x = a @ x
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(200):
+                total += float(np.sum((c @ x / error) ** 2))
+                x = a @ x
         if total > 0 and np.isfinite(total):
             q += np.outer(column, column) / total
     gain = kalman_gain(a, c, q, np.diag(np.maximum(noise, 0.05 * error) ** 2))
@@ -202,7 +209,7 @@ def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarra
     return gain
 
 
-def propagate(r: Run, forces: list[tuple[int, np.ndarray]], n_free: int) -> np.ndarray:
+def propagate(r: Run, forces: Sequence[tuple[int, np.ndarray]] = ()) -> np.ndarray:
     """Output changes of free parameters, the initial state, and forces at ports.
 
     Parameters
@@ -214,7 +221,7 @@ def propagate(r: Run, forces: list[tuple[int, np.ndarray]], n_free: int) -> np.n
     -------
     array, shape (M, n_y, n_free + n_x + total n)
     """
-    m, n_x, _ = r.a.shape
+    (m, n_x, _), n_free = r.a.shape, r.n_free
     n_y, first = r.c.shape[1], n_free + n_x
     edges = first + np.cumsum([0, *(f.shape[1] for _, f in forces)])
     spans = [slice(i, j) for i, j in pairwise(edges)]

@@ -17,8 +17,8 @@ from ..laws.base import Law
 from ..recording import InputError
 from .floor import effective_size
 from .gates import Gate
-from .linearise import linearised, propagate
-from .remainder import block_diagonal, orthonormal
+from .linearise import linearised
+from .remainder import block_diagonal, moved, orthonormal
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats that an offset has to gain
@@ -45,15 +45,13 @@ class Offset(Law):
 def first_order(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
     """Share of the mean square that a constant at each port takes away, to first order."""
     probe, runs = linearised(bench, fitted)
-    n_free = len(probe.free) - len(probe.ports)
     blocks, errors = [], []
     for r, one in zip(bench.recordings, runs, strict=True):
         forces = [(probe.ports.index(name), np.ones((len(r), 1))) for name in ports]
-        y = propagate(one, forces, n_free) / bench.scale[:, None]
-        blocks.append(y[r.skip :].reshape(-1, y.shape[2]))
+        blocks.append(moved(bench, one, forces, r.skip))
         errors.append((one.error / bench.scale)[r.skip :].ravel())
     first = blocks[0].shape[1] - len(ports)
-    base = orthonormal(block_diagonal([b[:, :first] for b in blocks], n_free))
+    base = orthonormal(block_diagonal([b[:, :first] for b in blocks], runs[0].n_free))
     left, columns = np.concatenate(errors), np.concatenate([b[:, first:] for b in blocks])
     total = float(left @ left)
     size = np.linalg.norm(columns, axis=0)

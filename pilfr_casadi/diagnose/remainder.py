@@ -5,7 +5,7 @@ With base the orthonormal directions in which these can change the stacked outpu
     e' = e - base baseᵀ e,    φ' = φ - base baseᵀ φ
 
 where φ holds the outputs' changes by a small dose of each law at a port, a column for each of its shapes and strengths.
-One port is looked at after the other: its columns are the largest arrays of a diagnosis.
+Each port is looked at by itself: its columns are the largest arrays of a diagnosis.
 """
 
 from __future__ import annotations
@@ -59,7 +59,6 @@ class Remainder:
 
     bench: Workbench
     runs: list[Run]
-    n_free: int
     base: np.ndarray
     left: np.ndarray
     tasks: tuple[Task, ...]
@@ -68,16 +67,15 @@ class Remainder:
     @classmethod
     def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
         """Along some runs, for the laws that the data can speak to; only `at` one port where it is named."""
-        n_free = len(probe.free) - len(probe.ports)
         short = [
             replace(r, **{k: getattr(r, k)[w] for k in ("a", "b", "c", "d", "error", "z", "dz")})
             for r, w in zip(runs, _windows(bench, runs), strict=True)
         ]
         error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
-        base = orthonormal(block_diagonal([_moved(bench, r, [], n_free) for r in short], n_free))
+        base = followed(bench, short)
         left = error - base @ (base.T @ error)
         tasks = [t for t in _tasks(bench, probe, laws, runs, short) if at in ("", t.port.name)]
-        return cls(bench, short, n_free, base, left, tuple(tasks), folds(len(left), len(runs)))
+        return cls(bench, short, base, left, tuple(tasks), folds(len(left), len(runs)))
 
     def columns(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
         """What the forces of a port's laws, each of unit size, change beside the base, and what their sizes were.
@@ -92,7 +90,7 @@ class Remainder:
         blocks, at = [], 0
         for r in self.runs:
             now = slice(at, at + len(r.z))
-            blocks.append(_moved(self.bench, r, [(task.index, forces[now])], self.n_free)[:, -len(size) :])
+            blocks.append(moved(self.bench, r, [(task.index, forces[now])])[:, -len(size) :])
             at = now.stop
         phi = np.concatenate(blocks) if len(blocks) > 1 else blocks[0]
         size_before = lengths(phi)
@@ -101,14 +99,23 @@ class Remainder:
         return phi, size
 
 
-def _moved(bench: Workbench, r: Run, forces: list[tuple[int, np.ndarray]], n_free: int) -> np.ndarray:
-    """Changes of the stacked outputs in units of their deviation, by free parameters, initial state, and forces."""
+def moved(bench: Workbench, r: Run, forces: Sequence[tuple[int, np.ndarray]] = (), skip: int = 0) -> np.ndarray:
+    """Changes of the stacked outputs in units of their deviation, by free parameters, initial state, and forces.
+
+    The first `skip` samples are left out; see `propagate` for the forces.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
-        y = propagate(r, forces, n_free)
+        y = propagate(r, forces)[skip:]
         y /= bench.scale[:, None]
     y = y.reshape(-1, y.shape[2])
     y[:, ~((y.max(axis=0) < HUGE) & (y.min(axis=0) > -HUGE))] = 0.0  # what grows without end says nothing
     return y
+
+
+def followed(bench: Workbench, runs: Sequence[Run], skips: Sequence[int] = ()) -> np.ndarray:
+    """Orthonormal directions of the stacked outputs that parameters and initial states can follow, (R, n)."""
+    blocks = [moved(bench, r, skip=skip) for r, skip in zip(runs, skips or [0] * len(runs), strict=True)]
+    return orthonormal(block_diagonal(blocks, runs[0].n_free))
 
 
 def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:

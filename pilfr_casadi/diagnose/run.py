@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..accepted import as_simulator
+from ..interrupts import Progress
 from ..laws import CATALOGUE, Law, readable_unit
 from ..recording import InputError, Recording, as_recordings, check_for_identification
 from ..threads import one_blas_thread, processors
+from .arranged import arranged
 from .candidate import Candidate
 from .clipping import clipped_input
 from .experiment import next_experiment, placebo
@@ -23,9 +25,7 @@ from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import MISHELD, Pass, Search
 from .verdict import UNSURE, confidence, judge
-from .workbench import Fitted, arranged
-
-Progress = Callable[[str, int, int, float], None]
+from .workbench import Fitted
 
 
 @one_blas_thread

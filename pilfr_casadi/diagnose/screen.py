@@ -17,9 +17,11 @@ from ..laws import Law
 from ..laws.base import Local
 from ..laws.trace import columns
 from ..threads import side_by_side
-from .linearise import linearised, observer_gain, run
-from .remainder import Remainder, Task, held_out
+from .linearise import Run, linearised, observer_gain, run
+from .remainder import HUGE, Remainder, Task, held_out
 from .workbench import Fitted, Workbench
+
+KEPT = 3  # start values of each pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +40,7 @@ class Scored:
 
 
 def screen(
-    bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, workers: int = 1, keep: int = 3
+    bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, workers: int = 1
 ) -> tuple[list[Scored], dict[str, int], np.ndarray | None]:
     """Every port and law with its score along the simulation and along the observer, best first.
 
@@ -50,25 +52,29 @@ def screen(
         Standard deviation of the outputs' noise.
     workers : int
         Ports looked at side by side.
-    keep : int
-        Start values kept of each pair.
     """
     probe, runs = linearised(bench, fitted)
     gain = observer_gain(probe, runs, noise)
     signs = {name: int(s) for name, s in zip(probe.ports, runs[0].sign, strict=True)}
     led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
-    if not all(np.all(np.isfinite(values)) for r in led for values in (r.a, r.b, r.z, r.dz, r.error)):
+    if not all(_holds(r, bench.scale) for r in led):
         led = []
     ways = [("simulation", Remainder.of(bench, probe, runs, laws))]
     if led:
         ways.append(("observer", Remainder.of(bench, probe, led, laws)))
-    tasks = [(rest, task, source, keep) for source, rest in ways for task in rest.tasks]
+    tasks = [(rest, task, source) for source, rest in ways for task in rest.tasks]
     found = [scored for one in side_by_side(lambda task: _score(*task), tasks, workers) for scored in one]
     seen = any(s.source == "observer" for s in found)
     return sorted(found, key=lambda s: -s.share), signs, gain if seen else None
 
 
-def _score(rest: Remainder, task: Task, source: str, keep: int) -> list[Scored]:
+def _holds(r: Run, scale: np.ndarray) -> bool:
+    """Whether an observer has kept a simulator in its range, and has not let it grow without end."""
+    finite = all(np.all(np.isfinite(values)) for values in (r.a, r.b, r.z, r.dz))
+    return finite and bool(np.all(np.abs(r.error) < HUGE * scale))
+
+
+def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
     """Each law of one port."""
     phi, size = rest.columns(task)
     total, at, out = max(float(rest.left @ rest.left), 1e-300), 0, []
@@ -81,13 +87,14 @@ def _score(rest: Remainder, task: Task, source: str, keep: int) -> list[Scored]:
             scores.append((drop / total, shape, -strength / size[cols], cols))
         at += width * len(shapes)
         scores.sort(key=lambda s: -s[0])
-        starts = tuple(_start(law, shape, c) for _, shape, c, _ in scores[:keep])
+        starts = tuple(start_values(law, shape, c) for _, shape, c, _ in scores[:KEPT])
         share = held_out(phi[:, scores[0][3]], rest.left, rest.odd)
         out.append(Scored(task.port.name, law, share, starts, task.local, source))
     return out
 
 
-def _start(law: Law, shape: dict[str, Any], strength: np.ndarray) -> dict[str, Any]:
+def start_values(law: Law, shape: dict[str, Any], strength: np.ndarray) -> dict[str, Any]:
+    """Start values of a law: its shape, and its strengths one entry a column."""
     values, at, p = dict(shape), 0, law.at(shape).parameters()
     for name in law.strength:
         size = p[name].size

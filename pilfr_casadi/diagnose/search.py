@@ -8,12 +8,13 @@ explain it. It is accepted at another port when it removes most of what is left.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..interrupts import Progress
 from ..laws import Law
 from ..recording import InputError
 from .candidate import Candidate, heads, judged, polish
@@ -21,9 +22,10 @@ from .explain import explain
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .linearise import linearised
+from .pairs import two_at_once
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
 from .screen import Scored, screen
-from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, left_open
+from .verdict import CONTAINS, FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, explains, left_open
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
@@ -39,7 +41,6 @@ IMITATED = 3  # simpler laws put up against one that can imitate others
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
 Seen = tuple[list[Scored], dict[str, int], np.ndarray | None]
-Say = Callable[[str, int, int, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ class Search:
     floor: Floor
     laws: Sequence[type[Law]]
     workers: int
-    say: Say
+    say: Progress
     hold_said: bool = True
     misheld: float = 1.0
     base: Fitted = field(init=False)
@@ -113,17 +114,17 @@ class Search:
     def _run(self, effects: int) -> None:
         linearised(self.bench, self.without)  # what both of the next look at
         with ThreadPoolExecutor(1) as other:
-            looked = other.submit(self._screen)
+            looked = other.submit(self.screened)
             self.open_before = self.open_after = self.flexible(self.without)
             seen = looked.result()
         for number in range(effects):
             if number:
                 if not self._much():
                     break
-                seen = self._screen()
+                seen = self.screened()
                 if max([*self.open_after.values(), *(s.share for s in seen[0])], default=0.0) < HINT:
                     break
-            found = self._pass(number, seen)
+            found = self.pass_(number, seen)
             self.passes.append(found)
             if not found.accepted:
                 break
@@ -141,6 +142,15 @@ class Search:
             if self._wrongly_held():
                 return
             self.open_after = self.flexible(self.base)
+        if effects > 1 and self._unexplained():
+            two_at_once(self)
+
+    def _unexplained(self) -> bool:
+        """Whether something is left that a force explains and what is named does not."""
+        named = [p.choice for p in self.passes if p.accepted and p.choice is not None]
+        if named and explains(named, *left_open(self)):
+            return False
+        return self._much() and max(self.open_after.values(), default=0.0) > HINT
 
     def _wrongly_held(self) -> bool:
         """Whether, with the effects in place, inputs seem to do the other thing between samples."""
@@ -161,14 +171,16 @@ class Search:
         much = excess > MORE or self.base.cost > max(LOUD**2 * self.floor2, SEEN)
         return much or (excess > LITTLE and still > MAINLY)
 
-    def _screen(self) -> Seen:
+    def screened(self) -> Seen:
+        """Every law at every port beside the effects so far, scored."""
         began = time.perf_counter()
         self.say("screen", 0, 1, self.base.cost**0.5)
         seen = screen(self.bench, self.base, self.laws, self.floor.deviation, self.workers)
         self.timed("screen", began)
         return seen
 
-    def _pass(self, number: int, seen: Seen) -> Pass:
+    def pass_(self, number: int, seen: Seen) -> Pass:
+        """Fit what the screen lets through, and choose; `number` effects were accepted before."""
         scored, signs, gain = seen
         taken = {e.port for e in self.base.simulator.elements[len(self.bench.simulator.elements) :]}
         scored = [s for s in scored if s.port not in taken]
@@ -258,12 +270,13 @@ class Search:
 
 
 def _imitated(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
-    """The simpler laws, at the port of one that can imitate them, which the screen did not let through."""
-    if not candidates or candidates[0].law.id not in FLEXIBLE:
+    """The simpler laws, at the port of one that contains or can imitate them, which the screen did not let through."""
+    if not candidates:
         return []
     best, tried = candidates[0], {(c.port, type(c.law)) for c in candidates}
-    other = [
-        s for s in scored if s.port == best.port and s.law.id not in FLEXIBLE and (s.port, type(s.law)) not in tried
-    ]
-    chosen = list(dict.fromkeys(type(s.law) for s in other))[:IMITATED]  # `scored` is best first
+    other = [s for s in scored if s.port == best.port and (s.port, type(s.law)) not in tried]  # best first
+    chosen = [type(s.law) for s in other if s.law.id in CONTAINS.get(best.law.id, ())]
+    if best.law.id in FLEXIBLE:
+        plain = [type(s.law) for s in other if s.law.id not in FLEXIBLE]
+        chosen += list(dict.fromkeys(plain))[:IMITATED]
     return [s for s in other if type(s.law) in chosen]

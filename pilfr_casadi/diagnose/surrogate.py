@@ -10,7 +10,7 @@ a real eigenvalue `-r` the equation `q' = -r q + b u`. Frequencies, dampings and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -32,12 +32,9 @@ EXACT = 1e-3  # NRMSE at which no higher order is looked for
 HIGHEST = 8
 SMALL = 1e-3  # share of an output below which a coefficient is held
 Array = np.ndarray
-Progress = Callable[[str, int, int, float], None]
 
 
-def surrogate(
-    recordings: Recording | Sequence[Recording], *, nx: int | None = None, progress: Progress | None = None
-) -> tuple[Simulator, float]:
+def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = None) -> tuple[Simulator, float]:
     """Identify a linear simulator from what a simulation was given and what it answered.
 
     Parameters
@@ -46,8 +43,6 @@ def surrogate(
         Inputs and outputs of the simulation.
     nx : int, optional
         States; chosen on the recordings where left out.
-    progress : callable, optional
-        Called with (stage, done, total, smallest error so far).
 
     Returns
     -------
@@ -67,7 +62,7 @@ def surrogate(
     records = tuple(r if r.period else r.with_(initial="estimate") for r in records)
     found: list[tuple[float, Simulator]] = []
     for n in range(HIGHEST + 1) if nx is None else (nx,):  # a simulation has no noise: its order shows by itself
-        one = _identified(records, n, hold, progress)
+        one = _identified(records, n, hold)
         found += [one] if one is not None else []
         if found and found[-1][0] < EXACT:
             break
@@ -81,11 +76,9 @@ def surrogate(
     return simulator, error
 
 
-def _identified(
-    records: Sequence[Recording], n: int, hold: str | None, progress: Progress | None
-) -> tuple[float, Simulator] | None:
+def _identified(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:
     try:
-        found = fit(PILFR(n), records, progress=progress)
+        found = fit(PILFR(n), records)
     except InputError:
         return None
     p = found.parameters

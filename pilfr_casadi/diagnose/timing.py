@@ -13,10 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..recording import Recording
 from .gates import Change, Gate, changed, refit, shifted
-from .linearise import linearised, propagate
-from .remainder import block_diagonal, orthonormal
+from .linearise import linearised
+from .remainder import followed
 from .workbench import Fitted, Workbench
 
 SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples
@@ -33,24 +32,23 @@ Trial = tuple[float, str, str, float, str, tuple[int, ...]]  # share left, chann
 
 def nominal_directions(bench: Workbench, fitted: Fitted) -> np.ndarray:
     """Orthonormal basis of what parameters and initial states can change in the stacked outputs."""
-    probe, runs = linearised(bench, fitted)
-    n_free = len(probe.free) - len(probe.ports)
-    blocks = []
-    for r, one in zip(bench.recordings, runs, strict=True):
-        y = propagate(one, [], n_free) / bench.scale[:, None]
-        blocks.append(y[r.skip :].reshape(-1, y.shape[2]))
-    return orthonormal(block_diagonal(blocks, n_free))
+    return followed(bench, linearised(bench, fitted)[1], [r.skip for r in bench.recordings])
 
 
-def _remainder(bench: Workbench, fitted: Fitted, basis: np.ndarray, change: Change, input_changed: bool) -> float:
+def _remainder(bench: Workbench, fitted: Fitted, basis: np.ndarray, change: Change, simulate: bool) -> float:
+    """Mean square that parameters and initial states leave of the error on changed recordings.
+
+    Without `simulate` the run of the fit stands, as it does where no input is changed.
+    """
     parts = []
-    for r, e, state in zip(bench.recordings, fitted.residual, fitted.initial, strict=True):
-        other = change(r)
-        y = fitted.engine.simulate(fitted.model.drive(other), fitted.vector, state)[0] if input_changed else e + r.y
-        parts.append(((y - other.y) / bench.scale)[r.skip :].ravel())
-    error = np.concatenate(parts)
-    left = error - basis @ (basis.T @ error)
-    value = float(left @ left) / len(error)
+    with np.errstate(over="ignore", invalid="ignore"):  # what diverges leaves everything
+        for r, e, state in zip(bench.recordings, fitted.residual, fitted.initial, strict=True):
+            other = change(r)
+            y = fitted.engine.simulate(fitted.model.drive(other), fitted.vector, state)[0] if simulate else e + r.y
+            parts.append(((y - other.y) / bench.scale)[r.skip :].ravel())
+        error = np.concatenate(parts)
+        left = error - basis @ (basis.T @ error)
+        value = float(left @ left) / len(error)
     return value if np.isfinite(value) else np.inf
 
 
@@ -164,9 +162,7 @@ def _settled(
     return best
 
 
-def _best_of_each(
-    trials: list[Trial],
-) -> list[Trial]:
+def _best_of_each(trials: list[Trial]) -> list[Trial]:
     """The best shift and the best clock of each channel, best first, three at most."""
     best: dict[tuple[str, str], Trial] = {}
     for trial in sorted(trials, key=lambda t: t[0]):
@@ -188,14 +184,7 @@ def _refined(
     basis = nominal_directions(original, fitted)
 
     def left(value: float) -> float:
-        parts = []
-        for r, state in zip(original.recordings, fitted.initial, strict=True):
-            other: Recording = make(value)(r)
-            y = fitted.engine.simulate(fitted.model.drive(other), fitted.vector, state)[0]
-            parts.append(((y - other.y) / now.scale)[r.skip :].ravel())
-        error = np.concatenate(parts)
-        rest = error - basis @ (basis.T @ error)
-        return float(rest @ rest)
+        return _remainder(original, fitted, basis, make(value), True)
 
     return _narrowed(left, at - width, at + width)[0]
 

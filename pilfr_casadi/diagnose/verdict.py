@@ -49,9 +49,12 @@ FLEXIBLE: dict[str, float] = {
 }
 # a law -> what it has as special cases: it always does as well, and is no rival of theirs
 CONTAINS = {
-    "hysteresis": ("backlash", "coulomb_friction"),
+    "hysteresis": ("backlash", "coulomb_friction", "linear_stiffness"),
     "stribeck_friction": ("coulomb_friction",),
-    "clearance": ("piecewise_stiffness",),  # one side of which is never touched
+    "clearance": ("piecewise_stiffness", "linear_stiffness"),  # one side of which is never touched; no gap
+    "piecewise_stiffness": ("linear_stiffness",),
+    "creep": ("linear_stiffness", "viscous_damping"),  # that takes longer than the record, or no time
+    "extra_mode": ("linear_stiffness", "viscous_damping"),  # above every frequency that is seen
 }
 # a law and one that it can imitate by its freedom alone -> how much nearer it has to come above the floor
 IMITATES = {
@@ -148,17 +151,18 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     before = float(np.sqrt(np.sqrt(without[0] * without[1])))
     gain = n * (np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
     first = {c.name: c for c in reversed(ranked) if c.name != winner.name}  # the best of each name
-    alike = [c for c in ranked if c is first.get(c.name) and _near(c, winner) and c.size <= winner.size]
-    ports, margin = {winner.port, *(c.port for c in alike)}, np.inf
+    no_larger = [c for c in reversed(ranked) if c.name in first and _near(c, winner) and c.size <= winner.size]
+    alike = {c.name: c for c in no_larger}
+    ports, margin = {winner.port, *(port for port, _ in alike)}, np.inf
     for c in first.values():
         ratio = c.error / winner.error
         contains = winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > 1 - LIKE
-        if c in alike or (c.port in ports and (_near(c, winner) or contains)):
+        if c.name in alike or (c.port in ports and (_near(c, winner) or contains)):
             continue  # a refinement of the winner, or of what cannot be told from it, is no rival
         else:
-            margin = min(margin, max(ratio, excess(c) / excess(winner)))
+            margin = min(margin, max(ratio, float(np.exp(key(c) - key(winner)))))
     remains = (winner.error**2 - floor) / max(before**2 - floor, 1e-300)
-    return Choice(winner, tuple(alike), float(gain), float(np.clip(remains, 0, 1)), float(margin))
+    return Choice(winner, tuple(alike.values())[::-1], float(gain), float(np.clip(remains, 0, 1)), float(margin))
 
 
 def left_open(search: Search) -> tuple[float, float]:
@@ -192,7 +196,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     cured = min((g.left for g in faults), default=1.0) < CURES
     if cured and search.without.cost < HALVED**2 * search.base.cost:  # next to the fault an effect is nothing
         return "recording-fault", faults[0].sentence
-    if accepted and _explains(accepted, remains, still):
+    if accepted and explains(accepted, remains, still):
         words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
         sure = min(confidence(c, search) for c in accepted) > UNSURE
         return "missing-physics", (
@@ -228,7 +232,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     )
 
 
-def _explains(accepted: Sequence[Choice], remains: float, still: float) -> bool:
+def explains(accepted: Sequence[Choice], remains: float, still: float) -> bool:
     """Whether what is named leaves little, or nothing that a force explains."""
     margin = min(c.margin for c in accepted)
     most = PARTLY if margin > CLEAR else LITTLE
@@ -260,10 +264,7 @@ def strained(fitted: Fitted) -> bool:
     """Whether one of the simulator's own free parameters stands at a bound other than zero."""
     prefixes = tuple(e.prefix for e in fitted.simulator.elements)
     for name, p in fitted.simulator.parameters.items():
-        if name.startswith(prefixes):
-            continue
-        value = np.asarray(fitted.values.get(name, p.value))
-        held = ((value <= p.bounds[0]) | (value >= p.bounds[1])) & (value != 0)
-        if np.any(held & ~p.fixed):
+        own = not name.startswith(prefixes)
+        if own and np.any(fitted.at_bound(name) & (fitted.values[name] != 0) & ~p.fixed):
             return True
     return False

@@ -20,6 +20,7 @@ from ..sensitivities import Engine
 from ..simulator import Simulator
 from ..substeps import MOST, REACH, choose_substeps, fastest, wanted_substeps
 from ..threads import one_at_a_time
+from .arranged import arranged
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 HUGE, ENDLESS = 1e6, 1e20  # times the largest measured value, and mean square error, of what grows without end
@@ -61,6 +62,11 @@ class Fitted:
         """Share of the free parameters that came out at a bound."""
         p, at = self.model.parameters, self.vector
         return float(np.mean(((at <= p.lower) | (at >= p.upper))[p.free])) if np.any(p.free) else 0.0
+
+    def at_bound(self, name: str) -> np.ndarray:
+        """Which entries of a parameter came out at one of its bounds."""
+        (low, high), value = self.model.parameters[name].bounds, self.values[name]
+        return np.asarray((value <= low) | (value >= high))
 
     @property
     def begin(self) -> list[np.ndarray]:
@@ -177,10 +183,7 @@ class Workbench:
 
     def _lost(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
         """Where a run from rest leaves every bound, in words."""
-        parameters = model.parameters
-        vector = np.clip(
-            parameters.pack({k: v for k, v in start.items() if k in parameters}), parameters.lower, parameters.upper
-        )
+        vector = started(model, start)
         for r in self.recordings:
             with np.errstate(all="ignore"):
                 y = engine.simulate(model.drive(r), vector, np.zeros(model.n_state))[0]
@@ -211,8 +214,7 @@ class Workbench:
         solver: GaussNewton,
     ) -> tuple[float, np.ndarray, Problem] | None:
         parameters = model.parameters
-        known = {k: v for k, v in start.items() if k in parameters}
-        vector = np.clip(parameters.pack(known), parameters.lower, parameters.upper)
+        vector = started(model, start)
         states = self._unknown(guess, model.n_state) if len(guess) else None
         problem: Problem | None = None
         for gamma in (*path, 0.0):
@@ -268,31 +270,7 @@ class Workbench:
         return Fitted(simulator, model, engine, values, initial, residual, cost)
 
 
-def arranged(simulator: Simulator, recording: Recording) -> Recording:
-    """A recording with its columns in the simulator's order.
-
-    Raises
-    ------
-    InputError
-        If a column is missing.
-    """
-    changes: dict[str, Any] = {}
-    for names, own, letter in (
-        (simulator.inputs, recording.inputs, "u"),
-        (simulator.output_names, recording.outputs, "y"),
-    ):
-        kind = {"u": "input", "y": "output"}[letter]
-        for name in names:
-            if name not in own:
-                raise InputError(
-                    f"The recording {recording.label} has no {kind} {name!r}, which the simulator has; "
-                    f"it has {', '.join(own) or 'none'}. Map a column to it by name."
-                )
-        if tuple(own) != tuple(names):
-            order = [own.index(name) for name in names]
-            values = getattr(recording, letter)[:, order]
-            changes |= {letter: values, f"{kind}s": tuple(names)}
-    if changes:
-        kept = {*changes.get("inputs", recording.inputs), *changes.get("outputs", recording.outputs)}
-        changes["units"] = {k: v for k, v in recording.units.items() if k in kept}
-    return recording.with_(**changes) if changes else recording
+def started(model: Model, start: Mapping[str, Any]) -> np.ndarray:
+    """Parameter vector at start values by name, inside the bounds; what the model does not know is left out."""
+    p = model.parameters
+    return np.asarray(np.clip(p.pack({k: v for k, v in start.items() if k in p}), p.lower, p.upper))

@@ -6,8 +6,10 @@ import json
 import math
 import os
 import sys
+import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from .files import path_text, short
 from .saving import FORMAT, VERSION
 
 WITHOUT_DIGEST = 1  # the version of the format that had none
+Built = TypeVar("Built")
 LARGEST = 200_000_000  # bytes; a model with 500 states takes 20 million
 
 
@@ -41,6 +44,12 @@ class ModelFile:
                 "was changed after it was written (its content does not have the SHA-256 that it was written with); "
                 "restore it, or save the model again"
             )
+        if said is None:
+            warnings.warn(
+                f"The file {short(self.path)} carries no digest (it has version {version} of the model format), so "
+                "changes made to it after it was written cannot be noticed; save the model again to give it one.",
+                stacklevel=3,
+            )
         self.content: dict[str, Any] = content
 
     def fail(self, what: str) -> NoReturn:
@@ -52,6 +61,13 @@ class ModelFile:
         if self.given:
             self.fail(f"does not fit the model given: {what}; give the model it was saved from")
         self.fail(f"is damaged: {what}; save the model again")
+
+    def build(self, make: Callable[..., Built], *parts: Any) -> Built:
+        """What is made of checked parts of the file; where they do not go together, the file is damaged."""
+        try:
+            return make(*parts)
+        except InputError as error:
+            self.damaged(str(error).rstrip("."))
 
     def _parse(self) -> Any:
         try:

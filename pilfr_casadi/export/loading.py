@@ -18,7 +18,6 @@ import numpy as np
 from ..lfr import PILFR, block_shapes
 from ..limits import Limit
 from ..model import Model
-from ..recording import InputError
 from ..solution import Iteration, Solution, Status
 from .checked_json import ModelFile
 from .loading_elements import element_of
@@ -51,6 +50,11 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     InputError
         If the file is missing, unreadable, damaged, of another kind or version, was changed after it was written, does
         not fit `model`, or holds values that are missing, not finite, or outside their bounds.
+
+    Warns
+    -----
+    UserWarning
+        If the file is of the first version of the format, which has no digest to tell changes by.
     """
     from ..fit import Fit
 
@@ -194,12 +198,8 @@ def _structure(file: ModelFile, n_u: int, n_y: int) -> PILFR:
                 file.damaged(f"the {key} of {name!r} are not a pair")
             low, high = (file.array(v, None, f"the {key} of {name!r}", end) for v, end in zip(pair, ends, strict=True))
             pairs[key][name] = (low, high)
-    try:
-        return PILFR(
-            nx, element, fixed, pairs["bounds"], pairs["priors"], file.entry(table, "offset", bool, "true or false")
-        )
-    except InputError as error:
-        file.damaged(str(error).rstrip("."))
+    offset = file.entry(table, "offset", bool, "true or false")
+    return file.build(PILFR, nx, element, fixed, pairs["bounds"], pairs["priors"], offset)
 
 
 def _with_values(file: ModelFile, model: Model, structure: PILFR | None) -> Model:

@@ -11,7 +11,6 @@ from ..elements import Element, PrandtlIshlinskii, StaticNetwork
 from ..envelope import Envelope
 from ..operators import GeneralizedPlay, Play, Stop
 from ..products import Products
-from ..recording import InputError
 from .checked_json import ModelFile
 
 OPERATORS = {"play": Play, "stop": Stop, "generalized_play": GeneralizedPlay}
@@ -30,10 +29,7 @@ def element_of(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, 
     }.get(kind)
     if build is None:
         file.fail(f"has the element {kind[:40]!r}, which a file cannot hold; give the model as `model=`")
-    try:
-        return build(file, table, parameters, prefix)
-    except InputError as error:
-        file.damaged(str(error).rstrip("."))
+    return build(file, table, parameters, prefix)
 
 
 def _value(file: ModelFile, parameters: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> None:
@@ -57,21 +53,21 @@ def _layer(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, Any]
         neurons = file.count(table, "neurons")
         for key in ("a", "b", "d"):
             _value(file, parameters, f"{prefix}gamma_l_{key}", (channels, neurons))
-        operator = GeneralizedPlay(neurons)
-    return PrandtlIshlinskii(operator, n, channels, file.entry(table, "rounded", bool, "true or false"))
+        operator = file.build(GeneralizedPlay, neurons)
+    return file.build(PrandtlIshlinskii, operator, n, channels, file.entry(table, "rounded", bool, "true or false"))
 
 
 def _network(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, Any], prefix: str) -> StaticNetwork:
     hidden, channels = file.count(table, "hidden"), file.count(table, "channels")
     for key in ("gain", "slope", "bias"):
         _value(file, parameters, prefix + key, (channels, hidden))
-    return StaticNetwork(hidden, channels)
+    return file.build(StaticNetwork, hidden, channels)
 
 
 def _envelope(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, Any], prefix: str) -> Envelope:
     channels = file.count(table, "channels")
     _value(file, parameters, f"{prefix}knee", (channels,))
-    return Envelope(channels)
+    return file.build(Envelope, channels)
 
 
 def _products(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, Any], prefix: str) -> Products:
@@ -80,7 +76,7 @@ def _products(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, A
     _value(file, parameters, f"{prefix}reach", (channels,))
     terms = sum(comb(channels + d - 1, d) for d in set(degrees) if d <= PARTS)
     _value(file, parameters, f"{prefix}gain", (channels, terms))
-    return Products(channels, degrees)
+    return file.build(Products, channels, degrees)
 
 
 def _combined(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, Any], prefix: str) -> Combined:
@@ -92,5 +88,5 @@ def _combined(file: ModelFile, table: dict[str, Any], parameters: Mapping[str, A
         name = file.text(row, "name")
         element = element_of(file, file.table(row, "element"), parameters, f"{name}_")
         reads, writes = (tuple(file.count({key: c}, key) for c in file.rows(row, key)) for key in ("reads", "writes"))
-        parts.append(Part(name, element, reads, writes))
-    return Combined(tuple(parts), file.count(table, "channels"))
+        parts.append(file.build(Part, name, element, reads, writes))
+    return file.build(Combined, tuple(parts), file.count(table, "channels"))

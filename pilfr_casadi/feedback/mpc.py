@@ -200,8 +200,11 @@ class PredictiveController:
             u, y = trial, output
             if converged:  # no kink in between, or next to nothing gained
                 break
-        over = np.max(np.maximum(0, np.maximum(self.low_y - y, y - self.high_y)), initial=0.0)
-        return u, y, float(over), bool(converged)
+        return u, y, self._over(y), bool(converged)
+
+    def _over(self, y: Array) -> float:
+        """How far the outputs are beyond their limits at most."""
+        return float(np.max(np.maximum(0, np.maximum(self.low_y - y, y - self.high_y)), initial=0.0))
 
     def _qp_step(
         self, u: Array, y: Array, jac: Array, wanted: Array, before: Array, moved: Array, rate: Array
@@ -280,5 +283,4 @@ class PredictiveController:
         found = np.asarray(out["x"]).ravel()
         u = np.clip(found[len(states) : -1], self.low, self.high)
         y = np.asarray(self._simulate(x, u.reshape(m, n_u).T)[1]).ravel(order="F")
-        over = np.max(np.maximum(0, np.maximum(self.low_y - y, y - self.high_y)), initial=0.0)
-        return u, y, float(over), bool(self._nlp.stats()["success"])
+        return u, y, self._over(y), bool(self._nlp.stats()["success"])

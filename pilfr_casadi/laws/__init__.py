@@ -23,11 +23,14 @@ from .friction import (
     AsymmetricFriction,
     CoulombFriction,
     CubicDamping,
+    DirectionalDamping,
+    DirectionalDrag,
     DirectionalFriction,
     PreslidingFriction,
     PreslidingStribeckFriction,
     QuadraticDrag,
     StribeckFriction,
+    ViscousDamping,
 )
 from .hysteresis import Backlash, BoucWen, BoucWenActuator, GeneralizedHysteresis, PlayHysteresis, StopHysteresis
 from .limits import (
@@ -45,6 +48,7 @@ from .stiffness import (
     GeometricStiffness,
     HarmonicForce,
     HertzContact,
+    LinearStiffness,
     OffCentreClearance,
     PeriodicForce,
     PiecewiseStiffness,
@@ -57,6 +61,7 @@ from .stiffness import (
 )
 
 CATALOGUE: tuple[type[Law], ...] = (
+    LinearStiffness,
     CubicStiffness,
     PowerStiffness,
     GeometricStiffness,
@@ -75,7 +80,10 @@ CATALOGUE: tuple[type[Law], ...] = (
     PreslidingFriction,
     StribeckFriction,
     PreslidingStribeckFriction,
+    ViscousDamping,
+    DirectionalDamping,
     QuadraticDrag,
+    DirectionalDrag,
     CubicDamping,
     StopHysteresis,
     PlayHysteresis,

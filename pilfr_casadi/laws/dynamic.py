@@ -214,18 +214,27 @@ class Mode(Resonance):
 
 
 class Attached(Resonance):
-    """A small mass on a spring, carried along (a tuned absorber, a loose part)."""
+    """A small mass on a spring and a damper, carried along (a tuned absorber, a loose part)."""
 
     form = "attached mass"
-    equation = "w = k_a (z - q_1),  d2q_1/dt2 = W^2 (z - q_1) - 2 D W dq_1/dt"
+    equation = "w = k_a (z - q) + 2 D k_a / W (dz/dt - dq/dt),  d2q/dt2 = W^2 w / k_a"
     source = "Den Hartog (1956), Mechanical Vibrations, sec. 3.2"
     sentence = "an unmodelled mode: a part on a spring of its own that is carried along"
     units: ClassVar[Mapping[str, str]] = {"k_a": "w/z", "W": "rad/s", "D": ""}
     strength: ClassVar[tuple[str, ...]] = ("k_a",)
     places: ClassVar[tuple[str, ...]] = ("parallel",)
 
-    def force(self, z: Any, q: Any, p: Any) -> Any:
-        return p.k_a * (z - q[0])
+    def force(self, z: Any, dz: Any, q: Any, p: Any) -> Any:  # type: ignore[override]
+        return p.k_a * _pull(z, dz, q, p)
+
+    def flow(self, z: Any, dz: Any, q: Any, p: Any) -> Any:  # type: ignore[override]
+        """Its travel and its speed over W."""
+        return ca.vertcat(p.W * q[1], p.W * _pull(z, dz, q, p))
+
+
+def _pull(z: Any, dz: Any, q: Any, p: Any) -> Any:
+    """What spring and damper pull with, over the spring's stiffness."""
+    return z - q[0] + 2 * p.D * (dz / p.W - q[1])
 
 
 class Drift(Law):

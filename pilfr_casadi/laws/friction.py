@@ -132,6 +132,36 @@ class PreslidingStribeckFriction(PreslidingFriction):
         return {**super().bounds(local), "v_s": (4e-3 * local.speed, 0.8 * local.speed)}
 
 
+class ViscousDamping(Law):
+    """A damper where the simulator has none."""
+
+    id = "viscous_damping"
+    equation = "w = c_1 dz/dt"
+    source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
+    sentence = "a viscous damper: a force in proportion to speed"
+    units: ClassVar[Mapping[str, str]] = {"c_1": "w*s/z"}
+    strength: ClassVar[tuple[str, ...]] = ("c_1",)
+    dissipative = True
+
+    def force(self, dz: Any, p: Any) -> Any:
+        return p.c_1 * dz
+
+
+class DirectionalDamping(ViscousDamping):
+    """A damper that differs between the two directions, such as a shock absorber (Dixon 2007)."""
+
+    form = "directional"
+    equation = "w = c_1 dz/dt + c_0 |dz/dt|"
+    source = "Dixon (2007), The Shock Absorber Handbook, ch. 6"
+    sentence = "viscous damping that differs between the two directions"
+    units: ClassVar[Mapping[str, str]] = {"c_1": "w*s/z", "c_0": "w*s/z"}
+    strength: ClassVar[tuple[str, ...]] = ("c_1", "c_0")
+    signed: ClassVar[tuple[str, ...]] = ("c_0",)
+
+    def force(self, dz: Any, p: Any) -> Any:
+        return p.c_1 * dz + p.c_0 * ca.fabs(dz)
+
+
 class QuadraticDrag(Law):
     """Drag of turbulent flow (White 2011)."""
 
@@ -145,6 +175,20 @@ class QuadraticDrag(Law):
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.c_2 * dz * ca.fabs(dz)
+
+
+class DirectionalDrag(QuadraticDrag):
+    """Drag that differs between the two directions, such as of an orifice with a sharp and a round edge."""
+
+    form = "directional"
+    equation = "w = c_2 dz/dt |dz/dt| + c_0 (dz/dt)^2"
+    sentence = "a drag that grows with the square of speed and differs between the two directions"
+    units: ClassVar[Mapping[str, str]] = {"c_2": "w*s^2/z^2", "c_0": "w*s^2/z^2"}
+    strength: ClassVar[tuple[str, ...]] = ("c_2", "c_0")
+    signed: ClassVar[tuple[str, ...]] = ("c_0",)
+
+    def force(self, dz: Any, p: Any) -> Any:
+        return p.c_2 * dz * ca.fabs(dz) + p.c_0 * dz**2
 
 
 class CubicDamping(Law):

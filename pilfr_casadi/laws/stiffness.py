@@ -22,6 +22,23 @@ def hardest(local: Local) -> tuple[float, float]:
     return -k, k
 
 
+class LinearStiffness(Law):
+    """A spring, or a leak, where the simulator has none; a negative one is a magnet or a load that tips over."""
+
+    id = "linear_stiffness"
+    equation = "w = k_1 z"
+    source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
+    sentence = "a spring (or a leak): a force in proportion to the deflection"
+    units: ClassVar[Mapping[str, str]] = {"k_1": "w/z"}
+    strength: ClassVar[tuple[str, ...]] = ("k_1",)
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.k_1 * z
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"k_1": (-local.stiffest, local.stiffest)}
+
+
 class CubicStiffness(Law):
     """Hardening (k_3 > 0) or softening spring (Duffing 1918)."""
 

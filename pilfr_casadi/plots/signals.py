@@ -48,10 +48,7 @@ def time(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = N
     for label, residual, colour in _residuals(fit, recording, output):
         drawn, note = _moved(drawable(residual, np.ptp(y)), np.ptp(y), plain_unit)
         line(ax, t, drawn / size, label + note, colour, linewidth=1.1)
-    if recording.skip:
-        ax.axvspan(0, recording.skip * recording.dt, color="#EEEEEE", label="not scored")
-    ax.margins(x=0.01)
-    return finish(ax, "time [s]", with_unit(recording.outputs[output], unit), recording.name)
+    return _over_time(ax, recording, with_unit(recording.outputs[output], unit))
 
 
 def traces(
@@ -109,10 +106,7 @@ def remains(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None 
         INK,
         linewidth=0.8,
     )
-    if recording.skip:
-        ax.axvspan(0, recording.skip * recording.dt, color="#EEEEEE", label="not scored")
-    ax.margins(x=0.01)
-    return finish(ax, "time [s]", with_unit(f"simulated − measured {recording.outputs[output]}", unit), recording.name)
+    return _over_time(ax, recording, with_unit(f"simulated − measured {recording.outputs[output]}", unit))
 
 
 def output_over_input(
@@ -234,6 +228,14 @@ def as_scored(fit: Fit, recording: Recording) -> Recording:
         return recording.with_(skip=fit.scored_from(recording))
     except InputError:  # it is no longer than that
         return recording
+
+
+def _over_time(ax: Axes, recording: Recording, label: str) -> Axes:
+    """Finish a picture over time; what is not scored is grey."""
+    if recording.skip:
+        ax.axvspan(0, recording.skip * recording.dt, color="#EEEEEE", label="not scored")
+    ax.margins(x=0.01)
+    return finish(ax, "time [s]", label, recording.name)
 
 
 def _level(y: np.ndarray) -> float:

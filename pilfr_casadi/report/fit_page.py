@@ -1,6 +1,6 @@
 """The page of a fit: how good it is on what data, the hysteresis it found, its modes and parameters, and how to use it.
 
-Errors are those of Krikelis et al. (2024), Eq. 27; the figures are its Fig. 8-11 and 15.
+Errors are those of Krikelis et al. (2024), Eq. 27.
 """
 
 from __future__ import annotations
@@ -11,17 +11,15 @@ from typing import Any
 import numpy as np
 
 from .. import plots
-from ..bla import robust_bla
 from ..elements import StaticNetwork
 from ..fit import Fit
-from ..local_polynomial import plain_bla
 from ..metrics import rmse_per_output
-from ..recording import InputError, Recording, as_recordings
-from .fit_tables import limit_blocks, mode_tables, parameter_blocks, usage
+from ..recording import Recording, as_recordings
+from .fit_pictures import curve, hysteresis, linear_part, output_pictures
+from .fit_tables import limit_blocks, parameter_blocks, usage
 from .page import Block, Code, Page, Picture, Section, Table, Text
 
 RUNAWAY = 1e3  # NRMSE beyond which a simulation is not called a simulation
-MOST = 4  # outputs drawn of each recording; tables have them all
 
 
 def fit_page(
@@ -38,10 +36,10 @@ def fit_page(
     rows = [row for recording, role in named for row in _errors(fit, recording, role)]
     shown = [recording for recording, role in named if role == "test"] or [named[0][0]]
     sections = [
-        Section("How well it fits", [Text(_verdict(rows)), _error_table(rows), *_pictures(fit, shown)]),
-        *([Section("The hysteresis it found", _hysteresis(fit, shown))] if fit.model.n_s else []),
-        *([Section("The curve it found", _curve(fit, shown[0]))] if fit.model.n_w == 1 and not fit.model.n_s else []),
-        Section("The linear part", _linear(fit, used)),
+        Section("How well it fits", [Text(_verdict(rows)), _error_table(rows), *output_pictures(fit, shown)]),
+        *([Section("The hysteresis it found", hysteresis(fit, shown))] if fit.model.n_s else []),
+        *([Section("The curve it found", curve(fit, shown[0]))] if fit.model.n_w == 1 and not fit.model.n_s else []),
+        Section("The linear part", linear_part(fit, used)),
         Section("What holds it", limit_blocks(fit)),
         Section("How it was found", _search(fit)),
         Section("Parameters", parameter_blocks(fit)),
@@ -178,123 +176,6 @@ def _subtitle(fit: Fit) -> str:
     elif element is not None:
         parts.append(type(element).__name__)
     return ", ".join([*parts, f"step {fit.dt:.4g} s ({1 / fit.dt:.4g} Hz)"])
-
-
-def _pictures(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
-    out: list[Block] = []
-    for r in recordings:
-        for i in range(min(r.n_y, MOST)):
-            out += _pictures_of(fit, r, i)
-        if r.n_y > MOST:
-            out.append(Text(f"The first {MOST} of {r.n_y} outputs are drawn; the table has them all."))
-    return out
-
-
-def _pictures_of(fit: Fit, r: Recording, i: int) -> list[Block]:
-    """The pictures of one output; a quasi-static device is drawn over its input, any other over time."""
-    name = f"{r.outputs[i]} in {r.name}"
-    likeness = [abs(np.corrcoef(u, r.y[:, i])[0, 1]) if np.ptp(u) > 0 else 0.0 for u in r.u.T]
-    j = int(np.argmax(likeness))
-    if likeness[j] > 0.9:
-        whole = Picture(
-            plots.output_over_input(fit, r, input=j, output=i).figure,
-            f"{name}, over {r.inputs[j]}.",
-            f"Measured and simulated {name} over {r.inputs[j]}.",
-        )
-    else:
-        whole = Picture(
-            plots.time(fit, r, output=i).figure,
-            f"{name}: the whole recording, and what the models leave over.",
-            f"Output and residuals of {name} over time.",
-        )
-    return [
-        Picture(
-            plots.traces(fit, r, output=i).figure,
-            f"{name}, measured and simulated, around the largest excursion.",
-            f"Simulated over measured {name}.",
-        ),
-        whole,
-        Picture(
-            plots.remains(fit, r, output=i).figure,
-            f"{name}: what this model leaves over, enlarged.",
-            f"Residual of {name} over time.",
-        ),
-        Picture(
-            plots.spectrum(fit, r, output=i).figure,
-            f"{name}: output and residuals over frequency.",
-            f"Amplitude densities of output and residuals of {name}.",
-        ),
-    ]
-
-
-def _curve(fit: Fit, recording: Recording) -> list[Block]:
-    drawn = plots.loop(fit, recording).figure
-    return [Picture(drawn, "The element has no memory: w is a curve over z.", "Curve of the element, w over z.")]
-
-
-def _hysteresis(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
-    intro = (
-        "The element turns its local input z into w. Its scale is free (the linear part takes it up), "
-        "so its shape counts, not its size."
-    )
-    out: list[Block] = [Text(intro)]
-    for c in range(fit.model.n_w):
-        of = f" of channel {c + 1}" if fit.model.n_w > 1 else ""
-        out.append(
-            Picture(
-                plots.loop(fit, recordings[0], channel=c).figure,
-                f"The identified loop{of}: w over z.",
-                f"Hysteresis loop{of}, w over z.",
-            )
-        )
-        out.append(
-            Picture(
-                plots.loading_curve(fit, recordings, channel=c).figure,
-                f"Loading curve{of}: w while z grows from rest.",
-                f"Loading curve{of}.",
-            )
-        )
-        out.insert(
-            -1,
-            Picture(
-                plots.loop(fit, recordings[0], channel=c, bare=True).figure,
-                f"The same{of} without its mean slope: the hysteresis alone.",
-                f"Hysteresis loop{of} without its slope.",
-            ),
-        )
-        if {"r", "w"} <= set(fit.parameters):
-            out.append(
-                Picture(
-                    plots.weights(fit, recordings, channel=c).figure,
-                    f"Weights of the operators{of} over their thresholds, with standard errors where known.",
-                    f"Weights{of} over thresholds.",
-                )
-            )
-    return out
-
-
-def _linear(fit: Fit, train: Sequence[Recording]) -> list[Block]:
-    out = mode_tables(fit)
-    linear = fit.linear if fit.linear is not None else fit.model if fit.model.element is None else None
-    if linear is None or "A" not in linear.parameters:
-        return out
-    try:
-        periodic = all(r.period for r in train)
-        bla = robust_bla(train) if periodic else plain_bla(train)
-    except InputError:
-        return out
-    for i in range(min(bla.n_y, 2)):
-        for j in range(min(bla.n_u, 2)):
-            if bla.var_total is not None and np.mean(bla.var_total[:, i, j] < np.abs(bla.G[:, i, j]) ** 2) < 0.5:
-                continue  # the training data excites too few frequencies for this one
-            units = [fit.units.get(n, "") for n in (fit.model.outputs[i], fit.model.inputs[j])]
-            figure = plots.best_linear_approximation(
-                bla, linear, output=i, input=j, unit="/".join(units) if all(units) else ""
-            ).figure
-            of = f"{fit.model.outputs[i]} over {fit.model.inputs[j]}"
-            caption = f"Best linear approximation of {of} in the training data, and the linear model of the start."
-            out.append(Picture(figure, caption, f"Frequency response, {of}."))
-    return out
 
 
 def _search(fit: Fit) -> list[Block]:

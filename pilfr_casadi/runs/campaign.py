@@ -14,13 +14,12 @@ from typing import Any
 
 from ..elements import PrandtlIshlinskii
 from ..hand import close_hands
+from ..interrupts import Progress
 from ..recording import InputError
 from .described import Run, read_run
 from .execute import RunResult, carried_out
-from .jobs import Recordings, RunJob, attempt
-from .side_by_side import AHEAD, Batch, Sent, side_by_side
-
-Progress = Callable[[str, int, int, float], None]
+from .jobs import Batch, Recordings, RunJob, attempt
+from .side_by_side import AHEAD, Sent, side_by_side
 
 
 def campaign(

@@ -19,6 +19,8 @@ from .execute import ConstraintsNotMet, RunInterrupted, RunResult, run
 from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own
 from .side_by_side import AHEAD
 
+WIDE = 10_000  # characters: a number that is cut off is a wrong number, so lines are as long as they have to be
+
 
 def run_command(options: argparse.Namespace) -> int:
     """Execute a run file; returns the exit status: 1 where no job meets its constraints or explains anything."""
@@ -98,7 +100,7 @@ def _print_summary(result: RunResult) -> None:
         cell = [str(s.cell[k]) for k in keys]
         counts = [str(s.jobs), f"{100 * s.failure_rate:.0f} %"]
         table.add_row(f"{s.recording} ({s.role})", *cell, *counts, *quartiles, f"{s.seconds:.1f}")
-    Console(highlight=False).print(table)
+    Console(highlight=False, width=WIDE).print(table)
     if result.selection is not None:
         print(result.selection)
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..export import load, made
 from ..fitted import Fit
-from ..interrupts import deferred_interrupt
+from ..interrupts import Progress, deferred_interrupt
 from ..model import Model
 from ..readers import read
 from ..recording import InputError, Recording
@@ -28,16 +28,15 @@ from ..solution import Status
 from .described import ROLES, Run, read_run
 from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own, read_times, sweep
 from .folds import fold
-from .jobs import Outcome, Recordings, RunJob, input_digests, jobs_of, outcome
+from .jobs import Batch, Recordings, RunJob, input_digests, jobs_of, outcome
 from .manifest import alone, digest
 from .results import Score, chosen, table
 from .selection import Selection, select
 from .store import Store
 from .summary import CellSummary, box_plots, summarised, summary_table
 
-Progress = Callable[[str, int, int, float], None]
 Tell = Callable[[str], None]
-Perform = Callable[[Run, Recordings, Sequence[RunJob]], Iterator[list[tuple[RunJob, Outcome]]]]
+Perform = Callable[[Run, Recordings, Sequence[RunJob]], Iterator[Batch]]
 
 
 class RunInterrupted(KeyboardInterrupt):
@@ -134,7 +133,7 @@ def run(
     given = path if isinstance(path, Run) else read_run(path)
     given = given if engine is None else replace(given, engine=engine)
 
-    def in_turn(given: Run, recordings: Recordings, jobs: Sequence[RunJob]) -> Iterator[list[tuple[RunJob, Outcome]]]:
+    def in_turn(given: Run, recordings: Recordings, jobs: Sequence[RunJob]) -> Iterator[Batch]:
         for job in jobs:
             yield [(job, outcome(given, recordings, job, executor=executor, progress=progress))]
 

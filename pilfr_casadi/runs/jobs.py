@@ -7,7 +7,7 @@ job whose key is known and whose model is there has been done.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 from ..export.saving import model_text
 from ..fit import fit as identify
 from ..fitted import Fit
+from ..interrupts import Progress
 from ..model import Model
 from ..recording import InputError, Recording
 from ..solution import Solution, Status
@@ -64,6 +65,9 @@ class Outcome:
     errors: Mapping[str, float | None] = field(default_factory=dict)
 
 
+Batch = list[tuple[RunJob, Outcome]]  # jobs that ended together
+
+
 def input_digests(run: Run) -> dict[str, str]:
     """SHA-256 of every recording by its name in the run file."""
     return {name: file_digest(run.located(name)) for names in run.files.values() for name in names}
@@ -105,7 +109,7 @@ def outcome(
     job: RunJob,
     *,
     executor: Executor | None = None,
-    progress: Callable[[str, int, int, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Outcome:
     """Do a job: identify its model and judge it.
 
@@ -116,7 +120,7 @@ def outcome(
     KeyboardInterrupt
         On Ctrl-C.
     """
-    fit = timeless(found := execute(run, job, recordings, executor=executor, progress=progress))
+    fit = timeless(found := _identified(run, recordings, job, executor, progress))
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     missed = [str(limit) for limit in fit.limits if not limit.met]
@@ -160,21 +164,10 @@ def error_of(fit: Fit, recording: Recording) -> float | None:
     return error if np.isfinite(error) else None
 
 
-def execute(
-    run: Run,
-    job: RunJob,
-    recordings: Recordings,
-    *,
-    executor: Executor | None = None,
-    progress: Callable[[str, int, int, float], None] | None = None,
+def _identified(
+    run: Run, recordings: Recordings, job: RunJob, executor: Executor | None, progress: Progress | None
 ) -> Fit:
-    """Identify the model of a job: nothing but its training recordings and, for a path, the validation is looked at.
-
-    Returns
-    -------
-    Fit
-        Interrupted ones tell by their status.
-    """
+    """The model of a job: nothing but its training recordings and, for a path, the validation is looked at."""
     options: dict[str, Any] = {
         "solver": run.solver,
         "stable": run.stable,

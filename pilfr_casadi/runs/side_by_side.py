@@ -14,10 +14,9 @@ from typing import Any
 
 from ..hand import Reply, do
 from ..recording import InputError
-from .jobs import LOST, TIMED_OUT, Outcome, RunJob, attempt, unfinished
+from .jobs import LOST, TIMED_OUT, Batch, Outcome, RunJob, attempt, unfinished
 from .manifest import versions
 
-Batch = list[tuple[RunJob, Outcome]]
 AHEAD = 64  # jobs that an executor is given at a time
 
 

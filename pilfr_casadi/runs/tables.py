@@ -46,10 +46,8 @@ class Table:
         self.known.append(key)
         return self.content.pop(key, default)
 
-    def take(self, key: str, kind: type, default: Any = None, required: bool = False) -> Any:
+    def take(self, key: str, kind: type, default: Any = None) -> Any:
         """A value of one kind; whole numbers are numbers too."""
-        if key not in self.content and required:
-            self.fail(f"{self.where(key)} is missing; give {KINDS[kind]}")
         value = self.any(key, default)
         if value is default:
             return value

@@ -1,0 +1,206 @@
+"""Two effects looked for at once, where one after the other explains too little: each may hide the other.
+
+Every pair of laws at two ports is scored together along the refitted simulation. With orthonormal columns Q_a and Q_b
+of what small doses of the two change (`remainder`) and e' what is left of the error, the share that they explain is
+
+    |Q_aᵀ e'|² + rᵀ (I - W Wᵀ)⁻¹ r,    r = Q_bᵀ e' - W Q_aᵀ e',    W = Q_bᵀ Q_a
+
+The best pairs are fitted together; then each law of the best is put up against every other, the other one in place.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..compiled import make_engine
+from ..laws.trace import columns
+from ..threads import side_by_side
+from .candidate import Candidate, attempt
+from .explain import BRIEF, closed
+from .linearise import linearised
+from .remainder import Remainder, held_out, orthonormal
+from .screen import Scored, start_values
+from .verdict import FLEXIBLE, FORMS, explains, left_open
+from .workbench import Fitted
+
+if TYPE_CHECKING:
+    from .search import Pass, Search
+
+SHAPES = 5  # of each law at each port, the best alone
+PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each
+LOOKED_AT = 60  # pairs of laws whose share is cross-validated
+RIDGE = 1e-4
+WORTH = 0.8  # times the error so far that a pair has to come to
+ROUNDS = 3  # times that one law is put up against all others
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """A law of one shape at a port, and what it changes."""
+
+    scored: Scored
+    shape: dict[str, Any]
+    phi: np.ndarray
+    size: np.ndarray
+    sign: int
+
+    @property
+    def handicap(self) -> float:
+        law = self.scored.law
+        return FLEXIBLE.get(law.id, 1.0) * FORMS.get(law.form, 1.0)
+
+
+def _blocks(rest: Remainder) -> Iterator[_Block]:
+    for task in rest.tasks:
+        phi, size = rest.columns(task)
+        sign, at = int(rest.runs[0].sign[task.index]), 0
+        for law, shapes in task.pairs:
+            width, found = columns(law), []
+            for k, shape in enumerate(shapes):
+                own = slice(at + k * width, at + (k + 1) * width)
+                if np.any(phi[:, own]):
+                    share = float(np.sum((orthonormal(phi[:, own]).T @ rest.left) ** 2))
+                    found.append((share, shape, own))
+            at += width * len(shapes)
+            for share, shape, own in sorted(found, key=lambda f: -f[0])[:SHAPES]:
+                scored = Scored(task.port.name, law, share, (), task.local)
+                yield _Block(scored, shape, phi[:, own].copy(), size[own], sign)
+
+
+def shares(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
+    """Share of `left` that each two parts explain together, shape (n, n); parts are orthonormal columns."""
+    q, width = np.hstack(parts), [p.shape[1] for p in parts]
+    begin = np.cumsum([0, *width])
+    gram, right = q.T @ q, q.T @ left
+    together = np.zeros((len(parts), len(parts)))
+    of_width = {w: np.flatnonzero(np.equal(width, w)) for w in set(width)}
+    for i in range(len(parts)):
+        own = slice(begin[i], begin[i + 1])
+        rest = right - gram[:, own] @ right[own]
+        for w, which in of_width.items():
+            at = begin[which][:, None] + np.arange(w)
+            r, across = rest[at], gram[:, own][at]
+            inner = (1 + RIDGE) * np.eye(w) - across @ np.swapaxes(across, 1, 2)
+            gained = np.einsum("jk,jk->j", r, np.linalg.solve(inner, r[:, :, None])[:, :, 0])
+            together[i, which] = right[own] @ right[own] + gained
+    return np.asarray(together / max(float(left @ left), 1e-300))
+
+
+def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
+    """Pairs worth a fit, best first: a few of each of the best pairs of ports."""
+    blocks = list(_blocks(rest))
+    if len(blocks) < 2:
+        return []
+    left = 1 - shares([orthonormal(b.phi) for b in blocks], rest.left)
+    ports, factor = np.array([b.scored.port for b in blocks]), np.array([b.handicap for b in blocks])
+    worth = np.maximum(left, 0.0) * np.outer(factor, factor) ** 2
+    worth[ports[:, None] == ports] = np.inf
+    seen: dict[tuple[Any, ...], tuple[float, tuple[_Block, _Block]]] = {}
+    for flat in np.argsort(worth, axis=None):
+        i, j = np.unravel_index(flat, worth.shape)
+        if len(seen) >= LOOKED_AT or not np.isfinite(worth[i, j]):
+            break
+        pair = blocks[min(i, j)], blocks[max(i, j)]
+        key = tuple((b.scored.port, type(b.scored.law)) for b in pair)
+        if key not in seen and _opposes(pair, rest.left):
+            kept = 1 - held_out(np.hstack([b.phi for b in pair]), rest.left, rest.odd)
+            seen[key] = (kept * (pair[0].handicap * pair[1].handicap) ** 2, pair)
+    chosen: dict[tuple[str, str], list[tuple[_Block, _Block]]] = {}
+    for _, pair in sorted(seen.values(), key=lambda s: s[0]):
+        place = pair[0].scored.port, pair[1].scored.port
+        if (place in chosen or len(chosen) < PLACES) and len(chosen.setdefault(place, [])) < LAWS:
+            chosen[place].append(pair)
+    return [pair for pairs in chosen.values() for pair in pairs]
+
+
+def _strengths(pair: tuple[_Block, _Block], left: np.ndarray) -> list[np.ndarray]:
+    """Strengths of both laws that explain most together."""
+    phi = np.hstack([b.phi for b in pair])
+    found = -np.linalg.lstsq(phi, left, rcond=1e-8)[0] / np.concatenate([b.size for b in pair])
+    return np.split(found, [pair[0].phi.shape[1]])
+
+
+def _opposes(pair: tuple[_Block, _Block], left: np.ndarray) -> bool:
+    """Whether the laws that must oppose motion do."""
+    for block, found in zip(pair, _strengths(pair, left), strict=True):
+        law = block.scored.law
+        if law.dissipative and block.sign and len(found) == 1 and block.sign * found[0] < 0:
+            return False
+    return True
+
+
+def _fitted_together(search: Search, rest: Remainder, pair: tuple[_Block, _Block]) -> Candidate | None:
+    """A pair fitted from what the screen says of it, and the simulator's parameters as refitted and as given."""
+    simulator, named = search.without.simulator, dict[str, Any]()
+    for block, strength in zip(pair, _strengths(pair, rest.left), strict=True):
+        simulator, own = closed(
+            simulator, block.scored, start_values(block.scored.law, block.shape, strength), block.sign
+        )
+        named |= own
+    nominal = {k: p.value for k, p in search.without.simulator.parameters.items()}
+    starts = [{**search.without.values, **named}, {**nominal, **named}]
+    return attempt(search.bench, simulator, starts, states=search.without.begin, solver=BRIEF)
+
+
+def _beside(search: Search, joint: Fitted, kept: Any) -> Fitted:
+    """The simulator with one law of a pair, at the values that it has beside the other."""
+    simulator = search.bench.simulator.with_element(kept.port, kept.law)
+    model = search.bench.model(simulator)
+    known = {k: v for k, v in joint.values.items() if k in model.parameters}
+    initial = [np.append(state, np.zeros(model.n_state - len(state))) for state in joint.begin]
+    return search.bench.result(simulator, known, initial, make_engine(model, search.bench.engine), model)
+
+
+def two_at_once(search: Search) -> None:
+    """Look for two effects together; the search goes over to them where they explain what it has not."""
+    before = search.base, list(search.passes), search.open_after, search.floor
+    found = _two(search)
+    if found is None or not _better(search, found, before[0].cost):
+        search.base, search.passes, search.open_after, search.floor = before
+
+
+def _better(search: Search, found: tuple[Fitted, list[Pass]], cost: float) -> bool:
+    search.base, search.passes = found
+    search.open_after = search.flexible(search.base)
+    choices = [p.choice for p in search.passes if p.choice is not None]
+    return len(choices) == 2 and search.base.cost < WORTH**2 * cost and explains(choices, *left_open(search))
+
+
+def _two(search: Search) -> tuple[Fitted, list[Pass]] | None:
+    """Both laws fitted, and the pass that put each up against all others."""
+    began, bench = time.perf_counter(), search.bench
+    search.say("two at once", 0, 1, search.base.cost**0.5)
+    rest = Remainder.of(bench, *linearised(bench, search.without), search.laws)
+    pairs = promising(rest)
+    fits = side_by_side(lambda pair: _fitted_together(search, rest, pair), pairs, search.workers)
+    best = min((c for c in fits if c is not None), key=lambda c: c.error, default=None)
+    best = search.polished(best) if best is not None else None
+    search.timed("two at once", began)
+    if best is None or best.full > search.base.cost:
+        return None
+    joint, passes = best.fitted, dict[str, Any]()
+    elements = list(joint.simulator.elements[-2:])
+    for k in range(ROUNDS):
+        kept, other = elements
+        search.base = _beside(search, joint, kept)
+        step = search.pass_(1, search.screened())
+        if step.choice is None or not np.isfinite(step.choice.gain):
+            return None
+        winner = search.polished(step.choice.winner)
+        if winner is None:
+            return None
+        joint, new = winner.fitted, winner.fitted.simulator.elements[-1]
+        same = (new.port, type(new.law)) == (other.port, type(other.law))
+        step = replace(step, choice=replace(step.choice, winner=winner), accepted=True)
+        passes = {kept.port: passes.get(kept.port), new.port: step}
+        elements = [new, joint.simulator.elements[-2]]
+        if k and same:
+            break
+    steps = [p for p in passes.values() if p is not None]
+    # strongest first: the one without which the other is further off
+    return joint, sorted(steps, key=lambda p: -p.before[0])
