@@ -10,9 +10,9 @@ reported is its relative error, RMSE / std(y), averaged over outputs and periods
 where the mirror rests and creeps is not in them: the models have no offset (`y_0 = 0`), and what mean their own
 hysteresis makes counts as an error.
 
-What the combined model is made of was chosen on realization 4, fitted to 1 and 5: second envelopes and ways of their own
-for the input plays take 8 % off after as many iterations, stops beside the envelopes and a scale of the damping that is
-halved each step nothing; from 16 to 26 iterations the error falls by another 9 %.
+What the combined model is made of was chosen on realization 4, fitted to 1 and 5: second envelopes together with input
+plays that have ways of their own take 8 % off after as many iterations, stops beside the envelopes and a scale of the
+damping that is halved each step nothing; from 16 to 26 iterations the error falls by another 9 %.
 """
 
 from __future__ import annotations
