@@ -79,4 +79,4 @@ def test_a_parameter_at_its_bound_is_said():
     bound = {**tight.parameters, "k": Parameter(55.0, bounds=(54, 200))}
     u = levels(3)
     d = pilfr.diagnose(tight.with_parameters(bound), recorded(u, moved(u), 4), laws=())
-    assert "k came out at its bound (54)" in str(d)
+    assert "k (54) came out at its bound" in str(d)

@@ -58,8 +58,18 @@ class Candidate:
     @property
     def at_bound(self) -> bool:
         """Whether a parameter of the law is held back by one of its bounds."""
+        return any(np.any(self.fitted.at_bound(k)) for k in self._own)
+
+    @property
+    def held_back(self) -> bool:
+        """Whether an upper bound holds one back: at a lower one it is as sharp or as small as the data can tell."""
+        p, values = self.fitted.model.parameters, self.fitted.values
+        return any(np.any(values[k] >= p[k].bounds[1]) for k in self._own)
+
+    @property
+    def _own(self) -> list[str]:
         prefix = self.fitted.simulator.elements[-1].prefix
-        return any(np.any(self.fitted.at_bound(k)) for k in self.fitted.model.parameters if k.startswith(prefix))
+        return [k for k in self.fitted.model.parameters if k.startswith(prefix)]
 
 
 def heads(recordings: Sequence[Recording]) -> tuple[Recording, ...]:

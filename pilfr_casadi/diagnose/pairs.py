@@ -158,10 +158,13 @@ def _beside(search: Search, joint: Fitted, kept: Any) -> Fitted:
 
 def two_at_once(search: Search) -> None:
     """Look for two effects together; the search goes over to them where they explain what it has not."""
-    before = search.base, list(search.passes), search.open_after, search.floor
-    found = _two(search)
-    if found is None or not _better(search, found, before[0].cost):
-        search.base, search.passes, search.open_after, search.floor = before
+    before, better = (search.base, list(search.passes), search.open_after, search.floor), False
+    try:
+        found = _two(search)
+        better = found is not None and _better(search, found, before[0].cost)
+    finally:  # an interrupt leaves what there was
+        if not better:
+            search.base, search.passes, search.open_after, search.floor = before
 
 
 def _better(search: Search, found: tuple[Fitted, list[Pass]], cost: float) -> bool:

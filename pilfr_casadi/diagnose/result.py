@@ -125,13 +125,15 @@ class Diagnosis:
     def warnings(self) -> list[str]:
         """What makes the answer less certain than it looks: parameters at bounds, a test error far above training's."""
         out, own = [], self.corrected.parameters
-        for name in self.parameters:
-            value, (low, high) = np.asarray(own[name].value), own[name].bounds
-            if not own[name].fixed and np.any((value <= low) | (value >= high)):
-                out.append(
-                    f"{name} came out at its bound ({np.ravel(value)[0]:.4g}); "
-                    "widen it, or take it as a sign that more is missing."
-                )
+        ends = {k: (np.asarray(own[k].value), *own[k].bounds) for k in self.parameters if not own[k].fixed}
+        held = {k: np.ravel(v)[0] for k, (v, low, high) in ends.items() if np.any((v <= low) | (v >= high))}
+        if held:
+            names = ", ".join(f"{k} ({v:.4g})" for k, v in held.items())
+            one = len(held) == 1
+            out.append(
+                f"{names} came out at {'its bound' if one else 'their bounds'}; "
+                f"widen {'it' if one else 'them'}, or take it as a sign that more is missing."
+            )
         test, train = self.errors["test"], self.errors["train"]
         if test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"]):
             out.append(

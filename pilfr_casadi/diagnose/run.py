@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -131,7 +132,7 @@ def diagnose(
         sentence=sentence,
         effects=effects_found,
         candidates=tuple(_row(c, p) for p in search.passes for c in p.candidates),
-        gates=tuple(g for g in gates if _still(g, after, std)),
+        gates=tuple(_apparent(g, verdict) for g in gates if _still(g, after, std)),
         mismatch=mismatch(
             bench.recordings,
             without.residual,
@@ -205,6 +206,13 @@ def _still(gate: Gate, after: Fitted, std: dict[str, np.ndarray]) -> bool:
         return True
     value, error = float(after.values[gate.parameter]), float(std[gate.parameter])
     return abs(value) > 3 * error and abs(value) > 0.1 * abs(gate.value)
+
+
+def _apparent(gate: Gate, verdict: str) -> Gate:
+    """An offset beside a mismatch that stays unexplained may be a part of that."""
+    if gate.finding != "offset" or verdict != "unexplained":
+        return gate
+    return replace(gate, sentence=f"{gate.sentence} As long as the mismatch is unexplained, it may be a part of that.")
 
 
 def _next(search: Search, accepted: Sequence[Pass], limits: Mapping[str, float] | None) -> dict[str, Any] | None:

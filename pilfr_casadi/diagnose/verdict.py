@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .search import Search
     from .workbench import Fitted
 
-AT_FLOOR = 1.15  # times the floor that counts as being at it
+AT_FLOOR, WELL_ABOVE = 1.15, 3.0  # times the floor that counts as being at it, and as being far from it
 QUANTISED, SOMEWHAT, COLOURED = 2.0, 4.0, 9.0  # times a measured floor, and an estimated one, that noise may be
 LOUD, SILENT = 0.05, 0.01  # largest coloured noise, and what a force may explain of it
 QUIET, CHANCE = 0.01, 0.05  # the same for noise that nobody minds: by chance a force explains that much
@@ -32,6 +32,7 @@ LITTLE = 0.02  # of the excess left, with rivals near and a force that explains 
 MAINLY = 0.6  # of it explainable: whatever the rivals, the name is wrong or incomplete
 CLEAR = 1.5  # times the winner's error that every rival's is, for a name that only comes near to be given all the same
 DRIVEN = 0.5  # share of a name's confidence where it takes a parameter at its bound
+FAR_OFF, FAR_AHEAD = 16.0, 4.0  # times the noise, and times the fitted part's error on the rest, that halve it
 UNSURE = 0.5  # confidence below which a name is called likely
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
@@ -244,19 +245,21 @@ def confidence(choice: Choice, search: Search) -> float:
     """How sure the law's name is: from the margin over true rivals, lowered by what stays unexplained.
 
     At the noise floor a small margin over thousands of samples says more than the same margin where model error rules.
-    A tie between ports does not lower it, a tie between laws does, and so does a parameter of the simulator that a law
-    has driven to one of its bounds (other than zero, where a damper is that friction has replaced) without coming down
-    to the noise.
+    A tie between ports does not lower it, a tie between laws does, and so do a residual that stays many times the
+    noise, an error on what is not fitted far above that on what is, and a bound that holds a parameter of the law or of
+    the simulator back short of the noise (other than zero, where a damper is that friction has replaced).
     """
-    remains, still = left_open(search)
-    error2 = max(choice.winner.error**2, 1e-300)
+    winner, (remains, still) = choice.winner, left_open(search)
+    error2 = max(winner.error**2, 1e-300)
     above = float(np.clip(1 - search.floor2 / error2, PURE, 1.0))
     lead = 1 - np.exp(-8 / above * np.log(max(min(choice.margin, 10.0), 1.0)))
     still *= min(1.0, remains / 0.03)  # of next to nothing, all may be explainable
     doubt = 1 / (1 + (remains / 0.15) ** 2) / (1 + (still / 0.3) ** 2)
-    others = len({c.law.id for c in choice.alike} - {choice.winner.law.id})
-    above_noise = search.base.cost > AT_FLOOR**2 * search.floor2
-    driven = DRIVEN if above_noise and strained(search.base) else 1.0
+    times2, unseen2 = search.base.cost / search.floor2, winner.tail / max(winner.head, 1e-300)
+    doubt /= (1 + times2 / FAR_OFF**2) * (1 + max(unseen2 - 1, 0.0) / FAR_AHEAD**2)
+    others = len({c.law.id for c in choice.alike} - {winner.law.id})
+    pressed = (times2 > AT_FLOOR**2 and strained(search.base)) or (times2 > WELL_ABOVE**2 and winner.held_back)
+    driven = DRIVEN if pressed else 1.0
     return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99))
 
 
