@@ -144,6 +144,44 @@ def loosened(constraints: Sequence[Constraint], least: float = 0.0) -> tuple[Con
     )
 
 
+class Rows:
+    """The constraints of a problem as one Function of the full parameter vector p, shape (n_p,).
+
+    Attributes
+    ----------
+    function : casadi.Function
+        `p -> g`.
+    lower, upper, units : array, shape (n_g,)
+        Limits, and the units as given, nan where not.
+    labels : tuple of str
+        One an entry.
+    sizes : tuple of int
+        Number of entries of each constraint.
+
+    Raises
+    ------
+    InputError
+        As `compile_constraints` and `check_free`.
+    """
+
+    def __init__(self, constraints: tuple[Constraint, ...], parameters: ParameterSet) -> None:
+        compiled = compile_constraints(constraints, parameters)
+        self.function, self._slope, self.lower, self.upper, self.labels, self.units = compiled
+        self.sizes = constraint_sizes(constraints, parameters)
+        p = parameters.start
+        named = parameters.unpack(p)
+        held = np.repeat([c.check is not None and c.check(named) <= 0 for c in constraints], self.sizes).astype(bool)
+        check_free(self.function, self._slope, parameters.free, p, self.lower, self.upper, self.labels, held)
+
+    def values(self, p: np.ndarray) -> np.ndarray:
+        """Shape (n_g,)."""
+        return np.asarray(self.function(p)).ravel()
+
+    def slope(self, p: np.ndarray) -> np.ndarray:
+        """Shape (n_g, n_p)."""
+        return np.asarray(self._slope(p))
+
+
 def compile_constraints(
     constraints: tuple[Constraint, ...], parameters: ParameterSet
 ) -> tuple[ca.Function, ca.Function, np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:

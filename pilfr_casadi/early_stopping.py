@@ -48,14 +48,20 @@ def hold_back(recordings: Sequence[Recording], share: float) -> tuple[tuple[Reco
                 "recordings or periods, or validation=0."
             )
     cut = min(max(cut, r.skip + 2), len(r) - 1)
-    return (r.slice(0, cut),), (r.with_(skip=cut),)
+    return (r.slice(0, cut),), (_scored_from(r, cut),)
 
 
 def _from_rest(recording: Recording) -> Recording:
     """Where the initial state is to be estimated, zero, and the first fifth is not scored."""
     if not isinstance(recording.initial, str) or recording.initial != "estimate":
         return recording
-    return recording.with_(initial="zero", skip=max(recording.skip, len(recording) // 5))
+    return _scored_from(recording.with_(initial="zero"), max(recording.skip, len(recording) // 5))
+
+
+def _scored_from(recording: Recording, skip: int) -> Recording:
+    """The recording with more samples that are not scored: behind them there need be no whole period."""
+    kept = recording.period if recording.period and len(recording) - skip >= recording.period else None
+    return recording.with_(skip=skip, period=kept)
 
 
 class Watch:

@@ -63,27 +63,21 @@ def exactly(problem: Problem, solution: Solution) -> Solution:
     unit = problem.constraint_units(theta, floor)
     unit = np.where(unit > 0, unit, 1.0)
     damped = hessian + 1e-6 * np.diag(floor)
-    squares = np.diag(damped)
-    scale = 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
-    damped = damped + np.diag(np.where(squares > 0, 0.0, 1.0))
+    damped += np.diag(np.where(np.diag(damped) > 0, 0.0, 1.0))
     qp, margin = QuadraticProgram(problem.size, len(unit), "daqp"), FIRST
     for _ in range(ROUNDS):
-        g, slope = problem.constraint(theta), problem.constraint_jacobian(theta) * scale
-        row = np.max(np.abs(slope), axis=1, initial=0.0)
-        row = np.where(row > 0, row, 1.0)
+        g = problem.constraint(theta)
         room = np.where(exact, np.minimum(margin * unit, 0.25 * (problem.g_upper - problem.g_lower)), 0.0)
-        # in units of the violation: a program's tolerances are absolute
-        size = max(float(np.max(np.maximum(problem.g_lower + room - g, g - problem.g_upper + room) / row)), 1e-300)
-        d, _, good = qp(
-            damped * scale * scale[:, None],
+        d, _, good = qp.scaled(
+            damped,
             np.zeros(problem.size),
-            (problem.lower - theta) / scale / size,
-            (problem.upper - theta) / scale / size,
-            slope / row[:, None],
-            (problem.g_lower + room - g) / row / size,
-            (problem.g_upper - room - g) / row / size,
+            problem.lower - theta,
+            problem.upper - theta,
+            problem.constraint_jacobian(theta),
+            problem.g_lower + room - g,
+            problem.g_upper - room - g,
         )
-        trial = np.clip(theta + scale * size * d, problem.lower, problem.upper)
+        trial = np.clip(theta + d, problem.lower, problem.upper)
         if not good or not np.all(np.isfinite(problem.constraint(trial))) or _far(problem, trial, unit):
             break
         theta = trial

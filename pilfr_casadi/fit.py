@@ -29,12 +29,13 @@ from .lagged_fit import fit_lagged
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
-from .multistart import POLISH, STARTS, stability
+from .multistart import POLISH, STARTS
 from .outcome import with_solution
 from .penalty import check_penalty
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings, check_for_identification
 from .solution import Status
+from .stability import stability_limits
 from .threads import one_blas_thread
 from .ways import at_values, from_starts, from_values, linear_only
 
@@ -115,7 +116,8 @@ def fit(
         A fit from values runs as many recordings side by side.
         Where processes are spawned, the call belongs below `if __name__ == "__main__":`.
     progress : bool or callable
-        True for a bar on the terminal; a callable gets (stage, done, total, smallest training error so far).
+        True for a bar on the terminal; a callable gets (stage, done, total, smallest training error so far). The stage
+        "steps" is the solve of a start at work, its error where it is; of starts in other processes it is not heard.
 
     Returns
     -------
@@ -224,15 +226,6 @@ def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any
             raise InputError(f"{name} = {value!r} was given; give a whole number, {least} or more.")
     if progress is not None and not isinstance(progress, bool) and not callable(progress):
         raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
-
-
-def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
-    """The limits that `stable` stands for."""
-    if bound is False:
-        return ()
-    if not isinstance(bound, bool | int | float | np.number) or not np.isfinite(bound):
-        raise InputError(f"stable = {bound!r} was given; give True, False or the largest spectral radius, above zero.")
-    return stability(structure, float(bound), exact=True)
 
 
 def constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:

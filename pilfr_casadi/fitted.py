@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -17,12 +17,14 @@ from .lfr import PILFR
 from .limits import Limit
 from .metrics import nrmse, rmse_per_output
 from .model import Model
-from .multistart import Candidate
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings
+from .search import Candidate
 from .sensitivities import Engine
 from .slopes import settled
 from .solution import Solution, Status
+
+STATES = ("A", "B_u", "B_w", "C_y", "C_z")  # blocks that a change of coordinates of the states changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +206,7 @@ class Fit:
         spent = f", {self.seconds:.1f} s in all" if self.seconds else ""
         lines = [
             self.status.value,
+            *([self.status.advice] if self.status.advice else []),
             f"NRMSE on the training recording{'s' if len(self.train_nrmse) > 1 else ''}: {errors}",
             f"{self.solution.iterations} iterations in the last solve{spent}",
         ]
@@ -218,10 +221,7 @@ class Fit:
             lines.append(f"the linear model alone, to judge the element by: NRMSE {alone}")
         if self.note:
             lines.append(self.note)
-        unknown = [f"{np.sum(np.isinf(e))} of {np.size(e)} entries of {k}" for k, e in self.errors.items()]
-        unknown = [line for line in unknown if not line.startswith("0 of")]
-        if unknown:
-            lines.append(f"the data alone says nothing about {', '.join(unknown)}")
+        lines += unknown_sentences(self.errors)
         lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
         constraints = [limit for limit in self.limits if limit.kind == "constraint"]
         if constraints:
@@ -234,6 +234,20 @@ class Fit:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def unknown_sentences(errors: Mapping[str, np.ndarray]) -> list[str]:
+    """What it means that standard errors are infinite, none where none is."""
+    count = {name: int(np.sum(np.isinf(e))) for name, e in errors.items()}
+    turned = [name for name in STATES if count.get(name)]
+    others = [f"{count[k]} of {np.size(e)} entries of {k}" for k, e in errors.items() if count[k] and k not in turned]
+    out = [f"the data alone says nothing about {', '.join(others)}"] if others else []
+    if turned:
+        out.append(
+            f"entries of {', '.join(turned)} have no standard error of their own: others, as in other coordinates of "
+            "the states, give the same outputs; judge poles, zeros and responses instead"
+        )
+    return out
 
 
 def fingerprint(recording: Recording) -> str:

@@ -10,6 +10,10 @@ space is over-parametrised, so damping is needed and has to know the scales. Tri
 alone; λ follows the gain ratio (Nielsen 1999). General constraints, in units of their own
 (`Problem.constraint_units`), enter an exact penalty `μ Σ violation`, with a second-order correction when a step along
 their tangent violates them.
+
+A penalty is exact only nearby, and a run may stray to where violating the constraints pays and linear steps do not lead
+back. So the cheapest feasible point is kept: a run that ends worse goes on from there, with more damping and a penalty
+under which nothing that it has seen is better (`feasible`).
 """
 
 from __future__ import annotations
@@ -24,6 +28,8 @@ import numpy as np
 from .callback import handled_interrupt
 from .constraints import TOLERATED
 from .damping import without_rounding
+from .exact_penalty import ExactPenalty
+from .feasible import Feasible
 from .lifted import Lifted
 from .magnitude import Neighbours
 from .problem import Problem
@@ -32,6 +38,7 @@ from .recording import InputError
 from .solution import Iteration, Progress, Solution, Status
 
 FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
+RETURNS = 4  # times that a run which has strayed goes on from the best feasible point
 Watch = Callable[[np.ndarray], bool]
 NOTHING = 1e-24  # a cost that is rounding: outputs are off by 1e-12 of their size
 
@@ -49,7 +56,8 @@ class GaussNewton:
     damping : float
         First λ.
     time_limit : float
-        Seconds.
+        Seconds of a solve, at a bound on a spectral radius with all its repetitions (`tightening`). A fit makes several
+        solves.
     qp : str
         CasADi conic plugin.
 
@@ -76,9 +84,14 @@ class GaussNewton:
         start: np.ndarray | None = None,
         progress: Progress | None = None,
         watch: Watch | None = None,
+        unfinished: bool = False,
     ) -> Solution:
-        """Minimise from `start` (n,), by default the problem's own; `watch` is given every point and may end it."""
-        return _Run(self, problem, problem.start if start is None else start, progress, watch).run()
+        """Minimise from `start` (n,), by default the problem's own.
+
+        `watch` is given every point and may end it. What a limit ends is the best feasible point, or, `unfinished`,
+        where the run is, feasible or not, from which another one can go on.
+        """
+        return _Run(self, problem, problem.start if start is None else start, progress, watch).run(unfinished)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,27 +116,16 @@ class _Run:
     ) -> None:
         self.options, self.problem, self.progress, self.watch = options, problem, progress, watch
         self.theta = np.clip(np.asarray(start, dtype=float), problem.lower, problem.upper)
+        self.penalty, self.best = ExactPenalty(problem), Feasible(options.tolerance)
         self.n_g = len(problem.g_lower)
-        self.unit, self.known = np.ones(self.n_g), np.zeros(self.n_g, dtype=bool)
         self.qp = QuadraticProgram(problem.size, self.n_g, options.qp)
-        self.damping, self.growth, self.penalty = options.damping, 2.0, 0.0
+        self.damping, self.growth, self.tried = options.damping, 2.0, 0
         self.multipliers = np.zeros(problem.size + self.n_g)
         self.history: list[Iteration] = []
         self.interrupted = False
         self.began = time.perf_counter()
 
-    def constraint(self, theta: np.ndarray) -> np.ndarray:
-        """Values of the general constraints, shape (n_g,)."""
-        return self.problem.constraint(theta) / self.unit if self.n_g else np.zeros(0)
-
-    def violation(self, theta: np.ndarray) -> np.ndarray:
-        """Violation of each general constraint, shape (n_g,)."""
-        if not self.n_g:
-            return np.zeros(0)
-        g, low, high = self.constraint(theta), self.problem.g_lower / self.unit, self.problem.g_upper / self.unit
-        return np.maximum(np.maximum(low - g, g - high), 0.0)
-
-    def run(self) -> Solution:
+    def run(self, unfinished: bool) -> Solution:
         status = Status.MAX_ITERATIONS
         self.cost = self.problem.cost(self.theta)
         if not np.isfinite(self.cost):
@@ -131,9 +133,33 @@ class _Run:
         try:
             with handled_interrupt(self._interrupt):  # casadi may swallow a KeyboardInterrupt
                 status = self._iterate()
+                for k in range(RETURNS):
+                    if not self._strayed(status):
+                        break
+                    self._back()
+                    self.penalty.raise_to(2.0 * self.best.tempting)
+                    self.damping, self.growth = self.options.damping * 10.0**k, 2.0
+                    status = self._iterate()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
+        limited = status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
+        if self.best.better(self.cost, self.penalty.violation(self.theta)) and not (limited and unfinished):
+            status = Status.SOLVER_FAILED if self._strayed(status) else status
+            self._back()
         return self._finish(status)
+
+    def _strayed(self, status: Status) -> bool:
+        """Whether it ended of itself, and worse than a feasible point that it has seen."""
+        ended = status in (Status.CONVERGED, Status.SMALL_STEP, Status.INFEASIBLE)
+        return ended and self.best.better(self.cost, self.penalty.violation(self.theta))
+
+    def _back(self) -> None:
+        self.cost, self.theta, self.multipliers = self.best.cost, self.best.theta, self.best.multipliers
+        self._accepted(0.0)
+
+    def _accepted(self, length: float) -> None:
+        seconds = time.perf_counter() - self.began
+        self.history.append(Iteration(self.tried, self.cost, seconds, length, self.damping))
 
     def _interrupt(self) -> None:
         self.interrupted = True
@@ -143,7 +169,8 @@ class _Run:
         scale, neighbours = np.zeros(problem.size), Neighbours(problem.labels)
         recent: list[tuple[float, float]] = []  # cost and violation
         fresh = True
-        for number in range(options.max_iterations):
+        while self.tried < options.max_iterations:
+            self.tried += 1
             if self.interrupted:
                 return Status.INTERRUPTED
             if time.perf_counter() - self.began > options.time_limit:
@@ -152,10 +179,10 @@ class _Run:
                 self.cost, gradient, hessian = problem.normal(self.theta)
                 scale = np.maximum(scale, np.diag(hessian))
                 floor = without_rounding(scale, self.theta, neighbours)
-                self._measure(floor)
-                slope = problem.constraint_jacobian(self.theta) / self.unit[:, None]
-                violation = float(self.violation(self.theta).sum())
+                self.penalty.measure(self.theta, floor)
+                slope, violation = self.penalty.slope(self.theta), self.penalty.violation(self.theta)
                 recent.append((self.cost, violation))
+                self.best.see(self.cost, violation, self.theta, self.multipliers)
                 if self.progress:
                     self.progress(self.history[-1] if self.history else Iteration(0, self.cost, 0.0))
                 if self.watch and self.watch(self.theta):
@@ -163,22 +190,20 @@ class _Run:
                 if self._calm(recent):
                     return Status.CONVERGED if violation <= FEASIBLE else Status.INFEASIBLE
             step = self._step(hessian + self.damping * np.diag(floor), gradient, slope)
-            self._raise_penalty(step)
+            if step.good:
+                self.multipliers = step.multipliers
+                self.penalty.follow(step.multipliers[problem.size :])
             predicted = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d)
-            trial, improvement = self._judge(step, hessian + self.damping * np.diag(floor), gradient, slope)
-            expected = predicted + self.penalty * violation
+            trial, cost, improvement = self._judge(step, hessian + self.damping * np.diag(floor), gradient, slope)
+            expected = predicted + self.penalty.weight * violation
             fresh = bool(step.good and improvement > 1e-4 * expected and improvement > 0)
             length = float(np.max(np.abs(step.d) * np.sqrt(floor))) if step.good else 0.0
             if fresh:
                 ratio = min(improvement / max(expected, 1e-300), 2.0)  # a cube of it follows
-                self.theta = trial
+                self.theta, self.cost = trial, cost
                 self.damping = max(self.damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 1e-12)
                 self.growth = 2.0
-                self.history.append(
-                    Iteration(
-                        number + 1, self.cost - improvement, time.perf_counter() - self.began, length, self.damping
-                    )
-                )
+                self._accepted(length)
             else:
                 if step.good and expected < 1e-3 * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
                     return self._stalled(hessian, floor, gradient, slope)
@@ -187,13 +212,6 @@ class _Run:
                 if self.damping > 1e12:
                     return Status.INFEASIBLE if violation > TOLERATED else Status.SMALL_STEP
         return Status.MAX_ITERATIONS
-
-    def _measure(self, floor: np.ndarray) -> None:
-        """Units of the constraints, once and for all: where they first have a slope."""
-        if not np.all(self.known):
-            unit = self.problem.constraint_units(self.theta, floor)
-            first = ~self.known & (unit > 0)
-            self.unit[first], self.known[first] = unit[first], True
 
     def _calm(self, recent: list[tuple[float, float]]) -> bool:
         """Whether the last few steps changed next to nothing, all feasible or all as infeasible as the last."""
@@ -204,7 +222,8 @@ class _Run:
             return False
         (cost, violation), (now, left) = recent[-1 - options.patience], recent[-1]
         if left > TOLERATED:
-            merits = cost + self.penalty * violation, now + self.penalty * left
+            mu = self.penalty.weight
+            merits = cost + mu * violation, now + mu * left
             return violation - left < options.tolerance * left and merits[0] - merits[1] < options.tolerance * merits[1]
         return max(violation, left) <= FEASIBLE and cost - now < options.tolerance * abs(now)
 
@@ -219,52 +238,38 @@ class _Run:
         self, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, correction: np.ndarray | None = None
     ) -> _Step:
         problem = self.problem
-        g = self.constraint(self.theta) if correction is None else correction
-        # unit diagonal and rows: daqp's tolerances are absolute
-        unit = 1.0 / np.sqrt(np.diag(damped))
-        lbx, ubx = (problem.lower - self.theta) / unit, (problem.upper - self.theta) / unit
-        size = max(float(np.max(np.abs(gradient * unit))), 1e-300)
-        h, steepest, a = damped * unit * unit[:, None], gradient * unit / size, slope * unit
-        row = np.max(np.abs(a), axis=1, initial=0.0)
-        row = np.where(row > 0, row, 1.0)
-        low, high, a = (
-            (problem.g_lower / self.unit - g) / row,
-            (problem.g_upper / self.unit - g) / row,
-            a / row[:, None],
-        )
+        low, high = self.penalty.room(self.penalty.values(self.theta) if correction is None else correction)
         for share in (1.0, 0.5, 0.1, 0.01, 0.0) if self.n_g else (1.0,):  # of the violation that the step has to remove
-            lba = np.minimum(low, share * np.maximum(low, 0.0))
-            uba = np.maximum(high, share * np.minimum(high, 0.0))
-            d, multipliers, good = self.qp(h, steepest, lbx / size, ubx / size, a, lba / size, uba / size)
+            d, multipliers, good = self.qp.scaled(
+                damped,
+                gradient,
+                problem.lower - self.theta,
+                problem.upper - self.theta,
+                slope,
+                np.minimum(low, share * np.maximum(low, 0.0)),
+                np.maximum(high, share * np.minimum(high, 0.0)),
+            )
             if good:
                 break
-        multipliers = size * multipliers / np.concatenate([unit, row])
-        return _Step(d * size * unit, multipliers, good)
-
-    def _raise_penalty(self, step: _Step) -> None:
-        if step.good:
-            self.multipliers = step.multipliers
-            if self.n_g:
-                # Powell's rule: a penalty that only grows keeps what far-off multipliers asked for, and crawls
-                needed = 1.5 * float(np.max(np.abs(step.multipliers[self.problem.size :])))
-                self.penalty = max(needed, 0.5 * (self.penalty + needed))
+        return _Step(d, multipliers, good)
 
     def _judge(
         self, step: _Step, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray
-    ) -> tuple[np.ndarray, float]:
-        """Trial point and the improvement of the penalised cost it brings."""
+    ) -> tuple[np.ndarray, float, float]:
+        """Trial point, its cost and the improvement of the penalised cost it brings."""
         if not step.good:
-            return self.theta, -np.inf
-        problem, here = self.problem, float(self.violation(self.theta).sum())
+            return self.theta, self.cost, -np.inf
+        problem, here = self.problem, self.penalty.violation(self.theta)
         trial = self._inside(step)
-        there = float(self.violation(trial).sum())
+        there = self.penalty.violation(trial)
         if self.n_g and there > max(here, 1e-12):
-            corrected = self._step(damped, gradient, slope, self.constraint(trial) - slope @ step.d)
+            corrected = self._step(damped, gradient, slope, self.penalty.values(trial) - slope @ step.d)
             if corrected.good:
                 candidate = self._inside(corrected)
-                if float(self.violation(candidate).sum()) < there:
-                    trial, there = candidate, float(self.violation(candidate).sum())
-        return trial, self.cost - problem.cost(trial) + self.penalty * (here - there)
+                if self.penalty.violation(candidate) < there:
+                    trial, there = candidate, self.penalty.violation(candidate)
+        cost = problem.cost(trial)
+        return trial, cost, self.cost - cost + self.penalty.weight * (here - there)
 
     def _inside(self, step: _Step) -> np.ndarray:
         """The end of a step: exactly on the bounds that its quadratic program holds active, and inside the others."""
@@ -280,7 +285,7 @@ class _Run:
             status=status,
             iterations=len(self.history),
             seconds=time.perf_counter() - self.began,
-            violation=float((self.violation(self.theta) * self.unit).max(initial=0.0)),
-            multipliers=self.multipliers / np.concatenate([np.ones(self.problem.size), self.unit]),
+            violation=float((self.penalty.violations(self.theta) * self.penalty.unit).max(initial=0.0)),
+            multipliers=self.multipliers / np.concatenate([np.ones(self.problem.size), self.penalty.unit]),
             history=tuple(self.history),
         )

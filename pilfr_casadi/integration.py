@@ -84,6 +84,8 @@ class Equations:
                 w = call(e.law.force, f"law {e.law.id!r}", **have)
                 if self.n_q[i]:
                     flow[i] = call(e.law.flow, f"law {e.law.id!r}", **have)
+            if by := getattr(e.law, "scaled_by", ""):
+                w = w * now[by]
             signals[i] = (z, dz, w)
             return w
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from .callback import Callback, handled_interrupt
 from .damping import Damping, Point
+from .ipopt_settings import ENDINGS, SETTINGS, check_settings
 from .problem import Problem
 from .recording import InputError
 from .scaling import Scaled
@@ -31,28 +32,6 @@ from .solution import Iteration, Progress, Solution, Status
 Sparsities = dict[str, ca.Sparsity]
 FEASIBLE = 1e-8  # violation of a constraint, in units of the change that one scaled variable makes
 ROUNDS = 4  # solves: where IPOPT's line search fails, the next one starts from the best point with more damping
-SETTINGS = {
-    "print_level": 0,
-    "sb": "yes",
-    "tol": 1e-9,
-    "nlp_scaling_method": "none",
-    "bound_relax_factor": 0.0,
-    "mu_strategy": "adaptive",
-    "adaptive_mu_globalization": "never-monotone-mode",
-    "mu_max": 1e-3,
-    "mu_init": 1e-3,
-    "watchdog_shortened_iter_trigger": 0,
-    "bound_push": 1e-4,
-    "bound_frac": 1e-4,
-    "slack_bound_push": 1e-4,
-    "slack_bound_frac": 1e-4,
-}
-ENDINGS = {
-    "Solve_Succeeded": Status.CONVERGED,
-    "Solved_To_Acceptable_Level": Status.CONVERGED,
-    "Maximum_Iterations_Exceeded": Status.MAX_ITERATIONS,
-    "Infeasible_Problem_Detected": Status.INFEASIBLE,
-}
 
 
 @dataclass(frozen=True)
@@ -70,7 +49,7 @@ class Ipopt:
     damping : float
         First λ.
     time_limit : float
-        Seconds.
+        Seconds of a solve; see `GaussNewton`.
     options : mapping
         Further options of IPOPT by name, for example `{"print_level": 5}`.
 
@@ -91,25 +70,11 @@ class Ipopt:
     def __post_init__(self) -> None:
         if self.hessian not in ("gauss-newton", "limited-memory"):
             raise InputError(f"The Hessian {self.hessian!r} is unknown; use 'gauss-newton' or 'limited-memory'.")
-        _check_settings(self.options)
+        check_settings(self.options)
 
     def solve(self, problem: Problem, start: np.ndarray | None = None, progress: Progress | None = None) -> Solution:
         """Minimise from `start` (n,), by default the problem's own."""
         return _Run(self, problem, problem.start if start is None else start, progress).run()
-
-
-def _check_settings(options: Any) -> None:
-    """Let IPOPT itself judge its options, on a problem of one variable."""
-    if not isinstance(options, Mapping):
-        raise InputError(f'IPOPT\'s options were given as {options!r}; give them by name, like {{"print_level": 5}}.')
-    x = ca.MX.sym("x")
-    for name, value in options.items():
-        try:
-            ca.nlpsol("check", "ipopt", {"x": x, "f": x**2}, {"ipopt": {name: value, "sb": "yes"}, "print_time": False})
-        except (RuntimeError, TypeError, NotImplementedError):
-            raise InputError(
-                f"IPOPT does not take the option {name!r} with the value {value!r}; see its own list of options."
-            ) from None
 
 
 class _Run:

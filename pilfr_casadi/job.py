@@ -16,14 +16,13 @@ from .gauss_newton import GaussNewton
 from .interrupts import Progress, deferred_interrupt
 from .ipopt import Ipopt
 from .lfr import PILFR
-from .linear_model import iterations
 from .model import Model
 from .outcome import outcome, with_solution
 from .penalty import element_alone, merged, restored, sentence, unit_weights, without_idle
 from .problem import Problem
 from .recording import Recording
 from .solution import Solution, Status
-from .tightening import within_bounds
+from .told import solve_inside
 
 Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
 LAST = GaussNewton()  # at a bound on a radius, where another solver is asked for
@@ -70,9 +69,8 @@ class Job:
         if not isinstance(self.solver, GaussNewton | Ipopt):
             solution: Solution = self.solver.solve(problem, start)
             return solution
-        solver, report = self.solver, iterations(self.progress, stage, self.solver.max_iterations)
-        last = solver if isinstance(solver, GaussNewton) else LAST
-        return within_bounds(problem, start, lambda p, s: solver.solve(p, s, report), last, progress=report)
+        last = self.solver if isinstance(self.solver, GaussNewton) else LAST
+        return solve_inside(problem, start, self.solver, stage, self.progress, last)
 
     def result(self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, **more: Any) -> Fit:
         """What a solution of a problem amounts to; Ctrl-C waits until it is known, and is told by the status."""

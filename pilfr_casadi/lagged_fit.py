@@ -21,10 +21,11 @@ from .gauss_newton import GaussNewton
 from .job import Job
 from .lfr import PILFR
 from .model import Model
-from .multistart import EXPLORE, Candidate, run_tasks
+from .multistart import EXPLORE
 from .outcome import with_solution
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings, check_for_identification
+from .search import Candidate, run_tasks
 from .sensitivities import Engine
 from .solution import Solution, Status
 from .threads import one_blas_thread
@@ -72,12 +73,10 @@ def fit_lagged(
     job = replace(job, recordings=check_for_identification(train, unknown + 2))
     split = hold_back(job.recordings, wanted.validation) if wanted.validation else (job.recordings, ())
     search = LaggedSearch(wanted, structure, replace(job, progress=None), *split)
-    seen: list[float] = []
 
-    def report(candidate: Candidate) -> None:
-        seen.append(candidate.error)
+    def report(found: list[Candidate], total: int) -> None:
         if job.progress:
-            job.progress("starts", len(seen), starts, min(seen))
+            job.progress("starts", len(found), total, min((c.error for c in found), default=np.nan))
 
     sequences = np.random.SeedSequence(seed).spawn(starts)
     found, stopped = run_tasks(explore_lagged, [(search, i, s) for i, s in enumerate(sequences)], executor, report)

@@ -7,7 +7,7 @@ would be in the way.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,8 +22,9 @@ from .modal import in_modal_coordinates, is_modal
 from .model import Model
 from .problem import Problem
 from .recording import InputError, Recording
-from .solution import Iteration, Solution, Status
+from .solution import Solution, Status
 from .subspace import subspace_matrices
+from .told import iterations
 
 Array = np.ndarray
 
@@ -123,10 +124,3 @@ def _offset(recordings: Sequence[Recording], a: Array, b: Array, c: Array, d: Ar
         states = propagate(a.T, (r.u @ b.T)[None], np.zeros((1, len(a))))[0][0] if len(a) else np.zeros((len(r), 0))
         left.append((r.y - states @ c.T - r.u @ d.T)[r.skip :])
     return np.asarray(np.mean(np.concatenate(left), axis=0))
-
-
-def iterations(progress: Progress | None, stage: str, most: int) -> Callable[[Iteration], None] | None:
-    """A solver's progress function that reports iterations as a stage, with the error that their cost stands for."""
-    if progress is None:
-        return None
-    return lambda i: progress(stage, min(i.number, most), most, float(np.sqrt(2 * max(i.cost, 0.0))))

@@ -18,29 +18,26 @@ Every task depends on its own seed alone, so the numbers are the same for any ex
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from .compiled import make_engine
-from .constraints import Constraint, loosened, stable
 from .elements import PrandtlIshlinskii, StaticNetwork
 from .envelopes import enveloped, has_networks
 from .gauss_newton import GaussNewton
-from .lfr import PILFR
 from .model import Model
 from .problem import Problem
-from .recording import InputError, Recording
-from .sensitivities import Engine
+from .recording import InputError
+from .search import Candidate, Search, run_tasks
 from .solution import Solution, Status
-from .start import Blocks, grid_start, network_start, paper_start, regridded, unit_states
+from .start import grid_start, network_start, paper_start, regridded, unit_states
 from .threads import one_blas_thread
-from .tightening import at_bounds, within_bounds
+from .tightening import at_bounds
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
@@ -49,71 +46,6 @@ STARTS = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
 MARGIN = 1.1  # times the smallest error, for the weights of a smooth density
 PRIOR = "weights held near a smooth density by a weak prior"
-
-
-@dataclass(frozen=True, eq=False)
-class Search:
-    """All that the tasks of one identification share."""
-
-    structure: PILFR
-    recordings: tuple[Recording, ...]
-    linear: Blocks
-    solver: Any = field(default_factory=GaussNewton)
-    constraints: tuple[Constraint, ...] = ()
-    engine: str = "auto"
-    start: str = "grid"
-    l1: dict[str, float] = field(default_factory=dict)
-    noise: float | None = None
-    level: float = 1.0
-    coordinates: bool = True  # whether the states' coordinates are free to choose
-
-    def problem(self, model: Model, engine: Engine | None = None, noise: float | None = None) -> Problem:
-        """The simulation-error problem of a model of this structure.
-
-        Priors are weighed against the noise that was asked for, else what has been reached, `noise`; else what a linear
-        model reaches, `level`.
-        """
-        return Problem(
-            model,
-            self.recordings,
-            engine=engine or self.engine,
-            constraints=loosened(self.constraints, least=1.0),
-            l1=self.l1,
-            noise=self.noise or noise or self.level,
-        )
-
-    def model(self, values: dict[str, Any]) -> Model:
-        """The closed model starting at `values`."""
-        first = self.recordings[0]
-        return self.structure.model(first.n_u, first.n_y, values, inputs=first.inputs, outputs=first.outputs)
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """What one start led to; `drawn` tells whether its start depends on the seed."""
-
-    seed: int
-    model: Model
-    theta: np.ndarray
-    error: float
-    solution: Solution
-    note: str = ""
-    drawn: bool = True
-
-
-def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tuple[Constraint, ...]:
-    """Bounds on the spectral radius of A, and of A + B_w diag(Σw) C_z: no operator slips, or all (stops: sticks)."""
-    if structure.nx == 0:
-        return ()
-    limits: tuple[Constraint, ...] = (stable(radius, exact=exact),)
-    element = structure.element
-    if isinstance(element, PrandtlIshlinskii):
-        limits += (stable(radius, _with_element, "spectral radius with the element's full slope", exact=exact),)
-    return limits
-
-
-def _with_element(p: Any) -> Any:
-    return p["A"] + p["B_w"] @ ca.diag(ca.sum2(p["w"])) @ p["C_z"]
 
 
 @one_blas_thread
@@ -138,7 +70,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
         values = paper_start(search.structure, scaled, rng)
     model = search.model(values)
     problem = search.problem(model)
-    candidate = _candidate(seed, model, problem, within_bounds(problem, None, solver.solve))
+    candidate = _candidate(seed, model, problem, search.solve(problem, None, solver))
     candidate = replace(candidate, drawn=_drawn(search, seed))
     done = candidate.solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error)
     if search.start != "paper" or done:
@@ -148,7 +80,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
         return polished
     # the user's solver has the last word
     problem = search.problem(polished.model, problem.engine, noise=polished.error)
-    solution = within_bounds(problem, polished.theta, search.solver.solve)
+    solution = search.solve(problem, polished.theta, search.solver)
     return _candidate(seed, polished.model, problem, solution, polished.note)
 
 
@@ -180,7 +112,7 @@ def polish(search: Search, candidate: Candidate) -> Candidate:
     held = _held(search, candidate)
 
     def solve(problem: Problem, start: np.ndarray) -> Solution:
-        return within_bounds(problem, start, POLISH.solve, held=held)
+        return search.solve(problem, start, POLISH, held)
 
     found = [candidate]
     for beyond, spread in ((1.0, 0.0), (1.3, 0.02)):
@@ -230,37 +162,6 @@ def held_near(model: Model, values: dict[str, Any], spread: float) -> Model:
     return model.with_parameters(model.parameters.change(**own))
 
 
-def run_tasks(
-    function: Callable[..., Candidate],
-    tasks: Iterable[tuple[Any, ...]],
-    executor: Executor | None,
-    report: Callable[[Candidate], None],
-) -> tuple[list[Candidate], bool]:
-    """Results in the order of the tasks, from an executor or one after the other; whether the run was interrupted."""
-    tasks, results = list(tasks), []
-    if executor is not None:
-        try:
-            pickle.dumps(tasks[:1])
-        except Exception as error:
-            raise InputError(
-                f"The model or a constraint cannot be sent to other processes ({error}); "
-                "define functions at the top of a module, or use workers=1."
-            ) from None
-    futures = [executor.submit(function, *task) for task in tasks] if executor is not None else None
-    try:
-        for i, task in enumerate(tasks):
-            candidate = futures[i].result() if futures else function(*task)
-            results.append(candidate)
-            report(candidate)
-            if candidate.solution.status is Status.INTERRUPTED:
-                return results, True
-    except KeyboardInterrupt:
-        for future in futures or ():
-            future.cancel()
-        return results, True
-    return results, False
-
-
 def _merit(candidate: Candidate) -> tuple[bool, float]:
     """What candidates are compared by: whether the constraints hold comes first."""
     return candidate.solution.status is Status.INFEASIBLE, candidate.error
@@ -271,10 +172,12 @@ def search_starts(
     starts: int,
     seed: int,
     executor: Executor | None,
-    report: Callable[[Candidate], None],
+    report: Callable[[str, list[Candidate], int], None],
     keep: int = KEEP,
 ) -> tuple[list[Candidate], Candidate | None, bool]:
     """All candidates of the exploration, the winner (None if interrupted before there was one), whether interrupted.
+
+    `report` is told the stage, what it has found and how many it will, first when there is nothing yet.
 
     Raises
     ------
@@ -282,7 +185,9 @@ def search_starts(
         If no start gives a finite simulation.
     """
     sequences = np.random.SeedSequence(seed).spawn(starts)
-    found, stopped = run_tasks(explore, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
+    found, stopped = run_tasks(
+        explore, [(search, i, s) for i, s in enumerate(sequences)], executor, partial(report, "starts")
+    )
     usable = sorted((c for c in found if np.isfinite(c.error)), key=_merit)
     if not usable and stopped:
         return found, None, True
@@ -297,5 +202,5 @@ def search_starts(
         # what exploring reaches says less: every one that was among the best when it came, so that more starts are
         # never worse than fewer
         chosen = [c for i, c in enumerate(found) if c in sorted(found[: i + 1], key=_merit)[:keep] and c in usable]
-    polished, stopped = run_tasks(polish, [(search, c) for c in chosen], executor, report)
+    polished, stopped = run_tasks(polish, [(search, c) for c in chosen], executor, partial(report, "polish"))
     return found, min(polished or usable[:1], key=_merit), stopped

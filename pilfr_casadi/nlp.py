@@ -83,11 +83,11 @@ def to_nlp(problem: Problem) -> Horizon:
         simulated.append(y)
         residual.append(ca.vec(((y - r.y.T) / np.tile(part.scale[:, None], (1, len(r))))[:, r.skip :]))
     e = ca.vertcat(*residual)
-    prior = 0.5 * ca.dot(problem._prior_weight, (theta - problem._prior_mean) ** 2)
+    prior = 0.5 * ca.dot(problem.penalties.weight, (theta - problem.penalties.mean) ** 2)
     return Horizon(
         x=theta,
-        f=0.5 * ca.sumsqr(e) / problem.residuals + prior + ca.dot(problem._l1, theta),
-        g=problem._g(p),
+        f=0.5 * ca.sumsqr(e) / problem.residuals + prior + ca.dot(problem.penalties.slope, theta),
+        g=problem.rows.function(p),
         x0=problem.start,
         lbx=problem.lower,
         ubx=problem.upper,

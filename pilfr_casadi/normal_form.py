@@ -2,8 +2,9 @@
 
 Channels first: z has unit standard deviation (or reach), the weights of a channel sum to one, its thresholds ascend,
 and the largest entry of the impulse response from u to z is positive. A generalized play's output has a scale of its
-own, such that the two envelopes rise by two on average over -1 <= z <= 1; its smallest threshold is zero. Channels
-ascend by their mean threshold.
+own, such that the two envelopes rise by two on average over -1 <= z <= 1; its smallest threshold is zero. Where its
+envelopes cross, `γ_l(z) - r > γ_r(z) + r`, the lower one counts, and the mirror image is another element: such a
+channel keeps its sign. Channels ascend by their mean threshold.
 
 Then the states, in the input-normal basis ordered by Hankel singular values (Moore 1981): driven by white u and w of
 given standard deviations (w: one), they are uncorrelated with unit variance, and their energies in y and z are
@@ -31,6 +32,7 @@ from .recording import InputError
 Array = np.ndarray
 Values = dict[str, Array]
 FASTEST = 0.999
+GRID = np.linspace(-2.0, 2.0, 801)
 
 
 def normalise(
@@ -82,7 +84,8 @@ def normalise(
         size = _sizes(element, out, z, by)
         blocks = []
         for i in range(element.channels):
-            scales = _scales(structure, element, out, i, float(size[i]), u_std)
+            reach = float(np.max(np.abs(np.asarray(z)[:, i])))
+            scales = _scales(structure, element, out, i, float(size[i]), reach, u_std)
             _rescale(element, out, i, *scales)
             _lower_thresholds(structure, element, out, i)
             blocks.append(scales[0] * scales[2] * np.eye(element.n)[_sort(structure, element, out, i)])
@@ -127,7 +130,7 @@ def _sizes(element: PrandtlIshlinskii, out: Values, z: Array | None, by: str) ->
 
 
 def _scales(
-    structure: PILFR, element: PrandtlIshlinskii, out: Values, i: int, size: float, u_std: Array
+    structure: PILFR, element: PrandtlIshlinskii, out: Values, i: int, size: float, reach: float, u_std: Array
 ) -> tuple[float, float, float, float]:
     """Sign, and what z, the operators' output, and the weights of channel i are to be multiplied with."""
     operator = element.operator
@@ -145,8 +148,15 @@ def _scales(
         of_v = 4.0 / rise if v_free and rise > 0 else 1.0
     total = out["w"][i].sum()
     of_w = 1.0 / of_v if after_held else 1.0 / total if total > 0 else 1.0
-    down = z_free and v_free and not after_held and _points_down(out, i, u_std)
+    mirrors = not (general and free and _crosses(operator, out, i, reach))
+    down = z_free and v_free and not after_held and mirrors and _points_down(out, i, u_std)
     return (-1.0 if down else 1.0), of_z, of_v, (1.0 if w_held else of_w)
+
+
+def _crosses(operator: GeneralizedPlay, out: Values, i: int, reach: float) -> bool:
+    """Whether the envelopes of channel i, each its smallest threshold away, cross within twice the reach of z."""
+    z, least = reach * GRID, out["r"][i].min()
+    return bool(np.any(operator.envelope("l", z, out, i) - least > operator.envelope("r", z, out, i) + least))
 
 
 def _points_down(out: Values, i: int, u_std: Array) -> bool:

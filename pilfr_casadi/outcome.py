@@ -10,9 +10,11 @@ from .gauge import standard_errors
 from .lfr import PILFR
 from .limits import limits_of
 from .model import Model
-from .multistart import PRIOR, Candidate
+from .multistart import PRIOR
+from .open_memory import open_memory_sentence
 from .problem import Problem
 from .recording import Recording
+from .search import Candidate
 from .solution import Solution
 
 
@@ -37,7 +39,7 @@ def outcome(
     """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
 
     Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the standard
-    errors know of them.
+    errors know of them. The note also says which memory a periodic steady state leaves open (`open_memory`).
     """
     fitted = with_solution(model, problem, solution)
     judged = problem
@@ -49,6 +51,7 @@ def outcome(
         options: dict[str, Any] = {"constraints": problem.constraints, "noise": problem.noise, "scale": problem.scale}
         judged = Problem(fitted, recordings, engine=problem.engine, **options)
     theta = solution.theta
+    note = "; ".join(part for part in (note, open_memory_sentence(judged, theta)) if part)
     at_bound = [
         f"{label} = {value:g}"
         for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)

@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 
 from .compiled import make_engine
-from .constraints import Constraint, check_free, compile_constraints, constraint_sizes
+from .constraints import Constraint, Rows
 from .layout import Part, checked_weights, lay_out, output_scale
 from .magnitude import Neighbours
 from .model import Model
 from .nlp import Horizon, to_nlp
+from .penalties import Penalties
 from .recording import InputError, Recording, as_recordings
 from .sensitivities import Engine, VirtualMachine
 from .slopes import Pass, settled, steady_slope, steady_sums, sums
@@ -109,43 +110,10 @@ class Problem:
         self._columns = np.where(self.free, np.cumsum(self.free) - 1, -1)
         self.noise = noise
         self.l1 = dict(l1 or {})
-        self._set_penalties(self.l1, noise)
-        compiled = compile_constraints(self.constraints, parameters)
-        self._g, self._g_slope, self.g_lower, self.g_upper, self.g_labels, self._g_units = compiled
-        self.g_sizes = constraint_sizes(self.constraints, parameters)
-        named = parameters.unpack(self._base)
-        held = np.repeat([c.check is not None and c.check(named) <= 0 for c in self.constraints], self.g_sizes)
-        check_free(
-            self._g,
-            self._g_slope,
-            self.free,
-            self._base,
-            self.g_lower,
-            self.g_upper,
-            self.g_labels,
-            np.asarray(held, dtype=bool),
-        )
-
-    def _set_penalties(self, l1: dict[str, float], noise: float) -> None:
-        parameters = self.model.parameters
-        weight, mean, slope = (np.zeros(parameters.size) for _ in range(3))
-        for name, strength in l1.items():
-            where = parameters.position(name)
-            if np.any(parameters.lower[where] < 0):
-                raise InputError(
-                    f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior."
-                )
-            slope[where] = strength
-        for name, p in parameters.items():
-            if p.prior is not None:
-                where = parameters.position(name)
-                mean[where] = np.broadcast_to(np.asarray(p.prior[0], dtype=float), p.value.shape).ravel(order="F")
-                std = np.broadcast_to(np.asarray(p.prior[1], dtype=float), p.value.shape).ravel(order="F")
-                weight[where] = noise**2 / std**2 / self._residuals
-        pad = np.zeros(self.size - int(self.free.sum()))
-        self._prior_weight, self._prior_mean, self._l1 = (
-            np.concatenate([a[self.free], pad]) for a in (weight, mean, slope)
-        )
+        self.penalties = Penalties(parameters, self.l1, noise, self._residuals, self.size)
+        self.rows = Rows(self.constraints, parameters)
+        self.g_lower, self.g_upper, self.g_labels = self.rows.lower, self.rows.upper, self.rows.labels
+        self.g_sizes = self.rows.sizes
 
     @property
     def size(self) -> int:
@@ -188,9 +156,6 @@ class Problem:
         with ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(function, items))
 
-    def _penalty(self, theta: np.ndarray) -> float:
-        return float(0.5 * self._prior_weight @ (theta - self._prior_mean) ** 2 + self._l1 @ theta)
-
     def simulate(self, theta: np.ndarray) -> list[np.ndarray]:
         """Simulated outputs, one (M, n_y) array a recording."""
         p, states = self.parameters(theta), self.first_states(theta)
@@ -207,7 +172,7 @@ class Problem:
         """Value of the objective; infinite where the simulation diverges."""
         e = self.residual(theta)
         with np.errstate(over="ignore", invalid="ignore"):
-            value = 0.5 * float(e @ e) / self._residuals + self._penalty(theta)
+            value = 0.5 * float(e @ e) / self._residuals + self.penalties.value(theta)
         return value if np.isfinite(value) else np.inf
 
     def _pass(self, part: Part, theta: np.ndarray, state: np.ndarray, slopes: np.ndarray | None = None) -> Pass:
@@ -273,18 +238,18 @@ class Problem:
                 gradient[columns] += slope
                 hessian[np.ix_(columns, columns)] += square
         m = self._residuals
-        gradient = gradient / m + self._prior_weight * (theta - self._prior_mean) + self._l1
-        return 0.5 * value / m + self._penalty(theta), gradient, hessian / m + np.diag(self._prior_weight)
+        gradient = gradient / m + self.penalties.gradient(theta)
+        return 0.5 * value / m + self.penalties.value(theta), gradient, hessian / m + np.diag(self.penalties.weight)
 
     def constraint(self, theta: np.ndarray) -> np.ndarray:
         """Values g(θ) of the general constraints."""
-        return np.asarray(self._g(self.parameters(theta))).ravel()
+        return self.rows.values(self.parameters(theta))
 
     def constraint_jacobian(self, theta: np.ndarray) -> np.ndarray:
         """Jacobian of `constraint`, shape (n_g, size)."""
         jac = np.zeros((len(self.g_lower), self.size))
         if len(jac):
-            jac[:, : int(self.free.sum())] = np.asarray(self._g_slope(self.parameters(theta)))[:, self.free]
+            jac[:, : int(self.free.sum())] = self.rows.slope(self.parameters(theta))[:, self.free]
         return jac
 
     def constraint_units(self, theta: np.ndarray, squares: np.ndarray | None = None) -> np.ndarray:
@@ -297,7 +262,7 @@ class Problem:
         size = Neighbours(self.labels).sizes(theta)
         still = np.ones(self.size) if squares is None else 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
         change = np.abs(self.constraint_jacobian(theta)) * np.where(size > 0, size, still)
-        return np.where(np.isnan(self._g_units), np.max(change, axis=1, initial=0.0), self._g_units)
+        return np.where(np.isnan(self.rows.units), np.max(change, axis=1, initial=0.0), self.rows.units)
 
     def active_constraints(self, theta: np.ndarray, tolerance: float = 1e-7) -> np.ndarray:
         """Which general constraints are at a limit, or beyond, up to a share of their unit: (n_g,), bool."""

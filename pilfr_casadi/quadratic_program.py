@@ -46,6 +46,31 @@ class QuadraticProgram:
         multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])
         return d, multipliers, bool(self._solve.stats()["success"]) and bool(np.all(np.isfinite(d)))
 
+    def scaled(
+        self,
+        h: np.ndarray,
+        g: np.ndarray,
+        lbx: np.ndarray,
+        ubx: np.ndarray,
+        a: np.ndarray,
+        lba: np.ndarray,
+        uba: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, bool]:
+        """The same with unit diagonal and rows, h having a positive diagonal: a solver's tolerances are absolute.
+
+        The step is scaled by the steepest slope or, where there is none, by what the rows lack at d = 0.
+        """
+        unit = 1.0 / np.sqrt(np.diag(h))
+        a, g = a * unit, g * unit
+        row = np.max(np.abs(a), axis=1, initial=0.0)
+        row = np.where(row > 0, row, 1.0)
+        low, high = lba / row, uba / row
+        size = float(np.max(np.abs(g))) or float(np.max(np.maximum(low, -high), initial=0.0))
+        size = max(size, 1e-300)
+        rows = a / row[:, None], low / size, high / size
+        d, multipliers, good = self(h * unit * unit[:, None], g / size, lbx / unit / size, ubx / unit / size, *rows)
+        return d * size * unit, size * multipliers / np.concatenate([unit, row]), good
+
 
 def unconstrained(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
     """`-h⁻¹ g` for a positive definite h, else None."""

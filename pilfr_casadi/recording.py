@@ -40,7 +40,9 @@ class Recording:
     period : int, optional
         Samples per period, when the recording is in periodic steady state from sample `skip` on.
     initial : {"estimate", "zero", "periodic"} or array, (nx,)
-        State at the first sample: to be estimated, zero, that of the periodic steady state, or given.
+        State at the first sample: to be estimated, zero, that of the periodic steady state, or given. The memory of an
+        operator that never slips in a period is not unique in steady state: periods from rest with zero memory lead to
+        the one that is taken, and a fit says so.
     hold : {"zero", "linear"}, optional
         What the input does between the samples: held, or interpolated. ``None`` means not said.
     skip : int

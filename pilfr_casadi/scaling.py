@@ -87,7 +87,7 @@ class Scaled:
     def _weighted_curvature(self) -> ca.Function | None:
         """`(p, λ) -> ∇²(λ'g)` over the model's full parameter vector; None where the constraints are linear."""
         p, lam = ca.MX.sym("p", len(self.problem.free)), ca.MX.sym("lam", len(self.g_unit))
-        h = ca.hessian(ca.dot(lam, self.problem._g(p)), p)[0]
+        h = ca.hessian(ca.dot(lam, self.problem.rows.function(p)), p)[0]
         return ca.Function("curvature", [p, lam], [ca.densify(h)], ["p", "lam"], ["hessian"]) if h.nnz() else None
 
     def curvature(self, x: np.ndarray, multipliers: np.ndarray) -> np.ndarray:

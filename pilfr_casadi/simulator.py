@@ -211,6 +211,13 @@ class Simulator:
         derivatives = zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True)
         return frozenset(n for n, d in derivatives if d.is_symbolic() and d.name() in self.states and d.name() != n)
 
+    @cached_property
+    def idle_inputs(self) -> tuple[str, ...]:
+        """Inputs that no equation reads: they may scale what is missing."""
+        x, u, p, t = self._symbols()
+        read = ca.vertcat(self.derivatives(x, u, p, t), *self.measured(x, u, p, t).values())
+        return tuple(name for name in self.inputs if not ca.depends_on(read, u[name]))
+
     def with_parameters(self, parameters: Mapping[str, Parameter]) -> Simulator:
         """The same equations with other parameters of the same names."""
         return replace(self, parameters=ParameterSet(dict(parameters)))

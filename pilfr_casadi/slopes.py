@@ -28,7 +28,9 @@ CHUNK = 512  # samples of a period whose slopes are held at a time
 def settled(engine: Engine, period: Array, p: Array, state: Array, tolerance: float = SETTLED) -> Array:
     """State at the beginning of a steady period, not finite where none is reached.
 
-    Periods are run from a state; where that takes long, for slow poles, Newton's rule on `x = Φ(x)` leaps ahead.
+    Memory of operators that never slip in a period is not decided by it: it stays as the periods leave it that are run
+    from the state given, which is zero for a recording (`open_memory` finds it). Periods are run from there; where that
+    takes long, for slow poles, Newton's rule on `x = Φ(x)` leaps ahead.
     """
     change, size = np.inf, 1.0
     with np.errstate(over="ignore", invalid="ignore"):

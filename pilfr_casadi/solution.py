@@ -28,6 +28,19 @@ class Status(Enum):
         """Whether the result is what was looked for: a minimum, or the best point on data held back."""
         return self in (Status.CONVERGED, Status.SMALL_STEP, Status.STOPPED_EARLY)
 
+    @property
+    def advice(self) -> str:
+        """What to do about it, in one sentence; empty where nothing is to be done or the status says it."""
+        return ADVICE.get(self, "")
+
+
+ADVICE = {
+    Status.MAX_ITERATIONS: "Judge it by its error on a test recording; to go on, give a solver more iterations, as in "
+    "solver=GaussNewton(max_iterations=1000).",
+    Status.TIME_LIMIT: "Judge it by its error on a test recording; to go on, give more time.",
+    Status.SOLVER_FAILED: "Judge it by its error on a test recording; to go on, fit again from it or from more starts.",
+}
+
 
 @dataclass(frozen=True)
 class Iteration:

@@ -21,14 +21,16 @@ from typing import Any
 import numpy as np
 
 from .elements import PrandtlIshlinskii
-from .fit import constraint_list, stability_limits
+from .fit import constraint_list
 from .fit import fit as identify
 from .fitted import Fit, fingerprint
 from .interrupts import Progress
 from .job import Job
-from .multistart import POLISH, Candidate, Search, polish
+from .multistart import POLISH, polish
 from .recording import InputError, Recording, as_recordings
+from .search import Candidate, Search
 from .solution import Status
+from .stability import stability_limits
 from .thinning import thinned
 
 LAYER = ("w", "r")

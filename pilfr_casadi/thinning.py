@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from .elements import PrandtlIshlinskii
-from .fit import constraint_list, stability_limits
+from .fit import constraint_list
 from .fitted import Fit
 from .job import Job
 from .multistart import POLISH, PRIOR, held_near
 from .recording import Recording, as_recordings
 from .solution import Status
+from .stability import stability_limits
 from .start import regrid
 
 LAYER = ("w", "r")

@@ -13,18 +13,20 @@ outside ends in poor points. So
 3. at the bound the Schur forms are taken anew until nothing improves, and the radii are held inside by a margin that
    grows until the eigenvalues of the numbers themselves are inside.
 
-What results is a minimum in the feasible set, not merely a point of it; which one is a matter of the start.
+What results is a minimum in the feasible set, not merely a point of it; which one is a matter of the start. Where the
+start itself is inside and better, 2 begins there.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from .constraints import BeyondRadius, Constraint, loosened
+from .constraints import TOLERATED, BeyondRadius, Constraint, loosened
 from .exactness import beyond
 from .gauss_newton import GaussNewton
 from .lifted import Lifted, back, radius_limits, rotated
@@ -67,14 +69,17 @@ def within_bounds(
     """
     if not radius_limits(problem):
         return solve(problem, start)
-    begin = problem.start if start is None else start
+    ends = time.perf_counter() + last.time_limit
+    given = begin = problem.start if start is None else start
     if not held and not at_bounds(problem, begin):
         found = solve(with_constraints(problem, loosened(problem.constraints)), start)
         if found.status in (Status.INTERRUPTED, Status.DIVERGED_START) or _room(problem, found.theta) >= 0:
             return found
         begin = found.theta
-    tightened = tighten(problem, begin, last, progress)
-    if tightened.status is not Status.INFEASIBLE:
+    tightened = tighten(problem, begin, _until(ends, last), progress)
+    if begin is not given and _beats(problem, given, tightened):
+        tightened = tighten(problem, given, _until(ends, last), progress)
+    if tightened.status is not Status.INFEASIBLE or time.perf_counter() > ends:
         return tightened
     other = solve(problem, start)  # the bound as one row, for what no scaling brings inside
     return other if other.status is not Status.INFEASIBLE else tightened
@@ -85,15 +90,31 @@ def at_bounds(problem: Problem, theta: Array) -> bool:
     return bool(radius_limits(problem)) and 0 <= _room(problem, theta) <= NEAR
 
 
+def _beats(problem: Problem, theta: Array, found: Solution) -> bool:
+    """Whether θ is inside every constraint, and better than what was found."""
+    g, unit = problem.constraint(theta), problem.constraint_units(theta)
+    over = np.maximum(problem.g_lower - g, g - problem.g_upper) > TOLERATED * np.where(unit > 0, unit, 1.0)
+    own = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)  # these have a check of their own
+    if beyond(problem, theta) or np.any(over & ~own) or found.status is Status.INTERRUPTED:
+        return False
+    return found.status is Status.INFEASIBLE or problem.cost(theta) < found.cost
+
+
+def _until(ends: float, solver: GaussNewton) -> GaussNewton:
+    """The solver with what is left of the time."""
+    return replace(solver, time_limit=ends - time.perf_counter())
+
+
 def tighten(problem: Problem, theta: Array, last: GaussNewton, progress: Progress | None = None) -> Solution:
     """The best solution inside that is found when the bounds are tightened from where θ is."""
     if not np.isfinite(problem.cost(theta)):
         theta = _scaled(problem, theta)
     if not np.isfinite(problem.cost(theta)):
         return _unsolved(problem, theta, Status.DIVERGED_START)
+    ends = time.perf_counter() + last.time_limit
     for constraints in list(_steps(problem, theta))[:-1]:
         step = with_constraints(problem, constraints)
-        found = _at_bound(step, _scaled(step, theta), STEP, INSIDE[0], True, progress)
+        found = _at_bound(step, _scaled(step, theta), _until(ends, STEP), INSIDE[0], True, progress)
         if found.status is Status.INTERRUPTED:
             return found
         theta = found.theta if found.status is not Status.INFEASIBLE else theta
@@ -102,18 +123,21 @@ def tighten(problem: Problem, theta: Array, last: GaussNewton, progress: Progres
     if beyond(problem, theta):
         best = replace(best, status=Status.INFEASIBLE)
     for _ in range(ROUNDS):
-        found = _inside(problem, theta, last, coordinates, progress)
+        found = _inside(problem, theta, last, ends, coordinates, progress)
         iterations += found.iterations
         if found.status is Status.INTERRUPTED:
             return found if best.status is Status.INFEASIBLE else replace(best, status=Status.INTERRUPTED)
-        first = best.status in (Status.INFEASIBLE, Status.RESTORED)
+        first = best.status is Status.INFEASIBLE
         # of two that are as good the one that has converged
         margin = GAIN if found.status.converged and not best.status.converged else 0.0
         better = found.status is not Status.INFEASIBLE and (first or found.cost < (1.0 + margin) * best.cost)
         gain = 1.0 if best.status is Status.INFEASIBLE else 1.0 - found.cost / max(best.cost, 1e-300)
         best, theta = (found, found.theta) if better else (best, theta)
-        if not better or gain < GAIN or found.status is Status.TIME_LIMIT:
-            if not coordinates or found.status is Status.TIME_LIMIT:
+        if found.status is Status.TIME_LIMIT:
+            best = replace(best, status=found.status) if best.status is Status.RESTORED else best
+            break
+        if not better or gain < GAIN:
+            if not coordinates:
                 break
             coordinates = False  # the last word has a solve in any coordinates
     return replace(best, iterations=iterations)
@@ -172,12 +196,12 @@ def _room(problem: Problem, theta: Array) -> float:
 
 
 def _inside(
-    problem: Problem, theta: Array, solver: GaussNewton, coordinates: bool, progress: Progress | None
+    problem: Problem, theta: Array, solver: GaussNewton, ends: float, coordinates: bool, progress: Progress | None
 ) -> Solution:
     """A solve at the bounds, held so far inside that the eigenvalues of the result are; infeasible where none is."""
     found = _unsolved(problem, theta, Status.INFEASIBLE)
     for inside in INSIDE:
-        found = _at_bound(problem, theta, solver, inside, coordinates, progress)
+        found = _at_bound(problem, theta, _until(ends, solver), inside, coordinates, progress)
         if found.status is Status.INTERRUPTED or not np.isfinite(found.cost):
             break
         if found.status is not Status.INFEASIBLE:
@@ -194,7 +218,7 @@ def _at_bound(
     turned = rotated(problem, theta) if coordinates else None
     held, begin = turned or (problem, theta)
     lifted = Lifted(held, begin, inside, triangular=turned is not None)
-    found = solver.solve(lifted, lifted.start, progress)
+    found = solver.solve(lifted, lifted.start, progress, unfinished=True)
     there = lifted.theta(found.theta)
     force = lifted.multipliers(found.theta, found.multipliers)
     multipliers = np.zeros(problem.size + len(problem.g_lower))

@@ -20,10 +20,11 @@ from .job import Job, interrupted, penalised, rms_error
 from .known_blocks import known_entries
 from .lfr import PILFR
 from .model import Model
-from .multistart import KEEP, Candidate, Search, search_starts
+from .multistart import search_starts
 from .penalty import check_penalty
 from .problem import Problem
 from .recording import InputError, Recording
+from .search import Candidate, Search
 from .solution import Solution, Status
 
 
@@ -97,15 +98,14 @@ def from_starts(
     blocks = {k: p.value for k, p in linear.parameters.items()}
     options: dict[str, Any] = {"engine": job.engine, "start": start, "noise": job.noise}
     options |= {"level": rms_error(problem, solution), "coordinates": not known_entries(structure)}
+    options["progress"] = job.progress if executor is None else None
     search = Search(structure, job.recordings, blocks, job.solver, job.limits, **options)
-    seen: list[float] = []
+    least: list[float] = [np.inf]
 
-    def report(candidate: Candidate) -> None:
-        seen.append(candidate.error)
+    def report(stage: str, found: list[Candidate], total: int) -> None:
+        least.append(min([least[-1], *(c.error for c in found)]))
         if job.progress:
-            polishing = len(seen) > starts
-            stage, total = ("polish", min(starts, KEEP)) if polishing else ("starts", starts)
-            job.progress(stage, len(seen) - starts * polishing, total, min(seen))
+            job.progress(stage, len(found), total, least[-1] if np.isfinite(least[-1]) else np.nan)
 
     candidates, best, stopped = search_starts(search, starts, seed, executor, report)
     if best is None:

@@ -116,8 +116,8 @@ def growth(folder: Path, samples: int) -> Figures:
 def one_start(folder: Path, engine: str) -> Figures:
     """One start run to the end, as the pipeline would: with its constraints, code generation and building included."""
     from pilfr_casadi.gauss_newton import GaussNewton
-    from pilfr_casadi.multistart import stability
     from pilfr_casadi.problem import Problem
+    from pilfr_casadi.stability import stability
 
     model = load(folder, "vm", 200).model
     record = load(folder, "vm").recordings

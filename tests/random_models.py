@@ -4,7 +4,9 @@ import numpy as np
 
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.lfr import PILFR, block_shapes
+from pilfr_casadi.multisines import multisine
 from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
+from pilfr_casadi.recording import Recording
 
 
 def random_lfr(seed, nx=3, n_u=1, n_y=1, n_w=1, n=4, operator=Play, radius=0.8, gain=0.1, **options):
@@ -84,6 +86,21 @@ def reference(operator, values, u, state):
 
 
 OPERATORS = (Play, Stop, GeneralizedPlay)
+
+
+def coupled_plays(seed, samples=800):
+    """Two plays that read a mode's position and push it, with noise of a hundredth of the output."""
+    rng = np.random.default_rng(seed)
+    u = multisine(samples, f_max=8, fs=100, rng=rng)
+    A, r, x, q, y = np.array([[0.96, 0.18], [-0.18, 0.96]]) * 0.985, np.array([0.1, 0.5]), np.zeros(2), np.zeros(2), []
+    for value in u:
+        z = value + 0.5 * x[0]
+        q = np.maximum(z - r, np.minimum(z + r, q))
+        w = q @ [0.4, 0.3]
+        y.append(x[0] + 0.1 * w)
+        x = A @ x + np.array([0.05, 0.1]) * value + np.array([0.03, -0.08]) * w
+    measured = np.array(y) + 0.01 * np.std(y) * rng.standard_normal(samples)
+    return Recording(u, measured, 0.01, initial="zero")
 
 
 def simulate_lti(system, u, x=None):

@@ -264,10 +264,29 @@ def test_what_is_held_back():
     assert (len(kept), held.skip) == (60, 60)
     with pytest.raises(pilfr.InputError, match="one period only"):
         hold_back([periodic.with_(period=60)], 0.25)
+    for period in (30, 60):  # known, but the start is no steady state: what is held back need not be whole periods
+        (kept,), (held,) = hold_back([one.with_(initial="estimate", period=period)], 0.25)
+        assert (len(kept), held.skip, held.period) == (80, 80, None) and len(held) == 100
     several = [one.with_(name=str(k), initial="estimate") for k in range(4)]
     kept, held = hold_back(several, 0.25)
     assert [r.name for r in kept] == ["0", "1", "2"] and [r.name for r in held] == ["3"]
     assert held[0].initial == "zero" and held[0].skip == 20
+    assert hold_back([r.with_(period=80) for r in several], 0.25)[1][0].skip == 20
+
+
+def test_a_noe_of_a_periodic_recording_whose_start_is_estimated():
+    train = recordings(truth("NARX"), length=400)[0].with_(initial="estimate", period=150)
+    quick = pilfr.GaussNewton(max_iterations=30)
+    assert pilfr.fit(pilfr.NOE(2, 3), train, starts=1, solver=quick).train_nrmse[0] < 0.3
+
+
+@pytest.mark.parametrize("wanted", [pilfr.NARX(2, 3), pilfr.NOE(2, 3, validation=0.0), pilfr.ssnn(2, 2)])
+def test_what_ends_at_a_limit_says_what_to_do(wanted):
+    train = recordings(truth("NARX"), length=400)[0]
+    fit = pilfr.fit(wanted, train, starts=1, solver=pilfr.GaussNewton(max_iterations=2))
+    assert fit.status is pilfr.Status.MAX_ITERATIONS
+    assert str(fit).splitlines()[1] == fit.status.advice and "max_iterations=1000" in fit.status.advice
+    assert not pilfr.Status.CONVERGED.advice
 
 
 def test_a_noe_of_several_recordings_has_a_state_for_each(tmp_path):

@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.constraints import BeyondRadius, Constraint, stable
@@ -114,6 +115,15 @@ def test_a_known_gain_and_its_multiplier(record):
     # the multiplier is the slope of the objective over the limit
     slope = (fits[1].solution.cost - fits[0].solution.cost) / (0.001 * wanted)
     assert limit.multiplier == pytest.approx(slope, rel=0.1)
+
+
+def test_a_second_fit_under_the_same_constraint_is_never_worse():
+    record, gain = coupled_plays(5), [dc_gain(1.0)]
+    first = pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=2, constraints=gain)
+    second = pilfr.fit(first, record, constraints=gain)
+    assert first.status.converged and second.status.converged
+    assert second.train_nrmse[0] <= first.train_nrmse[0]
+    assert second.solution.violation <= 1e-6
 
 
 def test_a_gain_within_limits_is_exact(record):

@@ -179,11 +179,13 @@ def test_the_inverse_gives_back_the_input_from_any_memory(thresholds, seed, oper
         memories.append(q)
         q = play(value, q, r)
         v.append(gain * value + np.sum(w * (q if operator is pilfr.Play else value - q)))
-    made = pilfr.inverse_element(r, w, gain=gain, operator=operator)
-    memory = made.memory(memories[begin])
-    for wanted, truth in zip(v[begin:], z[begin:], strict=True):
-        memory, u = made.step(memory, wanted)
-        assert float(u) == pytest.approx(truth, abs=1e-9)
+    for sign in (1.0, -1.0):  # an output that falls as the input rises has an inverse too
+        made = pilfr.inverse_element(r, sign * w, gain=sign * gain, operator=operator)
+        memory = made.memory(memories[begin])
+        assert np.all(made.r >= 0)
+        for wanted, truth in zip(v[begin:], z[begin:], strict=True):
+            memory, u = made.step(memory, sign * wanted)
+            assert float(u) == pytest.approx(truth, abs=1e-9)
 
 
 def test_the_inverse_is_a_prandtl_ishlinskii_element():
@@ -201,6 +203,8 @@ def test_what_has_no_inverse_says_why():
         pilfr.inverse_element([0.5, 1.0], [0.4, 0.6], operator=pilfr.Stop)
     with pytest.raises(pilfr.InputError, match="add a linear part"):
         pilfr.inverse_element([0.5], [1.0])
+    with pytest.raises(pilfr.InputError, match="above zero, or all below"):
+        pilfr.inverse_element([0.5], [-2.0], gain=1.0)
     with pytest.raises(pilfr.InputError, match="closed form"):
         pilfr.inverse_element([0.5], [1.0], gain=1.0, operator=pilfr.GeneralizedPlay)
     with pytest.raises(pilfr.InputError, match="2 thresholds and 1 weights"):

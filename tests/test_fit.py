@@ -117,9 +117,10 @@ def test_progress_tells_every_stage(record):
     seen = []
     fit(PILFR(2, layer(4)), record, starts=2, progress=lambda *report: seen.append(report), l1={"w": 1e-5})
     stages = list(dict.fromkeys(stage for stage, *_ in seen))
-    assert stages == ["subspace", "linear model", "starts", "polish", "solve", "L1 penalty", "standard errors"]
+    assert stages == ["subspace", "linear model", "starts", "steps", "polish", "solve", "L1 penalty", "standard errors"]
     assert all(0 <= done <= total for _, done, total, _ in seen)
     assert all(np.isnan(error) or error > 0 for *_, error in seen)
+    assert [(done, total) for stage, done, total, _ in seen if stage == "starts"] == [(0, 2), (1, 2), (2, 2)]
     last = [error for stage, *_, error in seen if stage == "linear model"][-1]
     problem, solution = linear_model([record], PILFR(2))[1:]
     assert last == pytest.approx(np.sqrt(np.mean(problem.residual(solution.theta) ** 2)), rel=1e-3)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from random_models import OPERATORS, envelope, random_input, random_lfr, reference
 
@@ -29,6 +29,12 @@ def signals(operator, values, u, state=None):
     return reference(operator, values, u, np.zeros(len(values["A"]) + values["w"].size) if state is None else state)
 
 
+def crossing(values, channel):
+    """Whether the envelopes of a generalized play cross somewhere."""
+    ends = [[envelope(values, side, channel, z) for z in np.linspace(-60.0, 60.0, 241)] for side in "lr"]
+    return np.any(np.subtract(*ends) > 2 * values["r"][channel].min())
+
+
 def moved(values, operator, rng, mild=1.0):
     """The same model in another random gauge, operators and channels in another order; and the change of the state."""
     nx, (n_w, n) = len(values["A"]), values["w"].shape
@@ -37,6 +43,8 @@ def moved(values, operator, rng, mild=1.0):
     t = t * np.exp(mild * rng.uniform(-1, 1, nx)) if nx else t
     inverse = np.linalg.inv(t)
     sign = rng.choice([-1.0, 1.0], n_w)
+    if general:  # the mirror image of envelopes that cross is another element
+        sign = np.where([crossing(values, i) for i in range(n_w)], 1.0, sign)
     of_z, of_v, of_w = np.exp(rng.uniform(-1, 1, (3, n_w)))
     of_v = of_v if general else of_z
     out = {k: np.array(v) for k, v in values.items()}
@@ -163,10 +171,15 @@ def test_fixed_blocks_leave_fewer_freedoms():
 
 
 @settings(max_examples=25)
-@given(st.integers(0, 10**6), st.sampled_from(OPERATORS), st.integers(1, 2), st.integers(0, 4))
-def test_equal_models_normalise_to_equal_numbers(seed, operator, n_w, nx):
+@given(st.integers(0, 10**6), st.sampled_from(OPERATORS), st.integers(1, 2), st.integers(0, 4), st.booleans())
+@example(813270, GeneralizedPlay, 1, 0, True)
+@example(423326, GeneralizedPlay, 2, 4, False)
+def test_equal_models_normalise_to_equal_numbers(seed, operator, n_w, nx, crosses):
     rng = np.random.default_rng(seed)
     structure, values = random_lfr(seed % 50, nx=nx, n_u=2, n_y=2, n_w=n_w, operator=operator)
+    if operator is GeneralizedPlay and not crosses:
+        values["gamma_r_a0"], values["gamma_r_c"] = values["gamma_l_a0"], values["gamma_r_c"] + 2.0
+        assert not crossing(values, 0)
     other, to_other = moved(values, operator, rng)
     u = random_input(seed, 60, 2)
     state = rng.normal(size=len(to_other))

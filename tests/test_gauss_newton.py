@@ -111,13 +111,13 @@ def test_a_correction_leaves_penalty_and_multipliers_alone(case, monkeypatch):
     curved = Constraint(lambda p: ca.sumsqr(p["C_z"]), 1.0, 1.0)
     problem = Problem(model, record, constraints=(curved,))
     run = _Run(GaussNewton(), problem, problem.start, None)
-    run.penalty, run.multipliers = 3.0, np.ones(problem.size + 1)
+    run.penalty.weight, run.multipliers = 3.0, np.ones(problem.size + 1)
     run.cost, gradient, hessian = problem.normal(run.theta)
     wild = _Step(np.zeros(problem.size), np.full(problem.size + 1, 1e9), True)
     monkeypatch.setattr(run, "_step", lambda *_: wild)
     forward = _Step(0.1 * np.ones(problem.size), np.zeros(problem.size + 1), True)
     run._judge(forward, hessian, gradient, problem.constraint_jacobian(run.theta))
-    assert run.penalty == 3.0 and np.all(run.multipliers == 1.0)
+    assert run.penalty.weight == 3.0 and np.all(run.multipliers == 1.0)
 
 
 def test_damping_remembers_the_largest_diagonal():
@@ -128,6 +128,49 @@ def test_damping_remembers_the_largest_diagonal():
     slope = np.exp(-first) ** 2
     assert second == pytest.approx(slope / (slope + found.history[0].damping * 1.0))
     assert found.history[0].damping > 1e-3
+
+
+class Wavy(Scalar):
+    """A slope down to x = 7 under `0.3 x <= cos x`: in the valley near 2π linear steps do not lead back from."""
+
+    g_lower, g_upper, edge = np.full(1, -np.inf), np.zeros(1), 1.2019131
+
+    def __init__(self, start):
+        super().__init__(lambda x: 7.0 - x, lambda x: -1.0)
+        self.start = np.array([start])
+
+    def constraint(self, theta):
+        return 0.3 * theta - np.cos(theta)
+
+    def constraint_jacobian(self, theta):
+        return (0.3 + np.sin(theta)).reshape(1, 1)
+
+    def constraint_units(self, theta, squares):
+        return np.ones(1)
+
+
+@pytest.mark.parametrize("start", [-0.5, -1.0])
+def test_a_run_that_strays_comes_back_to_what_was_feasible(start, monkeypatch):
+    strays = Wavy(start)
+    found = GaussNewton().solve(strays)
+    assert max(strays.points) > 5.0  # it has been to where the constraint cannot be met
+    assert found.status is Status.CONVERGED and found.theta[0] == pytest.approx(strays.edge, abs=1e-5)
+    assert found.cost == found.history[-1].cost and found.violation <= 1e-9
+    monkeypatch.setattr("pilfr_casadi.gauss_newton.RETURNS", 0)
+    ended = GaussNewton().solve(strays)
+    assert ended.status is Status.SOLVER_FAILED and ended.theta[0] == start == strays.start[0]
+    assert ended.cost == strays.cost(ended.theta) == ended.history[-1].cost
+
+
+@pytest.mark.parametrize("most", range(1, 12))
+def test_no_limit_ends_a_run_worse_than_a_feasible_point_it_has_seen(most):
+    strays = Wavy(-0.5)
+    found = GaussNewton(max_iterations=most).solve(strays)
+    seen = [x for x in strays.points if 0.3 * x - np.cos(x) <= 0]
+    assert found.violation <= 1e-6 and found.cost <= min(strays.cost(np.array([x])) for x in seen)
+    assert found.status in (Status.MAX_ITERATIONS, Status.CONVERGED)
+    there = GaussNewton(max_iterations=most).solve(strays, unfinished=True)
+    assert there.status is Status.MAX_ITERATIONS and there.theta[0] > 5 and there.cost < found.cost
 
 
 def test_what_only_damping_makes_small_is_no_minimum():

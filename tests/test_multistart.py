@@ -13,9 +13,11 @@ from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.linear_model import linear_model
-from pilfr_casadi.multistart import POLISH, Candidate, Search, explore, polish, search_starts, stability
+from pilfr_casadi.multistart import POLISH, explore, polish, search_starts
 from pilfr_casadi.operators import Play
+from pilfr_casadi.search import Candidate, Search
 from pilfr_casadi.solution import Solution, Status
+from pilfr_casadi.stability import stability
 from pilfr_casadi.start import grid_start, paper_start, unit_states
 
 
@@ -97,7 +99,7 @@ def test_every_seed_has_its_own_starts(search, monkeypatch):
 
     monkeypatch.setattr(multistart, "explore", draw)
     for seed in (0, 1, 0):
-        search_starts(search, 3, seed, None, lambda _: None)
+        search_starts(search, 3, seed, None, lambda *_: None)
     assert len(set(drawn)) == 6 and drawn[:3] == drawn[6:]
 
 
@@ -110,7 +112,7 @@ def test_the_first_starts_place_the_element(search, monkeypatch):
 
     monkeypatch.setattr(multistart, "grid_start", kept)
     monkeypatch.setattr(multistart, "EXPLORE", GaussNewton(max_iterations=1))
-    search_starts(replace(search, start="grid"), 4, 0, None, lambda _: None, keep=0)
+    search_starts(replace(search, start="grid"), 4, 0, None, lambda *_: None, keep=0)
     assert places == ["output", "input", "random", "random"]
 
 

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr
 
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi.fit import fit
 from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.open_memory import open_memory
 from pilfr_casadi.operators import Play, Stop
 from pilfr_casadi.periods import mean_period, noise_weights, period_noise
 from pilfr_casadi.problem import Problem
@@ -114,3 +118,24 @@ def test_without_a_steady_state_the_cost_is_infinite():
     model = PILFR(1, offset=False).model(1, 1, {"A": [[1.0]], "B_u": [[1.0]], "C_y": [[1.0]], "D_yu": [[0.0]]})
     problem = Problem(model, [Recording(np.tile(u, 2), np.tile(u, 2), 0.1, period=64, initial="periodic")])
     assert problem.cost(problem.start) == np.inf
+
+
+@pytest.mark.parametrize("weight, width, resting", [(0.5, 5.0, 1), (0.5, 0.3, 0), (0.0, 5.0, 0)])
+def test_memory_that_a_period_does_not_tell_is_said(weight, width, resting):
+    """A wide play that never slips may rest anywhere: the period decides nothing about it, unless it has no weight."""
+    u = np.tile(np.sin(2 * np.pi * np.arange(100) / 100), 2)
+    values = {"D_zu": [[1.0]], "D_yw": [[1.0]], "r": [[0.1, width]], "w": [[1.0, weight]]}
+    model = PILFR(0, PrandtlIshlinskii(Play, 2), offset=False).model(1, 1, values)
+    held = {k: {"fixed": True} for k in model.parameters if k != "D_yu"}
+    y = make_engine(model, "vm").simulate(u[:, None], model.parameters.start, np.zeros(2))[0]
+    record = Recording(u, y + 0.1 * u[:, None], 0.1, period=100, initial="periodic", name="sine")
+    held = model.with_parameters(model.parameters.change(**held))
+    problem = Problem(held, record)
+    assert len(open_memory(problem, problem.start, record, problem.first_states(problem.start)[0])) == resting
+    found = fit(held, record)
+    assert ("never slip in a steady period: 1 in recording 'sine'" in str(found)) == bool(resting)
+    assert "never slip" not in str(fit(held, record.with_(initial="zero")))
+    state = found.initial_state(record)
+    if resting:  # another memory is a steady state as well, and gives another mean
+        shifted = [found.simulate(record.with_(initial=state + np.array([0.0, q]))) for q in (0.0, 2.0)]
+        np.testing.assert_allclose(shifted[1] - shifted[0], 2.0 * weight, rtol=1e-9)

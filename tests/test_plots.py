@@ -18,10 +18,10 @@ from pilfr_casadi.bla import BLA, robust_bla
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.fit import Fit
 from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.multistart import Candidate
 from pilfr_casadi.operators import Play, Stop
 from pilfr_casadi.plots import canvas
 from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi.search import Candidate
 from pilfr_casadi.solution import Iteration, Solution, Status
 
 BLOCKS = {

@@ -10,10 +10,10 @@ from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.fit import fit
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.multistart import stability
 from pilfr_casadi.operators import Play
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi.stability import stability
 from pilfr_casadi.start import grid_start, network_start, paper_start, regrid, unit_states
 from pilfr_casadi.subspace import time_subspace
 

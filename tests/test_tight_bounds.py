@@ -1,10 +1,13 @@
 """Tight bounds on the spectral radius: smooth rows where eigenvalues meet, and minima in the feasible set."""
 
+import time
+
 import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from random_models import coupled_plays
 from scipy.optimize import minimize
 
 import pilfr_casadi as pilfr
@@ -13,6 +16,7 @@ from pilfr_casadi.lifted import Lifted, rotated
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.schur import below_blocks, bounded_rows, paired_schur
 from pilfr_casadi.solution import Status
+from pilfr_casadi.tightening import within_bounds
 from problems.constrained import radius, three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
@@ -195,3 +199,46 @@ def test_a_bound_where_a_is_known(record):
 def test_the_seed_of_starts_that_are_not_drawn(record):
     few, more = (pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=n) for n in (2, 3))
     assert "the seed changes nothing" in str(few) and "the seed changes nothing" not in str(more)
+
+
+def test_every_step_of_a_tightened_fit_is_told(record, monkeypatch):
+    unheard, counts = [0], []
+    normal = Problem.normal
+
+    def counted(*args):
+        unheard[0] += 1
+        return normal(*args)
+
+    def heard(stage, *_):
+        counts.append((unheard[0], stage))
+        unheard[0] = 0
+
+    monkeypatch.setattr(Problem, "normal", counted)
+    pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=2, stable=0.6, progress=heard)
+    assert sum(count for count, _ in counts) > 200 and max(counts)[0] <= 2
+
+
+@pytest.mark.parametrize(("bound", "looser"), [(0.9, 0.91), (0.6, 0.61)])
+def test_a_looser_bound_is_never_worse(bound, looser):
+    other = coupled_plays(7)
+    first = pilfr.fit(pilfr.PILFR(2, PLAYS), other, starts=2, stable=bound)
+    second = pilfr.fit(first, other, stable=looser)
+    assert radius(second) <= looser and second.train_nrmse[0] <= first.train_nrmse[0]
+
+
+def test_a_limit_on_time_holds_for_all_solves_at_a_bound(record, monkeypatch):
+    linear, limits = pilfr.fit(pilfr.PILFR(2), record), []
+    solve = pilfr.GaussNewton.solve
+
+    def slow(solver, *args, **more):
+        limits.append(solver.time_limit)
+        time.sleep(0.02)
+        return solve(solver, *args, **more)
+
+    monkeypatch.setattr(pilfr.GaussNewton, "solve", slow)
+    solver = pilfr.GaussNewton(time_limit=0.1)
+    problem = Problem(linear.model, record, constraints=(stable(0.3, exact=True),))
+    found = within_bounds(problem, None, solver.solve, solver)
+    values = problem.model.parameters.unpack(problem.parameters(found.theta))
+    assert found.status is Status.TIME_LIMIT and radius_of(values["A"]) <= 0.3
+    assert 3 <= len(limits) <= 8 and np.all(np.diff(limits) < 0)

@@ -110,6 +110,8 @@ class Run:
         Simulated (or predicted) minus measured output.
     z, dz : array, shape (M, n_ports)
         Local signals.
+    u : array, shape (M, n_u)
+        Inputs.
     sign : array, shape (n_ports,)
         +1 where a positive force opposes the port's motion, -1 where it drives it, 0 where there is no such sense.
     lift, push : array, shape (n_ports,)
@@ -124,6 +126,7 @@ class Run:
     error: np.ndarray
     z: np.ndarray
     dz: np.ndarray
+    u: np.ndarray
     sign: np.ndarray
     lift: np.ndarray
     push: np.ndarray
@@ -161,7 +164,7 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     sign = np.where(np.abs(lift).max(axis=0) > 0, 0.0, -np.sign(np.median(push, axis=0)))
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
     a, b = over_samples(a, b, n)
-    return Run(a, b, c[::n], d[::n], mean, error=y[::n, :, 0] - r.y, z=z, dz=dz, sign=sign, **felt)
+    return Run(a, b, c[::n], d[::n], mean, error=y[::n, :, 0] - r.y, z=z, dz=dz, u=u, sign=sign, **felt)
 
 
 def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -261,4 +264,5 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     lift, push = (np.max([getattr(r, name) for r in runs], axis=0) for name in ("lift", "push"))
     with np.errstate(divide="ignore", over="ignore"):  # a force that does not move the port has no limit
         stiffest = np.where(lift > 0, rate / lift, rate**2 / push)
-    return [Local(z[:, j], dz[:, j], bench.dt, lengths, float(k)) for j, k in enumerate(stiffest)]
+    inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in runs]).T, strict=True))
+    return [Local(z[:, j], dz[:, j], bench.dt, lengths, float(k), inputs) for j, k in enumerate(stiffest)]

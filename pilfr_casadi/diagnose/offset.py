@@ -59,7 +59,7 @@ def first_order(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[
     columns = columns - base @ (base.T @ columns)
     rest = np.linalg.norm(columns, axis=0)
     seen = rest > 1e-6 * np.maximum(size, 1e-300)  # a constant that the initial state can follow is not
-    drop = np.where(seen, (columns.T @ left) ** 2 / np.maximum(rest, 1e-300) ** 2, 0.0)
+    drop = np.where(seen, (columns.T @ left) ** 2 / np.maximum(rest, 1e-150) ** 2, 0.0)
     return dict(zip(ports, (drop / max(total, 1e-300)).tolist(), strict=True))
 
 

@@ -68,7 +68,7 @@ class Remainder:
     def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
         """Along some runs, for the laws that the data can speak to; only `at` one port where it is named."""
         short = [
-            replace(r, **{k: getattr(r, k)[w] for k in ("a", "b", "c", "d", "error", "z", "dz")})
+            replace(r, **{k: getattr(r, k)[w] for k in ("a", "b", "c", "d", "error", "z", "dz", "u")})
             for r, w in zip(runs, _windows(bench, runs), strict=True)
         ]
         error = np.concatenate([(r.error / bench.scale).ravel() for r in short])

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..accepted import as_simulator
 from ..interrupts import Progress
-from ..laws import CATALOGUE, Law, readable_unit
+from ..laws import CATALOGUE, SCALABLE, Law, readable_unit, scaled
 from ..recording import InputError, Recording, as_recordings, check_for_identification
 from ..threads import one_blas_thread, processors
 from .arranged import arranged
@@ -56,7 +56,7 @@ def diagnose(
     hold : {"zero", "linear"}, optional
         What inputs do between samples, where neither recordings nor simulator say.
     laws : sequence of Law classes
-        The catalogue.
+        The catalogue. Inputs that the simulator's equations do not read are tried as scales of some of its laws.
     effects : int
         Most effects looked for.
     limits : mapping, optional
@@ -93,6 +93,7 @@ def diagnose(
                 f"The limit {name}={most!r} is no amplitude of an input; give a positive number for any of "
                 f"{', '.join(simulator.inputs)}."
             )
+    laws = (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
     say("refit", 0, 1, np.inf)
     ready = prepare(simulator, recordings, hold, engine, workers)
     prepared_at = time.perf_counter()

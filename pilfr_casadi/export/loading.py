@@ -81,7 +81,7 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
 
 def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[str, Any]:
     """What is kept of the way to the fit, as fields of `Fit`."""
-    from ..multistart import Candidate
+    from ..search import Candidate
 
     variables = file.table(training, "variables")
     theta = file.array(list(variables.values()), (len(variables),), "a variable")

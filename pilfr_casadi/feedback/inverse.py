@@ -10,7 +10,8 @@ Kuhnen (2001), IEE Proc. Control Theory Appl. 148, give the inverse in closed fo
 r' are the values of the virgin loading curve at the kinks, and w' the changes of slope of its inverse function; q' are
 the memories, which follow from those of the plays at the moment when play i slipped last. Stops are turned into plays
 by `S_r[z] = z - P_r[z]`: `Σ w_j S_rj = (Σ w_j) z - Σ w_j P_rj`. A sum of stops alone saturates and has no inverse; one
-with a spring of stiffness `gain` beside it has.
+with a spring of stiffness `gain` beside it has. Where all partial sums are negative, so that the output falls as the
+input rises, the formulas hold with -r' for r', since plays are odd: `P_r[-z] = -P_r[z]` from the negative memory.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, 
     Raises
     ------
     InputError
-        If the element has no inverse: its slope right after a reversal or along its loading curve is not positive.
+        If the element has no inverse: its slope right after a reversal or along its loading curve is zero or
+        changes its sign.
     """
     kind = operator() if isinstance(operator, type) else operator
     r, w = numbers(r, "The thresholds").ravel(), numbers(w, "The weights").ravel()
@@ -101,15 +103,17 @@ def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, 
     r, w = np.concatenate([[0.0], r[order]]), np.concatenate([[float(gain)], w[order]])
     slope = np.cumsum(w)
     first = int(np.sum(r == 0))  # operators without width belong to the linear part
-    if np.any(slope[first - 1 :] <= 1e-12 * np.max(np.abs(slope))):
+    sign = 1.0 if slope[first - 1] > 0 else -1.0
+    if np.any(sign * slope[first - 1 :] <= 1e-12 * np.max(np.abs(slope))):
         raise InputError(
             f"This element has no inverse: its slope is {slope[first - 1]:.4g} right after a reversal and "
-            f"{slope[-1]:.4g} once everything slips, and all slopes must be positive; add a linear part with gain=."
+            f"{slope[-1]:.4g} once everything slips, and all slopes must be above zero, or all below; add a linear "
+            "part with gain=."
         )
     own = np.zeros(len(r))
     own[0] = 1 / slope[first - 1]
     own[first:] = -w[first:] / (slope[first:] * slope[first - 1 : -1])
-    low = np.array([np.sum(w[: i + 1] * (r[i] - r[: i + 1])) for i in range(len(r))])
+    low = sign * np.array([np.sum(w[: i + 1] * (r[i] - r[: i + 1])) for i in range(len(r))])
     q, v = ca.SX.sym("memory", len(r)), ca.SX.sym("wanted")
     following = ca.vertcat(*[play(v, q[i], low[i]) for i in range(len(r))])
     names = ["memory", "wanted"], ["memory_next", "u"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .base import Law, Local, readable_unit
+from .composed import behind_gap, scaled
 from .curves import Cubic, Magnitude, Polynomial, Power, PowerWithGain, Quadratic, Root
 from .density import SmoothHysteresis
 from .dynamic import (
@@ -77,6 +78,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     CoulombFriction,
     AsymmetricFriction,
     DirectionalFriction,
+    behind_gap(CoulombFriction),
     PreslidingFriction,
     StribeckFriction,
     PreslidingStribeckFriction,
@@ -124,4 +126,13 @@ CATALOGUE: tuple[type[Law], ...] = (
 # what a named law is put more finely by, once it is named: it costs more to fit
 FINER: dict[type[Law], tuple[type[Law], ...]] = {StopHysteresis: (SmoothHysteresis,)}
 
-__all__ = ["CATALOGUE", "FINER", "Law", "Local", "readable_unit"]
+# what an input that the simulator's equations do not read may scale
+SCALABLE: tuple[type[Law], ...] = (
+    LinearStiffness,
+    ViscousDamping,
+    CoulombFriction,
+    PreslidingFriction,
+    StopHysteresis,
+)
+
+__all__ = ["CATALOGUE", "FINER", "SCALABLE", "Law", "Local", "behind_gap", "readable_unit", "scaled"]

@@ -33,6 +33,8 @@ class Local:
         Samples of each recording.
     stiffest : float
         Largest stiffness (w/z) that the simulation's steps can follow at the port: a harder contact is a wall.
+    inputs : mapping of str to array, shape (M,)
+        The simulator's inputs, for laws that one of them scales.
     """
 
     z: np.ndarray
@@ -40,6 +42,7 @@ class Local:
     dt: float
     lengths: tuple[int, ...]
     stiffest: float = np.inf
+    inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def low(self) -> float:
@@ -96,6 +99,8 @@ class Law:
         Its memory is a shift register, which takes in the signal at the begin of a step.
     substeps : int
         Integration steps a sample that it needs at least.
+    scaled_by : str
+        Input that the force is multiplied by, where there is one; see `composed.scaled`.
     """
 
     id: ClassVar[str]
@@ -111,6 +116,7 @@ class Law:
     order: ClassVar[int] = 0
     shifts: ClassVar[bool] = False
     substeps: ClassVar[int] = 1
+    scaled_by: ClassVar[str] = ""
 
     values: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)

@@ -39,6 +39,9 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
     if not shapes:
         return np.zeros((len(local.z), 0, columns(law)))
     kind: Any = type(law)
+    if law.scaled_by:
+        bare = trace(kind.__base__(law.values, law.limits), local, shapes)
+        return np.asarray(bare * local.inputs[law.scaled_by][:, None, None])
     step = _step(kind, len(shapes), local.dt if law.shifts else 0.0)
     p = law.at(shapes[0]).parameters()
     names = [name for name in p if name not in law.strength]

@@ -50,7 +50,7 @@ def fit_page(
         f"Identified model: {', '.join(fit.model.inputs)} → {', '.join(fit.model.outputs)}",
         [s for s in sections if s.blocks],
         subtitle=_subtitle(fit),
-        status=status.value,
+        status=f"{status.value} {status.advice}".strip(),
         tone="good" if status.converged else "bad" if status.value.startswith("Failed") else "warning",
         facts=_facts(fit, rows),
     )

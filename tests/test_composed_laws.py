@@ -1,0 +1,128 @@
+"""Laws made of laws: behind a gap, scaled by a signal, two in one port; and a rig that hides one of each."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import InputError
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.integration import discretise
+from pilfr_casadi.laws import (
+    CoulombFriction,
+    CubicStiffness,
+    PreslidingFriction,
+    Relaxation,
+    Saturation,
+    SoftClearance,
+    behind_gap,
+    scaled,
+)
+
+DT, SAMPLES = 2e-3, 3000
+
+
+def rig(k=900.0, d=6.0):
+    """A mass on a spring; the coil's voltage is recorded, and nobody knows what it does."""
+    return pilfr.Simulator(
+        lambda x, u, p: {"pos": x.vel, "vel": (u.force - p.k * x.pos - p.d * x.vel) / 2.0},
+        lambda x: {"position": x.pos},
+        states=("pos", "vel"),
+        inputs=("force", "voltage"),
+        parameters={
+            "k": pilfr.Parameter(k, bounds=(100, 5000)),
+            "d": pilfr.Parameter(d, bounds=(0, 100)),
+        },
+        ports=(pilfr.Port("damper", {"vel": -0.5}, lambda x: x.pos, lambda x: x.vel, "N", "m"),),
+    )
+
+
+def recorded(true, seed):
+    """A recording of the true machine from rest."""
+    rng = np.random.default_rng(seed)
+    force = 30.0 * pilfr.multisine(SAMPLES, f_max=10.0, fs=1 / DT, rng=rng)
+    voltage = 2.0 + np.repeat(rng.uniform(-1.5, 2.0, SAMPLES // 250), 250)
+    blank = pilfr.Recording(
+        np.column_stack([force, voltage]), np.zeros(SAMPLES), DT, ("force", "voltage"), ("position",),
+        initial="zero", hold="zero",
+    )  # fmt: skip
+    model = discretise(true, DT, "zero", 8)
+    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_state))[0]
+    return blank.with_(y=y + 1e-3 * np.std(y) * rng.standard_normal(y.shape))
+
+
+@pytest.mark.parametrize(
+    ("law", "values", "form"),
+    [
+        (scaled(CoulombFriction, "voltage"), {"F_c": 3.0, "v_0": 5e-3}, "smooth, scaled by voltage"),
+        (behind_gap(CoulombFriction), {"F_c": 9.0, "v_0": 5e-3, "g": 0.012}, "smooth, behind a gap"),
+    ],
+    ids=("scaled", "behind a gap"),
+)
+def test_a_composed_law_is_found(law, values, form):
+    true = rig().with_element("damper", law().at(values))
+    found = pilfr.diagnose(rig(1000.0, 7.5), recorded(true, 0), test=recorded(true, 1))
+    assert [(e.port, e.law, e.form) for e in found.effects] == [("damper", "coulomb_friction", form)]
+    assert found.effects[0].confidence > 0.8
+    assert found.errors["test"]["after"] < 0.02 * found.errors["test"]["before"]
+    for name in set(values) - {"v_0"}:
+        assert found.effects[0].parameters[name]["value"] == pytest.approx(values[name], rel=0.03)
+
+
+def test_a_scaled_law_is_the_law_times_the_signal():
+    law = scaled(PreslidingFriction, "voltage")().at({"k_t": 400.0, "r": 0.004})
+    one, two = recorded(rig().with_element("damper", law), 3), recorded(rig(), 3)
+    assert np.std(one.y - two.y) > 0.05 * np.std(two.y)
+    halved = scaled(PreslidingFriction, "voltage")().at({"k_t": 200.0, "r": 0.004})
+    true = rig().with_element("damper", halved)
+    r = one.with_(u=one.u * [1.0, 2.0])
+    model = discretise(true, DT, "zero", 8)
+    y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
+    clean = one.y - (y - y)  # the same but for noise
+    np.testing.assert_allclose(y, clean, atol=6e-3 * np.std(y))
+    assert law.parameters()["k_t"].unit == "w/z/[voltage]"
+
+
+@pytest.mark.parametrize("kind", [CoulombFriction, PreslidingFriction, CubicStiffness], ids=lambda k: k.__name__)
+def test_beyond_the_gap_a_law_is_its_own(kind):
+    """Pulled to z, the law feels z - g; inside the gap nothing."""
+    law = behind_gap(kind)().at({name: 1.0 for name in kind.units} | {"g": 0.5})
+    p = pilfr.ParameterSet(law.parameters())
+    values = type("P", (), {k: float(v.value) for k, v in p.items()} | {"__getitem__": lambda s, k: getattr(s, k)})()
+    for z, beyond, rate in ((2.0, 1.5, 0.3), (-2.0, -1.5, 0.3), (0.25, 0.0, 0.0)):
+        if hasattr(kind, "step"):
+            got, expected = law.step(z, 0.0, values)[0], kind().step(beyond, 0.0, values)[0]
+        else:
+            have = {"dz": 0.3} if "dz" in kind.reads() else {}
+            own = {"z": beyond} if "z" in kind.reads() else {"dz": rate}
+            got, expected = law.force(z=z, **{"dz": 0.3} | have, p=values), kind().force(**own, p=values)
+        assert float(ca.DM(got)) == pytest.approx(float(ca.DM(expected)), abs=1e-8)
+
+
+def test_two_laws_in_one_port_act_together():
+    """A cube and a friction in one port are the two in two equal ports."""
+    cube, rub = CubicStiffness().at({"k_3": 3e5}), CoulombFriction().at({"F_c": 3.0, "v_0": 5e-3})
+    both = recorded(rig().with_element("damper", cube).with_element("damper", rub), 5)
+    again = recorded(rig().with_element("damper", rub).with_element("damper", cube), 5)
+    alone = recorded(rig().with_element("damper", cube), 5)
+    np.testing.assert_allclose(both.y, again.y, atol=1e-12)
+    assert np.std(both.y - alone.y) > 0.05 * np.std(both.y)
+
+
+def test_only_inputs_that_no_equation_reads_are_tried_as_scales():
+    assert rig().idle_inputs == ("voltage",)
+    assert pilfr.diagnose.__doc__ and scaled(CoulombFriction, "voltage") is scaled(CoulombFriction, "voltage")
+
+
+@pytest.mark.parametrize(
+    ("compose", "sentence"),
+    [
+        (lambda: scaled("coulomb_friction", "voltage"), "made of a class of laws"),
+        (lambda: scaled(Saturation, "voltage"), "stands in series"),
+        (lambda: behind_gap(Relaxation), "states of its own"),
+        (lambda: behind_gap(SoftClearance), "a gap of its own"),
+    ],
+)
+def test_what_cannot_be_composed_is_said(compose, sentence):
+    with pytest.raises(InputError, match=sentence):
+        compose()
