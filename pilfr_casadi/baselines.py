@@ -95,6 +95,10 @@ class Lagged:
         """The LFR for n_u inputs and n_y outputs."""
         return lagged(self.lags, self.input_lags or self.lags, self.hidden, n_u, n_y, self.linear)
 
+    def model(self, n_u: int, n_y: int) -> Model:
+        """The closed model for n_u inputs and n_y outputs, at no values in particular."""
+        return self.structure(n_u, n_y).model(n_u, n_y)
+
 
 @dataclass(frozen=True)
 class NARX(Lagged):

@@ -202,8 +202,12 @@ def _structure_options(fit: argparse.ArgumentParser) -> None:
     )
     fit.add_argument("--channels", type=int, help="channels of the element (default 1)")
     fit.add_argument(
-        "--structure", choices=("lfr", "hammerstein", "wiener"), help="where the element sits (default: lfr)"
+        "--structure",
+        choices=("lfr", "hammerstein", "wiener", "ssnn", "network_lfr", "narx", "noe"),
+        help="where the element sits (default: lfr), or a network to compare with",
     )
+    fit.add_argument("--hidden", type=int, metavar="N", help="neurons of a network (default: 15; 10 of narx and noe)")
+    fit.add_argument("--lags", type=int, metavar="N", help="past outputs and inputs of narx and noe")
     fit.add_argument("--bound", action="append", metavar="NAME=LOW:HIGH", help="bounds of a parameter (repeatable)")
     fit.add_argument("--fix", action="append", metavar="NAME=VALUE", help="hold a block at a value (repeatable)")
     fit.add_argument("--starts", type=int, help="random starts (default 8)")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .baselines import Lagged
 from .cli import DONE, INTERRUPTED, NO_RESULT, say
 from .compiled import compiler, make_engine
 from .export import load
@@ -28,20 +29,26 @@ from .readers import read
 from .recording import InputError, Recording, listed
 from .sensitivities import VirtualMachine
 from .solution import Status
-from .structures import named_structure
+from .structures import ANY, TAKES, named_structure
 
+LEAST = {"starts": 1, "seed": 0, "workers": 1, "operators": 0, "channels": 1, "hidden": 1, "lags": 1}
 # options of a search with their defaults; a saved model to start from has them already
 SEARCH = {
     "nx": None,
-    "operators": 20,
-    "operator": "play",
-    "channels": 1,
+    "operators": None,
+    "operator": None,
+    "channels": None,
     "structure": "lfr",
+    "hidden": None,
+    "lags": None,
     "bound": (),
     "fix": (),
     "starts": 8,
     "seed": 0,
 }
+
+
+NAMES = {"bound": "bounds"}  # options that the structures call otherwise
 
 
 def fit(options: argparse.Namespace) -> int:
@@ -59,9 +66,10 @@ def fit(options: argparse.Namespace) -> int:
     seen = [Path(path).resolve() for path in (*options.train, *options.test)]
     if len(set(seen)) < len(seen):
         raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
-    for name, least in (("starts", 1), ("seed", 0), ("workers", 1), ("operators", 0), ("channels", 1)):
-        if getattr(options, name) < least:
+    for name, least in LEAST.items():
+        if getattr(options, name) is not None and getattr(options, name) < least:
             raise InputError(f"--{name} {getattr(options, name)} was given; give {least} or more.")
+    check_structure(options.structure, [name for name in SEARCH if f"--{name}" in given])
     if options.time_limit is not None and not 0 < options.time_limit < math.inf:
         raise InputError(f"--time-limit {options.time_limit:g} was given; give seconds, above zero.")
     target = Path(options.out) / "model.json"
@@ -86,7 +94,7 @@ def fit(options: argparse.Namespace) -> int:
             progress_bar() as bar,
             insistent(bar) as progress,
         ):
-            task: PILFR | Fit = saved if saved is not None else _structure(options, _order(options, train))
+            task = saved if saved is not None else _structure(options, train)
             engine = announced_engine(task, train[0], options.engine)
             search = {} if saved is not None else {"starts": options.starts, "seed": options.seed, "executor": pool}
             result = identify(task, train, solver=solver, engine=engine, progress=progress, **search)
@@ -180,16 +188,22 @@ def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> N
             )
 
 
-def _structure(options: argparse.Namespace, nx: int) -> PILFR:
-    return named_structure(
-        nx,
-        structure=options.structure,
-        operator=options.operator,
-        operators=options.operators,
-        channels=options.channels,
-        fixed={name: number(value, "--fix") for name, value in pairs(options.fix, "--fix").items()},
-        bounds=bounds(options.bound),
-    )
+def check_structure(structure: str, given: Sequence[str]) -> None:
+    """Refuse options that are not for the structure, and a NARX or NOE of no lags."""
+    takes = TAKES[structure]
+    for name in given:
+        if NAMES.get(name, name) in ANY and NAMES.get(name, name) not in takes:
+            raise InputError(f"--{name} is not for --structure {structure}; leave it out.")
+    if "lags" in takes and "lags" not in given:
+        raise InputError(f"--structure {structure} needs --lags, the number of past outputs; give it.")
+
+
+def _structure(options: argparse.Namespace, train: Sequence[Recording]) -> PILFR | Lagged:
+    given = {k: getattr(options, k) for k in ("operators", "operator", "channels", "hidden", "lags")}
+    if "nx" in TAKES[options.structure]:
+        given |= {"nx": _order(options, train), "bounds": bounds(options.bound)}
+        given["fix"] = {name: number(value, "--fix") for name, value in pairs(options.fix, "--fix").items()}
+    return named_structure(options.structure, **{k: v for k, v in given.items() if v is not None})
 
 
 def _order(options: argparse.Namespace, train: Sequence[Recording]) -> int:
@@ -201,10 +215,10 @@ def _order(options: argparse.Namespace, train: Sequence[Recording]) -> int:
     return nx
 
 
-def announced_engine(task: PILFR | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
+def announced_engine(task: PILFR | Lagged | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
     """Build the engine once, say which one it is and why; returns the choice that gives it without a warning."""
     if choice != "vm":
-        model = task.model(recording.n_u, recording.n_y) if isinstance(task, PILFR) else task.model
+        model = task.model if isinstance(task, Fit) else task.model(recording.n_u, recording.n_y)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             engine = make_engine(model, choice)

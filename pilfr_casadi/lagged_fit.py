@@ -69,7 +69,7 @@ def fit_lagged(
         raise InputError("Early stopping needs the solver GaussNewton(); give that, or validation=0.")
     first = as_recordings(train)[0]
     structure = wanted.structure(first.n_u, first.n_y)
-    unknown = int(structure.model(first.n_u, first.n_y).parameters.free.sum())
+    unknown = int(wanted.model(first.n_u, first.n_y).parameters.free.sum())
     job = replace(job, recordings=check_for_identification(train, unknown + 2))
     split = hold_back(job.recordings, wanted.validation) if wanted.validation else (job.recordings, ())
     search = LaggedSearch(wanted, structure, replace(job, progress=None), *split)

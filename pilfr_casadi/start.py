@@ -21,7 +21,9 @@ from .lfr import PILFR
 
 Blocks = dict[str, np.ndarray]
 LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
-FLAT = 0.3  # deviation of the signals of neurons of slope one at the start
+# deviation of the signals of neurons of slope one at the start: of 1, 0.3, 0.1 and 0.03 the one of the least training
+# error over two records of the two-mass rig and two sizes; no test had a part in it
+FLAT = 0.1
 
 
 def states_of(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:

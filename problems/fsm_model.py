@@ -52,8 +52,8 @@ def in_volts(v: Values, paths: Array, C_z: Array, D_z: Array) -> Values:
     }
 
 
-def known(mask: Array, n_w: int, inputs: slice, idle: slice) -> Values:
-    """Fixed entries: A outside its blocks, channels that are the inputs alone, channels that act on nothing."""
+def known(mask: Array, n_w: int, inputs: slice) -> Values:
+    """Fixed entries: A outside its blocks, channels that are the inputs alone."""
     n = len(mask)
     fixed = {
         "A": np.where(mask, np.nan, 0.0),
@@ -63,7 +63,6 @@ def known(mask: Array, n_w: int, inputs: slice, idle: slice) -> Values:
         "D_yw": np.full((3, n_w), np.nan),
     }
     fixed["C_z"][inputs], fixed["D_zu"][inputs] = 0.0, np.eye(3) / (INPUT * U_UNIT)
-    fixed["B_w"][:, idle], fixed["D_yw"][:, idle] = 0.0, 0.0
     return fixed
 
 
@@ -90,14 +89,15 @@ def pure(family: Levels, theta: Array, signals: list[Array]) -> tuple[PILFR, Val
     values |= {"w": np.vstack([weights + 1e-3, np.full((3, len(STOPS)), 0.01)])}
     values |= {"r": np.vstack([thresholds, np.tile(STOPS, (3, 1))])}
     element = PrandtlIshlinskii(Stop, len(STOPS), 6)
-    return PILFR(n, element, known(v["mask"], 6, slice(3, 6), slice(6, 6)), offset=False), values
+    return PILFR(n, element, known(v["mask"], 6, slice(3, 6)), offset=False), values
 
 
 def combined(family: Levels, theta: Array, signals: list[Array], deviation: Array) -> tuple[PILFR, Values]:
-    """Envelopes on the signals that the level acts through, products of what the outputs show, plays at the inputs.
+    """Envelopes on the signals that the level acts through, envelopes and products of the outputs, plays at the inputs.
 
-    Channels: z 0-2 the envelopes' signals, 3-5 the products', 6-8 the inputs; w 0-2 begin as forces of the actuators,
-    3-5 are a second way for products, 6-8 act on nothing. `deviation` : that of the outputs at the middle level, µm.
+    Channels: z 0-2 the signals that the level acts through, 3-5 begin as the outputs, 6-8 are the inputs; w 0-2 and 6-8
+    begin as forces of the actuators, 3-5 are a second way for products, and that of the second envelopes. `deviation` :
+    that of the outputs at the middle level, µm.
     """
     v = loop_closed_at(family, theta, np.full(3, -STEEP / KNEE))
     gain = STEEP * (1 + 1 / KNEE)  # κ(a) = -STEEP/KNEE + gain a/(a + KNEE)
@@ -106,12 +106,13 @@ def combined(family: Levels, theta: Array, signals: list[Array], deviation: Arra
         Part("envelope", Envelope(3), (0, 1, 2)),
         Part("products", Products(3, (2, 3)), (3, 4, 5), (0, 1, 2)),
         Part("further", Products(3, (2, 3)), (3, 4, 5)),
-        Part("input", PrandtlIshlinskii(Play, len(PLAYS), 3), (6, 7, 8), (0, 1, 2)),
+        Part("second", Envelope(3), (3, 4, 5)),
+        Part("input", PrandtlIshlinskii(Play, len(PLAYS), 3), (6, 7, 8)),
     )
     n = len(v["A"])
     C_z = np.vstack([gain * v["C_z"], v["C"] / deviation[:, None], np.zeros((3, n))])
     D_z = np.vstack([gain * v["D_z"], v["D"] / deviation[:, None], np.eye(3) / INPUT])
-    values = in_volts(v, np.hstack([np.eye(3), np.zeros((3, 6))]), C_z, D_z)
+    values = in_volts(v, np.hstack([np.eye(3), np.zeros((3, 3)), np.eye(3)]), C_z, D_z)
     terms = parts[1].element.terms
     further = np.zeros((3, len(terms)))
     for i in range(3):
@@ -122,23 +123,27 @@ def combined(family: Levels, theta: Array, signals: list[Array], deviation: Arra
         "envelope_reach": CREST * LOUDEST * size,
         "products_reach": np.full(3, 6.0),
         "further_reach": np.full(3, 6.0),
+        "second_rate": np.full(3, 1e-3),
+        "second_knee": np.full(3, KNEE),
+        "second_reach": np.full(3, CREST * LOUDEST),
         "further_gain": further,
         "input_w": np.full((3, len(PLAYS)), 0.01),
         "input_r": np.tile(PLAYS, (3, 1)),
     }
-    fixed = known(v["mask"], 9, slice(6, 9), slice(6, 9))
-    bounds = {"envelope_rate": (1e-4, 0.1)}
+    fixed = known(v["mask"], 9, slice(6, 9))
+    bounds = {"envelope_rate": (1e-4, 0.1), "second_rate": (1e-4, 0.1)}
     reaches = {name: values[name] for name in values if name.endswith("_reach")}
     return PILFR(n, Combined(parts), {**fixed, **reaches}, bounds, offset=False), values
 
 
 def envelope_alone(structure: PILFR, values: Values) -> tuple[PILFR, Values]:
-    """The combined model without products and plays; the difference is what these are worth."""
+    """The combined model with the first envelopes alone: the difference is what the rest is worth."""
     n = structure.nx
     silent = {name: np.zeros_like(values[name]) for name in ("further_gain", "input_w")}
-    silent |= {"products_gain": np.zeros_like(values["further_gain"]), "input_r": values["input_r"]}
+    silent |= {name: values[name] for name in ("second_rate", "second_knee", "input_r")}
+    silent |= {"products_gain": np.zeros_like(values["further_gain"])}
     blocks = {name: np.array(structure.fixed[name], dtype=float) for name in ("B_w", "D_yw", "C_z", "D_zu")}
-    blocks["B_w"][:, 3:6], blocks["D_yw"][:, 3:6] = 0.0, 0.0
+    blocks["B_w"][:, 3:], blocks["D_yw"][:, 3:] = 0.0, 0.0
     blocks["C_z"][3:6], blocks["D_zu"][3:6] = np.zeros((3, n)), np.zeros((3, 3))
     fixed = {**structure.fixed, **silent, **blocks}
     return replace(structure, fixed=fixed), {k: v for k, v in values.items() if k not in silent}

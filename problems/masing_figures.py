@@ -156,8 +156,9 @@ def draw(seed: int, found: Mapping[str, Result], folder: Path) -> str:
         if rows:
             groups = {s: {k: r.errors[:, i].tolist() for k, r in rows.items()} for i, s in enumerate(SETS)}
             published = {s: {k: PUBLISHED[r.row.published][i] for k, r in rows.items()} for i, s in enumerate(SETS)}
+            x = f"operators ({len(next(iter(rows.values())).errors)} starts each, {kind})"
             figures[name] = plots.compared_spread(
-                groups, published=published, floor=FLOOR, source="published 25th percentile", x=f"operators, {kind}"
+                groups, published=published, floor=FLOOR, source="published 25th percentile", x=x
             )
     claims += _of_starts(found)
     for name, figure in figures.items():

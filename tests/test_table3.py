@@ -5,10 +5,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from pilfr_casadi.baselines import NOE
+from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.modal import is_modal
 from problems.measured_data import measured
 from problems.piezo_platform import PERIODS, Platform, measure
 from problems.piezo_stack import recordings
-from problems.table3 import Row, identify, lti, main, pi_hammerstein, pi_lfr, rows, stack_rows, table
+from problems.table3 import Row, identify, lti, main, pi_hammerstein, pi_lfr, rows, ss_nn, stack_rows, table
 from problems.table3_figures import quietened
 
 SMALL = Platform(
@@ -61,9 +64,21 @@ def test_rows_of_a_small_platform_come_in_the_paper_s_order(capsys):
 
 
 def test_the_table_has_every_row_of_the_paper():
-    names = set(rows())
-    assert {f"{k} nx={nx} N={n}" for k in ("PI-Hamm", "PI-LFR") for nx in (8, 15) for n in (10, 20)} < names
-    assert "LTI nx=8" in names
+    found = rows()
+    sizes = [(nx, n) for nx in (8, 15) for n in (10, 20)]
+    published = ["LTI nx=8", *(f"NOE lags={nx} n={n}" for nx, n in sizes), *(f"SS-NN nx={nx} n={n}" for nx, n in sizes)]
+    published += [f"{kind} nx={nx} N={n}" for kind in ("PI-Hamm", "PI-LFR") for nx, n in sizes]
+    assert [name for name, row in found.items() if row.published] == published
+    assert all(is_modal(r.model.fixed, r.model.nx) for r in found.values() if isinstance(r.model, PILFR))
+
+
+def test_networks_of_a_small_platform():
+    data = small()
+    averaged, wanted = data.averaged(), {"LTI": Row(lti(6)), "SS-NN": Row(ss_nn(6, 3), None, (20, 5))}
+    wanted["NOE"] = Row(NOE(6, 3), None, (20, 5))
+    error = {name: identify(row, averaged[:-1]).nrmse(averaged[-1]) for name, row in wanted.items()}
+    assert error["SS-NN"] < 0.8 * error["LTI"]
+    assert np.isfinite(error["NOE"])
 
 
 PIEZO = measured("piezo_dbo")

@@ -12,9 +12,9 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
+from ..elements import PrandtlIshlinskii
 from ..hand import close_hands
 from ..interrupts import Progress
-from ..lfr import PILFR
 from ..recording import InputError
 from .described import Run, read_run
 from .execute import RunResult, carried_out
@@ -84,8 +84,8 @@ def campaign(
 def _check_seeds(run: Run) -> None:
     """Refuse seeds that would all give the same model: the first starts of a grid start are not random."""
     for cell in run.cells:
-        search = cell.search
-        if len(run.seeds) > 1 and isinstance(cell.model, PILFR) and search["start"] == "grid" and search["starts"] < 3:
+        search, layer = cell.search, isinstance(getattr(cell.model, "element", None), PrandtlIshlinskii)
+        if len(run.seeds) > 1 and layer and search["start"] == "grid" and search["starts"] < 3:
             raise InputError(
                 f"{run.file}: the first two of the starts 'grid' are not random, so {len(run.seeds)} seeds with starts "
                 f"= {search['starts']} would give one model; give start = 'paper' in [solver], or 3 starts or more."

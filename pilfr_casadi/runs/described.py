@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..baselines import Lagged
 from ..constraints import Constraint
 from ..gauss_newton import GaussNewton
 from ..ipopt import Ipopt
@@ -22,12 +23,13 @@ from ..load_simulator import user_variable
 from ..model import Model
 from ..multistart import POLISH, STARTS
 from ..recording import InputError
-from ..structures import OPERATORS, STRUCTURES, named_structure
+from ..structures import OPERATORS, STRUCTURES, TAKES, named_structure
 from .folder import check_inside
 from .grid import Cell, cells_of, seeds_of
 from .tables import Table, as_plain, shown
 
 ROLES = ("train", "validation", "test")
+SIZE = {"nx": "states", "lags": "past outputs"}
 OPTIONS = {"period": int, "hold": str, "skip": int, "dt": float, "time_tolerance": float, "initial": str}
 
 
@@ -179,26 +181,24 @@ def _check_files(top: Table, files: Mapping[str, tuple[str, ...]]) -> None:
             seen[path] = role
 
 
-def _model(table: Table) -> PILFR:
-    nx = table.number("nx", None, 0, whole=True)
-    if nx is None:
-        table.fail("'nx' in [model] is missing; give the number of states")
-    given: dict[str, Any] = {
-        "structure": table.choice("structure", STRUCTURES, "lfr"),
-        "operator": table.choice("operator", tuple(OPERATORS), "play"),
-        "operators": table.number("operators", 20, 0, whole=True),
-        "channels": table.number("channels", 1, 1, whole=True),
-        "neurons": table.number("neurons", None, 0, whole=True),
-        "offset": table.take("offset", bool, True),
-        "fixed": table.take("fix", dict, {}),
-        "bounds": table.take("bounds", dict, {}),
-        "priors": table.take("priors", dict, {}),
-    }
+def _model(table: Table) -> PILFR | Lagged:
+    structure = table.choice("structure", STRUCTURES, "lfr")
+    numbers = {"nx": 0, "operators": 0, "channels": 1, "neurons": 0, "hidden": 1, "lags": 1, "input_lags": 1}
+    read: dict[str, Any] = {key: table.number(key, None, least, whole=True) for key, least in numbers.items()}
+    read["operator"] = table.choice("operator", tuple(OPERATORS), None)
+    read["offset"] = table.take("offset", bool)
+    read |= {key: table.take(key, dict) for key in ("fix", "bounds", "priors")}
+    given, takes = {key: value for key, value in read.items() if value is not None}, TAKES[structure]
+    if takes[0] not in given:
+        table.fail(f"'{takes[0]}' in [model] is missing; give the number of {SIZE[takes[0]]}")
     table.done()
-    if given["neurons"] is not None and given["operator"] != "generalized_play":
+    for key in given:
+        if key not in takes:
+            table.fail(f"{key!r} in [model] is not for structure = {structure!r}, which takes {', '.join(takes)}")
+    if "neurons" in given and given.get("operator") != "generalized_play":
         table.fail("'neurons' in [model] goes with operator = 'generalized_play'; leave it out")
     try:
-        return named_structure(nx, **given)
+        return named_structure(structure, **given)
     except InputError as error:
         table.fail(f"[model]: {str(error).rstrip('.')}")
 
@@ -227,7 +227,7 @@ def _solver(table: Table) -> tuple[Any, dict[str, Any]]:
     return (GaussNewton(**{"tolerance": POLISH.tolerance, **given}) if given else POLISH), search
 
 
-def _constraints(table: Table, model: PILFR | Model) -> tuple[bool | float, tuple[Constraint, ...]]:
+def _constraints(table: Table, model: PILFR | Lagged | Model) -> tuple[bool | float, tuple[Constraint, ...]]:
     stable = table.any("spectral_radius", True)
     if not isinstance(stable, bool) and not (isinstance(stable, int | float) and 0 < stable < float("inf")):
         table.fail(f"'spectral_radius' in [constraints] is {shown(stable)}; give a number above zero, true or false")
@@ -252,6 +252,8 @@ def _constraints(table: Table, model: PILFR | Model) -> tuple[bool | float, tupl
     table.done()
     if found and isinstance(model, Model):
         table.fail("dc_gain and ordered_thresholds are for a PI-LFR, and the model is your own; use 'own'")
+    if isinstance(model, Lagged) and not isinstance(stable, bool):
+        table.fail("'spectral_radius' in [constraints] is not for structure = 'narx' or 'noe', whose state is the past")
     return stable if isinstance(stable, bool) else float(stable), (*found, *own)
 
 

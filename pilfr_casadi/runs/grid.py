@@ -11,11 +11,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from ..baselines import Lagged
 from ..lfr import PILFR
 from ..model import Model
+from ..structures import ANY, TAKES
 from .tables import Table, as_plain, shown
 
-MODEL_KEYS = ("structure", "nx", "operator", "operators", "channels", "neurons")
+MODEL_KEYS = ("structure", "nx", "operator", "operators", "channels", "neurons", "hidden", "lags")
 SOLVER_KEYS = ("start", "starts")
 
 
@@ -27,7 +29,7 @@ class Cell:
     ----------
     values : dict
         Key of the grid -> value; empty where there is no grid.
-    model : PILFR or Model
+    model : PILFR, NARX, NOE or Model
     search : dict
         `starts` and `start`.
     said : dict
@@ -35,7 +37,7 @@ class Cell:
     """
 
     values: Mapping[str, Any]
-    model: PILFR | Model
+    model: PILFR | Lagged | Model
     search: dict[str, Any]
     said: dict[str, Any] = field(default_factory=dict)
 
@@ -46,11 +48,11 @@ class Cell:
 
 
 def cells_of(
-    top: Table, model_of: Callable[[Table], PILFR], solver_of: Callable[[Table], tuple[Any, dict[str, Any]]]
+    top: Table, model_of: Callable[[Table], PILFR | Lagged], solver_of: Callable[[Table], tuple[Any, dict[str, Any]]]
 ) -> tuple[tuple[Cell, ...], Any]:
     """The cells of a run, in the order of the grid's keys with the last varying fastest; and the solver of all."""
     model, solver = top.any("model", {}), top.any("solver", {})
-    if isinstance(model, PILFR | Model):
+    if isinstance(model, PILFR | Lagged | Model):
         if top.has("grid"):
             top.fail("[grid] varies a [model] table, and the model is an object; leave one of them out")
         found, search = solver_of(Table(top.file, "solver", solver))
@@ -66,6 +68,9 @@ def cells_of(
         }
         if "operator" in axes and cell["operator"] != "generalized_play" and "neurons" not in axes:
             said["model"].pop("neurons", None)
+        if cell.get("structure") in TAKES:  # leave out what the file says for other structures
+            others = ANY.difference(TAKES[cell["structure"]], axes)
+            said["model"] = {k: v for k, v in said["model"].items() if k not in others}
         found, search = solver_of(Table(top.file, "solver", said["solver"]))
         cells.append(Cell(cell, model_of(Table(top.file, "model", said["model"])), search, as_plain(said)[0]))
     return tuple(cells), found

@@ -18,7 +18,7 @@ from ..export.saving import model_text
 from ..fit import fit as identify
 from ..fitted import Fit
 from ..interrupts import Progress
-from ..lfr import PILFR
+from ..model import Model
 from ..recording import InputError, Recording
 from ..solution import Solution, Status
 from ..sparse import operators_used, prune, regularization_path
@@ -177,7 +177,7 @@ def _identified(
     cell = run.cells[job.cell]
     search = (
         {**cell.search, "seed": int(job.parameters["seed"]), "executor": executor}
-        if isinstance(cell.model, PILFR)
+        if not isinstance(cell.model, Model)
         else {}
     )
     train = recordings["train"] if job.fold is None else fold(recordings["train"], job.fold, run.folds)[0]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..lfr import PILFR
+from ..model import Model
 from ..recording import InputError
 from .jobs import RunJob
 
@@ -74,7 +74,7 @@ def select(place: Store, jobs: Sequence[RunJob]) -> Selection:
         if s.role == ("held" if run.folds else "validation"):
             scores.setdefault(s.job, []).append(s.nrmse if np.isfinite(s.nrmse) else np.inf)
     for number, cell in enumerate(run.cells):
-        model = cell.model.model(first.n_u, first.n_y) if isinstance(cell.model, PILFR) else cell.model
+        model = cell.model.model(first.n_u, first.n_y) if not isinstance(cell.model, Model) else cell.model
         counts.append(int(model.parameters.free.sum()))
         parts: dict[int | None, list[RunJob]] = {k: [] for k in (range(run.folds) if run.folds else (None,))}
         for job in (j for j in jobs if j.cell == number and j.id in scores):

@@ -1,0 +1,134 @@
+"""Baselines by their names, in run files, campaigns and on the command line."""
+
+import csv
+
+import pytest
+from test_cli import fit_arguments, refused, run, write_csv
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.recording import InputError
+from pilfr_casadi.runs.described import read_run
+from pilfr_casadi.structures import ANY, STRUCTURES, TAKES, named_structure
+
+TEXT = """
+report = false
+
+[data]
+inputs = "u"
+outputs = "y"
+initial = "zero"
+train = "train.csv"
+test = "test.csv"
+
+[model]
+MODEL
+
+[solver]
+starts = 1
+max_iterations = 15
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for seed, name in enumerate(("train", "test")):
+        write_csv(tmp_path / f"{name}.csv", seed=seed, m=400)
+    return tmp_path
+
+
+def written(folder, model, more=""):
+    (folder / "rig.toml").write_text(TEXT.replace("MODEL", model) + more)
+    return folder / "rig.toml"
+
+
+@pytest.mark.parametrize(
+    "said, expected",
+    [
+        ("nx = 2", pilfr.PILFR(2, pilfr.PrandtlIshlinskii(pilfr.Play, 20))),
+        ("nx = 2\noperators = 0", pilfr.PILFR(2)),
+        ('structure = "ssnn"\nnx = 2\nhidden = 3\noffset = false', pilfr.ssnn(2, 3, offset=False)),
+        ('structure = "network_lfr"\nnx = 2\nchannels = 2', pilfr.network_lfr(2, channels=2)),
+        ('structure = "narx"\nlags = 2', pilfr.NARX(2)),
+        ('structure = "noe"\nlags = 3\nhidden = 4\ninput_lags = 1', pilfr.NOE(3, 4, 1)),
+    ],
+)
+def test_a_name_stands_for_the_structure(folder, said, expected):
+    (cell,) = read_run(written(folder, said)).cells
+    assert type(cell.model) is type(expected) and repr(cell.model) == repr(expected)
+
+
+def test_what_is_known_goes_beside_what_a_network_holds():
+    one = named_structure("ssnn", nx=2, hidden=3, fix={"D_yu": 0.0}, bounds={"A": (-1, 1)})
+    assert set(one.fixed) == {*pilfr.ssnn(2, 3).fixed, "D_yu"} and one.bounds == {"A": (-1, 1)}
+    assert {"lags", "nx"} < ANY == {k for takes in TAKES.values() for k in takes}
+
+
+def test_a_run_fits_the_same_model_as_the_function(folder):
+    said = 'structure = "noe"\nlags = 2\nhidden = 3'
+    found = pilfr.run(written(folder, said)).fit
+    train = pilfr.read(folder / "train.csv", "u", "y", initial="zero")
+    options = {"starts": 1, "solver": pilfr.GaussNewton(max_iterations=15, tolerance=1e-4)}
+    assert found.train_nrmse == pilfr.fit(pilfr.NOE(2, 3), train, **options).train_nrmse
+
+
+def test_a_campaign_compares_structures_and_each_takes_what_is_its_own(folder):
+    grid = f"[grid]\nstructure = {list(STRUCTURES)}\n"
+    model = "nx = 1\noperators = 2\noperator = 'stop'\nhidden = 2\nlags = 2"
+    result = pilfr.campaign(written(folder, model, grid).rename(folder / "all.toml"))
+    assert not result.failed and result.done == tuple(f"structure-{s}_seed-0" for s in STRUCTURES)
+    rows = list(csv.DictReader((result.folder / "results.csv").read_text().splitlines()))
+    errors = {r["structure"]: float(r["nrmse"]) for r in rows if r["role"] == "test"}
+    assert errors["lfr"] == min(errors.values()) and len(errors) == len(STRUCTURES)
+    models = {cell.values["structure"]: cell.model for cell in read_run(folder / "all.toml").cells}
+    assert models["narx"] == pilfr.NARX(2, 2) and models["lfr"].element.operator == pilfr.Stop()
+    seeds = "seeds = [0, 1]\n" + written(folder, 'structure = "ssnn"\nnx = 1\nhidden = 2').read_text()
+    (folder / "two.toml").write_text(seeds)
+    assert len({s.nrmse for s in pilfr.campaign(folder / "two.toml").scores if s.role == "train"}) == 2
+
+
+@pytest.mark.parametrize(
+    "model, says",
+    [
+        ('structure = "narx"\nnx = 2', "'lags' in [model] is missing; give the number of past outputs"),
+        ('structure = "ssnn"\nhidden = 2', "'nx' in [model] is missing; give the number of states"),
+        ('structure = "noe"\nlags = 0', "'lags' in [model] is 0; give 1 or more"),
+        ('structure = "noe"\nlags = 2\nnx = 1', "'nx' in [model] is not for structure = 'noe', which takes lags"),
+        ('structure = "ssnn"\nnx = 2\noperators = 3', "'operators' in [model] is not for structure = 'ssnn'"),
+        ("nx = 2\nhidden = 3", "'hidden' in [model] is not for structure = 'lfr'"),
+        ('structure = "rnn"\nnx = 2', "'structure' in [model] is 'rnn'; give 'lfr'"),
+        ('structure = "narx"\nlags = 2\n[constraints]\nspectral_radius = 0.9', "'spectral_radius' in [constraints]"),
+        ('structure = "narx"\nlags = 2\n[constraints]\nordered_thresholds = true', "'r'"),
+        ('structure = "narx"\nlags = 2\n[regularization]\nl1 = 1e-3', "leave l1 out"),
+        ('structure = "ssnn"\nnx = 1\nhidden = 2\n[regularization]\nl1 = 1e-3', "'w'"),
+        ('structure = "noe"\nlags = 2\n[grid]\nlags = [1, "two"]', "'lags' in [model] is 'two'"),
+        ('[grid]\nstructure = ["narx", "lfr"]\nlags = [1, 2]\nnx = [1]', "'nx' in [model] is not for structure"),
+    ],
+)
+def test_bad_options_get_one_sentence(folder, model, says):
+    with pytest.raises(InputError) as found:
+        pilfr.run(written(folder, model))
+    assert says in str(found.value) and "\n" not in str(found.value)
+
+
+def test_the_command_line_fits_them_too(capsys, folder):
+    data = ("fit", folder / "train.csv", "--inputs", "u", "--outputs", "y", "--initial", "zero", "--starts", 1)
+    tested = ("--test", folder / "test.csv", "--out", folder / "out", "--overwrite", "--hidden", 2)
+    for options in (("noe", "--lags", 2), ("ssnn", "--nx", 1), ("network_lfr", "--nx", 1, "--fix", "D_yu=0")):
+        status, out, err = run(capsys, *data, *tested, "--structure", *options)
+        assert status == 0, err
+        assert "NRMSE on test" in out and (folder / "out" / "report.html").exists()
+    assert pilfr.load(folder / "out" / "model.json").structure == named_structure(
+        "network_lfr", nx=1, hidden=2, fix={"D_yu": 0.0}
+    )
+
+
+def test_unfit_options_of_the_command_get_one_sentence(capsys, folder):
+    arguments = fit_arguments(folder / "train.csv", folder)
+    refused(capsys, *arguments, "--structure", "ssnn", says="--operators is not for --structure ssnn; leave it out.")
+    few = [a for a in arguments if a not in ("--operators", 3)]
+    refused(capsys, *few, "--lags", 2, says="--lags is not for --structure lfr")
+    refused(capsys, *few, "--structure", "narx", "--lags", 2, says="--nx is not for --structure narx")
+    bare = [a for a in few if a not in ("--nx", 1)]
+    refused(capsys, *bare, "--structure", "narx", says="--structure narx needs --lags")
+    refused(capsys, *bare, "--structure", "noe", "--lags", 0, says="--lags 0 was given; give 1 or more.")
+    refused(capsys, *bare, "--structure", "noe", "--lags", 2, "--bound", "w=0:1", says="--bound is not for")
