@@ -23,6 +23,7 @@ from .workbench import Fitted, Workbench, started
 
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
 BEST = 10  # pairs of each list that are fitted, besides the best of each port
+EQUAL = 1e-3  # difference of shares that is none
 REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first
 AGAIN = 3  # starts that a pair is fitted from again
 SAME = 1.02  # times the mean square error of fits that came to the same place
@@ -34,15 +35,23 @@ def survivors(scored: Sequence[Scored]) -> list[tuple[str, type[Law], list[Score
     chosen: dict[tuple[str, type[Law]], list[Scored]] = {}
     for source in ("simulation", "observer"):
         ranked = [s for s in scored if s.source == source]
-        ports: set[str] = set()
-        for i, s in enumerate(ranked):
-            if i < BEST or s.port not in ports:
+        ports, passed = set[str](), list[Scored]()
+        for s in ranked:
+            if len(passed) < BEST or s.port not in ports:
                 chosen.setdefault((s.port, type(s.law)), [])
+            if not any(_adds_nothing(s, other) for other in passed):  # two forms of one law are one hypothesis
+                passed.append(s)
             ports.add(s.port)
     for s in scored:
         if (s.port, type(s.law)) in chosen:
             chosen[s.port, type(s.law)].append(s)
     return [(port, law, entries) for (port, law), entries in chosen.items()]
+
+
+def _adds_nothing(one: Scored, other: Scored) -> bool:
+    """Whether of two laws at a port the one refines the other and scores the same."""
+    a, b = type(one.law), type(other.law)
+    return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < EQUAL
 
 
 def closed(

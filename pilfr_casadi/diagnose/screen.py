@@ -88,7 +88,8 @@ def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
         at += width * len(shapes)
         scores.sort(key=lambda s: -s[0])
         starts = tuple(start_values(law, shape, c) for _, shape, c, _ in scores[:KEPT])
-        share = held_out(phi[:, scores[0][3]], rest.left, rest.odd)
+        # a law that would have to drive the motion explains nothing
+        share = min(held_out(phi[:, scores[0][3]], rest.left, rest.odd), scores[0][0])
         out.append(Scored(task.port.name, law, share, starts, task.local, source))
     return out
 

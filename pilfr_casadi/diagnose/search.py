@@ -23,9 +23,10 @@ from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .linearise import linearised
 from .pairs import two_at_once
+from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
 from .screen import Scored, screen
-from .verdict import CONTAINS, FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, explains, left_open
+from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, explains, left_open
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
@@ -37,7 +38,6 @@ POLISHED = 4  # candidates fitted to everything before one is chosen
 MOSTLY = 0.5  # share of the rest that a second effect may leave
 UNSEEN, NO_WORSE = 0.7, 1.1  # shares of the mean square on the unseen part that a second effect may leave
 NOTHING = 0.01  # below this share nothing is explained
-IMITATED = 3  # simpler laws put up against one that can imitate others
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
 Seen = tuple[list[Scored], dict[str, int], np.ndarray | None]
@@ -191,9 +191,9 @@ class Search:
             return Pass(None, (), tuple(scored), before, False)
         began = time.perf_counter()
         candidates = self._explained(number, scored, signs, gain)
-        simpler = _imitated(candidates, scored)
-        if simpler:
-            more = self._explained(number, simpler, signs, gain)
+        missed = passed_over(candidates, scored)
+        if missed:
+            more = self._explained(number, missed, signs, gain)
             candidates = sorted([*candidates, *more], key=lambda c: c.error)
         self.timed("fits", began)
         began = time.perf_counter()
@@ -267,16 +267,3 @@ class Search:
         """A candidate fitted to everything; None where it does not hold there."""
         done = candidate if np.isfinite(candidate.full) else polish(self.bench, candidate)
         return done if np.isfinite(done.full) else None
-
-
-def _imitated(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
-    """The simpler laws, at the port of one that contains or can imitate them, which the screen did not let through."""
-    if not candidates:
-        return []
-    best, tried = candidates[0], {(c.port, type(c.law)) for c in candidates}
-    other = [s for s in scored if s.port == best.port and (s.port, type(s.law)) not in tried]  # best first
-    chosen = [type(s.law) for s in other if s.law.id in CONTAINS.get(best.law.id, ())]
-    if best.law.id in FLEXIBLE:
-        plain = [type(s.law) for s in other if s.law.id not in FLEXIBLE]
-        chosen += list(dict.fromkeys(plain))[:IMITATED]
-    return [s for s in other if type(s.law) in chosen]

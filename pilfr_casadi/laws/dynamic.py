@@ -157,6 +157,7 @@ class Lag(Law):
     units: ClassVar[Mapping[str, str]] = {"T": "s"}
     places: ClassVar[tuple[str, ...]] = ("series",)
     order = 1
+    substeps: ClassVar[int] = 4  # a lag shorter than a sample is still one
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return q - z
@@ -166,10 +167,10 @@ class Lag(Law):
         return (z - q) / p.T
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(T=local.dt * np.geomspace(0.7, 40, 7))
+        yield from grid(T=local.dt * np.geomspace(0.25, 40, 8))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"T": (0.4 * local.dt, local.duration / 4)}
+        return {"T": (0.15 * local.dt, local.duration / 4)}
 
 
 class Resonance(Law):
@@ -223,6 +224,10 @@ class Attached(Resonance):
     units: ClassVar[Mapping[str, str]] = {"k_a": "w/z", "W": "rad/s", "D": ""}
     strength: ClassVar[tuple[str, ...]] = ("k_a",)
     places: ClassVar[tuple[str, ...]] = ("parallel",)
+    dissipative = True
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(W=np.geomspace(0.015, 1.2, 32) / local.dt, D=[0.05])
 
     def force(self, z: Any, dz: Any, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.k_a * _pull(z, dz, q, p)

@@ -1,0 +1,49 @@
+"""Laws that the screen did not let through and that what came out best asks for.
+
+A flexible law may have taken the place of a simpler one at its port. And a resonance whose frequency is found at the
+wrong port is found at the right one from there: a small mass that is carried along is felt in a narrow band, between
+whose neighbours on the grid the screen may miss it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..laws.dynamic import Attached
+from .candidate import Candidate
+from .screen import Scored
+from .verdict import CONTAINS, FLEXIBLE
+
+IMITATED = 3  # simpler laws put up against one that can imitate others
+AHEAD = 1.5  # times the best error of a carried mass that is worth another start
+
+
+def passed_over(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
+    """Pairs of port and law to be fitted as well; candidates and what was scored are best first."""
+    if not candidates:
+        return []
+    best, tried = candidates[0], {(c.port, type(c.law)) for c in candidates}
+    other = [s for s in scored if s.port == best.port and (s.port, type(s.law)) not in tried]
+    chosen = [type(s.law) for s in other if s.law.id in CONTAINS.get(best.law.id, ())]
+    if best.law.id in FLEXIBLE:
+        plain = [type(s.law) for s in other if s.law.id not in FLEXIBLE]
+        chosen += list(dict.fromkeys(plain))[:IMITATED]
+    return [*(s for s in other if type(s.law) in chosen), *_carried(candidates, scored)]
+
+
+def _carried(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
+    """Carried masses at every port where none came near, from the frequency and damping of the best resonance."""
+    best = candidates[0]
+    if not {"W", "D"} <= set(best.law.units) or isinstance(best.law, Attached):
+        return []
+    prefix = best.fitted.simulator.elements[-1].prefix
+    found = {k: float(np.ravel(best.fitted.values[f"{prefix}{k}"])[0]) for k in ("W", "D")}
+    near = {c.port for c in candidates if isinstance(c.law, Attached) and c.error < AHEAD * best.error}
+    out: dict[str, Scored] = {}
+    for s in scored:
+        if isinstance(s.law, Attached) and s.port not in near and s.port not in out:
+            out[s.port] = replace(s, starts=(*({**start, **found} for start in s.starts), *s.starts))
+    return list(out.values())
