@@ -207,6 +207,10 @@ class Search:
         kept = list({(c.port, type(c.law)): c for c in sorted(kept, key=lambda c: -c.error)}.values())[::-1]
         samples = self.effective_samples(kept)
         choice = choose(kept, before, self.floor2, samples)
+        while choice is not None and not np.isfinite(choice.winner.full):  # what does not hold on everything is out
+            done = polish(self.bench, choice.winner)
+            kept = sorted((done if c is choice.winner else c for c in kept), key=lambda c: c.error)
+            choice = choose(kept, before, self.floor2, samples)
         accepted = choice is not None and choice.gain > ROOM
         if accepted and number:  # what is not fitted has to improve as well
             assert choice is not None
