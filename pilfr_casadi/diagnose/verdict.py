@@ -32,8 +32,9 @@ LITTLE = 0.02  # of the excess left, with rivals near and a force that explains 
 MAINLY = 0.6  # of it explainable: whatever the rivals, the name is wrong or incomplete
 CLEAR = 1.5  # times the winner's error that every rival's is, for a name that only comes near to be given all the same
 DRIVEN = 0.5  # share of a name's confidence where it takes a parameter at its bound
-FAR_OFF = 16.0  # times the noise that halve it; more do not, for a good sensor knows of no model error
-FAR_AHEAD = 4.0  # times the fitted part's error on the rest that halve it
+# times the noise, and times the fitted part's error on the rest, that halve it; more does not, for a good sensor knows
+# of no model error and an integrator drifts
+FAR_OFF, FAR_AHEAD = 16.0, 4.0
 UNSURE = 0.5  # confidence below which a name is called likely
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
@@ -114,8 +115,12 @@ def handicap(candidate: Candidate) -> float:
 
 
 def imitates(candidate: Candidate, rival: Candidate, floor: float) -> bool:
-    """Whether a law comes so little nearer than another at its port, above the floor, that it may just imitate it."""
-    needed = IMITATES.get((candidate.law.id, rival.law.id), 0.0) if candidate.port == rival.port else 0.0
+    """Whether a law comes so little nearer than another at its port, above the floor, that it may just imitate it.
+
+    It does so by its freedom: one of no more parameters cannot.
+    """
+    free = candidate.port == rival.port and candidate.size > rival.size
+    needed = IMITATES.get((candidate.law.id, rival.law.id), 0.0) if free else 0.0
     own, other = (max(c.error**2 - floor, 0.05 * floor) for c in (candidate, rival))
     return other < needed**2 * own
 
@@ -257,7 +262,7 @@ def confidence(choice: Choice, search: Search) -> float:
     still *= min(1.0, remains / 0.03)  # of next to nothing, all may be explainable
     doubt = 1 / (1 + (remains / 0.15) ** 2) / (1 + (still / 0.3) ** 2)
     times2, unseen2 = search.base.cost / search.floor2, winner.tail / max(winner.head, 1e-300)
-    doubt /= (1 + min(times2 / FAR_OFF**2, 1.0)) * (1 + max(unseen2 - 1, 0.0) / FAR_AHEAD**2)
+    doubt /= (1 + min(times2 / FAR_OFF**2, 1.0)) * (1 + float(np.clip((unseen2 - 1) / FAR_AHEAD**2, 0.0, 1.0)))
     others = len({c.law.id for c in choice.alike} - {winner.law.id})
     pressed = (times2 > AT_FLOOR**2 and strained(search.base)) or (times2 > WELL_ABOVE**2 and winner.held_back)
     driven = DRIVEN if pressed else 1.0
