@@ -9,7 +9,8 @@ from test_missing_flows import axis, moved
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.gates import Gate
-from pilfr_casadi.diagnose.search import Search, _imitated
+from pilfr_casadi.diagnose.passed_over import passed_over
+from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.timing import timing
 from pilfr_casadi.diagnose.verdict import choose, strained
 from pilfr_casadi.diagnose.workbench import Workbench
@@ -39,7 +40,7 @@ def candidate(port, law, error, size=2, at_bound=False):
     """What the choice reads of a fitted candidate."""
     return SimpleNamespace(
         port=port,
-        law=SimpleNamespace(id=law, form=""),
+        law=SimpleNamespace(id=law, form="", units={}),
         error=error,
         size=size,
         at_bound=at_bound,
@@ -70,10 +71,10 @@ class Looser(Loose):
 def test_a_law_that_can_imitate_others_is_put_up_against_them():
     scored = [SimpleNamespace(port=port, law=law) for port in ("a", "b") for law in (Loose(), Looser())]
     flexible = candidate("a", "extra_mode", 0.1)
-    assert [(s.port, s.law.id) for s in _imitated([flexible], scored)] == [("a", "delay"), ("a", "backlash")]
+    assert [(s.port, s.law.id) for s in passed_over([flexible], scored)] == [("a", "delay"), ("a", "backlash")]
     tried = SimpleNamespace(port="a", law=Looser())
-    assert [s.law.id for s in _imitated([flexible, tried], scored)] == ["delay"]
-    assert _imitated([candidate("a", "cubic_stiffness", 0.1)], scored) == []
+    assert [s.law.id for s in passed_over([flexible, tried], scored)] == ["delay"]
+    assert passed_over([candidate("a", "cubic_stiffness", 0.1)], scored) == []
 
 
 def spring():

@@ -1,4 +1,4 @@
-"""Two effects looked for at once, where one after the other explains too little: each may hide the other.
+"""Two effects looked for at once, where one after the other explains too little or is not sure: each hides the other.
 
 Every pair of laws at two ports is scored together along the refitted simulation. With orthonormal columns Q_a and Q_b
 of what small doses of the two change (`remainder`) and e' what is left of the error, the share that they explain is
@@ -25,7 +25,7 @@ from .explain import BRIEF, closed
 from .linearise import linearised
 from .remainder import Remainder, held_out, orthonormal
 from .screen import Scored, start_values
-from .verdict import FLEXIBLE, FORMS, explains, left_open
+from .verdict import FLEXIBLE, FORMS
 from .workbench import Fitted
 
 if TYPE_CHECKING:
@@ -159,9 +159,10 @@ def _beside(search: Search, joint: Fitted, kept: Any) -> Fitted:
 def two_at_once(search: Search) -> None:
     """Look for two effects together; the search goes over to them where they explain what it has not."""
     before, better = (search.base, list(search.passes), search.open_after, search.floor), False
+    certainty = search.certainty()
     try:
         found = _two(search)
-        better = found is not None and _better(search, found, before[0].cost)
+        better = found is not None and _better(search, found, before[0].cost) and search.certainty() > certainty
     finally:  # an interrupt leaves what there was
         if not better:
             search.base, search.passes, search.open_after, search.floor = before
@@ -170,8 +171,7 @@ def two_at_once(search: Search) -> None:
 def _better(search: Search, found: tuple[Fitted, list[Pass]], cost: float) -> bool:
     search.base, search.passes = found
     search.open_after = search.flexible(search.base)
-    choices = [p.choice for p in search.passes if p.choice is not None]
-    return len(choices) == 2 and search.base.cost < WORTH**2 * cost and explains(choices, *left_open(search))
+    return len(search.passes) == 2 and search.base.cost < WORTH**2 * cost
 
 
 def _two(search: Search) -> tuple[Fitted, list[Pass]] | None:

@@ -26,7 +26,7 @@ from .pairs import two_at_once
 from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
 from .screen import Scored, screen
-from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, Choice, choose, explains, left_open
+from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, UNSURE, Choice, choose, confidence, explains, left_open
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
@@ -142,15 +142,21 @@ class Search:
             if self._wrongly_held():
                 return
             self.open_after = self.flexible(self.base)
-        if effects > 1 and self._unexplained():
+        if effects > 1 and self._unsure():
             two_at_once(self)
 
-    def _unexplained(self) -> bool:
-        """Whether something is left that a force explains and what is named does not."""
-        named = [p.choice for p in self.passes if p.accepted and p.choice is not None]
-        if named and explains(named, *left_open(self)):
+    def _unsure(self) -> bool:
+        """Whether something is left that a force explains, and what is named does not explain it or is not sure."""
+        if self.certainty() > UNSURE or not self._much():
             return False
-        return self._much() and max(self.open_after.values(), default=0.0) > HINT
+        return max(self.open_after.values(), default=0.0) > HINT
+
+    def certainty(self) -> float:
+        """Confidence of the least sure name; nothing where nothing is named, or what is named does not explain."""
+        named = [p.choice for p in self.passes if p.accepted and p.choice is not None]
+        if not named or not explains(named, *left_open(self)):
+            return 0.0
+        return min(confidence(c, self) for c in named)
 
     def _wrongly_held(self) -> bool:
         """Whether, with the effects in place, inputs seem to do the other thing between samples."""
