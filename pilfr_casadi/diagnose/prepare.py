@@ -15,6 +15,7 @@ from .gates import Gate, choose_hold, hold_note, opened, said_hold, wrong_scale
 from .linearise import along, linearised, observer_gain
 from .offset import offsets
 from .proof import errors_of
+from .settling import without_transients
 from .timing import FAR, as_given, in_steps, timing
 from .workbench import THOROUGH, Fitted, Workbench
 
@@ -47,7 +48,9 @@ def prepare(
     simulator: Simulator, recordings: Sequence[Recording], hold: str | None, engine: str, workers: int = 1
 ) -> Prepared:
     """Open the bench, look at the dull causes, refit, and measure the floor."""
-    bench, gates = opened(simulator, tuple(recordings), hold or "zero", engine)
+    recordings, transients = without_transients(recordings)
+    bench, gates = opened(simulator, recordings, hold or "zero", engine)
+    gates = [*transients, *gates]
     between, notes = choose_hold(simulator, bench.recordings, hold, engine)
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, simulator)

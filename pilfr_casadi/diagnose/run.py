@@ -21,7 +21,7 @@ from .experiment import next_experiment, placebo
 from .gates import Gate, hold_note, said_hold
 from .mismatch import mismatch
 from .offset import without_idle_offsets
-from .prepare import prepare
+from .prepare import Prepared, prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import MISHELD, Pass, Search
@@ -97,15 +97,11 @@ def diagnose(
     say("refit", 0, 1, np.inf)
     ready = prepare(simulator, recordings, hold, engine, workers)
     prepared_at = time.perf_counter()
-    bench, without = ready.bench, ready.without
     said = said_hold(simulator, recordings, hold) is not None
-    search = Search(bench, without, ready.floor, laws, workers, say, said).run(effects)
-    gates = ready.gates
-    if (ratio := search.misheld) > MISHELD:
-        ready = prepare(simulator, recordings, bench.otherwise_held().hold, engine, workers)
-        bench, without = ready.bench, ready.without
-        search = Search(bench, without, ready.floor, laws, workers, say).run(effects)
-        gates = (*ready.gates, hold_note(simulator, bench.hold, ratio))
+    search = Search(ready.bench, ready.without, ready.floor, laws, workers, say, said).run(effects)
+    if not said and (search.misheld > MISHELD or search.unsure()) and not search.interrupted:
+        ready, search = _otherwise_held(simulator, recordings, engine, ready, search, effects)
+    bench, without, gates = ready.bench, ready.without, ready.gates
     search.base = without_idle_offsets(bench, search.base)
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
@@ -156,6 +152,27 @@ def diagnose(
         evidence={"search": search, "without": without, "after": after},
         substeps=after.model.substeps,
     )
+
+
+def _otherwise_held(
+    simulator: Any, recordings: Sequence[Recording], engine: str, ready: Prepared, search: Search, effects: int
+) -> tuple[Prepared, Search]:
+    """The same with inputs that do the other thing between samples, where they seem to or names are surer then."""
+    wrong = search.misheld > MISHELD
+    try:
+        hold = search.bench.otherwise_held().hold
+        other = prepare(simulator, recordings, hold, engine, search.workers)
+        again = Search(other.bench, other.without, other.floor, search.laws, search.workers, search.say).run(effects)
+    except InputError:  # it cannot be run so
+        return ready, search
+    except KeyboardInterrupt:
+        search.interrupted = True
+        return ready, search
+    if not wrong and again.certainty() <= search.certainty():
+        search.interrupted = again.interrupted
+        return ready, search
+    ratio = search.misheld if wrong else float(np.sqrt(search.base.cost / max(again.base.cost, 1e-300)))
+    return replace(other, gates=(*other.gates, hold_note(simulator, hold, ratio))), again
 
 
 def _lost_input(search: Search, verdict: str) -> Gate | None:

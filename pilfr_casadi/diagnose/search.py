@@ -142,10 +142,10 @@ class Search:
             if self._wrongly_held():
                 return
             self.open_after = self.flexible(self.base)
-        if effects > 1 and self._unsure():
+        if effects > 1 and self.unsure():
             two_at_once(self)
 
-    def _unsure(self) -> bool:
+    def unsure(self) -> bool:
         """Whether something is left that a force explains, and what is named does not explain it or is not sure."""
         if self.certainty() > UNSURE or not self._much():
             return False
