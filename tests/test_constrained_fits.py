@@ -316,3 +316,19 @@ def test_a_sparse_fit_halves_the_operators():
 def test_what_bounds_nothing_is_refused(record, given, says):
     with pytest.raises(InputError, match=says):
         pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=1, **given)
+
+
+@pytest.mark.parametrize(
+    "model, kind",
+    [
+        (pilfr.NARX(1, 2), "StaticNetwork"),
+        (pilfr.NOE(1, 2), "StaticNetwork"),
+        (pilfr.ssnn(1, 2), "StaticNetwork"),
+        (pilfr.network_lfr(1, 2), "StaticNetwork"),
+        (pilfr.PILFR(1, pilfr.PrandtlIshlinskii(pilfr.GeneralizedPlay, 2)), "GeneralizedPlay"),
+        (pilfr.PILFR(1, pilfr.Combined([pilfr.Part("a", PLAYS, (0,))])).model(1, 1), "Combined"),
+    ],
+)
+def test_a_gain_is_refused_where_its_formula_does_not_hold(record, model, kind):
+    with pytest.raises(InputError, match=f"plays and stops, and the model has a {kind}"):
+        pilfr.fit(model, record, starts=1, constraints=dc_gain(2.0))
