@@ -91,6 +91,16 @@ class Lagged:
         if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
             raise InputError(f"validation = {share!r} was given; give the share to hold back, 0 or more and below 1.")
 
+    @property
+    def element(self) -> StaticNetwork:
+        """The neurons, one a channel."""
+        return StaticNetwork(1, self.hidden)
+
+    def unknowns(self, n_u: int, n_y: int) -> int:
+        """How many parameters are free, told without building the model, which of many lags takes long."""
+        past = self.lags * n_y + (self.input_lags or self.lags) * n_u
+        return self.hidden * (past + 1 + n_y) + n_y * (past * self.linear + 1)
+
     def structure(self, n_u: int, n_y: int) -> PILFR:
         """The LFR for n_u inputs and n_y outputs."""
         return lagged(self.lags, self.input_lags or self.lags, self.hidden, n_u, n_y, self.linear)

@@ -26,7 +26,7 @@ from .option_values import bounds, name_list, number, pairs
 from .order_selection import select_order
 from .progress import progress_bar
 from .readers import read
-from .recording import InputError, Recording, listed
+from .recording import InputError, Recording, check_for_identification, listed
 from .sensitivities import VirtualMachine
 from .solution import Status
 from .structures import ANY, TAKES, named_structure
@@ -95,6 +95,8 @@ def fit(options: argparse.Namespace) -> int:
             insistent(bar) as progress,
         ):
             task = saved if saved is not None else _structure(options, train)
+            if isinstance(task, Lagged):  # too many lags are refused before they are built
+                check_for_identification(train, task.unknowns(train[0].n_u, train[0].n_y) + 2)
             engine = announced_engine(task, train[0], options.engine)
             search = {} if saved is not None else {"starts": options.starts, "seed": options.seed, "executor": pool}
             result = identify(task, train, solver=solver, engine=engine, progress=progress, **search)

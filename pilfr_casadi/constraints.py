@@ -125,7 +125,9 @@ def stable(
     """
     if not (radius > 0 and slack >= 0):
         raise InputError(
-            f"The spectral radius was bounded by {radius} with slack {slack}; give a positive number, and 0 or more."
+            f"A bound of {radius} on the spectral radius was given; give a number above zero."
+            if slack >= 0
+            else f"The bound on the spectral radius has a slack of {slack}; give zero or more."
         )
     limit = float(np.log(radius) + (-INSIDE if exact else np.log1p(slack)))
     check = BeyondRadius(radius, matrix) if exact else None
@@ -171,7 +173,8 @@ class Rows:
         p = parameters.start
         named = parameters.unpack(p)
         held = np.repeat([c.check is not None and c.check(named) <= 0 for c in constraints], self.sizes).astype(bool)
-        check_free(self.function, self._slope, parameters.free, p, self.lower, self.upper, self.labels, held)
+        logs = np.repeat([isinstance(c.expression, LogRadius) for c in constraints], self.sizes).astype(bool)
+        check_free(self.function, self._slope, parameters.free, p, self.lower, self.upper, self.labels, held, logs)
 
     def values(self, p: np.ndarray) -> np.ndarray:
         """Shape (n_g,)."""
@@ -266,10 +269,11 @@ def check_free(
     upper: np.ndarray,
     labels: tuple[str, ...],
     held: np.ndarray,
+    logs: np.ndarray,
 ) -> None:
     """Refuse a constraint that is no number at the start, or that does not hold and that no free parameter enters.
 
-    `held` says of which entries a check of their own says that they hold.
+    `held` says of which entries a check of their own says that they hold, `logs` which are logarithms of what is told.
 
     Raises
     ------
@@ -288,7 +292,8 @@ def check_free(
     for i in np.flatnonzero(~np.any(reach[:, free], axis=1) & ~held):
         room = TOLERATED * max(abs(value[i]), 1.0)
         if not lower[i] - room <= value[i] <= upper[i] + room:
+            found, low, high = (np.exp(v) if logs[i] else v for v in (value[i], lower[i], upper[i]))
             raise InputError(
-                f"The constraint {labels[i]!r} is infeasible: all that enters it is fixed and gives {value[i]:g}, "
-                f"limits {lower[i]:g} and {upper[i]:g}; free a parameter or loosen it."
+                f"The constraint {labels[i]!r} is infeasible: all that enters it is fixed and gives {found:g}, "
+                f"limits {low:g} and {high:g}; free a parameter or loosen it."
             )

@@ -24,8 +24,9 @@ from .exactness import beyond
 from .fitted import Fit, fingerprint
 from .interrupts import Progress
 from .job import Job
+from .known import check_gain
 from .known_blocks import in_known_coordinates
-from .lagged_fit import fit_lagged
+from .lagged_fit import check_lagged_options, fit_lagged
 from .lfr import PILFR
 from .linear_model import linear_model
 from .model import Model
@@ -176,7 +177,9 @@ def _fit(
         raise InputError("A linear model to begin with goes with a PILFR; any other model has its own values.")
     if isinstance(start, Mapping) and not isinstance(model, PILFR):
         raise InputError("Values to start from go with a PILFR; a Model and a Fit have their own.")
+    check_gain(job.limits, (model.model if isinstance(model, Fit) else model).element)
     if isinstance(model, Lagged):
+        check_lagged_options(model, stable, start)
         return fit_lagged(model, train, job, starts, seed, executor)
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
     limits = stability_limits(structure, stable) if structure else ()

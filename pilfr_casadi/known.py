@@ -11,7 +11,7 @@ All are classes, so that they can be sent to other processes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,8 @@ import casadi as ca
 import numpy as np
 
 from .constraints import Constraint
+from .elements import PrandtlIshlinskii
+from .operators import Play, Stop
 from .recording import InputError
 
 
@@ -51,7 +53,9 @@ class Steps:
 
 
 def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
-    """A known steady gain of a PI-LFR, from every input to every output.
+    """A known steady gain of a linear model or a PI-LFR of plays or stops, from every input to every output.
+
+    Other elements, such as generalized plays and networks, have no slope `Σw`: with them it is refused.
 
     Parameters
     ----------
@@ -78,6 +82,24 @@ def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
     flat, room = (np.broadcast_to(a, both).ravel(order="F") for a in (gain, room))
     shown = ", ".join(f"{g:g}" for g in flat) + ("" if not np.any(room) else f" ± {np.max(room):g}")
     return Constraint(Gain(slope), flat - room, flat + room, f"DC gain = {shown}", exact=bool(np.all(room > 0)))
+
+
+def check_gain(constraints: Iterable[Constraint], element: Any) -> None:
+    """Refuse a DC gain for an element whose gain is not the one of `Gain`.
+
+    Raises
+    ------
+    InputError
+        If the element is neither none nor a Prandtl-Ishlinskii one of plays or stops.
+    """
+    if element is None or (isinstance(element, PrandtlIshlinskii) and isinstance(element.operator, Play | Stop)):
+        return
+    if any(isinstance(c.expression, Gain) for c in constraints):
+        kind = getattr(element, "operator", element)
+        raise InputError(
+            f"dc_gain is for linear models and for plays and stops, and the model has a {type(kind).__name__}, whose "
+            "gain is another; leave it out, or give a Constraint of your own."
+        )
 
 
 def ordered(name: str = "r", gap: float = 0.0) -> Constraint:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,24 @@ class LaggedSearch:
         return replace(self.job, recordings=self.kept).problem(model, engine=engine or self.job.engine)
 
 
+def check_lagged_options(wanted: Lagged, stable: bool | float, start: Any) -> None:
+    """Refuse what a NARX or NOE would leave unheard: a bound on a spectral radius, a start of another kind.
+
+    Raises
+    ------
+    InputError
+        That says which.
+    """
+    kind = type(wanted).__name__
+    if not isinstance(stable, bool):
+        raise InputError(
+            f"stable = {stable!r} was given for a {kind}, whose state is the past of its signals and has no spectral "
+            "radius to bound; leave it out."
+        )
+    if start != "grid":
+        raise InputError(f"start = {start!r} was given for a {kind}, whose starts are of their own kind; leave it out.")
+
+
 def fit_lagged(
     wanted: Lagged,
     train: Recording | Sequence[Recording],
@@ -68,9 +87,8 @@ def fit_lagged(
     if not isinstance(job.solver, GaussNewton) and wanted.validation:
         raise InputError("Early stopping needs the solver GaussNewton(); give that, or validation=0.")
     first = as_recordings(train)[0]
+    job = replace(job, recordings=check_for_identification(train, wanted.unknowns(first.n_u, first.n_y) + 2))
     structure = wanted.structure(first.n_u, first.n_y)
-    unknown = int(wanted.model(first.n_u, first.n_y).parameters.free.sum())
-    job = replace(job, recordings=check_for_identification(train, unknown + 2))
     split = hold_back(job.recordings, wanted.validation) if wanted.validation else (job.recordings, ())
     search = LaggedSearch(wanted, structure, replace(job, progress=None), *split)
 

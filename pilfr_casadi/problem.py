@@ -19,6 +19,7 @@ import numpy as np
 
 from .compiled import make_engine
 from .constraints import Constraint, Rows
+from .known import check_gain
 from .layout import Part, checked_weights, lay_out, output_scale
 from .magnitude import Neighbours
 from .model import Model
@@ -79,6 +80,7 @@ class Problem:
         self.recordings = as_recordings(recordings)
         self.engine = make_engine(model, engine) if isinstance(engine, str) else engine
         self.constraints = tuple(constraints)
+        check_gain(self.constraints, model.element)
         parameters = model.parameters
         self._base = parameters.start
         self.free = parameters.free

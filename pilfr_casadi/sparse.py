@@ -106,7 +106,7 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     InputError
         If the model has no such element.
     """
-    structure = fit.structure
+    structure = getattr(fit, "structure", None)
     if structure is None or not isinstance(structure.element, PrandtlIshlinskii):
         raise InputError(
             "Only a PI-LFR with a Prandtl-Ishlinskii element has operators to take out; give a fit of one."
@@ -218,6 +218,8 @@ def regularization_path(
     InputError
         If the fit is not one of a PI-LFR, a strength or the margin is unfit, or validation is training.
     """
+    if not isinstance(fit, Fit):
+        raise InputError(f"A regularization path was asked for of a {type(fit).__name__}; give a Fit.")
     structure, seen, judged = fit.structure, as_recordings(train), as_recordings(validation)
     if structure is None or (priors is None and not isinstance(structure.element, PrandtlIshlinskii)):
         raise InputError("A regularization path needs a fit of a PI-LFR with an element; give one.")
@@ -227,7 +229,10 @@ def regularization_path(
     given = [scale * s for s in STRENGTHS] if priors is None else [0.01, 0.1, 1.0, 10.0, 100.0]
     given = sorted(set(given if strengths is None else strengths))
     if not given or not all(0 < s < np.inf for s in given) or not 0 <= margin < np.inf:
-        raise InputError(f"strengths {given} with a margin of {margin} were given; give positive numbers, 0 or more.")
+        raise InputError(
+            f"strengths = {given} and margin = {margin} were given; give one strength or more, all above zero, and a "
+            "margin of zero or more."
+        )
     fits, errors = [fit], [fit.nrmse(judged)]
     thin: dict[int, tuple[Fit, ...]] = {}
     for i, strength in enumerate(given):

@@ -39,7 +39,7 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.baselines import NARX, NOE, network_lfr, ssnn
+from pilfr_casadi.baselines import NARX, NOE, Lagged, network_lfr, ssnn
 from pilfr_casadi.bla import robust_bla
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.demo import FLOOR, PUBLISHED, SETS, structure
@@ -159,7 +159,8 @@ def linear_start(row: Row, data: Benchmark) -> Any:
 def identify(row: Row, data: Benchmark, seed: int, pool: Executor | None) -> Result:
     """All starts of a row."""
     began, records = time.perf_counter(), data.records
-    options: dict[str, Any] = {"start": row.start, "starts": row.starts, "seed": seed}
+    options: dict[str, Any] = {"starts": row.starts, "seed": seed}
+    options |= {} if isinstance(row.model, Lagged) else {"start": row.start}
     result = fit(row.model, records["train"], linear=linear_start(row, data), executor=pool, **options)
     if row.start == "grid" or not result.candidates:
         errors = np.array([[result.nrmse(records[name]) for name in SETS]])

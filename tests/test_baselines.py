@@ -14,6 +14,7 @@ from pilfr_casadi.early_stopping import hold_back, solve_watched
 from pilfr_casadi.export.digests import ordered_digest
 from pilfr_casadi.gauge import gauge_tangents
 from pilfr_casadi.problem import Problem
+from pilfr_casadi.recording import InputError
 
 NOISE = 0.01
 rng = np.random.default_rng(5)
@@ -297,3 +298,27 @@ def test_a_noe_of_several_recordings_has_a_state_for_each(tmp_path):
     fit.save(tmp_path / "model.json")
     again = pilfr.load(tmp_path / "model.json")
     np.testing.assert_array_equal(again.simulate(records[1]), fit.simulate(records[1]))
+
+
+@pytest.mark.parametrize("kind", [pilfr.NARX, pilfr.NOE])
+@pytest.mark.parametrize(
+    "options, says", [({"stable": 0.9}, "stable = 0.9"), ({"start": "paper"}, "'paper'"), ({"start": "plain"}, "plain")]
+)
+def test_what_a_lagged_model_would_not_hear_is_refused(kind, options, says):
+    train, _ = recordings(truth("NARX"))
+    with pytest.raises(InputError, match=f"{says}.*was given for a {kind.__name__}"):
+        pilfr.fit(kind(2, 3), train, **options)
+
+
+@pytest.mark.parametrize("linear", [True, False])
+@pytest.mark.parametrize("lags, input_lags", [(2, None), (3, 1), (1, 4)])
+def test_the_unknowns_of_a_lagged_model_are_its_free_parameters(linear, lags, input_lags):
+    model = pilfr.NARX(lags, 3, input_lags, linear=linear)
+    assert model.unknowns(2, 3) == int(model.model(2, 3).parameters.free.sum())
+
+
+def test_too_many_lags_are_refused_before_the_model_is_built(monkeypatch):
+    train, _ = recordings(truth("NARX"))
+    monkeypatch.setattr(pilfr.NARX, "structure", lambda *_: pytest.fail("built"))
+    with pytest.raises(InputError, match="scored samples"):
+        pilfr.fit(pilfr.NARX(2000), train)

@@ -249,11 +249,27 @@ def test_a_path_over_priors(record, full):
 
 @pytest.mark.parametrize(
     "options, says",
-    [({"strengths": (0.0,)}, "positive"), ({"strengths": ()}, "positive"), ({"margin": -1.0}, "margin")],
+    [
+        ({"strengths": (0.0,)}, "all above zero"),
+        ({"strengths": ()}, "give one strength or more"),
+        ({"margin": -1.0}, "margin of zero or more"),
+    ],
 )
 def test_what_cannot_be_a_path(record, full, options, says):
     with pytest.raises(InputError, match=says):
         pilfr.regularization_path(full, record, three_plays(7, 1200), **options)
+
+
+def test_a_path_of_what_is_no_fit(record):
+    with pytest.raises(InputError, match="asked for of a str; give a Fit"):
+        pilfr.regularization_path("f", record, three_plays(7, 1200))
+    with pytest.raises(InputError, match="give a fit of one"):
+        pilfr.prune("f", record)
+
+
+def test_a_fixed_radius_is_told_in_its_own_units(record):
+    with pytest.raises(InputError, match=r"'spectral radius <= 1' is infeasible: .* gives 2, limits 0 and 1;"):
+        pilfr.fit(pilfr.PILFR(1, PLAYS, fixed={"A": 2.0}), record, starts=1)
 
 
 def test_validation_is_no_training(record, full):
@@ -316,3 +332,19 @@ def test_a_sparse_fit_halves_the_operators():
 def test_what_bounds_nothing_is_refused(record, given, says):
     with pytest.raises(InputError, match=says):
         pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=1, **given)
+
+
+@pytest.mark.parametrize(
+    "model, kind",
+    [
+        (pilfr.NARX(1, 2), "StaticNetwork"),
+        (pilfr.NOE(1, 2), "StaticNetwork"),
+        (pilfr.ssnn(1, 2), "StaticNetwork"),
+        (pilfr.network_lfr(1, 2), "StaticNetwork"),
+        (pilfr.PILFR(1, pilfr.PrandtlIshlinskii(pilfr.GeneralizedPlay, 2)), "GeneralizedPlay"),
+        (pilfr.PILFR(1, pilfr.Combined([pilfr.Part("a", PLAYS, (0,))])).model(1, 1), "Combined"),
+    ],
+)
+def test_a_gain_is_refused_where_its_formula_does_not_hold(record, model, kind):
+    with pytest.raises(InputError, match=f"plays and stops, and the model has a {kind}"):
+        pilfr.fit(model, record, starts=1, constraints=dc_gain(2.0))

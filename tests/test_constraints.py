@@ -112,9 +112,9 @@ def test_no_constraints():
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: stable(slack=-1e-6), "bounded by 1.0 with slack"),
+        (lambda: stable(slack=-1e-6), "slack of -1e-06; give zero or more"),
         (lambda: compile_constraints((Constraint(lambda p: p["gain"], unit=0.0),), system()), "unit of the constraint"),
-        (lambda: stable(0.0), "bounded by 0.0 with slack"),
+        (lambda: stable(0.0), "bound of 0.0 on the spectral radius was given; give a number above zero"),
         (
             lambda: compile_constraints((Constraint(lambda p: p["mass"], name="m"),), system()),
             "'m' reads a parameter 'mass'",

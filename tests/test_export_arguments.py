@@ -1,9 +1,11 @@
 """Whatever is wrong with the arguments of an export is one plain sentence; what is odd but usable compiles."""
 
 import ctypes
+import re
 import subprocess
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from test_export import one_sentence, some_fit
@@ -140,3 +142,30 @@ def test_options_that_are_none(options):
 )
 def test_bounds_where_there_are_no_numbers(x, u, words):
     refused(lambda: some_fit().export(smooth=0.1).bound(x, u), words)
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        (([0, 0], [1]), "The state x of a step of model has 7 entries; the shape (2,) was given."),
+        ((0.0, [1]), "has 7 entries; one number was given."),
+        ((np.zeros((2, 7)), [1]), "the shape (2, 7)"),
+        ((np.zeros(7), [1, 2]), "The input u of a step of model has 1 entry; the shape (2,)"),
+        ((np.zeros(7), None), "The input u"),
+        ((np.zeros(7),), "needs x and u"),
+        ((np.zeros(7), 1, 2), "needs x and u"),
+        ((ca.SX.sym("x", 2), 1.0), "the shape (2, 1)"),
+    ],
+)
+def test_a_step_refuses_what_does_not_fit(given, words):
+    refused(lambda: some_fit().export().step(*given), re.escape(words))
+
+
+def test_a_step_takes_what_fits():
+    step, x = some_fit().export().step, np.linspace(0.1, 0.7, 7)
+    refused(lambda: step(x=x), "needs x and u")
+    following, y = (np.asarray(v) for v in step(x, 0.3))
+    for other in (step(x[None], [0.3]), step(ca.DM(x), ca.DM(0.3)), tuple(step(x=x, u=0.3).values())):
+        assert np.array_equal(np.asarray(other[0]).ravel(), following.ravel()) and float(other[1]) == y.item()
+    assert step(np.tile(x[:, None], 3), np.full((1, 3), 0.3))[0].shape == (7, 3)
+    assert step(ca.MX.sym("x", 7), ca.MX.sym("u"))[1].shape == (1, 1)

@@ -12,6 +12,7 @@ from test_feedback import A, fitted, plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, PredictiveController
+from pilfr_casadi.feedback.asked import planned_with
 
 
 def refused(call, words=None):
@@ -184,3 +185,14 @@ def test_do_mpc_gets_the_same_sentences():
     refused(lambda: make(function, 5, np.zeros((9, 2)), **limits), re.escape("give (samples, 1)"))
     refused(lambda: make(function, 5, [np.nan] * 9, **limits), "finite")
     refused(lambda: make(function, 5, np.zeros(9), inputs=(1.0, -1.0)), "low below high")
+
+
+def test_what_a_controller_plans_with_is_what_do_mpc_takes(small):
+    pytest.importorskip("do_mpc")
+    fit, _, observer = small
+    for plant in (fit, observer, fit.export(), fit.to_casadi()):
+        function = planned_with(plant)
+        model = pilfr.do_mpc_model(plant)
+        assert model.x.shape[0] == function.size1_in(0) and model.u.shape[0] == function.size1_in(1)
+        assert pilfr.PredictiveController(plant, 3, inputs=(-1, 1)).function.size1_in(0) == function.size1_in(0)
+    refused(lambda: pilfr.do_mpc_model("f"), "A str cannot be planned with; give a Fit")

@@ -97,6 +97,12 @@ def test_a_campaign_compares_structures_and_each_takes_what_is_its_own(folder):
         ("nx = 2\nhidden = 3", "'hidden' in [model] is not for structure = 'lfr'"),
         ('structure = "rnn"\nnx = 2', "'structure' in [model] is 'rnn'; give 'lfr'"),
         ('structure = "narx"\nlags = 2\n[constraints]\nspectral_radius = 0.9', "'spectral_radius' in [constraints]"),
+        ('structure = "narx"\nlags = 2\n[constraints]\ndc_gain = 2.0', "[constraints]: dc_gain is for linear models"),
+        (
+            '[grid]\nstructure = ["lfr", "ssnn"]\nnx = [1]\n[constraints]\ndc_gain = 2.0',
+            "[constraints]: dc_gain is for",
+        ),
+        ('[grid]\nstructure = ["narx"]\nlags = [1]\nstart = ["paper"]', "start = 'paper' is not for a NARX or NOE"),
         ('structure = "narx"\nlags = 2\n[constraints]\nordered_thresholds = true', "'r'"),
         ('structure = "narx"\nlags = 2\n[regularization]\nl1 = 1e-3', "leave l1 out"),
         ('structure = "ssnn"\nnx = 1\nhidden = 2\n[regularization]\nl1 = 1e-3', "'w'"),
@@ -132,3 +138,14 @@ def test_unfit_options_of_the_command_get_one_sentence(capsys, folder):
     refused(capsys, *bare, "--structure", "narx", says="--structure narx needs --lags")
     refused(capsys, *bare, "--structure", "noe", "--lags", 0, says="--lags 0 was given; give 1 or more.")
     refused(capsys, *bare, "--structure", "noe", "--lags", 2, "--bound", "w=0:1", says="--bound is not for")
+
+
+def test_too_many_lags_and_a_start_of_another_kind_are_refused(capsys, folder):
+    data = ("fit", folder / "train.csv", "--inputs", "u", "--outputs", "y", "--out", folder / "out")
+    refused(capsys, *data, "--structure", "narx", "--lags", 2000, says=("400 scored samples", "smaller model"))
+    path = written(folder, 'structure = "noe"\nlags = 2')
+    path.write_text(path.read_text().replace("[solver]", '[solver]\nstart = "plain"'))
+    refused(capsys, "run", path, says="start = 'plain' is not for a NARX or NOE")
+    path.write_text(path.read_text().replace('structure = "noe"\nlags = 2', "lags = 2\nnx = 1\noperators = 1"))
+    path.write_text(path.read_text() + "[grid]\nstructure = ['noe', 'lfr']\n")  # left out where it is for the others
+    assert [cell.search["start"] for cell in read_run(path).cells] == ["grid", "plain"]

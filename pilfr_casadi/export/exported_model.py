@@ -31,7 +31,8 @@ class Exported:
     Attributes
     ----------
     step : casadi.Function
-        x (n_x,) and u (n_u,) to x_next (n_x,) and y (n_y,); y belongs to the sample at which x and u are given.
+        x (n_x,) and u (n_u,) to x_next (n_x,) and y (n_y,); y belongs to the sample at which x and u are given. Called
+        from Python it refuses other sizes (`CheckedStep`).
     states : dict
         Name of each entry of x -> its index: linear states, then the operators' memory `memory[i,j]` of channel i and
         threshold r[i,j]; of a simulator its states, then the laws' own, `<port>.q1`, and their memory,

@@ -16,6 +16,7 @@ from ..model import Model
 from ..recording import InputError, Recording
 from ..simulator import Simulator
 from ..substeps import choose_substeps
+from .checked_step import CheckedStep
 from .exported_model import Exported
 from .names import check_name
 from .sampled import Sampled, right_hand_side, sampled
@@ -95,7 +96,7 @@ def exported(
         raise InputError(f"{what} was given; give a Fit, a Simulator, a Model or a Diagnosis.")
     one = smoothed(step.one, smooth) if smooth else None
     return Exported(
-        step=step.function(name, one),
+        step=CheckedStep(step.function(name, one)),
         start=_start(model, closed, step, start),
         states={n: i for i, n in enumerate(step.states)},
         thresholds=step.thresholds,

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from ..checks import numbers
+from ..fitted import Fit
 from ..recording import InputError
 
 Array = np.ndarray
@@ -50,18 +51,7 @@ def asked(
     InputError
         That says which is unfit.
     """
-    if not isinstance(function, ca.Function):  # of an observer, of an export
-        function = getattr(function, "function", getattr(function, "step", function))
-    if not isinstance(function, ca.Function):
-        raise InputError(
-            f"A {type(function).__name__} cannot be planned with; give a casadi.Function (x, u) -> (x_next, y), "
-            "such as fit.to_casadi() or observer.function."
-        )
-    if function.n_in() != 2 or function.n_out() != 2 or function.size1_in(0) != function.size1_out(0):
-        raise InputError(
-            f"The function {function.name()} has {function.n_in()} inputs and {function.n_out()} outputs, or another "
-            "state behind a step than before; give (x, u) -> (x_next, y)."
-        )
+    function = planned_with(function)
     n_u, n_y = function.size1_in(1), function.size1_out(1)
     if not count(horizon):
         raise InputError(f"A horizon of {horizon!r} was given; give a number of samples, 1 or more.")
@@ -74,6 +64,32 @@ def asked(
     if any(np.any(size <= 0) for size in (*scales, rates)) or weight < 0:
         raise InputError("y_scale, u_scale, rate and move are sizes; give numbers above zero (move may be zero).")
     return Asked(function, int(horizon), low, high, low_y, high_y, outputs is not None, rates, weight, *scales)
+
+
+def planned_with(given: Any) -> ca.Function:
+    """The function `(x, u) -> (x_next, y)` of a model, an observer or an export, or one that is given itself.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    function = given
+    if isinstance(given, Fit):
+        function = given.to_casadi()
+    elif not isinstance(given, ca.Function):  # of an observer, of an export
+        function = getattr(given, "function", getattr(given, "step", given))
+    if not isinstance(function, ca.Function):
+        raise InputError(
+            f"A {type(given).__name__} cannot be planned with; give a Fit, an observer, an export, or a "
+            "casadi.Function (x, u) -> (x_next, y)."
+        )
+    if function.n_in() != 2 or function.n_out() != 2 or function.size1_in(0) != function.size1_out(0):
+        raise InputError(
+            f"The function {function.name()} has {function.n_in()} inputs and {function.n_out()} outputs, or another "
+            "state behind a step than before; give (x, u) -> (x_next, y)."
+        )
+    return function
 
 
 def count(value: Any) -> bool:

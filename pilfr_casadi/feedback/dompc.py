@@ -14,7 +14,7 @@ import numpy as np
 
 from ..checks import numbers
 from ..recording import InputError
-from .asked import asked
+from .asked import asked, planned_with
 from .mpc import PENALTY
 
 Array = np.ndarray
@@ -38,13 +38,13 @@ def imported() -> Any:
     return do_mpc
 
 
-def do_mpc_model(function: ca.Function) -> Any:
+def do_mpc_model(function: Any) -> Any:
     """A discrete `do_mpc.model.Model` of `F(x, u) -> (x_next, y)`: state x, input u, expression y, reference r.
 
     Parameters
     ----------
-    function : casadi.Function
-        For example `fit.to_casadi()`.
+    function : casadi.Function, Fit, KalmanFilter or Exported
+        What `PredictiveController` takes.
 
     Returns
     -------
@@ -54,8 +54,9 @@ def do_mpc_model(function: ca.Function) -> Any:
     Raises
     ------
     InputError
-        If do-mpc is not installed.
+        If do-mpc is not installed, or there is no such function.
     """
+    function = planned_with(function)
     model = imported().model.Model("discrete", "SX")
     x = model.set_variable("_x", "x", (function.size1_in(0), 1))
     u = model.set_variable("_u", "u", (function.size1_in(1), 1))
@@ -68,7 +69,7 @@ def do_mpc_model(function: ca.Function) -> Any:
 
 
 def do_mpc_controller(
-    function: ca.Function,
+    function: Any,
     horizon: int,
     reference: Array,
     *,

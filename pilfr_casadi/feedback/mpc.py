@@ -50,8 +50,8 @@ class PredictiveController:
 
     Parameters
     ----------
-    function : casadi.Function
-        The model, for example `fit.to_casadi()` or an observer's `function`.
+    function : casadi.Function, Fit, KalmanFilter or Exported
+        The model: `(x, u) -> (x_next, y)`, for example `fit.to_casadi()` or an observer's `function`.
     horizon : int
         Samples N.
     inputs : (low, high)
@@ -79,7 +79,7 @@ class PredictiveController:
 
     def __init__(
         self,
-        function: ca.Function,
+        function: Any,
         horizon: int,
         *,
         inputs: tuple[Any, Any],

@@ -8,7 +8,7 @@ Where there are objects, the jobs depend on the contents of the Python file; wha
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from ..baselines import Lagged
 from ..constraints import Constraint
 from ..gauss_newton import GaussNewton
 from ..ipopt import Ipopt
-from ..known import dc_gain, ordered
+from ..known import check_gain, dc_gain, ordered
 from ..lfr import PILFR
 from ..load_simulator import user_variable
 from ..model import Model
@@ -125,7 +125,7 @@ def _checked(file: Path, content: Any, kind: str) -> Run:
     data.done()
     _check_files(top, files)
     cells, solver = cells_of(top, _model, _solver)
-    stable, constraints = _constraints(top.table("constraints"), cells[0].model)
+    stable, constraints = _constraints(top.table("constraints"), [cell.model for cell in cells])
     regularization = _regularization(top.table("regularization"), files)
     out = top.take("out", str, f"{file.stem}-{kind}")
     wrong = check_inside(file, out)
@@ -227,7 +227,7 @@ def _solver(table: Table) -> tuple[Any, dict[str, Any]]:
     return (GaussNewton(**{"tolerance": POLISH.tolerance, **given}) if given else POLISH), search
 
 
-def _constraints(table: Table, model: PILFR | Lagged | Model) -> tuple[bool | float, tuple[Constraint, ...]]:
+def _constraints(table: Table, models: Sequence[PILFR | Lagged | Model]) -> tuple[bool | float, tuple[Constraint, ...]]:
     stable = table.any("spectral_radius", True)
     if not isinstance(stable, bool) and not (isinstance(stable, int | float) and 0 < stable < float("inf")):
         table.fail(f"'spectral_radius' in [constraints] is {shown(stable)}; give a number above zero, true or false")
@@ -250,10 +250,15 @@ def _constraints(table: Table, model: PILFR | Lagged | Model) -> tuple[bool | fl
     if not isinstance(own, list | tuple) or not all(isinstance(c, Constraint) for c in own):
         table.fail(f"'own' in [constraints] is {shown(own)}; give a list of Constraint, in a Python run file")
     table.done()
-    if found and isinstance(model, Model):
+    if found and isinstance(models[0], Model):
         table.fail("dc_gain and ordered_thresholds are for a PI-LFR, and the model is your own; use 'own'")
-    if isinstance(model, Lagged) and not isinstance(stable, bool):
+    if any(isinstance(model, Lagged) for model in models) and not isinstance(stable, bool):
         table.fail("'spectral_radius' in [constraints] is not for structure = 'narx' or 'noe', whose state is the past")
+    try:
+        for model in models:
+            check_gain((*found, *own), model.element)
+    except InputError as error:
+        table.fail(f"[constraints]: {str(error).rstrip('.')}")
     return stable if isinstance(stable, bool) else float(stable), (*found, *own)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 from ..baselines import Lagged
 from ..lfr import PILFR
 from ..model import Model
-from ..structures import ANY, TAKES
+from ..structures import ANY, LAGGED, TAKES
 from .tables import Table, as_plain, shown
 
 MODEL_KEYS = ("structure", "nx", "operator", "operators", "channels", "neurons", "hidden", "lags")
@@ -56,6 +56,7 @@ def cells_of(
         if top.has("grid"):
             top.fail("[grid] varies a [model] table, and the model is an object; leave one of them out")
         found, search = solver_of(Table(top.file, "solver", solver))
+        _check_start(top, model, search)
         return (Cell({}, model, search, as_plain({"model": model, "solver": solver})[0]),), found
     axes = _axes(top.table("grid"))
     base = {"model": Table(top.file, "model", model).content, "solver": Table(top.file, "solver", solver).content}
@@ -71,9 +72,20 @@ def cells_of(
         if cell.get("structure") in TAKES:  # leave out what the file says for other structures
             others = ANY.difference(TAKES[cell["structure"]], axes)
             said["model"] = {k: v for k, v in said["model"].items() if k not in others}
+            if cell["structure"] in LAGGED and "start" not in axes:
+                said["solver"].pop("start", None)
         found, search = solver_of(Table(top.file, "solver", said["solver"]))
-        cells.append(Cell(cell, model_of(Table(top.file, "model", said["model"])), search, as_plain(said)[0]))
+        built = model_of(Table(top.file, "model", said["model"]))
+        _check_start(top, built, search)
+        cells.append(Cell(cell, built, search, as_plain(said)[0]))
     return tuple(cells), found
+
+
+def _check_start(top: Table, model: PILFR | Lagged | Model, search: Mapping[str, Any]) -> None:
+    if isinstance(model, Lagged) and search["start"] != "grid":
+        top.fail(
+            f"start = {search['start']!r} is not for a NARX or NOE, whose starts are of their own kind; leave it out"
+        )
 
 
 def _axes(table: Table) -> dict[str, list[Any]]:
