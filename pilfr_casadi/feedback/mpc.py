@@ -44,6 +44,17 @@ class Plan:
         """The input to apply now, (n_u,)."""
         return self.inputs[0]
 
+    def __str__(self) -> str:
+        how = "converged" if self.converged else "NOT converged"
+        applied = ", ".join(f"{v:.5g}" for v in self.u)
+        limits = f"outputs beyond their limits by {self.slack:.3g}" if self.slack > 0 else "outputs within their limits"
+        return (
+            f"plan over {len(self.inputs)} samples, {how} in {1e3 * self.seconds:.2f} ms, cost {self.cost:.5g}\n"
+            f"input to apply now: {applied}; {limits}"
+        )
+
+    __repr__ = __str__
+
 
 class PredictiveController:
     """Model predictive control of any `F(x, u) -> (x_next, y)`; `controller(x, reference, u_previous)` gives a `Plan`.
@@ -104,6 +115,16 @@ class PredictiveController:
         self._weighted = np.sqrt(move) * self._differences / self.u_scale[:, None]
         self._plan: Array | None = None
         {"sqp": self._build_sqp, "ipopt": self._build_ipopt}[solver]()
+
+    def __str__(self) -> str:
+        n, n_u, n_y = (self.function.size1_in(0), self.function.size1_in(1), self.function.size1_out(1))
+        limits = "inputs and outputs" if self.limited else "inputs"
+        return (
+            f"predictive controller over {self.horizon} samples by {self.solver}: {n} states, {n_u} inputs, {n_y} "
+            f"outputs, limits of the {limits}" + (", rates limited" if np.isfinite(self.rate).any() else "")
+        )
+
+    __repr__ = __str__
 
     def __call__(self, x: Array, reference: Array, u_previous: Array) -> Plan:
         """Plan from the state x, towards the reference (N, n_y) from the present sample on.
