@@ -65,8 +65,8 @@ class KalmanFilter:
         noise = ", ".join(f"{v:.3g}" for v in np.sqrt(np.diag(self.R)))
         return (
             f"extended Kalman filter of {len(self.x0)} states (memory included), {self.step.size1_in(2)} inputs and "
-            f"{self.step.size1_in(3)} outputs\nnoise of the outputs, std: {noise}; process noise a step: {share:.2g} of "
-            "each state's size"
+            f"{self.step.size1_in(3)} outputs\nnoise of the outputs, std: {noise}; process noise a step: {share:.2g} "
+            "of each state's size"
         )
 
     __repr__ = __str__

@@ -11,7 +11,6 @@ x and u, so the Gauss-Newton Hessian is the exact one for plays and stops.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -22,38 +21,11 @@ from ..checks import numbers
 from ..quadratic_program import unconstrained
 from ..recording import InputError
 from .asked import ENORMOUS, SOLVERS, asked, count, path
+from .plan import Plan
 
 Array = np.ndarray
 PENALTY = 30.0  # of a violated output limit, per y_scale
 CLOSE = 1e-5  # of u_scale: a smaller step ends the search
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What a predictive controller found: inputs (N, n_u), outputs (N, n_y), cost, slack, s, whether it converged."""
-
-    inputs: Array
-    outputs: Array
-    cost: float
-    slack: float
-    seconds: float
-    converged: bool
-
-    @property
-    def u(self) -> Array:
-        """The input to apply now, (n_u,)."""
-        return self.inputs[0]
-
-    def __str__(self) -> str:
-        how = "converged" if self.converged else "NOT converged"
-        applied = ", ".join(f"{v:.5g}" for v in self.u)
-        limits = f"outputs beyond their limits by {self.slack:.3g}" if self.slack > 0 else "outputs within their limits"
-        return (
-            f"plan over {len(self.inputs)} samples, {how} in {1e3 * self.seconds:.2f} ms, cost {self.cost:.5g}\n"
-            f"input to apply now: {applied}; {limits}"
-        )
-
-    __repr__ = __str__
 
 
 class PredictiveController:
