@@ -67,6 +67,12 @@ class Candidate:
         return any(np.any(values[k] >= p[k].bounds[1]) for k in self._own)
 
     @property
+    def doubtful(self) -> bool:
+        """Whether the law at its fitted values is hardly what its name says."""
+        prefix = self.fitted.simulator.elements[-1].prefix
+        return self.law.doubtful({k.removeprefix(prefix): self.fitted.values[k] for k in self._own})
+
+    @property
     def _own(self) -> list[str]:
         prefix = self.fitted.simulator.elements[-1].prefix
         return [k for k in self.fitted.model.parameters if k.startswith(prefix)]
@@ -131,6 +137,7 @@ def attempt(
 def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     """Fit a candidate to everything; one whose strength may as well be zero lives off its initial state and is out."""
     candidate = simpler(bench, candidate)
+    bench = _as_fine(bench, candidate)
     placed = candidate.fitted.corrected()  # sub-steps for the law as it was fitted
     out = replace(candidate, head=np.inf, tail=np.inf, full=np.inf)
     try:
@@ -140,8 +147,17 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     if shown(bench, fitted) < SHOWN:
         return out
     done = replace(candidate, fitted=fitted, full=fitted.cost)
+    if fitted.model.substeps > candidate.fitted.model.substeps:  # what coarse steps cost is no fault of the law
+        own = {"states": fitted.begin, "model": fitted.model, "engine": fitted.engine}
+        finer = attempt(bench, placed, [fitted.values], **own)
+        done = replace(done, head=finer.head, tail=finer.tail) if finer is not None else done
     plain = simpler(bench, done, deviations(bench, fitted))
     return done if plain is done else polish(bench, plain)
+
+
+def _as_fine(bench: Workbench, candidate: Candidate) -> Workbench:
+    """The bench with steps at least as fine as a candidate's: on coarser ones its knee would look wider."""
+    return replace(bench, substeps=max(bench.substeps, candidate.fitted.model.substeps))
 
 
 def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray] | None = None) -> Candidate:
@@ -156,7 +172,10 @@ def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray
     own = {
         k.removeprefix(element.prefix): v for k, v in candidate.fitted.values.items() if k.startswith(element.prefix)
     }
-    doubt = {name: WEAK * std[f"{element.prefix}{name}"] if std else 0.0 for name in candidate.law.strength}
+    # at a bound there is no standard error: there only nothing is nothing
+    doubt = {
+        name: np.nan_to_num(WEAK * std[f"{element.prefix}{name}"]) if std else 0.0 for name in candidate.law.strength
+    }
     idle = [name for name, most in doubt.items() if np.all(np.abs(own[name]) <= most)]
     if not idle or not getattr(plain, "units", {}) or not set(plain.units) <= set(own) - set(idle):
         return candidate
@@ -166,5 +185,5 @@ def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray
         {k: own[k] for k in plain.units}, {k: v for k, v in candidate.law.limits.items() if k in plain.units}
     )
     placed = candidate.fitted.simulator.without_last_element().with_element(element.port, law)
-    found = attempt(bench, placed, [candidate.fitted.values], states=candidate.fitted.begin)
+    found = attempt(_as_fine(bench, candidate), placed, [candidate.fitted.values], states=candidate.fitted.begin)
     return found if found is not None and found.error < (NO_WORSE if std else 1.01) * candidate.error else candidate

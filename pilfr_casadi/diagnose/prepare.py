@@ -16,6 +16,7 @@ from .linearise import along, linearised, observer_gain
 from .offset import offsets
 from .proof import errors_of
 from .settling import without_transients
+from .stale import stale_samples
 from .timing import FAR, as_given, in_steps, timing
 from .workbench import THOROUGH, Fitted, Workbench
 
@@ -50,7 +51,7 @@ def prepare(
     """Open the bench, look at the dull causes, refit, and measure the floor."""
     recordings, transients = without_transients(recordings)
     bench, gates = opened(simulator, recordings, hold or "zero", engine)
-    gates = [*transients, *gates]
+    gates = [*transients, *stale_samples(recordings), *gates]
     between, notes = choose_hold(simulator, bench.recordings, hold, engine)
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, simulator)

@@ -122,6 +122,9 @@ def diagnose(
     }
     effects_found = tuple(_effect(search, p, after, std) for p in accepted) if explained else ()
     experiment = _next(search, accepted, limits) if explained else None
+    settled = (
+        verdict in ("complete", "recording-fault") or min((e.confidence for e in effects_found), default=0) > UNSURE
+    )
     now = time.perf_counter()
     times = {"gates and refit": prepared_at - began, **search.times, "proof": now - searched_at}
     return Diagnosis(
@@ -129,7 +132,7 @@ def diagnose(
         sentence=sentence,
         effects=effects_found,
         candidates=tuple(_row(c, p) for p in search.passes for c in p.candidates),
-        gates=tuple(_apparent(g, verdict) for g in gates if _still(g, after, std)),
+        gates=tuple(g if settled else _apparent(g) for g in gates if _still(g, after, std)),
         mismatch=mismatch(
             bench.recordings,
             without.residual,
@@ -226,11 +229,13 @@ def _still(gate: Gate, after: Fitted, std: dict[str, np.ndarray]) -> bool:
     return abs(value) > 3 * error and abs(value) > 0.1 * abs(gate.value)
 
 
-def _apparent(gate: Gate, verdict: str) -> Gate:
-    """An offset beside a mismatch that stays unexplained may be a part of that."""
-    if gate.finding != "offset" or verdict != "unexplained":
+def _apparent(gate: Gate) -> Gate:
+    """An offset beside a mismatch that stays unexplained, or has no sure name, may be a part of that."""
+    if gate.finding != "offset":
         return gate
-    return replace(gate, sentence=f"{gate.sentence} As long as the mismatch is unexplained, it may be a part of that.")
+    return replace(
+        gate, sentence=f"{gate.sentence} As long as the mismatch has no sure name, it may be a part of that."
+    )
 
 
 def _next(search: Search, accepted: Sequence[Pass], limits: Mapping[str, float] | None) -> dict[str, Any] | None:

@@ -252,8 +252,9 @@ def confidence(choice: Choice, search: Search) -> float:
 
     At the noise floor a small margin over thousands of samples says more than the same margin where model error rules.
     A tie between ports does not lower it, a tie between laws does, and so do a residual that stays many times the
-    noise, an error on what is not fitted far above that on what is, and a bound that holds a parameter of the law or of
-    the simulator back short of the noise (other than zero, where a damper is that friction has replaced).
+    noise, an error on what is not fitted far above that on what is, values at which the law is hardly what its name
+    says, and a bound that holds a parameter of the law or of the simulator back short of the noise (other than zero,
+    where a damper is that friction has replaced).
     """
     winner, (remains, still) = choice.winner, left_open(search)
     error2 = max(winner.error**2, 1e-300)
@@ -265,7 +266,7 @@ def confidence(choice: Choice, search: Search) -> float:
     doubt /= (1 + min(times2 / FAR_OFF**2, 1.0)) * (1 + float(np.clip((unseen2 - 1) / FAR_AHEAD**2, 0.0, 1.0)))
     others = len({c.law.id for c in choice.alike} - {winner.law.id})
     pressed = (times2 > AT_FLOOR**2 and strained(search.base)) or (times2 > WELL_ABOVE**2 and winner.held_back)
-    driven = DRIVEN if pressed else 1.0
+    driven = DRIVEN if pressed or winner.doubtful else 1.0
     return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99))
 
 

@@ -137,6 +137,10 @@ class Law:
         """Why the data cannot speak to this law, or nothing."""
         return ""
 
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Whether at fitted values the law is hardly what its sentence says."""
+        return False
+
     def size(self, values: Mapping[str, Any]) -> int:
         """Free numbers of the law at fitted values."""
         return sum(int(np.sum(~p.fixed)) for p in self.parameters().values())

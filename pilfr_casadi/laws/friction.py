@@ -11,6 +11,8 @@ import numpy as np
 from ..operators import play
 from .base import Law, Local, grid
 
+KNEE = 0.15  # of the speed at which friction has fallen, that its reversal may take
+
 
 class CoulombFriction(Law):
     """Dry friction with a smooth reversal (Armstrong-Hélouvry et al. 1994)."""
@@ -106,6 +108,10 @@ class StribeckFriction(CoulombFriction):
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (2e-3 * local.speed, 0.3 * local.speed)}
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """A knee as wide as the range over which friction falls: at rest there is none that is larger."""
+        return bool(values["v_0"] > KNEE * values["v_s"])
 
 
 class PreslidingStribeckFriction(PreslidingFriction):
