@@ -122,6 +122,9 @@ def fit(options: argparse.Namespace) -> int:
         return say(f"Interrupted; the model is in {target}, a report was not written.", INTERRUPTED)
     if result.status is Status.INTERRUPTED:
         return INTERRUPTED
+    if result.status is Status.INFEASIBLE:
+        missed = "; ".join(str(limit) for limit in result.limits if not limit.met)
+        return say(f"The model does not meet its constraints: {missed}.", NO_RESULT)
     return (
         DONE
         if min(result.train_nrmse) < 1.0

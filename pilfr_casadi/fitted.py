@@ -218,7 +218,9 @@ class Fit:
                 lines.append("none of them is drawn, so the seed changes nothing")
         if self.linear_nrmse:
             alone = ", ".join(f"{e:.4f}" for e in self.linear_nrmse)
-            lines.append(f"the linear model alone, to judge the element by: NRMSE {alone}")
+            tight = any(v.kind == "constraint" and not v.name.endswith("<= 1") for v in self.limits)
+            without = ", without the constraints" if tight else ""
+            lines.append(f"the linear model alone{without}, to judge the element by: NRMSE {alone}")
         if self.note:
             lines.append(self.note)
         lines += unknown_sentences(self.errors)

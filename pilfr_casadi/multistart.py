@@ -71,7 +71,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     model = search.model(values)
     problem = search.problem(model)
     candidate = _candidate(seed, model, problem, search.solve(problem, None, solver))
-    candidate = replace(candidate, drawn=_drawn(search, seed))
+    candidate = replace(candidate, drawn=drawn(search.structure, search.start, seed))
     done = candidate.solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error)
     if search.start != "paper" or done:
         return candidate
@@ -84,11 +84,11 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     return _candidate(seed, polished.model, problem, solution, polished.note)
 
 
-def _drawn(search: Search, seed: int) -> bool:
+def drawn(structure: Any, start: str, seed: int) -> bool:
     """Whether a start has anything random in it: with the grid, the direction of z where it is free."""
-    fixed = {k for k, v in search.structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))}
-    network = isinstance(search.structure.element, StaticNetwork)
-    return search.start != "grid" or network or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
+    fixed = {k for k, v in structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))}
+    network = isinstance(structure.element, StaticNetwork)
+    return start != "grid" or network or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
 
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:

@@ -14,7 +14,11 @@ from pilfr_casadi import hand
 from pilfr_casadi.cli import main
 from pilfr_casadi.recording import InputError
 from pilfr_casadi.runs import cluster, side_by_side
+from pilfr_casadi.runs.command import _alike
+from pilfr_casadi.runs.grid import Cell
 from pilfr_casadi.runs.manifest import Manifest
+from pilfr_casadi.runs.results import reasons
+from pilfr_casadi.structures import named_structure
 
 
 @pytest.fixture
@@ -80,3 +84,37 @@ def test_unfit_workers_get_one_sentence(folder, monkeypatch):
     monkeypatch.setattr(hand.sys, "executable", "/bin/false")
     with pytest.raises(InputError, match="The workers cannot begin a job"):
         pilfr.campaign(folder / "rig.toml")
+
+
+def test_why_jobs_have_no_model_is_told_once_a_reason(capsys, folder):
+    two = ("count = 4", "count = 2")
+    gain = "[constraints]\ndc_gain = { value = 1e9, within = 1.0 }\n[grid]"
+    bounds = "nx = 1\nbounds = { A = [-0.5, 0.5], w = [0, 1], B_w = [0, 1], C_y = [0, 1], D_yw = [0, 1] }"
+    path = changed(folder, two, ("[grid]\noperators = [1, 3]", gain + "\noperators = [2]"), ("nx = 1", bounds))
+    for kind in ("run", "campaign"):
+        assert main([kind, str(path)]) == 1
+        out, err = capsys.readouterr()
+        assert "off by" not in out and out.count("no model (infeasible)") == 2
+        assert err.count("\n") == 1 and "no job meets its constraints" in err and "off by" in err
+
+
+def test_reasons_are_grouped():
+    entries = {"a": {"sentence": "X."}, "b": {"sentence": "Y."}, "c": {"sentence": "X."}}
+    assert reasons(entries, ("a", "b", "c")) == ["a and 1 more: X.", "b: Y."]
+
+
+@pytest.mark.parametrize(
+    "structure, starts, says",
+    [
+        ("lfr", 4, ""),
+        ("lfr", 2, "every seed gives the same model; use one seed, or 3 starts or more"),
+        ("hammerstein", 2, "every seed gives the same model; use one seed"),
+        ("hammerstein", 4, "every seed gives the same model; use one seed"),
+        ("ssnn", 1, ""),
+    ],
+)
+def test_seeds_are_advised_on_only_where_it_is_true(structure, starts, says):
+    own = {"hidden": 2} if structure == "ssnn" else {"operators": 3}
+    cell = Cell({}, named_structure(structure, nx=1, **own), {"start": "grid", "starts": starts})
+    assert _alike(cell).endswith(says) and bool(_alike(cell)) == bool(says)
+    assert _alike(Cell({}, cell.model, {"start": "plain", "starts": starts})) == ""

@@ -395,3 +395,14 @@ def test_an_interrupted_run_writes_the_best_so_far(tmp_path):
     assert process.returncode == 130
     assert "interrupted" in out
     assert json.loads(Path(tmp_path / "out" / "model.json").read_text())["parameters"]["A"]
+
+
+def test_a_model_that_misses_its_constraints_is_no_usable_result(capsys, tmp_path):
+    """What contradicts itself is bad input (2), what no solver could meet no usable result (1), as in a run."""
+    write_csv(tmp_path / "train.csv", seed=0, m=400)
+    data = fit_arguments(tmp_path / "train.csv", tmp_path)
+    says = ("'spectral radius <= 1' is infeasible", "gives 2, limits 0 and 1")
+    refused(capsys, *data, "--fix", "A=2", says=says)
+    status, _, err = run(capsys, *data, "--bound", "A=1.01:2")
+    assert status == 1 and err.startswith("pilfr: The model does not meet its constraints: spectral radius <= 1"), err
+    assert err.count("\n") == 1 and "off by" in err

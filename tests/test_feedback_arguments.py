@@ -196,3 +196,18 @@ def test_what_a_controller_plans_with_is_what_do_mpc_takes(small):
         assert model.x.shape[0] == function.size1_in(0) and model.u.shape[0] == function.size1_in(1)
         assert pilfr.PredictiveController(plant, 3, inputs=(-1, 1)).function.size1_in(0) == function.size1_in(0)
     refused(lambda: pilfr.do_mpc_model("f"), "A str cannot be planned with; give a Fit")
+
+
+def test_what_is_printed_is_short_and_readable(small):
+    fit, _, observer = small
+    controller = PredictiveController(fit, 4, inputs=(-1, 1), outputs=(-9, 9), rate=0.5)
+    plan = controller(np.zeros(controller.function.size1_in(0)), np.zeros(4), [0.0])
+    inverse = pilfr.inverse_element([0.2, 1.0], [0.5, 0.3], gain=1.0)
+    for thing, words in (
+        (observer, "extended Kalman filter of 5 states (memory included), 1 inputs and 1 outputs"),
+        (controller, "over 4 samples by sqp: 5 states, 1 inputs, 1 outputs, limits of the inputs and outputs, rates"),
+        (plan, "plan over 4 samples, converged in"),
+        (inverse, "inverse element of 3 plays"),
+    ):
+        assert words in str(thing) == repr(thing) and len(str(thing)) < 300 and "array(" not in str(thing), str(thing)
+    assert "process noise a step: 0.001 of each" in str(observer) and "outputs within their limits" in str(plan)

@@ -242,3 +242,9 @@ def test_a_limit_on_time_holds_for_all_solves_at_a_bound(record, monkeypatch):
     values = problem.model.parameters.unpack(problem.parameters(found.theta))
     assert found.status is Status.TIME_LIMIT and radius_of(values["A"]) <= 0.3
     assert 3 <= len(limits) <= 8 and np.all(np.diff(limits) < 0)
+
+
+def test_a_linear_model_without_the_bound_is_called_so(record):
+    tight, free = (pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=1, stable=stable) for stable in (0.7, True))
+    assert "the linear model alone, without the constraints, to judge" in str(tight)
+    assert "the linear model alone, to judge" in str(free)

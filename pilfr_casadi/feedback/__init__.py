@@ -4,7 +4,8 @@ from .compensation import Feedforward, feedforward
 from .dompc import do_mpc_controller, do_mpc_model
 from .inverse import Inverse, inverse_element
 from .kalman import KalmanFilter, kalman_filter
-from .mpc import Plan, PredictiveController
+from .mpc import PredictiveController
+from .plan import Plan
 from .unseen import Visibility, visibility
 
 __all__ = [

@@ -46,6 +46,13 @@ class Inverse:
     w: Array
     _sorted: tuple[Array, Array, Array]
 
+    def __str__(self) -> str:
+        r = ", ".join(f"{v:.4g}" for v in self.r)
+        w = ", ".join(f"{v:.4g}" for v in self.w)
+        return f"inverse element of {len(self.r)} plays, u from what is wanted\nthresholds: {r}\nweights: {w}"
+
+    __repr__ = __str__
+
     def memory(self, s: Array | None = None) -> Array:
         """The inverse's memory that belongs to the element's memory s, shape (n,); at rest by default.
 

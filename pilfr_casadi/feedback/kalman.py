@@ -60,6 +60,17 @@ class KalmanFilter:
     R: Array
     spread: Array
 
+    def __str__(self) -> str:
+        share = np.sqrt(np.diag(self.Q)[0]) / self.spread[0] if len(self.spread) and self.spread[0] else 0.0
+        noise = ", ".join(f"{v:.3g}" for v in np.sqrt(np.diag(self.R)))
+        return (
+            f"extended Kalman filter of {len(self.x0)} states (memory included), {self.step.size1_in(2)} inputs and "
+            f"{self.step.size1_in(3)} outputs\nnoise of the outputs, std: {noise}; process noise a step: {share:.2g} "
+            "of each state's size"
+        )
+
+    __repr__ = __str__
+
     def run(self, u: Array, y: Array, x0: Array | None = None, P0: Array | None = None) -> tuple[Array, Array, Array]:
         """Filter a whole recording: states (M + 1, n) before each sample and after the last, predictions (M, n_y), P.
 

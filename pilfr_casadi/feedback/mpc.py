@@ -11,7 +11,6 @@ x and u, so the Gauss-Newton Hessian is the exact one for plays and stops.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -22,27 +21,11 @@ from ..checks import numbers
 from ..quadratic_program import unconstrained
 from ..recording import InputError
 from .asked import ENORMOUS, SOLVERS, asked, count, path
+from .plan import Plan
 
 Array = np.ndarray
 PENALTY = 30.0  # of a violated output limit, per y_scale
 CLOSE = 1e-5  # of u_scale: a smaller step ends the search
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What a predictive controller found: inputs (N, n_u), outputs (N, n_y), cost, slack, s, whether it converged."""
-
-    inputs: Array
-    outputs: Array
-    cost: float
-    slack: float
-    seconds: float
-    converged: bool
-
-    @property
-    def u(self) -> Array:
-        """The input to apply now, (n_u,)."""
-        return self.inputs[0]
 
 
 class PredictiveController:
@@ -104,6 +87,16 @@ class PredictiveController:
         self._weighted = np.sqrt(move) * self._differences / self.u_scale[:, None]
         self._plan: Array | None = None
         {"sqp": self._build_sqp, "ipopt": self._build_ipopt}[solver]()
+
+    def __str__(self) -> str:
+        n, n_u, n_y = (self.function.size1_in(0), self.function.size1_in(1), self.function.size1_out(1))
+        limits = "inputs and outputs" if self.limited else "inputs"
+        return (
+            f"predictive controller over {self.horizon} samples by {self.solver}: {n} states, {n_u} inputs, {n_y} "
+            f"outputs, limits of the {limits}" + (", rates limited" if np.isfinite(self.rate).any() else "")
+        )
+
+    __repr__ = __str__
 
     def __call__(self, x: Array, reference: Array, u_previous: Array) -> Plan:
         """Plan from the state x, towards the reference (N, n_y) from the present sample on.

@@ -15,6 +15,8 @@ from typing import Any
 from ..elements import PrandtlIshlinskii
 from ..hand import close_hands
 from ..interrupts import Progress
+from ..lfr import PILFR
+from ..multistart import drawn
 from ..recording import InputError
 from .described import Run, read_run
 from .execute import RunResult, carried_out
@@ -84,11 +86,13 @@ def campaign(
 def _check_seeds(run: Run) -> None:
     """Refuse seeds that would all give the same model: the first starts of a grid start are not random."""
     for cell in run.cells:
-        search, layer = cell.search, isinstance(getattr(cell.model, "element", None), PrandtlIshlinskii)
+        search = cell.search
+        layer = isinstance(cell.model, PILFR) and isinstance(cell.model.element, PrandtlIshlinskii)
         if len(run.seeds) > 1 and layer and search["start"] == "grid" and search["starts"] < 3:
+            more = ", or 3 starts or more" if drawn(cell.model, "grid", 2) else ", or one seed"
             raise InputError(
                 f"{run.file}: the first two of the starts 'grid' are not random, so {len(run.seeds)} seeds with starts "
-                f"= {search['starts']} would give one model; give start = 'paper' in [solver], or 3 starts or more."
+                f"= {search['starts']} would give one model; give start = 'paper' in [solver]{more}."
             )
 
 

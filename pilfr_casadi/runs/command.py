@@ -11,19 +11,23 @@ from pathlib import Path
 from ..cli import DONE, INTERRUPTED, NO_RESULT, say
 from ..commands import make_folder
 from ..interrupts import insistent, worker_pool
+from ..lfr import PILFR
+from ..multistart import PLACES, drawn
 from ..progress import progress_bar
 from ..recording import InputError
 from .campaign import campaign
 from .described import ROLES, Run, read_run
-from .execute import ConstraintsNotMet, RunInterrupted, RunResult, run
+from .execute import NoModel, RunInterrupted, RunResult, run
 from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own
+from .grid import Cell
+from .results import reasons
 from .side_by_side import AHEAD
 
 WIDE = 10_000  # characters: a number that is cut off is a wrong number, so lines are as long as they have to be
 
 
 def run_command(options: argparse.Namespace) -> int:
-    """Execute a run file; returns the exit status: 1 where no job meets its constraints or explains anything."""
+    """Execute a run file; returns the exit status: 1 where no job gives a model or explains anything."""
     given = _given(options, "run")
     count = len(given.seeds) * len(given.cells)
     print(f"run: {given.file}, {count} job{'s' * (count > 1)}, results in {given.out}", flush=True)
@@ -32,7 +36,7 @@ def run_command(options: argparse.Namespace) -> int:
             result = run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=_tell)
     except RunInterrupted as stop:
         return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
-    except ConstraintsNotMet as missed:
+    except NoModel as missed:
         return say(str(missed), NO_RESULT)
     return _told(given, result, TABLE, MODEL)
 
@@ -68,7 +72,7 @@ def campaign_command(options: argparse.Namespace) -> int:
             )
     except RunInterrupted as stop:
         return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
-    except ConstraintsNotMet as missed:
+    except NoModel as missed:
         return say(str(missed), NO_RESULT)
     _print_summary(result)
     return _told(given, result, TABLE, SUMMARY, PICTURE, MODEL)
@@ -113,12 +117,30 @@ def _told(given: Run, result: RunResult, *files: str) -> int:
                 print(f"NRMSE on {s.recording} ({role}): {s.nrmse:.4f}")
     failed = f", {len(result.failed)} of them without a model" if result.failed else ""
     print(f"chosen: {result.chosen}; {len(result.done)} jobs done now, {len(result.skipped)} before{failed}")
-    if len(given.seeds) > 1 and result.fit.candidates and not any(c.drawn for c in result.fit.candidates):
-        print("no start is drawn where there are so few: every seed gives the same model; use one seed, or more starts")
+    for line in reasons(result.manifest["jobs"], result.failed):
+        print(f"without a model: {line}")
+    if len(given.seeds) > 1:
+        for cell in given.cells:
+            alike = _alike(cell)
+            if alike:
+                print(f"{cell.name or 'the model'}: {alike}")
     for name in (*files, *([PAGE] if given.report else []), "manifest.json"):
         print(result.folder / name)
     useless = min(result.fit.train_nrmse) >= 1.0
     return say("The model explains nothing of the training recording.", NO_RESULT) if useless else DONE
+
+
+def _alike(cell: Cell) -> str:
+    """Why every seed gives the same model of a cell, and what to do; empty where starts are drawn."""
+    model, start, starts = cell.model, cell.search["start"], cell.search["starts"]
+    if not isinstance(model, PILFR):
+        return ""
+    if model.element is None:
+        return "a linear model has no starts, so every seed gives the same one; use one seed"
+    if any(drawn(model, start, i) for i in range(starts)):
+        return ""
+    more = f", or {len(PLACES) + 1} starts or more" if drawn(model, start, len(PLACES)) else ""
+    return f"no start is drawn, so every seed gives the same model; use one seed{more}"
 
 
 def _tell(line: str) -> None:

@@ -30,7 +30,7 @@ from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own, read_times,
 from .folds import fold
 from .jobs import Batch, Recordings, RunJob, input_digests, jobs_of, outcome
 from .manifest import alone, digest
-from .results import Score, chosen, table
+from .results import Score, chosen, reasons, table
 from .selection import Selection, select
 from .store import Store
 from .summary import CellSummary, box_plots, summarised, summary_table
@@ -47,7 +47,11 @@ class RunInterrupted(KeyboardInterrupt):
         self.done, self.total = done, total
 
 
-class ConstraintsNotMet(InputError):
+class NoModel(InputError):
+    """No job of a run gave a model, and not because of what it was given; the manifest says why of each."""
+
+
+class ConstraintsNotMet(NoModel):
     """No job of a run meets its constraints; the manifest says by how much each misses them."""
 
 
@@ -126,7 +130,7 @@ def run(
     ------
     InputError
         If the run file, a recording or the folder cannot be used, or results were changed afterwards;
-        `ConstraintsNotMet`, which is one, if no job meets its constraints.
+        `NoModel`, which is one, if no job gives a model, and `ConstraintsNotMet` if none meets its constraints.
     RunInterrupted
         On Ctrl-C; what is complete stays.
     """
@@ -211,7 +215,8 @@ class _Execution:
                 for job, found in batch:
                     ready.append(job)
                     self.done.append(job.id)
-                    self.tell(f"{job.id}: {found.entry['sentence']}")
+                    none = f"no model ({found.entry['status'].lower().replace('_', ' ')})"
+                    self.tell(f"{job.id}: {found.entry['sentence'] if place.ended_well(job) else none}")
                 place.write_table((*before, *ready))
                 best = min(place.entries[j.id].get("train", np.inf) for j in ready)
                 self.progress("jobs", len(before) + len(ready), total, best)
@@ -225,11 +230,11 @@ class _Execution:
         whole = [j for j in jobs if j.fold is None and (selection is None or j.cell == selection.cell)]
         usable = [j for j in whole if place.has_model(j)]
         if not usable:
-            first, met = whole[0].id, entries[whole[0].id]["status"] == Status.INFEASIBLE.name
-            about = f"{first}: {entries[first]['sentence']}"
-            if met:
+            about = "; ".join(reasons(entries, [j.id for j in whole]))
+            if all(entries[j.id]["status"] == Status.INFEASIBLE.name for j in whole):
                 raise ConstraintsNotMet(f"{given.file}: no job meets its constraints; {about}")
-            raise InputError(f"{given.file}: no job gave a model; {about}")
+            kind = InputError if all(entries[j.id].get("refused") for j in whole) else NoModel
+            raise kind(f"{given.file}: no job gave a model; {about}")
         scores = place.scores(jobs)
         best = chosen(scores, [j.id for j in usable])
         job = next(j for j in usable if j.id == best)

@@ -146,8 +146,9 @@ def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:
     try:
         return outcome(run, recordings, job)
     except Exception as error:
-        text = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-        return unfinished(FAILED, f"Failed: {text}")
+        if isinstance(error, InputError):
+            return unfinished(FAILED, f"Failed: {error}", refused=True)
+        return unfinished(FAILED, f"Failed: {type(error).__name__}: {error}")
 
 
 def unfinished(status: str, sentence: str, **more: Any) -> Outcome:

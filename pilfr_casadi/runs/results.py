@@ -57,3 +57,12 @@ def table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapping[str,
         for s in by_job.get(job.id, [Score(job.id, "", "", np.nan)]):
             writer.writerow([*about, entry["status"], entry["operators_used"], s.role, s.recording, repr(s.nrmse)])
     return text.getvalue()
+
+
+def reasons(entries: Mapping[str, Mapping[str, Any]], ids: Sequence[str]) -> list[str]:
+    """Why jobs have no model: a line for every distinct reason, with the first job that has it."""
+    found: dict[str, list[str]] = {}
+    for job in ids:
+        found.setdefault(entries[job]["sentence"], []).append(job)
+    more = {text: f" and {len(jobs) - 1} more" if len(jobs) > 1 else "" for text, jobs in found.items()}
+    return [f"{jobs[0]}{more[text]}: {text}" for text, jobs in found.items()]
