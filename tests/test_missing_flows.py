@@ -157,7 +157,8 @@ def test_a_fit_goes_on_from_given_states():
 
 @pytest.mark.parametrize(("margin", "verdict"), [(2.0, "missing-physics"), (1.2, "unexplained")])
 def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
-    winner = SimpleNamespace(port="guide", law=SimpleNamespace(id="coulomb_friction"), error=0.4)
+    judged = {"error": 0.4, "head": 0.16, "tail": 0.16, "held_back": False, "doubtful": False}
+    winner = SimpleNamespace(port="guide", law=SimpleNamespace(id="coulomb_friction"), **judged)
     found = SimpleNamespace(accepted=True, choice=SimpleNamespace(winner=winner, margin=margin, alike=()))
     search = SimpleNamespace(
         passes=[found],
