@@ -89,10 +89,14 @@ def simulator() -> Simulator:
 
 
 def in_closed_loop(axis: Simulator) -> Simulator | None:
-    """The axis under its position controller, driven by the reference; None with more than an offset at the drive."""
+    """The axis under its position controller, driven by the reference; None with more than an offset at the drive.
+
+    A drift at the encoder is that of a free run, which the controller takes away.
+    """
     inside = tuple(e for e in axis.elements if e.port == "axis")
     biases = [f"{e.prefix}w_0" for e in axis.elements if e.port == "actuator:u_vir_V" and e.law.id == "offset"]
-    if len(inside) + len(biases) < len(axis.elements):
+    drifts = [e for e in axis.elements if e.port == "sensor:y_qm_m" and e.law.id == "drift"]
+    if len(inside) + len(biases) + len(drifts) < len(axis.elements):
         return None
 
     def driven(x: Any, u: Any, p: Any) -> dict[str, Any]:

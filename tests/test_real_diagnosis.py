@@ -22,8 +22,9 @@ def named(diagnosis):
 
 def test_axis_lacks_friction():
     diagnosis, errors = emps.run(folder_of("emps"))
-    ((port, law),) = named(diagnosis)
+    (port, law), *others = named(diagnosis)
     assert port == "axis"
+    assert all(other == ("sensor:y_qm_m", "drift") for other in others)  # of a free run: the axis is an integrator
     assert law in ("coulomb_friction", "stribeck_friction")
     assert errors["after"]["test"] <= 8.0
     assert errors["after"]["closed loop"] <= 0.1
@@ -53,7 +54,6 @@ def test_tanks_are_followed_as_well_as_published_models_do(tanks_found):
     assert tanks_found[True][1]["after"]["test"] <= 0.20
 
 
-@pytest.mark.xfail(reason="two overflows and the outlets' curves are missing, too much to name: unexplained")
 def test_tanks_with_linear_outflow_overflow_too(tanks_found):
     assert named(tanks_found[False][0])[0] == ("upper-tank", "piecewise_stiffness")
 
