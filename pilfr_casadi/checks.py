@@ -132,7 +132,7 @@ def check_options(r: "Recording", m: int) -> None:
             f"{r.label} was given period={r.period!r}; it must be a whole number of samples from 2 to {m - r.skip}, so "
             "that one period lies after the skipped samples."
         )
-    if isinstance(r.initial, str) and r.initial == "periodic" and r.period is None:
+    if r.begins == "periodic" and r.period is None:
         raise InputError(f"{r.label} was given initial='periodic' but no period; set period=SAMPLES.")
 
 

@@ -39,7 +39,7 @@ def hold_back(recordings: Sequence[Recording], share: float) -> tuple[tuple[Reco
         return tuple(recordings[:-n]), tuple(_from_rest(r) for r in recordings[-n:])
     (r,) = recordings
     cut = r.skip + round((1 - share) * (len(r) - r.skip))
-    if isinstance(r.initial, str) and r.initial == "periodic" and r.period:
+    if r.begins == "periodic" and r.period:
         periods = len(r) // r.period
         cut = (periods - max(1, round(share * periods))) * r.period
         if cut < r.skip + r.period:
@@ -53,7 +53,7 @@ def hold_back(recordings: Sequence[Recording], share: float) -> tuple[tuple[Reco
 
 def _from_rest(recording: Recording) -> Recording:
     """Where the initial state is to be estimated, zero, and the first fifth is not scored."""
-    if not isinstance(recording.initial, str) or recording.initial != "estimate":
+    if recording.begins != "estimate":
         return recording
     return _scored_from(recording.with_(initial="zero"), max(recording.skip, len(recording) // 5))
 

@@ -68,7 +68,7 @@ def exactly(problem: Problem, solution: Solution) -> Solution:
     for _ in range(ROUNDS):
         g = problem.constraint(theta)
         room = np.where(exact, np.minimum(margin * unit, 0.25 * (problem.g_upper - problem.g_lower)), 0.0)
-        d, _, good = qp.scaled(
+        d, _, good = qp(
             damped,
             np.zeros(problem.size),
             problem.lower - theta,

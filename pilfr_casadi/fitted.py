@@ -126,7 +126,7 @@ class Fit:
         InputError
             If no sample is left.
         """
-        estimated = isinstance(recording.initial, str) and recording.initial == "estimate"
+        estimated = recording.begins == "estimate"
         if not estimated or fingerprint(recording) in self.initial or not self.model.n_x + self.model.n_s:
             return recording.skip
         first = max(recording.skip, samples_for_state(self.model))
@@ -168,7 +168,7 @@ class Fit:
                 "and the time step."
             )
         n_u, n_y = len(self.model.inputs), self.model.n_y
-        unmeasured = recording.n_y == 0 and not (isinstance(recording.initial, str) and recording.initial == "estimate")
+        unmeasured = recording.n_y == 0 and recording.begins != "estimate"
         if recording.n_u != n_u or not (recording.n_y == n_y or unmeasured):
             raise InputError(
                 f"The recording has {recording.n_u} inputs and {recording.n_y} outputs, "

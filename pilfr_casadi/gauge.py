@@ -37,7 +37,7 @@ def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, held: Array
     parameters = problem.model.parameters
     values = parameters.unpack(problem.parameters(theta))
     states = problem.initial_states(theta)
-    estimated = [isinstance(r.initial, str) and r.initial == "estimate" for r in problem.recordings]
+    estimated = [r.begins == "estimate" for r in problem.recordings]
     columns = []
     for change, move in generators(structure, values):
         blocks = [np.ravel(change.get(name, np.zeros(p.value.shape)), order="F") for name, p in parameters.items()]

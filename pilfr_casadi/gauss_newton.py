@@ -240,7 +240,7 @@ class _Run:
         problem = self.problem
         low, high = self.penalty.room(self.penalty.values(self.theta) if correction is None else correction)
         for share in (1.0, 0.5, 0.1, 0.01, 0.0) if self.n_g else (1.0,):  # of the violation that the step has to remove
-            d, multipliers, good = self.qp.scaled(
+            d, multipliers, good = self.qp(
                 damped,
                 gradient,
                 problem.lower - self.theta,

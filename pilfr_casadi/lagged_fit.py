@@ -146,8 +146,8 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
     theta = solution.theta
     if problem.size > len(theta):  # the initial states of the recordings held back
         fitted = with_solution(model, problem, solution)
-        others = [r for r in search.job.recordings[len(search.kept) :] if isinstance(r.initial, str)]
-        theta = np.concatenate([theta, *(first_state(fitted, engine, r) for r in others if r.initial == "estimate")])
+        others = [r for r in search.job.recordings[len(search.kept) :] if r.begins == "estimate"]
+        theta = np.concatenate([theta, *(first_state(fitted, engine, r) for r in others)])
         more = np.zeros(len(theta) - len(solution.theta))
         multipliers = np.insert(solution.multipliers, len(solution.theta), more)
         solution = replace(solution, multipliers=multipliers)

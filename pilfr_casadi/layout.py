@@ -60,9 +60,9 @@ def lay_out(
         zero, drive = np.zeros(n_state), model.drive(r)
         nothing = drive[:0]
         if isinstance(r.initial, str):
-            if r.initial == "zero":
+            if r.begins == "zero":
                 yield Part(r, None, zero, drive, nothing, scale)
-            elif r.initial == "estimate":
+            elif r.begins == "estimate":
                 yield Part(r, at, zero, drive, nothing, scale)
                 at += n_state
             else:

@@ -34,7 +34,7 @@ def open_memory_sentence(problem: Problem, theta: Array) -> str:
     """What it means for a result, naming the recordings; empty where every memory is decided."""
     counts = {}
     for k, (r, state) in enumerate(zip(problem.recordings, problem.first_states(theta), strict=True)):
-        periodic = isinstance(r.initial, str) and r.initial == "periodic"
+        periodic = r.begins == "periodic"
         if periodic and problem.model.n_s and np.all(np.isfinite(state)):
             counts[r.label if len(problem.recordings) == 1 or r.name else f"recording {k + 1}"] = len(
                 open_memory(problem, theta, r, state)

@@ -35,30 +35,10 @@ class QuadraticProgram:
         lba: np.ndarray,
         uba: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Minimise `1/2 d'h d + g'd` over `lbx <= d <= ubx, lba <= a d <= uba`: d, multipliers, whether found."""
-        d = unconstrained(h, g)
-        if d is not None and np.all((lbx <= d) & (d <= ubx)):
-            slack = a @ d
-            if np.all((lba <= slack) & (slack <= uba)):
-                return d, np.zeros(len(d) + len(slack)), True
-        out = self._solve(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
-        d = np.asarray(out["x"]).ravel()
-        multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])
-        return d, multipliers, bool(self._solve.stats()["success"]) and bool(np.all(np.isfinite(d)))
+        """Minimise `1/2 d'h d + g'd` over `lbx <= d <= ubx, lba <= a d <= uba`: d, multipliers, whether found.
 
-    def scaled(
-        self,
-        h: np.ndarray,
-        g: np.ndarray,
-        lbx: np.ndarray,
-        ubx: np.ndarray,
-        a: np.ndarray,
-        lba: np.ndarray,
-        uba: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, bool]:
-        """The same with unit diagonal and rows, h having a positive diagonal: a solver's tolerances are absolute.
-
-        The step is scaled by the steepest slope or, where there is none, by what the rows lack at d = 0.
+        h has a positive diagonal. A solver's tolerances are absolute: it gets unit diagonal and rows, and the step in
+        units of the steepest slope or, where there is none, of what the rows lack at d = 0.
         """
         unit = 1.0 / np.sqrt(np.diag(h))
         a, g = a * unit, g * unit
@@ -68,8 +48,23 @@ class QuadraticProgram:
         size = float(np.max(np.abs(g))) or float(np.max(np.maximum(low, -high), initial=0.0))
         size = max(size, 1e-300)
         rows = a / row[:, None], low / size, high / size
-        d, multipliers, good = self(h * unit * unit[:, None], g / size, lbx / unit / size, ubx / unit / size, *rows)
+        d, multipliers, good = self._solved(
+            h * unit * unit[:, None], g / size, lbx / unit / size, ubx / unit / size, *rows
+        )
         return d * size * unit, size * multipliers / np.concatenate([unit, row]), good
+
+    def _solved(self, h: np.ndarray, g: np.ndarray, *limits: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        """The same as it stands."""
+        lbx, ubx, a, lba, uba = limits
+        d = unconstrained(h, g)
+        if d is not None and np.all((lbx <= d) & (d <= ubx)):
+            slack = a @ d
+            if np.all((lba <= slack) & (slack <= uba)):
+                return d, np.zeros(len(d) + len(slack)), True
+        out = self._solve(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
+        d = np.asarray(out["x"]).ravel()
+        multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])
+        return d, multipliers, bool(self._solve.stats()["success"]) and bool(np.all(np.isfinite(d)))
 
 
 def unconstrained(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:

@@ -103,6 +103,11 @@ class Recording:
         return Recording, tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
 
     @property
+    def begins(self) -> str:
+        """What is known of the state at the first sample: "zero", "estimate", "periodic", or "given" as numbers."""
+        return self.initial if isinstance(self.initial, str) else "given"
+
+    @property
     def label(self) -> str:
         """How messages call this recording."""
         return f"recording {self.name!r}" if self.name else "the recording"
@@ -133,7 +138,7 @@ class Recording:
         text = f"{head}: {len(self)} samples, dt {self.dt:.6g} s ({len(self) * self.dt:.4g} s), "
         text += f"inputs {channels(self.inputs)}, outputs {channels(self.outputs) or 'none'}"
         extras = {"period": self.period, "hold": self.hold, "skip": self.skip or None}
-        initial = self.initial if isinstance(self.initial, str) else "given"
+        initial = self.begins
         shown = [f"initial {initial}", *(f"{key} {value}" for key, value in extras.items() if value is not None)]
         return f"<{text}, {', '.join(shown)}>"
 
@@ -159,7 +164,7 @@ class Recording:
             )
         skip = max(self.skip - first, 0) if self.skip < last else 0
         period = self.period if (self.period or 0) <= last - first - skip else None
-        periodic = isinstance(self.initial, str) and self.initial == "periodic"
+        periodic = self.begins == "periodic"
         keeps = period is not None if periodic else first == 0
         initial = self.initial if keeps else "estimate"
         return replace(self, u=self.u[first:last], y=self.y[first:last], period=period, skip=skip, initial=initial)

@@ -163,7 +163,7 @@ def polished(
         structure, recordings, {}, solver, limits, engine, noise=noise, level=float(np.mean(fit.train_nrmse))
     )
     problem = search.problem(fit.model)
-    states = [fit.initial_state(r) for r in recordings if isinstance(r.initial, str) and r.initial == "estimate"]
+    states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
     theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
     error = float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
     best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))

@@ -54,7 +54,7 @@ def thinned(
     z = np.concatenate([fit.signals(r)["z"] for r in recordings])
     reach = np.max(np.abs(z), axis=0)
     limits = (*stability_limits(structure, stable), *constraint_list(constraints))
-    states = [fit.initial_state(r) for r in recordings if isinstance(r.initial, str) and r.initial == "estimate"]
+    states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
     states = [np.concatenate([s[: old.n_x], np.zeros(n * structure.element.channels)]) for s in states]
     found: list[Fit] = []
     for beyond, spacing in WAYS:

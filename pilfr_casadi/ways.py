@@ -54,7 +54,7 @@ def from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit | 
         raise InputError("The simulation diverges at the start values; start from a stable model.")
     start = problem.start
     if earlier is not None:
-        estimated = [r for r in job.recordings if isinstance(r.initial, str) and r.initial == "estimate"]
+        estimated = [r for r in job.recordings if r.begins == "estimate"]
         begin = np.concatenate([start[: int(problem.free.sum())], *(earlier.initial_state(r) for r in estimated)])
         start = begin if problem.cost(begin) < problem.cost(start) else start
     latest = model, problem, job.solve(problem, "solve", start), ""

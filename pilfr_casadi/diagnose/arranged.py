@@ -1,4 +1,4 @@
-"""Recordings with their columns in a simulator's order."""
+"""Recordings as a diagnosis takes them: columns in the simulator's order, initial states left open."""
 
 from __future__ import annotations
 
@@ -36,3 +36,8 @@ def arranged(simulator: Simulator, recording: Recording) -> Recording:
         kept = {*changes.get("inputs", recording.inputs), *changes.get("outputs", recording.outputs)}
         changes["units"] = {k: v for k, v in recording.units.items() if k in kept}
     return recording.with_(**changes) if changes else recording
+
+
+def opened_at_the_start(recording: Recording) -> Recording:
+    """A recording that is not on its steady cycle: the initial state is to be estimated."""
+    return recording.with_(initial="estimate", period=None) if recording.begins == "periodic" else recording

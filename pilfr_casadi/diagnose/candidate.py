@@ -14,6 +14,7 @@ import numpy as np
 from ..laws import Law
 from ..recording import InputError, Recording
 from ..simulator import Simulator
+from .arranged import opened_at_the_start
 from .proof import deviations, shown
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
@@ -85,11 +86,7 @@ def heads(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
         most = int(len(r) * min(1.0, LONG / (HEAD * total)))
         cut = max(int(HEAD * most), min(len(r), r.skip + 20))
         part = r.slice(0, cut)
-        out.append(
-            part.with_(initial="estimate", period=None)
-            if isinstance(part.initial, str) and part.initial == "periodic"
-            else part
-        )
+        out.append(opened_at_the_start(part))
     return tuple(out)
 
 

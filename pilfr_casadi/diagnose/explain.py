@@ -19,7 +19,7 @@ from ..laws import Law
 from ..simulator import Simulator
 from .candidate import Candidate, attempt, heads
 from .screen import Scored
-from .workbench import Fitted, Workbench, started
+from .workbench import Fitted, Workbench, at_rest, started
 
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
 BEST = 10  # pairs of each list that are fitted, besides the best of each port
@@ -142,7 +142,7 @@ def by_cost(
 ) -> list[Mapping[str, Any]]:
     """Starts in the order of their error as they stand on the first parts, from the initial states of a fit."""
     part = bench.on(heads(bench.recordings))
-    initial = [np.append(state, np.zeros(model.n_state - len(state))) for state in without.begin]
+    initial = [at_rest(state, model.n_state) for state in without.begin]
 
     def cost(start: Mapping[str, Any]) -> float:
         values = model.parameters.unpack(started(model, start))

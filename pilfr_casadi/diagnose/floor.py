@@ -46,7 +46,7 @@ def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
 
 def _from_periods(r: Recording) -> np.ndarray | None:
     n = r.period
-    if not n or r.initial != "periodic":
+    if not n or r.begins != "periodic":
         return None
     y = r.y[r.skip :]
     count = len(y) // n

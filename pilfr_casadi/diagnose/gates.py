@@ -73,7 +73,7 @@ def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, 
         for i in index:
             values[:, i] = _read(r.t, values[:, i], at, end, smooth=kind == "y")
         other = r.with_(**{kind: values})
-        if kind == "y" and isinstance(r.initial, str) and r.initial == "zero":  # at rest when it was said to be
+        if kind == "y" and r.begins == "zero":  # at rest when it was said to be
             other = other.with_(initial="estimate")
         if end is not None or not cut:
             return other

@@ -18,15 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..compiled import make_engine
-from ..laws.trace import columns
 from ..threads import side_by_side
 from .candidate import Candidate, attempt
 from .explain import BRIEF, closed
 from .linearise import linearised
-from .remainder import Remainder, held_out, orthonormal
+from .remainder import Dose, Remainder, held_out, orthonormal
 from .screen import Scored, start_values
-from .verdict import FLEXIBLE, FORMS
-from .workbench import Fitted
+from .verdict import handicap
+from .workbench import Fitted, at_rest
 
 if TYPE_CHECKING:
     from .search import Pass, Search
@@ -44,40 +43,31 @@ class _Block:
     """A law of one shape at a port, and what it changes."""
 
     scored: Scored
-    shape: dict[str, Any]
-    phi: np.ndarray
-    size: np.ndarray
+    dose: Dose
     sign: int
 
     @property
     def handicap(self) -> float:
-        law = self.scored.law
-        return FLEXIBLE.get(law.id, 1.0) * FORMS.get(law.form, 1.0)
+        return handicap(self.scored.law)
 
 
 def _blocks(rest: Remainder) -> Iterator[_Block]:
     for task in rest.tasks:
-        phi, size = rest.columns(task)
-        sign, at = int(rest.runs[0].sign[task.index]), 0
-        for law, shapes in task.pairs:
-            width, found = columns(law), []
-            for k, shape in enumerate(shapes):
-                own = slice(at + k * width, at + (k + 1) * width)
-                if np.any(phi[:, own]):
-                    share = float(np.sum((orthonormal(phi[:, own]).T @ rest.left) ** 2))
-                    found.append((share, shape, own))
-            at += width * len(shapes)
-            for share, shape, own in sorted(found, key=lambda f: -f[0])[:SHAPES]:
-                scored = Scored(task.port.name, law, share, (), task.local)
-                yield _Block(scored, shape, phi[:, own].copy(), size[own], sign)
+        sign = int(rest.runs[0].sign[task.index])
+        for law, doses in rest.doses(task):
+            felt = [d for d in doses if np.any(d.phi)]
+            shares = [float(np.sum((orthonormal(d.phi).T @ rest.left) ** 2)) for d in felt]
+            for k in np.argsort(shares)[::-1][:SHAPES]:
+                scored = Scored(task.port.name, law, shares[k], (), task.local)
+                yield _Block(scored, replace(felt[k], phi=felt[k].phi.copy()), sign)
 
 
-def shares(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
+def together(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
     """Share of `left` that each two parts explain together, shape (n, n); parts are orthonormal columns."""
     q, width = np.hstack(parts), [p.shape[1] for p in parts]
     begin = np.cumsum([0, *width])
     gram, right = q.T @ q, q.T @ left
-    together = np.zeros((len(parts), len(parts)))
+    out = np.zeros((len(parts), len(parts)))
     of_width = {w: np.flatnonzero(np.equal(width, w)) for w in set(width)}
     for i in range(len(parts)):
         own = slice(begin[i], begin[i + 1])
@@ -87,8 +77,8 @@ def shares(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
             r, across = rest[at], gram[:, own][at]
             inner = (1 + RIDGE) * np.eye(w) - across @ np.swapaxes(across, 1, 2)
             gained = np.einsum("jk,jk->j", r, np.linalg.solve(inner, r[:, :, None])[:, :, 0])
-            together[i, which] = right[own] @ right[own] + gained
-    return np.asarray(together / max(float(left @ left), 1e-300))
+            out[i, which] = right[own] @ right[own] + gained
+    return np.asarray(out / max(float(left @ left), 1e-300))
 
 
 def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
@@ -96,7 +86,7 @@ def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
     blocks = list(_blocks(rest))
     if len(blocks) < 2:
         return []
-    left = 1 - shares([orthonormal(b.phi) for b in blocks], rest.left)
+    left = 1 - together([orthonormal(b.dose.phi) for b in blocks], rest.left)
     ports, factor = np.array([b.scored.port for b in blocks]), np.array([b.handicap for b in blocks])
     worth = np.maximum(left, 0.0) * np.outer(factor, factor) ** 2
     worth[ports[:, None] == ports] = np.inf
@@ -108,7 +98,7 @@ def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
         pair = blocks[min(i, j)], blocks[max(i, j)]
         key = tuple((b.scored.port, type(b.scored.law)) for b in pair)
         if key not in seen and _opposes(pair, rest.left):
-            kept = 1 - held_out(np.hstack([b.phi for b in pair]), rest.left, rest.odd)
+            kept = 1 - held_out(np.hstack([b.dose.phi for b in pair]), rest.left, rest.odd)
             seen[key] = (kept * (pair[0].handicap * pair[1].handicap) ** 2, pair)
     chosen: dict[tuple[str, str], list[tuple[_Block, _Block]]] = {}
     for _, pair in sorted(seen.values(), key=lambda s: s[0]):
@@ -120,9 +110,9 @@ def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
 
 def _strengths(pair: tuple[_Block, _Block], left: np.ndarray) -> list[np.ndarray]:
     """Strengths of both laws that explain most together."""
-    phi = np.hstack([b.phi for b in pair])
-    found = -np.linalg.lstsq(phi, left, rcond=1e-8)[0] / np.concatenate([b.size for b in pair])
-    return np.split(found, [pair[0].phi.shape[1]])
+    phi = np.hstack([b.dose.phi for b in pair])
+    found = -np.linalg.lstsq(phi, left, rcond=1e-8)[0] / np.concatenate([b.dose.size for b in pair])
+    return np.split(found, [len(pair[0].dose.size)])
 
 
 def _opposes(pair: tuple[_Block, _Block], left: np.ndarray) -> bool:
@@ -139,7 +129,7 @@ def _fitted_together(search: Search, rest: Remainder, pair: tuple[_Block, _Block
     simulator, named = search.without.simulator, dict[str, Any]()
     for block, strength in zip(pair, _strengths(pair, rest.left), strict=True):
         simulator, own = closed(
-            simulator, block.scored, start_values(block.scored.law, block.shape, strength), block.sign
+            simulator, block.scored, start_values(block.scored.law, block.dose.shape, strength), block.sign
         )
         named |= own
     nominal = {k: p.value for k, p in search.without.simulator.parameters.items()}
@@ -152,7 +142,7 @@ def _beside(search: Search, joint: Fitted, kept: Any) -> Fitted:
     simulator = search.bench.simulator.with_element(kept.port, kept.law)
     model = search.bench.model(simulator)
     known = {k: v for k, v in joint.values.items() if k in model.parameters}
-    initial = [np.append(state, np.zeros(model.n_state - len(state))) for state in joint.begin]
+    initial = [at_rest(state, model.n_state) for state in joint.begin]
     return search.bench.result(simulator, known, initial, make_engine(model, search.bench.engine), model)
 
 
@@ -192,15 +182,12 @@ def _two(search: Search) -> tuple[Fitted, list[Pass]] | None:
         kept, other = elements
         search.base = _beside(search, joint, kept)
         step = search.pass_(1, search.screened())
-        if step.choice is None or not np.isfinite(step.choice.gain):
+        if step.choice is None:
             return None
-        winner = search.polished(step.choice.winner)
-        if winner is None:
-            return None
-        joint, new = winner.fitted, winner.fitted.simulator.elements[-1]
+        joint = step.choice.winner.fitted
+        new = joint.simulator.elements[-1]
         same = (new.port, type(new.law)) == (other.port, type(other.law))
-        step = replace(step, choice=replace(step.choice, winner=winner), accepted=True)
-        passes = {kept.port: passes.get(kept.port), new.port: step}
+        passes = {kept.port: passes.get(kept.port), new.port: replace(step, accepted=True)}
         elements = [new, joint.simulator.elements[-2]]
         if k and same:
             break

@@ -33,7 +33,7 @@ def errors_of(bench: Workbench, simulator: Simulator) -> float:
     engine = make_engine(model, bench.engine)
     errors = []
     for r in bench.recordings:
-        estimated = isinstance(r.initial, str) and r.initial == "estimate" and model.n_state > 0
+        estimated = r.begins == "estimate" and model.n_state > 0
         used = min(samples_for_state(model), len(r) // 3) if estimated else 0
         with np.errstate(all="ignore"):
             try:

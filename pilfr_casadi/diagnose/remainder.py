@@ -10,7 +10,7 @@ Each port is looked at by itself: its columns are the largest arrays of a diagno
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from ..laws import Law
 from ..laws.base import Local
-from ..laws.trace import trace
+from ..laws.trace import columns, trace
 from ..simulator import Port
 from .linearise import Probe, Run, locals_of, propagate
 from .workbench import Workbench
@@ -37,6 +37,15 @@ class Task:
     local: Local
     part: Local
     pairs: list[tuple[Law, list[dict[str, Any]]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Dose:
+    """What a law of one shape changes: a column for each strength (R, n), and the forces' sizes (n,)."""
+
+    shape: dict[str, Any]
+    phi: np.ndarray
+    size: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +106,16 @@ class Remainder:
         phi -= self.base @ (self.base.T @ phi)
         phi[:, lengths(phi) < 1e-6 * size_before] = 0.0  # what the simulator's own parameters follow entirely
         return phi, size
+
+    def doses(self, task: Task) -> Iterator[tuple[Law, list[Dose]]]:
+        """Each law of a port with its shapes, and what a dose of each shape changes; see `columns`."""
+        phi, size = self.columns(task)
+        at = 0
+        for law, shapes in task.pairs:
+            width = columns(law)
+            spans = [slice(at + k * width, at + (k + 1) * width) for k in range(len(shapes))]
+            yield law, [Dose(shape, phi[:, own], size[own]) for shape, own in zip(shapes, spans, strict=True)]
+            at += width * len(shapes)
 
 
 def moved(bench: Workbench, r: Run, forces: Sequence[tuple[int, np.ndarray]] = (), skip: int = 0) -> np.ndarray:

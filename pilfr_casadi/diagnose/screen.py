@@ -15,7 +15,6 @@ import numpy as np
 
 from ..laws import Law
 from ..laws.base import Local
-from ..laws.trace import columns
 from ..threads import side_by_side
 from .linearise import Run, linearised, observer_gain, run
 from .remainder import HUGE, Remainder, Task, held_out
@@ -76,20 +75,17 @@ def _holds(r: Run, scale: np.ndarray) -> bool:
 
 def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
     """Each law of one port."""
-    phi, size = rest.columns(task)
-    total, at, out = max(float(rest.left @ rest.left), 1e-300), 0, []
+    total, out = max(float(rest.left @ rest.left), 1e-300), []
     sign = int(rest.runs[0].sign[task.index])
-    for law, shapes in task.pairs:
-        width, scores = columns(law), []
-        for k, shape in enumerate(shapes):
-            cols = slice(at + k * width, at + (k + 1) * width)
-            drop, strength = _gain(phi[:, cols], rest.left, law, sign)
-            scores.append((drop / total, shape, -strength / size[cols], cols))
-        at += width * len(shapes)
+    for law, doses in rest.doses(task):
+        scores = []
+        for dose in doses:
+            drop, strength = _gain(dose.phi, rest.left, law, sign)
+            scores.append((drop / total, dose, -strength / dose.size))
         scores.sort(key=lambda s: -s[0])
-        starts = tuple(start_values(law, shape, c) for _, shape, c, _ in scores[:KEPT])
+        starts = tuple(start_values(law, dose.shape, c) for _, dose, c in scores[:KEPT])
         # a law that would have to drive the motion explains nothing
-        share = min(held_out(phi[:, scores[0][3]], rest.left, rest.odd), scores[0][0])
+        share = min(held_out(scores[0][1].phi, rest.left, rest.odd), scores[0][0])
         out.append(Scored(task.port.name, law, share, starts, task.local, source))
     return out
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -129,12 +129,7 @@ class Search:
             if not found.accepted:
                 break
             assert found.choice is not None
-            winner = self.polished(found.choice.winner)
-            if winner is None:
-                self.passes[-1] = replace(found, accepted=False)
-                break
-            self.base = winner.fitted
-            self.passes[-1] = replace(found, choice=replace(found.choice, winner=winner))
+            self.base = found.choice.winner.fitted
             prefer_what_leaves_nothing(self)
             put_more_finely(self)
             if number:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..recording import Recording
+from .arranged import opened_at_the_start
 from .gates import Gate
 
 MORE = 1.5  # times the least difference of neighbouring periods that the first one is, where it dies away
@@ -26,18 +27,16 @@ def without_transients(recordings: Sequence[Recording]) -> tuple[tuple[Recording
         f"{name} has not settled{f' in {r.name}' if r.name else ''}: its first two periods differ {ratio:.2g} times as "
         "much as later ones; initial states are estimated, and the periods do not tell the noise."
     )
-    return tuple(map(_estimated, recordings)), [Gate(name, "transient", ratio, sentence, True, change=_estimated)]
+    return tuple(map(opened_at_the_start, recordings)), [
+        Gate(name, "transient", ratio, sentence, True, change=opened_at_the_start)
+    ]
 
 
 def _dying(r: Recording) -> np.ndarray:
     """Difference of the first two periods over the least of neighbours, by output; ones where there is none."""
-    count = (len(r) - r.skip) // r.period if r.period and r.initial == "periodic" else 0
+    count = (len(r) - r.skip) // r.period if r.period and r.begins == "periodic" else 0
     if count < 3 or not r.period:
         return np.ones(r.n_y)
     periods = r.y[r.skip :][: count * r.period].reshape(count, r.period, r.n_y)
     steps = np.sqrt(np.mean(np.diff(periods, axis=0) ** 2, axis=1))
     return np.asarray(steps[0] / np.maximum(steps.min(axis=0), 1e-9 * np.std(r.y, axis=0) + 1e-300))
-
-
-def _estimated(r: Recording) -> Recording:
-    return r.with_(initial="estimate", period=None) if isinstance(r.initial, str) and r.initial == "periodic" else r

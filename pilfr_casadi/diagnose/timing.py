@@ -89,7 +89,7 @@ def timing(bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0) ->
 def as_given(bench: Workbench, plain: Fitted) -> Fitted:
     """The simulator at the user's values: a refit to channels out of step may have gone astray."""
     values = {name: p.value for name, p in bench.simulator.parameters.items()}
-    unknown = [isinstance(r.initial, str) and r.initial == "estimate" for r in bench.recordings]
+    unknown = [r.begins == "estimate" for r in bench.recordings]
     initial = [0 * state if u else state for u, state in zip(unknown, plain.initial, strict=True)]
     return bench.result(bench.simulator, values, initial, plain.engine, plain.model)
 

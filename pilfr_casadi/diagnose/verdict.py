@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..laws import Law
 from .candidate import Candidate
 from .floor import swells_with
 from .gates import Gate
@@ -109,9 +110,9 @@ class Choice:
     margin: float
 
 
-def handicap(candidate: Candidate) -> float:
+def handicap(law: Law) -> float:
     """Factor on the error of a law that can imitate others."""
-    return FLEXIBLE.get(candidate.law.id, 1.0) * FORMS.get(candidate.law.form, 1.0)
+    return FLEXIBLE.get(law.id, 1.0) * FORMS.get(law.form, 1.0)
 
 
 def imitates(candidate: Candidate, rival: Candidate, floor: float) -> bool:
@@ -138,7 +139,7 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     def excess(c: Candidate) -> float:
         # a handicap counts for what lies above the floor: at the floor nothing is left to imitate
         above = max(c.error**2 - floor, 1e-4 * floor)
-        return float(np.sqrt(floor + above * handicap(c) ** 2))
+        return float(np.sqrt(floor + above * handicap(c.law) ** 2))
 
     def key(c: Candidate) -> float:
         return float(np.log(excess(c)) + 0.5 * c.size * np.log(n) / n)

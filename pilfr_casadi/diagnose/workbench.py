@@ -162,7 +162,7 @@ class Workbench:
         """
         model = model or self.model(simulator)
         engine = engine or make_engine(model, self.engine)
-        estimated = any(isinstance(r.initial, str) and r.initial == "estimate" for r in self.recordings)
+        estimated = any(r.begins == "estimate" for r in self.recordings)
         if not np.any(model.parameters.free) and not (estimated and model.n_state):
             return self._as_it_is(simulator, model, engine)
         best: tuple[float, np.ndarray, Problem] | None = None
@@ -247,9 +247,8 @@ class Workbench:
         """Guesses of the initial states that are estimated, one after the other, n each."""
         out = [np.zeros(0)]
         for r, state in zip(self.recordings, states, strict=True):
-            if isinstance(r.initial, str) and r.initial == "estimate":
-                kept = np.asarray(state, dtype=float)[:n]
-                out.append(np.append(kept, np.zeros(n - len(kept))))
+            if r.begins == "estimate":
+                out.append(at_rest(np.asarray(state, dtype=float)[:n], n))
         return np.concatenate(out)
 
     def result(
@@ -268,6 +267,11 @@ class Workbench:
             scored = [(e / self.scale)[r.skip :] for e, r in zip(residual, self.recordings, strict=True)]
             cost = float(np.mean(np.concatenate(scored) ** 2))
         return Fitted(simulator, model, engine, values, initial, residual, cost)
+
+
+def at_rest(state: np.ndarray, n: int) -> np.ndarray:
+    """A state (n,) whose first entries are given and whose others, those of laws, are zero."""
+    return np.append(state, np.zeros(n - len(state)))
 
 
 def started(model: Model, start: Mapping[str, Any]) -> np.ndarray:

@@ -20,7 +20,7 @@ def replay(bench: Workbench, simulator: Simulator) -> Fitted | None:
     held = simulator.with_parameters({k: replace(p, fixed=True) for k, p in simulator.parameters.items()})
     try:
         model = bench.model(held)
-        if model.n_state and any(isinstance(r.initial, str) and r.initial == "estimate" for r in bench.recordings):
+        if model.n_state and any(r.begins == "estimate" for r in bench.recordings):
             return bench.fit(held, solver=GaussNewton(max_iterations=20))
         engine = make_engine(model, bench.engine)
         freed = model.with_parameters(model.parameters.change(**{k: {"fixed": False} for k in model.parameters}))
