@@ -30,18 +30,19 @@ operators = 3
 [solver]
 starts = 3
 """
-CAMPAIGN = """
-seeds = { first = 0, count = 4 }
-report = false
-workers = 2
-
+DATA = """
 [data]
 inputs = "u"
 outputs = "y"
 initial = "zero"
 train = "train.csv"
 test = "test.csv"
-
+"""
+CAMPAIGN = f"""
+seeds = {{ first = 0, count = 4 }}
+report = false
+workers = 2
+{DATA}
 [model]
 structure = "hammerstein"
 nx = 1

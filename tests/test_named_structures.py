@@ -3,6 +3,7 @@
 import csv
 
 import pytest
+from run_files import DATA
 from test_cli import fit_arguments, refused, run, write_csv
 
 import pilfr_casadi as pilfr
@@ -10,16 +11,9 @@ from pilfr_casadi.recording import InputError
 from pilfr_casadi.runs.described import read_run
 from pilfr_casadi.structures import ANY, STRUCTURES, TAKES, named_structure
 
-TEXT = """
+TEXT = f"""
 report = false
-
-[data]
-inputs = "u"
-outputs = "y"
-initial = "zero"
-train = "train.csv"
-test = "test.csv"
-
+{DATA}
 [model]
 MODEL
 

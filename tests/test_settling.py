@@ -5,6 +5,7 @@ import pytest
 from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
+from pilfr_casadi.diagnose.floor import measured_floor
 from pilfr_casadi.diagnose.settling import without_transients
 
 
@@ -49,3 +50,12 @@ def test_a_diagnosis_of_recordings_that_have_not_settled_finds_nothing_missing()
     found = pilfr.diagnose(rig(OFF), r.with_(y=y + noise, initial="periodic", period=625))
     assert found.verdict == "complete"
     assert [g.finding for g in found.gates] == ["transient"]
+
+
+def test_a_given_state_is_neither_periodic_nor_in_the_way():
+    """What a recording begins with may be numbers, though it has a period."""
+    r = periodic(0.1).with_(initial=np.array([1.0, 2.0]))
+    assert r.begins == "given"
+    kept, gates = without_transients([r])
+    assert not gates and kept[0] is r
+    assert measured_floor([r, r.with_(y=r.y + 1e-3)]).source == "repeats"

@@ -46,10 +46,6 @@ class _Block:
     dose: Dose
     sign: int
 
-    @property
-    def handicap(self) -> float:
-        return handicap(self.scored.law)
-
 
 def _blocks(rest: Remainder) -> Iterator[_Block]:
     for task in rest.tasks:
@@ -87,7 +83,7 @@ def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
     if len(blocks) < 2:
         return []
     left = 1 - together([orthonormal(b.dose.phi) for b in blocks], rest.left)
-    ports, factor = np.array([b.scored.port for b in blocks]), np.array([b.handicap for b in blocks])
+    ports, factor = np.array([b.scored.port for b in blocks]), np.array([handicap(b.scored.law) for b in blocks])
     worth = np.maximum(left, 0.0) * np.outer(factor, factor) ** 2
     worth[ports[:, None] == ports] = np.inf
     seen: dict[tuple[Any, ...], tuple[float, tuple[_Block, _Block]]] = {}
@@ -99,7 +95,7 @@ def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
         key = tuple((b.scored.port, type(b.scored.law)) for b in pair)
         if key not in seen and _opposes(pair, rest.left):
             kept = 1 - held_out(np.hstack([b.dose.phi for b in pair]), rest.left, rest.odd)
-            seen[key] = (kept * (pair[0].handicap * pair[1].handicap) ** 2, pair)
+            seen[key] = (kept * (factor[i] * factor[j]) ** 2, pair)
     chosen: dict[tuple[str, str], list[tuple[_Block, _Block]]] = {}
     for _, pair in sorted(seen.values(), key=lambda s: s[0]):
         place = pair[0].scored.port, pair[1].scored.port
