@@ -54,14 +54,12 @@ def _adds_nothing(one: Scored, other: Scored) -> bool:
     return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < EQUAL
 
 
-def closed(
-    simulator: Simulator, entry: Scored, start: Mapping[str, Any], sign: int
-) -> tuple[Simulator, dict[str, Any]]:
+def closed(simulator: Simulator, entry: Scored, start: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:
     """The simulator with the law in its port, and its start values by full name."""
     law = entry.law
     limits: dict[str, tuple[Any, Any]] = dict(law.at(start).bounds(entry.local))
-    if law.dissipative and sign:
-        side = (0.0, np.inf) if sign > 0 else (-np.inf, 0.0)
+    if entry.sense:
+        side = (0.0, np.inf) if entry.sense > 0 else (-np.inf, 0.0)
         limits |= {name: side for name in law.strength if name not in law.signed}
     inside = {k: np.clip(v, *limits[k]) if k in limits else v for k, v in start.items()}
     placed = simulator.with_element(entry.port, law.at(inside, limits))
@@ -81,10 +79,10 @@ class _Pair:
     candidate: Candidate | None
 
 
-def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: int, gain: np.ndarray | None) -> _Pair:
+def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, gain: np.ndarray | None) -> _Pair:
     """Compile a pair and fit it briefly from its best start."""
     first = entries[0]
-    placed, _ = closed(without.simulator, first, first.starts[0], sign)
+    placed, _ = closed(without.simulator, first, first.starts[0])
     model = bench.model(placed, gain)
     engine = make_engine(model, bench.engine)
     nominal = {k: p.value for k, p in without.simulator.parameters.items()}
@@ -92,7 +90,7 @@ def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, sign: 
     led: list[Mapping[str, Any]] = []  # the observer's best: its run may be near the truth where the simulation is not
     for entry in entries:
         for i, own in enumerate(entry.starts):
-            _, named = closed(without.simulator, entry, own, sign)
+            _, named = closed(without.simulator, entry, own)
             starts.append({**without.values, **named})
             if i == 0:
                 led += [starts[-1]] if entry.source == "observer" else []
@@ -156,7 +154,6 @@ def explain(
     bench: Workbench,
     scored: Sequence[Scored],
     without: Fitted,
-    signs: Mapping[str, int],
     gain: np.ndarray | None,
     workers: int,
     enough: float,
@@ -176,7 +173,7 @@ def explain(
 
     pool = ThreadPoolExecutor(workers)
     try:
-        tasks = [pool.submit(prepare, bench, entries, without, signs[port], gain) for port, _, entries in pairs]
+        tasks = [pool.submit(prepare, bench, entries, without, gain) for *_, entries in pairs]
         prepared = []
         for task in tasks:
             prepared.append(task.result())

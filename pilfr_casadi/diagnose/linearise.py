@@ -114,6 +114,8 @@ class Run:
         Inputs.
     sign : array, shape (n_ports,)
         +1 where a positive force opposes the port's motion, -1 where it drives it, 0 where there is no such sense.
+    back : array, shape (n_ports,)
+        The same for a positive force that pushes the port back.
     lift, push : array, shape (n_ports,)
         Largest effect of a unit force on the local coordinate's first and second derivative.
     """
@@ -128,6 +130,7 @@ class Run:
     dz: np.ndarray
     u: np.ndarray
     sign: np.ndarray
+    back: np.ndarray
     lift: np.ndarray
     push: np.ndarray
 
@@ -135,6 +138,11 @@ class Run:
     def n_free(self) -> int:
         """Columns of b and d that belong to free parameters; those of the ports follow."""
         return int(self.b.shape[2] - len(self.sign))
+
+    def sense(self, law: Law, port: int) -> int:
+        """Sign that the law's strengths must have at a port: where it opposes motion, or pushes back; else 0."""
+        side = self.sign if law.dissipative else self.back
+        return int(side[port]) if law.dissipative or law.restoring else 0
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -161,10 +169,11 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     own = p[: len(p) - len(probe.ports)]
     at = states[::n, : probe.n_x], u, slope, r.dt * np.arange(len(u))[:, None], own
     z, dz, lift, push = (v[:, :, 0] for v in mapped(probe.local, *at))
-    sign = np.where(np.abs(lift).max(axis=0) > 0, 0.0, -np.sign(np.median(push, axis=0)))
+    moved, sign = np.abs(lift).max(axis=0) > 0, -np.sign(np.median(push, axis=0))
+    sense = {"sign": np.where(moved, 0.0, sign), "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign)}
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
     a, b = over_samples(a, b, n)
-    return Run(a, b, c[::n], d[::n], mean, error=y[::n, :, 0] - r.y, z=z, dz=dz, u=u, sign=sign, **felt)
+    return Run(a, b, c[::n], d[::n], mean, error=y[::n, :, 0] - r.y, z=z, dz=dz, u=u, **sense, **felt)
 
 
 def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -44,18 +44,16 @@ class _Block:
 
     scored: Scored
     dose: Dose
-    sign: int
 
 
 def _blocks(rest: Remainder) -> Iterator[_Block]:
     for task in rest.tasks:
-        sign = int(rest.runs[0].sign[task.index])
         for law, doses in rest.doses(task):
-            felt = [d for d in doses if np.any(d.phi)]
+            felt, sense = [d for d in doses if np.any(d.phi)], rest.runs[0].sense(law, task.index)
             shares = [float(np.sum((orthonormal(d.phi).T @ rest.left) ** 2)) for d in felt]
             for k in np.argsort(shares)[::-1][:SHAPES]:
-                scored = Scored(task.port.name, law, shares[k], (), task.local)
-                yield _Block(scored, replace(felt[k], phi=felt[k].phi.copy()), sign)
+                scored = Scored(task.port.name, law, shares[k], (), task.local, sense)
+                yield _Block(scored, replace(felt[k], phi=felt[k].phi.copy()))
 
 
 def together(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
@@ -112,10 +110,9 @@ def _strengths(pair: tuple[_Block, _Block], left: np.ndarray) -> list[np.ndarray
 
 
 def _opposes(pair: tuple[_Block, _Block], left: np.ndarray) -> bool:
-    """Whether the laws that must oppose motion do."""
+    """Whether the laws that must oppose motion, or push back, do."""
     for block, found in zip(pair, _strengths(pair, left), strict=True):
-        law = block.scored.law
-        if law.dissipative and block.sign and len(found) == 1 and block.sign * found[0] < 0:
+        if len(found) == 1 and block.scored.sense * found[0] < 0:
             return False
     return True
 
@@ -124,9 +121,8 @@ def _fitted_together(search: Search, rest: Remainder, pair: tuple[_Block, _Block
     """A pair fitted from what the screen says of it, and the simulator's parameters as refitted and as given."""
     simulator, named = search.without.simulator, dict[str, Any]()
     for block, strength in zip(pair, _strengths(pair, rest.left), strict=True):
-        simulator, own = closed(
-            simulator, block.scored, start_values(block.scored.law, block.dose.shape, strength), block.sign
-        )
+        start = start_values(block.scored.law, block.dose.shape, strength)
+        simulator, own = closed(simulator, block.scored, start)
         named |= own
     nominal = {k: p.value for k, p in search.without.simulator.parameters.items()}
     starts = [{**search.without.values, **named}, {**nominal, **named}]

@@ -27,7 +27,7 @@ KEPT = 3  # start values of each pair
 class Scored:
     """A port and law with the share of the residual that a small dose takes away, and start values, best first.
 
-    The share is judged on blocks it was not fitted to.
+    The share is judged on blocks it was not fitted to; `sense` is `linearise.Run.sense`.
     """
 
     port: str
@@ -35,15 +35,16 @@ class Scored:
     share: float
     starts: tuple[dict[str, Any], ...]
     local: Local
+    sense: int = 0
     source: str = "simulation"
 
 
 def screen(
     bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, workers: int = 1
-) -> tuple[list[Scored], dict[str, int], np.ndarray | None]:
+) -> tuple[list[Scored], np.ndarray | None]:
     """Every port and law with its score along the simulation and along the observer, best first.
 
-    Also returns each port's sense (+1: a positive force opposes motion, see `linearise.Run`) and the observer's gain.
+    Also returns the observer's gain.
 
     Parameters
     ----------
@@ -54,7 +55,6 @@ def screen(
     """
     probe, runs = linearised(bench, fitted)
     gain = observer_gain(probe, runs, noise)
-    signs = {name: int(s) for name, s in zip(probe.ports, runs[0].sign, strict=True)}
     led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
     if not all(_holds(r, bench.scale) for r in led):
         led = []
@@ -64,7 +64,7 @@ def screen(
     tasks = [(rest, task, source) for source, rest in ways for task in rest.tasks]
     found = [scored for one in side_by_side(lambda task: _score(*task), tasks, workers) for scored in one]
     seen = any(s.source == "observer" for s in found)
-    return sorted(found, key=lambda s: -s.share), signs, gain if seen else None
+    return sorted(found, key=lambda s: -s.share), gain if seen else None
 
 
 def _holds(r: Run, scale: np.ndarray) -> bool:
@@ -76,17 +76,16 @@ def _holds(r: Run, scale: np.ndarray) -> bool:
 def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
     """Each law of one port."""
     total, out = max(float(rest.left @ rest.left), 1e-300), []
-    sign = int(rest.runs[0].sign[task.index])
     for law, doses in rest.doses(task):
-        scores = []
+        sense, scores = rest.runs[0].sense(law, task.index), []
         for dose in doses:
-            drop, strength = _gain(dose.phi, rest.left, law, sign)
+            drop, strength = _gain(dose.phi, rest.left, law, sense)
             scores.append((drop / total, dose, -strength / dose.size))
         scores.sort(key=lambda s: -s[0])
         starts = tuple(start_values(law, dose.shape, c) for _, dose, c in scores[:KEPT])
         # a law that would have to drive the motion explains nothing
         share = min(held_out(scores[0][1].phi, rest.left, rest.odd), scores[0][0])
-        out.append(Scored(task.port.name, law, share, starts, task.local, source))
+        out.append(Scored(task.port.name, law, share, starts, task.local, sense, source))
     return out
 
 
@@ -106,7 +105,7 @@ def _signed(law: Law) -> np.ndarray:
     return np.concatenate([np.full(p[name].size, name in law.signed) for name in law.strength])
 
 
-def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sign: int) -> tuple[float, np.ndarray]:
+def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sense: int) -> tuple[float, np.ndarray]:
     """Drop of the sum of squares by the columns of one shape, and their coefficients."""
     gram, right = phi.T @ phi, phi.T @ left
     size = np.sqrt(np.diag(gram))
@@ -115,19 +114,19 @@ def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sign: int) -> tuple[float
     size = np.where(size > 0, size, 1.0)
     n = len(size)
     ridge = gram / np.outer(size, size) + 1e-10 * np.eye(n)
-    if law.dissipative and sign and n > 1:
+    if sense and n > 1:
         from scipy.optimize import nnls
 
         root = np.linalg.cholesky(ridge).T
-        target = np.linalg.solve(root.T, -sign * right / size)
+        target = np.linalg.solve(root.T, -sense * right / size)
         both = _signed(law)  # these may have either sign: their negatives are columns as well
         found = nnls(np.hstack([root, -root[:, both]]), target)[0]
         coefficients = found[:n]
         coefficients[both] -= found[n:]
-        coefficients = -sign * coefficients
+        coefficients = -sense * coefficients
     else:
         coefficients = np.linalg.solve(ridge, right / size)
-        if law.dissipative and sign and n == 1 and -sign * coefficients[0] < 0:
+        if sense and n == 1 and -sense * coefficients[0] < 0:
             coefficients = np.zeros(1)
     share = float(2 * coefficients @ (right / size) - coefficients @ ridge @ coefficients)
     return share, coefficients / size

@@ -40,7 +40,7 @@ UNSEEN, NO_WORSE = 0.7, 1.1  # shares of the mean square on the unseen part that
 NOTHING = 0.01  # below this share nothing is explained
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
-Seen = tuple[list[Scored], dict[str, int], np.ndarray | None]
+Seen = tuple[list[Scored], np.ndarray | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +182,7 @@ class Search:
 
     def pass_(self, number: int, seen: Seen) -> Pass:
         """Fit what the screen lets through, and choose; `number` effects were accepted before."""
-        scored, signs, gain = seen
+        scored, gain = seen
         taken = {e.port for e in self.base.simulator.elements[len(self.bench.simulator.elements) :]}
         scored = [s for s in scored if s.port not in taken]
         most = max((s.share for s in scored), default=0.0)
@@ -191,10 +191,10 @@ class Search:
         if nothing or not scored:
             return Pass(None, (), tuple(scored), before, False)
         began = time.perf_counter()
-        candidates = self._explained(number, scored, signs, gain)
+        candidates = self._explained(number, scored, gain)
         missed = passed_over(candidates, scored)
         if missed:
-            more = self._explained(number, missed, signs, gain)
+            more = self._explained(number, missed, gain)
             candidates = sorted([*candidates, *more], key=lambda c: c.error)
         self.timed("fits", began)
         began = time.perf_counter()
@@ -219,14 +219,12 @@ class Search:
         self.timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
-    def _explained(
-        self, number: int, scored: Sequence[Scored], signs: dict[str, int], gain: np.ndarray | None
-    ) -> list[Candidate]:
+    def _explained(self, number: int, scored: Sequence[Scored], gain: np.ndarray | None) -> list[Candidate]:
         """Full fits, smallest error first."""
         enough = float(np.sqrt(self.floor2 + NEARLY * max(self.base.cost - self.floor2, 0.0)))
         stage = "fits" if not number else "fits, second effect"
         return explain(
-            self.bench, scored, self.base, signs, gain, self.workers, enough, lambda i, n, e: self.say(stage, i, n, e)
+            self.bench, scored, self.base, gain, self.workers, enough, lambda i, n, e: self.say(stage, i, n, e)
         )
 
     def _only_drifts(self, choice: Choice) -> bool:

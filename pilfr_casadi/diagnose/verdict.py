@@ -83,6 +83,7 @@ FORMS = {
     "harmonics": 1.05,
     "gradual": 1.05,
     "root": 1.1,
+    "orifice": 1.1,
     "polynomial": 1.05,
     "attached mass": 1.1,
     "generalized_play": 1.1,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from .base import Law, Local, readable_unit
 from .composed import behind_gap, scaled
-from .curves import Cubic, Magnitude, Polynomial, Power, PowerWithGain, Quadratic, Root
+from .curves import Cubic, Magnitude, Orifice, Polynomial, Power, PowerWithGain, Quadratic, Root
 from .density import SmoothHysteresis
 from .dynamic import (
     Attached,
@@ -107,6 +107,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     Power,
     PowerWithGain,
     Root,
+    Orifice,
     Delay,
     Relaxation,
     TwoStageRelaxation,

@@ -93,6 +93,8 @@ class Law:
         Inside the dynamics, or at an actuator or a sensor.
     dissipative : bool
         Strengths must oppose motion, but for those in `signed`.
+    restoring : bool
+        Strengths must push back.
     order : int
         States of its own.
     shifts : bool
@@ -112,6 +114,7 @@ class Law:
     strength: ClassVar[tuple[str, ...]] = ()
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     dissipative: ClassVar[bool] = False
+    restoring: ClassVar[bool] = False
     signed: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[int] = 0
     shifts: ClassVar[bool] = False

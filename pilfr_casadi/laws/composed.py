@@ -65,7 +65,7 @@ def _scaled(base: Any, by: str) -> Any:
         sentence = f"{base.sentence}; {by} scales its strength"
         units = strengths
         places = ("parallel",)
-        dissipative = False  # the signal may have either sign
+        dissipative = restoring = False  # the signal may have either sign
         scaled_by = by
 
     Scaled.__doc__ = f"{base.__doc__}\n\n    Its strength is scaled by {by}."

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import casadi as ca
+import numpy as np
 
 from .base import Law, Local, grid
 
@@ -106,3 +107,23 @@ class Root(Power):
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"n": (0.3, 0.9)}
+
+
+class Orifice(Root):
+    """Flow through an orifice under its own head: laminar at first, a square root at last."""
+
+    form = "orifice"
+    restoring = True
+    equation = "w = a z / (z^2 + z_t^2)^(1/4)"
+    source = "Borutzky, Barnard & Thoma (2002), Simulation Modelling Practice and Theory 10"
+    sentence = "a memoryless curve: flow through an orifice, laminar below z_t and turbulent beyond"
+    units: ClassVar[Mapping[str, str]] = {"a": "w/z^0.5", "z_t": "z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a * z / (z**2 + p.z_t**2) ** 0.25
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        yield from grid(z_t=local.reach * np.array([0.02, 0.1, 0.3]))
+
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        return {"z_t": (1e-3 * local.reach, local.reach)}

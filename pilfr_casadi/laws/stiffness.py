@@ -79,6 +79,7 @@ class GeometricStiffness(CubicStiffness):
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 2.1"
     units: ClassVar[Mapping[str, str]] = {"k": "w/z", "L": "z"}
     strength: ClassVar[tuple[str, ...]] = ("k",)
+    restoring = True  # of either sign, and beside a plain spring, it is any curve
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k * z * (1 - p.L / ca.sqrt(p.L**2 + z**2))
