@@ -131,6 +131,11 @@ def _near(candidate: Candidate, winner: Candidate) -> bool:
     return candidate.error < (1 + LIKE) * winner.error
 
 
+def _fits(candidate: Candidate, winner: Candidate) -> bool:
+    """Whether a law at the same port follows everything as well, fitted to everything."""
+    return candidate.port == winner.port and candidate.full < (1 + LIKE) * winner.full
+
+
 def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor: float, n: float) -> Choice | None:
     """The winner among candidates; `without` are the errors of the simulator alone, `floor` the noise, all squared."""
     usable = [c for c in candidates if np.isfinite(c.error)]
@@ -150,7 +155,7 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     close = [c for c in ranked if _near(c, winner) and c.size < winner.size]
     if close:  # what does as well with fewer parameters
         winner = min(close, key=lambda c: (c.size, key(c)))
-    free = [c for c in ranked if _near(c, winner) and c.size <= winner.size and not c.at_bound]
+    free = [c for c in ranked if not c.at_bound and c.size <= winner.size and (_near(c, winner) or _fits(c, winner))]
     if winner.at_bound and free:  # what does as well without being held back
         winner = min(free, key=lambda c: (c.size, key(c)))
     for rival in ranked[1:]:
