@@ -17,6 +17,7 @@ import numpy as np
 from ..interrupts import Progress
 from ..laws import Law
 from ..recording import InputError
+from ..simulator import Placed
 from .candidate import Candidate, heads, judged, polish
 from .explain import explain
 from .flexible import explainable
@@ -26,7 +27,19 @@ from .pairs import two_at_once
 from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
 from .screen import Scored, screen
-from .verdict import FLEXIBLE, HINT, LITTLE, MAINLY, UNSURE, Choice, choose, confidence, explains, left_open
+from .verdict import (
+    FLEXIBLE,
+    HINT,
+    LITTLE,
+    MAINLY,
+    UNSURE,
+    Choice,
+    choose,
+    complements,
+    confidence,
+    explains,
+    left_open,
+)
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
@@ -36,6 +49,7 @@ SEEN = 2.5e-5  # mean square error below which what is more than noise is not wo
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 POLISHED = 4  # candidates fitted to everything before one is chosen
 MOSTLY = 0.5  # share of the rest that a second effect may leave
+NEARLY_ALL = 0.1  # the same beside another law at its port
 UNSEEN, NO_WORSE = 0.7, 1.1  # shares of the mean square on the unseen part that a second effect may leave
 NOTHING = 0.01  # below this share nothing is explained
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
@@ -183,8 +197,7 @@ class Search:
     def pass_(self, number: int, seen: Seen) -> Pass:
         """Fit what the screen lets through, and choose; `number` effects were accepted before."""
         scored, gain = seen
-        taken = {e.port for e in self.base.simulator.elements[len(self.bench.simulator.elements) :]}
-        scored = [s for s in scored if s.port not in taken]
+        scored = [s for s in scored if all(e.port != s.port or complements(e.law, s.law) for e in self._found())]
         most = max((s.share for s in scored), default=0.0)
         nothing = max(most, max(self.open_after.values(), default=0.0)) < NOTHING and self.base.cost < 0.0025
         before = (self.base.cost, self.base.cost)
@@ -219,6 +232,10 @@ class Search:
         self.timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
+    def _found(self) -> Sequence[Placed]:
+        """What stands in the ports so far."""
+        return self.base.simulator.elements[len(self.bench.simulator.elements) :]
+
     def _explained(self, number: int, scored: Sequence[Scored], gain: np.ndarray | None) -> list[Candidate]:
         """Full fits, smallest error first."""
         enough = float(np.sqrt(self.floor2 + NEARLY * max(self.base.cost - self.floor2, 0.0)))
@@ -245,6 +262,8 @@ class Search:
         `unseen` is the mean square error before on what is not fitted.
         """
         left = (choice.winner.full - self.floor2) / max(self.base.cost - self.floor2, 1e-300)
+        if any(e.port == choice.winner.port for e in self._found()) and left > NEARLY_ALL:
+            return False  # it mends the first law
         sure = choice.winner.law.id not in FLEXIBLE and left < MOSTLY
         clear = choice.remains < MOSTLY and choice.winner.tail < UNSEEN * unseen
         return clear or (sure and choice.winner.tail < NO_WORSE * unseen)

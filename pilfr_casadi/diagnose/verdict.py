@@ -116,6 +116,13 @@ def handicap(law: Law) -> float:
     return FLEXIBLE.get(law.id, 1.0) * FORMS.get(law.form, 1.0)
 
 
+def complements(one: Law, other: Law) -> bool:
+    """Whether two laws of a port are different physics: one opposes motion, the other is a curve of position."""
+    rubs, springs = sorted((one, other), key=lambda law: not law.dissipative)
+    apart = rubs.dissipative and not springs.dissipative and springs.reads() == {"z"} and not hasattr(springs, "step")
+    return apart and rubs.order == springs.order == 0 and rubs.id != "hysteresis"
+
+
 def imitates(candidate: Candidate, rival: Candidate, floor: float) -> bool:
     """Whether a law comes so little nearer than another at its port, above the floor, that it may just imitate it.
 

@@ -265,7 +265,7 @@ class PeriodicForce(Law):
         return p.a * ca.sin(angle) + p.b * ca.cos(angle)
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(L=2 * local.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 24.1, 1.0)]))
+        yield from grid(L=2 * local.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 60.1, 1.0)]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"L": (2 * local.half / 60, 2 * local.half / 1.5)}
