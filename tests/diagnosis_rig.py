@@ -55,10 +55,11 @@ def rig(factors=(1.0, 1.0, 1.0, 1.0)):
 OFF = (1.1, 0.8, 0.9, 1.2)
 
 
-def recordings(law=None, port="ground-m1", seed=0, count=2, noise=1e-3, hold="zero"):
-    """Recordings of the rig with a law in a port, from rest."""
-    rng = np.random.default_rng(seed)
-    true = rig() if law is None else rig().with_element(port, law)
+def recordings(*laws, port="ground-m1", seed=0, count=2, noise=1e-3, hold="zero"):
+    """Recordings of the rig with laws in a port, from rest."""
+    rng, true = np.random.default_rng(seed), rig()
+    for law in filter(None, laws):
+        true = true.with_element(port, law)
     t = np.arange(SAMPLES) * DT
     out = []
     for _ in range(count):

@@ -58,7 +58,7 @@ def test_the_catalogue_holds_every_law_of_the_contract():
     ids=lambda v: v if isinstance(v, str) else v.id,
 )
 def test_a_hidden_law_is_named_at_its_port(port, law):
-    train, test = recordings(law, port), recordings(law, port, seed=7, count=1)
+    train, test = recordings(law, port=port), recordings(law, port=port, seed=7, count=1)
     found = pilfr.diagnose(rig(OFF), train, test=test)
     assert found.verdict == "missing-physics"
     assert [(e.port, e.law) for e in found.effects] == [(port, law.id)]
@@ -115,7 +115,7 @@ def test_a_clipped_output_is_a_fault_of_the_recording():
 def test_the_next_experiment_stays_within_the_users_limits():
     """A delay before or behind a linear rig is the same; only what the rig does not do linearly can tell them apart."""
     law = Delay(values={"T": 3.3e-3}, limits={"T": (0.0, 0.02)})
-    train = [r.with_(initial="estimate") for r in recordings(law, "sensor:x2")]
+    train = [r.with_(initial="estimate") for r in recordings(law, port="sensor:x2")]
     found = pilfr.diagnose(rig(OFF), train, limits={"force": 7.0})
     assert [(e.law, e.indistinguishable) for e in found.effects] in (
         [("delay", (("actuator:force", "delay"),))],

@@ -1,0 +1,37 @@
+"""Two laws missing at one port: friction and a curve of position are different physics there."""
+
+import pytest
+from diagnosis_rig import OFF, recordings, rig
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import laws
+from pilfr_casadi.diagnose.verdict import complements
+
+FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
+RIPPLE = laws.PeriodicForce(values={"a": 5.0, "b": 3.0, "L": 0.02})
+
+
+def test_friction_and_ripple_at_one_port_are_both_named():
+    train, test = recordings(FRICTION, RIPPLE, noise=2e-3)
+    found = pilfr.diagnose(rig(OFF), train, test=test)
+    assert {(e.port, e.law) for e in found.effects} == {
+        ("ground-m1", "coulomb_friction"),
+        ("ground-m1", "periodic_force"),
+    }
+    assert found.errors["test"]["after"] < 1.2 * found.floor["nrmse"]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "apart"),
+    [
+        (laws.CoulombFriction, laws.CubicStiffness, True),
+        (laws.PiecewiseStiffness, laws.PreslidingFriction, True),
+        (laws.CoulombFriction, laws.ViscousDamping, False),  # both of motion
+        (laws.CubicStiffness, laws.PiecewiseStiffness, False),  # both of position
+        (laws.StopHysteresis, laws.CubicStiffness, False),  # is a spring and friction itself
+        (laws.CoulombFriction, laws.Drift, False),  # neither of position
+    ],
+)
+def test_only_different_physics_stands_beside_a_law(one, other, apart):
+    assert complements(one(), other()) is apart
+    assert complements(other(), one()) is apart
