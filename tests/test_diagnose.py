@@ -154,7 +154,7 @@ def test_a_missing_column_is_said():
 def test_a_spring_or_damper_that_was_left_out_is_named(left_out, hidden, port, name, strength):
     full = rig(OFF)
     none = {left_out: replace(full.parameters[left_out], value=0.0, bounds=(0.0, 1.0), fixed=True)}
-    found = pilfr.diagnose(full.with_parameters({**full.parameters, **none}), recordings(hidden, port))
+    found = pilfr.diagnose(full.with_parameters({**full.parameters, **none}), recordings(hidden, port=port))
     assert [(e.port, e.law) for e in found.effects] == [(port, name)]
     assert found.effects[0].confidence > 0.8
     for symbol, truth in strength.items():
