@@ -28,7 +28,7 @@ def test_friction_and_ripple_at_one_port_are_both_named():
         (laws.PiecewiseStiffness, laws.PreslidingFriction, True),
         (laws.CoulombFriction, laws.ViscousDamping, False),  # both of motion
         (laws.CubicStiffness, laws.PiecewiseStiffness, False),  # both of position
-        (laws.StopHysteresis, laws.CubicStiffness, False),  # is a spring and friction itself
+        (laws.Relaxation, laws.CubicStiffness, False),  # it is a spring itself
         (laws.CoulombFriction, laws.Drift, False),  # neither of position
     ],
 )

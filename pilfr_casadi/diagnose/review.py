@@ -19,7 +19,7 @@ from ..simulator import Simulator
 from ..threads import side_by_side
 from .candidate import Candidate, attempt, judged
 from .explain import by_cost
-from .verdict import HINT, choose, imitates
+from .verdict import HINT, choose, complements, imitates
 
 if TYPE_CHECKING:
     from .search import Search
@@ -103,6 +103,8 @@ def look_back(search: Search) -> None:
         if c.port != winner.port or type(c.law) is type(winner.law) or len(others) >= RIVALS:
             continue
         own = c.fitted.simulator.elements[-1]
+        if own.port == kept.port and not complements(own.law, kept.law):
+            continue
         placed = bare.with_element(own.port, own.law).with_element(kept.port, kept.law)
         values = {k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}
         others.append((c, placed, {**search.base.values, **values}))

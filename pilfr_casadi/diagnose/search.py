@@ -1,8 +1,8 @@
 """From a refitted simulator to the effects it lacks: one pass for each, then a look back at the first.
 
 A second effect is looked for where the first leaves more than a few per cent of the excess and a flexible force could
-explain it. It is accepted at another port when it removes most of what is left. What was accepted is looked at again
-(`review`).
+explain it. It is accepted at another port when it removes most of what is left; friction and a curve of position may
+share a port, when the second removes nearly all. What was accepted is looked at again (`review`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -143,11 +143,15 @@ class Search:
             if not found.accepted:
                 break
             assert found.choice is not None
+            before, passes = self.base, self.passes[:-1]
             self.base = found.choice.winner.fitted
             prefer_what_leaves_nothing(self)
             put_more_finely(self)
             if number:
                 look_back(self)
+                if self._mends(before):
+                    self.base, self.passes = before, [*passes, replace(found, accepted=False)]
+                    break
             if self._wrongly_held():
                 return
             self.open_after = self.flexible(self.base)
@@ -232,6 +236,12 @@ class Search:
         self.timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
+    def _mends(self, before: Fitted) -> bool:
+        """Whether a law beside another at its port does no more than mend it: it leaves too much of what was left."""
+        left = (self.base.cost - self.floor2) / max(before.cost - self.floor2, 1e-300)
+        ports = [e.port for e in self._found()]
+        return len(set(ports)) < len(ports) and left > NEARLY_ALL
+
     def _found(self) -> Sequence[Placed]:
         """What stands in the ports so far."""
         return self.base.simulator.elements[len(self.bench.simulator.elements) :]
@@ -262,8 +272,6 @@ class Search:
         `unseen` is the mean square error before on what is not fitted.
         """
         left = (choice.winner.full - self.floor2) / max(self.base.cost - self.floor2, 1e-300)
-        if any(e.port == choice.winner.port for e in self._found()) and left > NEARLY_ALL:
-            return False  # it mends the first law
         sure = choice.winner.law.id not in FLEXIBLE and left < MOSTLY
         clear = choice.remains < MOSTLY and choice.winner.tail < UNSEEN * unseen
         return clear or (sure and choice.winner.tail < NO_WORSE * unseen)

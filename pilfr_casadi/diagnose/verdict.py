@@ -120,7 +120,7 @@ def complements(one: Law, other: Law) -> bool:
     """Whether two laws of a port are different physics: one opposes motion, the other is a curve of position."""
     rubs, springs = sorted((one, other), key=lambda law: not law.dissipative)
     apart = rubs.dissipative and not springs.dissipative and springs.reads() == {"z"} and not hasattr(springs, "step")
-    return apart and rubs.order == springs.order == 0 and rubs.id != "hysteresis"
+    return apart and springs.order == 0 and rubs.id not in ("creep", "extra_mode")
 
 
 def imitates(candidate: Candidate, rival: Candidate, floor: float) -> bool:
