@@ -12,6 +12,7 @@ from ..simulator import Simulator
 from .clipping import unclip
 from .floor import Floor, measured_floor, white_part
 from .gates import Gate, choose_hold, hold_note, opened, said_hold, wrong_scale
+from .glitches import without_glitches
 from .linearise import along, linearised, observer_gain
 from .offset import offsets
 from .proof import errors_of
@@ -49,9 +50,10 @@ def prepare(
     simulator: Simulator, recordings: Sequence[Recording], hold: str | None, engine: str, workers: int = 1
 ) -> Prepared:
     """Open the bench, look at the dull causes, refit, and measure the floor."""
+    recordings, spikes = without_glitches(recordings)
     recordings, transients = without_transients(recordings)
     bench, gates = opened(simulator, recordings, hold or "zero", engine)
-    gates = [*transients, *stale_samples(recordings), *gates]
+    gates = [*spikes, *transients, *stale_samples(recordings), *gates]
     between, notes = choose_hold(simulator, bench.recordings, hold, engine)
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, simulator)
