@@ -215,7 +215,8 @@ class Search:
             candidates = sorted([*candidates, *more], key=lambda c: c.error)
         self.timed("fits", began)
         began = time.perf_counter()
-        near = [c for c in candidates[:POLISHED] if c.error < 1.5 * candidates[0].error]
+        best = candidates[0].error
+        near = [c for c in candidates[:POLISHED] if c.error < 1.5 * best or self.bench.too_coarse(c.fitted)]
         with ThreadPoolExecutor(self.workers) as pool:
             bare = pool.submit(self._judged, self.base)
             kept = [*pool.map(lambda c: polish(self.bench, c), near), *(c for c in candidates if c not in near)]

@@ -136,6 +136,10 @@ class Workbench:
         least = max(self.substeps, *(getattr(e.law, "substeps", 1) for e in simulator.elements))
         return int(np.clip(wanted, least, max(FINER * self.substeps, least)))
 
+    def too_coarse(self, fitted: Fitted) -> bool:
+        """Whether a law came out faster than the sub-steps it was fitted on, which were chosen where it started."""
+        return self._substeps(fitted.corrected()) > fitted.model.substeps
+
     def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:
         """The simulation-error problem of a model."""
         return Problem(model, recordings or self.recordings, engine=engine or self.engine, scale=self.scale)
