@@ -41,7 +41,9 @@ CURES = 1e-3  # share of the mean square that a fault leaves which was the misma
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
 PURE = 0.05  # share of model error in a residual that is taken for noise
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
-LIKE = 0.03  # rivals whose error is within this share cannot be told apart
+# rivals whose error is within this share, and which take away this share of the mean square that the winner does,
+# cannot be told apart: under loud noise the first alone would hold for nearly any
+LIKE, AS_MUCH = 0.03, 0.995
 # a law that can imitate others -> factor by which its error must be smaller
 FLEXIBLE: dict[str, float] = {
     "hysteresis": 1.25,
@@ -66,6 +68,7 @@ IMITATES = {
     ("hysteresis", "stribeck_friction"): 1.4,
     ("hysteresis", "backlash"): 1.4,
     ("clearance", "piecewise_stiffness"): 1.4,
+    ("extra_mode", "delay"): 1.4,
 }
 FORMS = {
     "mode": 1.15,
@@ -134,8 +137,10 @@ def imitates(candidate: Candidate, rival: Candidate, floor: float) -> bool:
     return other < needed**2 * own
 
 
-def _near(candidate: Candidate, winner: Candidate) -> bool:
-    return candidate.error < (1 + LIKE) * winner.error
+def _near(candidate: Candidate, winner: Candidate, before: float) -> bool:
+    """Whether a law does as well; `before` is the mean square error without any."""
+    as_much = before - candidate.error**2 >= AS_MUCH * (before - winner.error**2)
+    return candidate.error < (1 + LIKE) * winner.error and as_much
 
 
 def _fits(candidate: Candidate, winner: Candidate) -> bool:
@@ -151,38 +156,39 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
 
     def excess(c: Candidate) -> float:
         # a handicap counts for what lies above the floor: at the floor nothing is left to imitate
-        above = max(c.error**2 - floor, 1e-4 * floor)
-        return float(np.sqrt(floor + above * handicap(c.law) ** 2))
+        noise = min(floor, c.error**2)
+        return float(np.sqrt(noise + (c.error**2 - noise) * handicap(c.law) ** 2))
 
     def key(c: Candidate) -> float:
         return float(np.log(excess(c)) + 0.5 * c.size * np.log(n) / n)
 
     ranked = sorted(usable, key=key)
     winner = ranked[0]
-    close = [c for c in ranked if _near(c, winner) and c.size < winner.size]
+    before = float(np.sqrt(without[0] * without[1]))
+    close = [c for c in ranked if _near(c, winner, before) and c.size < winner.size]
     if close:  # what does as well with fewer parameters
         winner = min(close, key=lambda c: (c.size, key(c)))
-    free = [c for c in ranked if not c.at_bound and c.size <= winner.size and (_near(c, winner) or _fits(c, winner))]
+    as_small = [c for c in ranked if c.size <= winner.size and not c.at_bound]
+    free = [c for c in as_small if _near(c, winner, before) or _fits(c, winner)]
     if winner.at_bound and free:  # what does as well without being held back
         winner = min(free, key=lambda c: (c.size, key(c)))
     for rival in ranked[1:]:
         if imitates(winner, rival, floor):
             winner = rival
             break
-    before = float(np.sqrt(np.sqrt(without[0] * without[1])))
-    gain = n * (np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
+    gain = n * (0.5 * np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
     first = {c.name: c for c in reversed(ranked) if c.name != winner.name}  # the best of each name
-    no_larger = [c for c in reversed(ranked) if c.name in first and _near(c, winner) and c.size <= winner.size]
+    no_larger = [c for c in reversed(ranked) if c.name in first and _near(c, winner, before) and c.size <= winner.size]
     alike = {c.name: c for c in no_larger}
     ports, margin = {winner.port, *(port for port, _ in alike)}, np.inf
     for c in first.values():
         ratio = c.error / winner.error
         contains = winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > 1 - LIKE
-        if c.name in alike or (c.port in ports and (_near(c, winner) or contains)):
+        if c.name in alike or (c.port in ports and (_near(c, winner, before) or contains)):
             continue  # a refinement of the winner, or of what cannot be told from it, is no rival
         else:
             margin = min(margin, max(ratio, float(np.exp(key(c) - key(winner)))))
-    remains = (winner.error**2 - floor) / max(before**2 - floor, 1e-300)
+    remains = (winner.error**2 - floor) / max(before - floor, 1e-300)
     return Choice(winner, tuple(alike.values())[::-1], float(gain), float(np.clip(remains, 0, 1)), float(margin))
 
 
