@@ -24,7 +24,7 @@ from .explain import BRIEF, closed
 from .linearise import linearised
 from .remainder import Dose, Remainder, held_out, orthonormal
 from .screen import Scored, start_values
-from .verdict import handicap
+from .kinship import handicap
 from .workbench import Fitted, at_rest
 
 if TYPE_CHECKING:

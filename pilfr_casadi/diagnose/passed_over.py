@@ -15,7 +15,7 @@ import numpy as np
 from ..laws.dynamic import Attached
 from .candidate import Candidate
 from .screen import Scored
-from .verdict import CONTAINS, FLEXIBLE
+from .kinship import CONTAINS, FLEXIBLE
 
 IMITATED = 3  # simpler laws put up against one that can imitate others
 AHEAD = 1.5  # times the best error of a carried mass that is worth another start

@@ -19,7 +19,8 @@ from ..simulator import Simulator
 from ..threads import side_by_side
 from .candidate import Candidate, attempt, judged
 from .explain import by_cost
-from .verdict import HINT, choose, complements, imitates
+from .kinship import complements, imitates
+from .verdict import HINT, choose
 
 if TYPE_CHECKING:
     from .search import Search

@@ -22,24 +22,13 @@ from .candidate import Candidate, heads, judged, polish
 from .explain import explain
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
+from .kinship import FLEXIBLE, complements
 from .linearise import linearised
 from .pairs import two_at_once
 from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
 from .screen import Scored, screen
-from .verdict import (
-    FLEXIBLE,
-    HINT,
-    LITTLE,
-    MAINLY,
-    UNSURE,
-    Choice,
-    choose,
-    complements,
-    confidence,
-    explains,
-    left_open,
-)
+from .verdict import HINT, LITTLE, MAINLY, UNSURE, Choice, choose, confidence, explains, left_open
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed

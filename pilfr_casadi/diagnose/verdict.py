@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..laws import Law
 from .candidate import Candidate
 from .floor import swells_with
 from .gates import Gate
+from .kinship import CONTAINS, handicap, imitates
+from .ringing import ringing
 
 if TYPE_CHECKING:
     from .search import Search
@@ -36,6 +37,7 @@ DRIVEN = 0.5  # share of a name's confidence where it takes a parameter at its b
 # times the noise, and times the fitted part's error on the rest, that halve it; more does not, for a good sensor knows
 # of no model error and an integrator drifts
 FAR_OFF, FAR_AHEAD = 16.0, 4.0
+SLIGHT = 3e-3  # share of the whole excess that halves the confidence of an effect which explains no more
 UNSURE = 0.5  # confidence below which a name is called likely
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
@@ -44,53 +46,6 @@ MOST_OPEN = 0.4  # share of the excess that no named law may leave
 # rivals whose error is within this share, and which take away this share of the mean square that the winner does,
 # cannot be told apart: under loud noise the first alone would hold for nearly any
 LIKE, AS_MUCH = 0.03, 0.995
-# a law that can imitate others -> factor by which its error must be smaller
-FLEXIBLE: dict[str, float] = {
-    "hysteresis": 1.25,
-    "static_curve": 1.1,
-    "extra_mode": 1.15,
-    "stribeck_friction": 1.05,
-    "periodic_force": 1.25,
-    "drift": 1.25,
-}
-# a law -> what it has as special cases: it always does as well, and is no rival of theirs
-CONTAINS = {
-    "hysteresis": ("backlash", "coulomb_friction", "linear_stiffness"),
-    "stribeck_friction": ("coulomb_friction",),
-    "clearance": ("piecewise_stiffness", "linear_stiffness"),  # one side of which is never touched; no gap
-    "piecewise_stiffness": ("linear_stiffness",),
-    "creep": ("linear_stiffness", "viscous_damping"),  # that takes longer than the record, or no time
-    "extra_mode": ("linear_stiffness", "viscous_damping"),  # above every frequency that is seen
-}
-# a law and one that it can imitate by its freedom alone -> how much nearer it has to come above the floor
-IMITATES = {
-    ("hysteresis", "coulomb_friction"): 1.4,
-    ("hysteresis", "stribeck_friction"): 1.4,
-    ("hysteresis", "backlash"): 1.4,
-    ("clearance", "piecewise_stiffness"): 1.4,
-    ("extra_mode", "delay"): 1.4,
-}
-FORMS = {
-    "mode": 1.15,
-    "off-centre": 1.05,
-    "asymmetric": 1.05,
-    "directional": 1.05,
-    "soft asymmetric": 1.05,
-    "power": 1.1,
-    "power with gain": 1.15,
-    "quintic": 1.05,
-    "geometric": 1.05,
-    "two-stage": 1.05,
-    "hertz": 1.05,
-    "progressive": 1.05,
-    "harmonics": 1.05,
-    "gradual": 1.05,
-    "root": 1.1,
-    "orifice": 1.1,
-    "polynomial": 1.05,
-    "attached mass": 1.1,
-    "generalized_play": 1.1,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,29 +67,6 @@ class Choice:
     gain: float
     remains: float
     margin: float
-
-
-def handicap(law: Law) -> float:
-    """Factor on the error of a law that can imitate others."""
-    return FLEXIBLE.get(law.id, 1.0) * FORMS.get(law.form, 1.0)
-
-
-def complements(one: Law, other: Law) -> bool:
-    """Whether two laws of a port are different physics: one opposes motion, the other is a curve of position."""
-    rubs, springs = sorted((one, other), key=lambda law: not law.dissipative)
-    apart = rubs.dissipative and not springs.dissipative and springs.reads() == {"z"} and not hasattr(springs, "step")
-    return apart and springs.order == 0 and rubs.id not in ("creep", "extra_mode")
-
-
-def imitates(candidate: Candidate, rival: Candidate, floor: float) -> bool:
-    """Whether a law comes so little nearer than another at its port, above the floor, that it may just imitate it.
-
-    It does so by its freedom: one of no more parameters cannot.
-    """
-    free = candidate.port == rival.port and candidate.size > rival.size
-    needed = IMITATES.get((candidate.law.id, rival.law.id), 0.0) if free else 0.0
-    own, other = (max(c.error**2 - floor, 0.05 * floor) for c in (candidate, rival))
-    return other < needed**2 * own
 
 
 def _near(candidate: Candidate, winner: Candidate, before: float) -> bool:
@@ -234,7 +166,8 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
     open_now = max(search.open_before.values(), default=0.0)
-    bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and not _swells(search))
+    own = None if error < AT_FLOOR * floor else ringing(search.bench, search.without)
+    bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and not _swells(search) and own is None)
     if faults and (bare or (open_now < HINT and not accepted) or cured):
         return "recording-fault", faults[0].sentence
     if bare and open_now < HINT:
@@ -243,10 +176,13 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
             f"deviation, and no force at any port explains any of the rest."
         )
     if not accepted:
+        rings = (
+            f"; what is left swings at the simulator's own {own:.3g} Hz, as from a force not recorded" if own else ""
+        )
         at = f"; a force at {where} could explain {open_now:.0%} of the rest" if open_now > HINT else ""
         return "unexplained", (
             f"Something is missing and no law of the catalogue explains it: refitted, the simulator is off by "
-            f"{error:.3g} of the outputs' deviation, the noise is about {floor:.3g}{at}."
+            f"{error:.3g} of the outputs' deviation, the noise is about {floor:.3g}{at}{rings}."
         )
     near = accepted[0].winner
     port = near.port
@@ -271,8 +207,8 @@ def confidence(choice: Choice, search: Search) -> float:
     """How sure the law's name is: from the margin over true rivals, lowered by what stays unexplained.
 
     At the noise floor a small margin over thousands of samples says more than the same margin where model error rules.
-    A tie between ports does not lower it, a tie between laws does, and so do a residual that stays many times the
-    noise, an error on what is not fitted far above that on what is, values at which the law is hardly what its name
+    A tie between ports does not lower it, a tie between laws does, and so do a mismatch of which it is a slight part
+    (an error of the first effect may be that), a residual that stays many times the noise, an error on what is not fitted far above that on what is, values at which the law is hardly what its name
     says, and a bound that holds a parameter of the law or of the simulator back short of the noise (other than zero,
     where a damper is that friction has replaced).
     """
@@ -284,10 +220,19 @@ def confidence(choice: Choice, search: Search) -> float:
     doubt = 1 / (1 + (remains / 0.15) ** 2) / (1 + (still / 0.3) ** 2)
     times2, unseen2 = search.base.cost / search.floor2, winner.tail / max(winner.head, 1e-300)
     doubt /= (1 + min(times2 / FAR_OFF**2, 1.0)) * (1 + float(np.clip((unseen2 - 1) / FAR_AHEAD**2, 0.0, 1.0)))
+    share = _share(choice, search)
+    doubt *= share / (share + SLIGHT * (1 - share))
     others = len({c.law.id for c in choice.alike} - {winner.law.id})
     pressed = (times2 > AT_FLOOR**2 and strained(search.base)) or (times2 > WELL_ABOVE**2 and winner.held_back)
     driven = DRIVEN if pressed or winner.doubtful else 1.0
     return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99))
+
+
+def _share(choice: Choice, search: Search) -> float:
+    """Share of the excess that was there when an effect was looked for."""
+    there = next((p.before for p in search.passes if p.choice is choice), (search.without.cost,) * 2)
+    excess = float(np.sqrt(there[0] * there[1])) - search.floor2
+    return float(np.clip(excess / max(search.without.cost - search.floor2, 1e-300), 0.0, 1.0))
 
 
 def strained(fitted: Fitted) -> bool:
