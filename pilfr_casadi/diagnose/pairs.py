@@ -21,10 +21,10 @@ from ..compiled import make_engine
 from ..threads import side_by_side
 from .candidate import Candidate, attempt
 from .explain import BRIEF, closed
+from .kinship import handicap
 from .linearise import linearised
 from .remainder import Dose, Remainder, held_out, orthonormal
 from .screen import Scored, start_values
-from .kinship import handicap
 from .workbench import Fitted, at_rest
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..laws.dynamic import Attached
 from .candidate import Candidate
-from .screen import Scored
 from .kinship import CONTAINS, FLEXIBLE
+from .screen import Scored
 
 IMITATED = 3  # simpler laws put up against one that can imitate others
 AHEAD = 1.5  # times the best error of a carried mass that is worth another start

@@ -208,9 +208,10 @@ def confidence(choice: Choice, search: Search) -> float:
 
     At the noise floor a small margin over thousands of samples says more than the same margin where model error rules.
     A tie between ports does not lower it, a tie between laws does, and so do a mismatch of which it is a slight part
-    (an error of the first effect may be that), a residual that stays many times the noise, an error on what is not fitted far above that on what is, values at which the law is hardly what its name
-    says, and a bound that holds a parameter of the law or of the simulator back short of the noise (other than zero,
-    where a damper is that friction has replaced).
+    (the error of another effect may be that), a residual that stays many times the noise, an error on what is not
+    fitted far above that on what is, values at which the law is hardly what its name says, and a bound that holds a
+    parameter of the law or of the simulator back short of the noise (other than zero, where a damper is that friction
+    has replaced).
     """
     winner, (remains, still) = choice.winner, left_open(search)
     error2 = max(winner.error**2, 1e-300)
