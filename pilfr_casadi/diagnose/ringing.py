@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from .workbench import Fitted, Workbench
 
 LIGHT = 0.15  # damping ratio below which a mode rings
-LOUD = 20.0  # times the spectrum around it
-FINE = 20  # lines of the spectrum up to a mode
-AVERAGED = 6  # half-overlapping segments that its spectrum is averaged over at least
+LOUD = 10.0  # times the spectrum around it
+FINE = 10  # lines of the spectrum up to a mode
+AVERAGED = 4  # half-overlapping segments that its spectrum is averaged over at least
 AROUND = 1.2, 1.8  # times a mode's frequency, above and below, where the spectrum is compared with
 
 

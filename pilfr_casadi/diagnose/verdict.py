@@ -140,11 +140,12 @@ def _like_noise(search: Search, times: float) -> bool:
     return times < SOMEWHAT or (times < COLOURED and unexplained and search.without.cost < LOUD**2)
 
 
-def _swells(search: Search) -> bool:
-    """Whether the residual swells with the inputs, the outputs or their rates."""
+def _shaped(search: Search) -> bool:
+    """Whether the residual swells with the inputs, the outputs or their rates, or swings as the simulator does."""
     records = search.bench.recordings
     signals = [np.column_stack([r.u, r.y, np.gradient(r.y, axis=0)])[r.skip :] for r in records]
-    return swells_with([e[r.skip :] for e, r in zip(search.without.residual, records, strict=True)], signals)
+    rest = [e[r.skip :] for e, r in zip(search.without.residual, records, strict=True)]
+    return swells_with(rest, signals) or ringing(search.bench, search.without) is not None
 
 
 def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
@@ -166,8 +167,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
     open_now = max(search.open_before.values(), default=0.0)
-    own = None if error < AT_FLOOR * floor else ringing(search.bench, search.without)
-    bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and not _swells(search) and own is None)
+    bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and not _shaped(search))
     if faults and (bare or (open_now < HINT and not accepted) or cured):
         return "recording-fault", faults[0].sentence
     if bare and open_now < HINT:
@@ -176,6 +176,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
             f"deviation, and no force at any port explains any of the rest."
         )
     if not accepted:
+        own = ringing(search.bench, search.without)
         rings = (
             f"; what is left swings at the simulator's own {own:.3g} Hz, as from a force not recorded" if own else ""
         )
