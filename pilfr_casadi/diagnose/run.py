@@ -25,6 +25,7 @@ from .prepare import Prepared, prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import MISHELD, Pass, Search
+from .undeclared import beyond_the_ports
 from .verdict import UNSURE, confidence, judge
 from .workbench import Fitted
 
@@ -107,6 +108,8 @@ def diagnose(
     verdict, sentence = judge(search, gates)
     if (lost := _lost_input(search, verdict)) is not None:
         verdict, sentence, gates = "recording-fault", lost.sentence, (*gates, lost)
+    elif verdict == "unexplained":
+        gates = (*gates, *beyond_the_ports(search))
     if search.interrupted and not accepted:
         sentence = (
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "
