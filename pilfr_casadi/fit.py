@@ -36,7 +36,7 @@ from .penalty import check_penalty
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings, check_for_identification
 from .solution import Status
-from .stability import stability_limits
+from .stability import check_room, stability_limits
 from .threads import one_blas_thread
 from .ways import at_values, from_starts, from_values, linear_only
 
@@ -188,6 +188,7 @@ def _fit(
         model = at_values(model, as_recordings(train)[0], start)
     if not isinstance(model, PILFR):
         given = model.model if isinstance(model, Fit) else model
+        check_room(given.parameters, job.limits)
         job = replace(job, recordings=check_for_identification(train, int(given.parameters.free.sum()) + 2))
         return from_values(given, structure, job, model if isinstance(model, Fit) else None)
     if not isinstance(model.element, PrandtlIshlinskii | StaticNetwork | None):
@@ -196,6 +197,7 @@ def _fit(
         )
     first = as_recordings(train)[0]
     shape = model.model(first.n_u, first.n_y).parameters
+    check_room(shape, job.limits)
     if job.l1:
         check_penalty(job.l1, shape, model.element is None)
     assert isinstance(start, str)

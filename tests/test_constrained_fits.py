@@ -3,6 +3,8 @@
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
@@ -14,6 +16,7 @@ from pilfr_casadi.limits import limits_of
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import InputError
 from pilfr_casadi.solution import Status
+from pilfr_casadi.stability import least_radius
 from pilfr_casadi.thinning import WAYS, thinned
 from problems.constrained import infeasible_sentences, radius, slowest_pole, sparse_plays, stability_table, three_plays
 
@@ -348,3 +351,30 @@ def test_what_bounds_nothing_is_refused(record, given, says):
 def test_a_gain_is_refused_where_its_formula_does_not_hold(record, model, kind):
     with pytest.raises(InputError, match=f"plays and stops, and the model has a {kind}"):
         pilfr.fit(model, record, starts=1, constraints=dc_gain(2.0))
+
+
+@pytest.mark.parametrize("nx, bounds, least", [(1, (1.5, 2), 1.5), (1, (-3, -1.1), 1.1), (2, (0.6, 2), 1.2)])
+def test_bounds_that_deny_every_stable_model_are_refused(record, nx, bounds, least):
+    structure = pilfr.PILFR(nx, PLAYS, bounds={"A": bounds})
+    with pytest.raises(InputError, match=f"allow no spectral radius below {least}.*at most 1 .*widen the bounds"):
+        pilfr.fit(structure, record, starts=1)
+    with pytest.raises(InputError, match="allow no spectral radius below"):
+        pilfr.fit(structure, record, start={"A": np.full((nx, nx), bounds[1])})
+
+
+def test_an_unstable_model_over_a_short_record_is_fitted_where_it_may_grow(record):
+    structure = pilfr.PILFR(1, PLAYS, bounds={"A": (1.05, 2)})
+    fit = pilfr.fit(structure, record.slice(0, 60), starts=1, stable=False)
+    assert np.isfinite(fit.train_nrmse[0]) and fit.parameters["A"].item() >= 1.05
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 4))
+def test_no_matrix_between_bounds_has_a_smaller_radius(seed, n):
+    rng = np.random.default_rng(seed)
+    low = rng.normal(size=(n, n)) if seed % 2 else np.abs(rng.normal(size=(n, n)))
+    high = low + np.abs(rng.normal(size=(n, n)))
+    low, high = (low, high) if seed % 3 else (-high, -low)
+    least = least_radius(low, high)
+    for _ in range(20):
+        matrix = rng.uniform(low, high)
+        assert np.max(np.abs(np.linalg.eigvals(matrix))) >= least * (1 - 1e-12)
