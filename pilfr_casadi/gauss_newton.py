@@ -39,6 +39,7 @@ from .solution import Iteration, Progress, Solution, Status
 
 FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
 RETURNS = 4  # times that a run which has strayed goes on from the best feasible point
+ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # as far as a run gets
 Watch = Callable[[np.ndarray], bool]
 NOTHING = 1e-24  # a cost that is rounding: outputs are off by 1e-12 of their size
 
@@ -134,10 +135,13 @@ class _Run:
             with handled_interrupt(self._interrupt):  # casadi may swallow a KeyboardInterrupt
                 status = self._iterate()
                 for k in range(RETURNS):
-                    if not self._strayed(status):
+                    if self.penalty.shrink(self.theta):
+                        self.best = Feasible(self.options.tolerance)
+                    elif self._strayed(status):
+                        self._back()
+                        self.penalty.raise_to(2.0 * self.best.tempting)
+                    else:
                         break
-                    self._back()
-                    self.penalty.raise_to(2.0 * self.best.tempting)
                     self.damping, self.growth = self.options.damping * 10.0**k, 2.0
                     status = self._iterate()
         except KeyboardInterrupt:
@@ -146,6 +150,9 @@ class _Run:
         if self.best.better(self.cost, self.penalty.violation(self.theta)) and not (limited and unfinished):
             status = Status.SOLVER_FAILED if self._strayed(status) else status
             self._back()
+        self.penalty.shrink(self.theta)
+        if status in ENDED and np.any(self.penalty.violations(self.theta) > TOLERATED):
+            status = Status.INFEASIBLE
         return self._finish(status)
 
     def _strayed(self, status: Status) -> bool:

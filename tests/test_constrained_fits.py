@@ -9,6 +9,7 @@ from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.constraints import BeyondRadius, Constraint, stable
+from pilfr_casadi.exact_penalty import ExactPenalty
 from pilfr_casadi.exactness import beyond, exactly
 from pilfr_casadi.known import Gain, dc_gain, ordered
 from pilfr_casadi.known_blocks import changed_basis, nearest_basis
@@ -127,6 +128,34 @@ def test_a_second_fit_under_the_same_constraint_is_never_worse():
     assert first.status.converged and second.status.converged
     assert second.train_nrmse[0] <= first.train_nrmse[0]
     assert second.solution.violation <= 1e-6
+
+
+@pytest.mark.parametrize("seed, gain", [(5, 2.0), (8, 2.0), (10, 2.0), (11, 1.0)])
+def test_a_gain_far_from_the_machines_own_is_met(seed, gain):
+    """Beside a slow pole a gain has immense slopes, at a pole of 1 no value; one start may miss it, another not."""
+    fit = pilfr.fit(pilfr.PILFR(2, PLAYS), coupled_plays(seed), starts=4, constraints=[dc_gain(gain)])
+    assert fit.status.converged and all(limit.met for limit in fit.limits)
+
+
+def test_a_gain_at_an_integrator_has_no_value(record):
+    model = pilfr.PILFR(1, bounds={"A": (0.0, 1.0)}).model(1, 1, {"A": [[1.0]], "B_u": [[1.0]], "C_y": [[1.0]]})
+    with pytest.raises(InputError, match="'DC gain = 1' has no finite value at the start values"):
+        Problem(model, record, constraints=[dc_gain(1.0)])
+    model = model.with_parameters(model.parameters.change(A={"value": [[0.9]]}))
+    problem = Problem(model, record, constraints=[dc_gain(1.0)])
+    penalty = ExactPenalty(problem)
+    assert penalty.violations(np.array([0.9, 1.0, 1.0, 0.0, 0.0]))[0] == pytest.approx(9.0)
+    assert penalty.violations(np.array([1.0, 1.0, 1.0, 0.0, 0.0]))[0] == np.inf
+
+
+def test_a_unit_from_beside_a_pole_is_taken_anew(record):
+    model = pilfr.PILFR(1).model(1, 1, {"A": [[1 - 1e-9]], "B_u": [[1.0]], "C_y": [[1.0]]})
+    problem = Problem(model, record, constraints=[dc_gain(1.0)])
+    penalty, away = ExactPenalty(problem), np.array([0.9, 1.0, 1.0, 0.0, 0.0])
+    penalty.measure(problem.start, np.ones(problem.size))
+    assert penalty.unit[0] > 1e15 and penalty.violation(away) < 1e-12  # off by 9, and it seems nothing
+    assert penalty.shrink(away) and penalty.unit[0] < 200 and penalty.violation(away) > 0.05
+    assert not penalty.shrink(away)
 
 
 def test_a_gain_within_limits_is_exact(record):

@@ -145,7 +145,7 @@ class Wavy(Scalar):
     def constraint_jacobian(self, theta):
         return (0.3 + np.sin(theta)).reshape(1, 1)
 
-    def constraint_units(self, theta, squares):
+    def constraint_units(self, theta, squares=None):
         return np.ones(1)
 
 
