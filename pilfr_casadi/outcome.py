@@ -13,6 +13,7 @@ from .model import Model
 from .multistart import PRIOR
 from .open_memory import open_memory_sentence
 from .problem import Problem
+from .reached_gain import reached_gain_sentence
 from .recording import Recording
 from .search import Candidate
 from .solution import Solution
@@ -39,7 +40,8 @@ def outcome(
     """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
 
     Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the standard
-    errors know of them. The note also says which memory a periodic steady state leaves open (`open_memory`).
+    errors know of them. The note also says which memory a periodic steady state leaves open (`open_memory`), and
+    which DC gain holds beyond the recordings alone (`reached_gain`).
     """
     fitted = with_solution(model, problem, solution)
     judged = problem
@@ -51,7 +53,8 @@ def outcome(
         options: dict[str, Any] = {"constraints": problem.constraints, "noise": problem.noise, "scale": problem.scale}
         judged = Problem(fitted, recordings, engine=problem.engine, **options)
     theta = solution.theta
-    note = "; ".join(part for part in (note, open_memory_sentence(judged, theta)) if part)
+    told = (note, open_memory_sentence(judged, theta), reached_gain_sentence(problem, theta))
+    note = "; ".join(part for part in told if part)
     at_bound = [
         f"{label} = {value:g}"
         for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)

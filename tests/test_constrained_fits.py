@@ -3,13 +3,10 @@
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.constraints import BeyondRadius, Constraint, stable
-from pilfr_casadi.exact_penalty import ExactPenalty
 from pilfr_casadi.exactness import beyond, exactly
 from pilfr_casadi.known import Gain, dc_gain, ordered
 from pilfr_casadi.known_blocks import changed_basis, nearest_basis
@@ -17,7 +14,6 @@ from pilfr_casadi.limits import limits_of
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import InputError
 from pilfr_casadi.solution import Status
-from pilfr_casadi.stability import least_radius
 from pilfr_casadi.thinning import WAYS, thinned
 from problems.constrained import infeasible_sentences, radius, slowest_pole, sparse_plays, stability_table, three_plays
 
@@ -128,34 +124,6 @@ def test_a_second_fit_under_the_same_constraint_is_never_worse():
     assert first.status.converged and second.status.converged
     assert second.train_nrmse[0] <= first.train_nrmse[0]
     assert second.solution.violation <= 1e-6
-
-
-@pytest.mark.parametrize("seed, gain", [(5, 2.0), (8, 2.0), (10, 2.0), (11, 1.0)])
-def test_a_gain_far_from_the_machines_own_is_met(seed, gain):
-    """Beside a slow pole a gain has immense slopes, at a pole of 1 no value; one start may miss it, another not."""
-    fit = pilfr.fit(pilfr.PILFR(2, PLAYS), coupled_plays(seed), starts=4, constraints=[dc_gain(gain)])
-    assert fit.status.converged and all(limit.met for limit in fit.limits)
-
-
-def test_a_gain_at_an_integrator_has_no_value(record):
-    model = pilfr.PILFR(1, bounds={"A": (0.0, 1.0)}).model(1, 1, {"A": [[1.0]], "B_u": [[1.0]], "C_y": [[1.0]]})
-    with pytest.raises(InputError, match="'DC gain = 1' has no finite value at the start values"):
-        Problem(model, record, constraints=[dc_gain(1.0)])
-    model = model.with_parameters(model.parameters.change(A={"value": [[0.9]]}))
-    problem = Problem(model, record, constraints=[dc_gain(1.0)])
-    penalty = ExactPenalty(problem)
-    assert penalty.violations(np.array([0.9, 1.0, 1.0, 0.0, 0.0]))[0] == pytest.approx(9.0)
-    assert penalty.violations(np.array([1.0, 1.0, 1.0, 0.0, 0.0]))[0] == np.inf
-
-
-def test_a_unit_from_beside_a_pole_is_taken_anew(record):
-    model = pilfr.PILFR(1).model(1, 1, {"A": [[1 - 1e-9]], "B_u": [[1.0]], "C_y": [[1.0]]})
-    problem = Problem(model, record, constraints=[dc_gain(1.0)])
-    penalty, away = ExactPenalty(problem), np.array([0.9, 1.0, 1.0, 0.0, 0.0])
-    penalty.measure(problem.start, np.ones(problem.size))
-    assert penalty.unit[0] > 1e15 and penalty.violation(away) < 1e-12  # off by 9, and it seems nothing
-    assert penalty.shrink(away) and penalty.unit[0] < 200 and penalty.violation(away) > 0.05
-    assert not penalty.shrink(away)
 
 
 def test_a_gain_within_limits_is_exact(record):
@@ -380,30 +348,3 @@ def test_what_bounds_nothing_is_refused(record, given, says):
 def test_a_gain_is_refused_where_its_formula_does_not_hold(record, model, kind):
     with pytest.raises(InputError, match=f"plays and stops, and the model has a {kind}"):
         pilfr.fit(model, record, starts=1, constraints=dc_gain(2.0))
-
-
-@pytest.mark.parametrize("nx, bounds, least", [(1, (1.5, 2), 1.5), (1, (-3, -1.1), 1.1), (2, (0.6, 2), 1.2)])
-def test_bounds_that_deny_every_stable_model_are_refused(record, nx, bounds, least):
-    structure = pilfr.PILFR(nx, PLAYS, bounds={"A": bounds})
-    with pytest.raises(InputError, match=f"allow no spectral radius below {least}.*at most 1 .*widen the bounds"):
-        pilfr.fit(structure, record, starts=1)
-    with pytest.raises(InputError, match="allow no spectral radius below"):
-        pilfr.fit(structure, record, start={"A": np.full((nx, nx), bounds[1])})
-
-
-def test_an_unstable_model_over_a_short_record_is_fitted_where_it_may_grow(record):
-    structure = pilfr.PILFR(1, PLAYS, bounds={"A": (1.05, 2)})
-    fit = pilfr.fit(structure, record.slice(0, 60), starts=1, stable=False)
-    assert np.isfinite(fit.train_nrmse[0]) and fit.parameters["A"].item() >= 1.05
-
-
-@given(seed=st.integers(0, 10_000), n=st.integers(1, 4))
-def test_no_matrix_between_bounds_has_a_smaller_radius(seed, n):
-    rng = np.random.default_rng(seed)
-    low = rng.normal(size=(n, n)) if seed % 2 else np.abs(rng.normal(size=(n, n)))
-    high = low + np.abs(rng.normal(size=(n, n)))
-    low, high = (low, high) if seed % 3 else (-high, -low)
-    least = least_radius(low, high)
-    for _ in range(20):
-        matrix = rng.uniform(low, high)
-        assert np.max(np.abs(np.linalg.eigvals(matrix))) >= least * (1 - 1e-12)
