@@ -94,8 +94,10 @@ def fit(
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
         exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one. A number below
-        1 is a least rate of decay; False is no bound. The slope is that of plays and stops, `Σ w`: the envelopes of
-        generalized plays and other elements are not looked at, of which the linear part alone is bounded.
+        1 is a least rate of decay; False is no bound. The slope is `Σ w` of plays and stops, and that times the slope
+        far out of each envelope of generalized plays, also where they are parts of a `Combined`; where an envelope is
+        so steep in between that small motions there grow, the fit says so. Of elements with bounded forces the linear
+        part decides; of envelopes of your own no slope is known, which the fit says.
     constraints
         See `Problem`.
     noise : float, optional

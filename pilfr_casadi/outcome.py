@@ -17,6 +17,7 @@ from .reached_gain import reached_gain_sentence
 from .recording import Recording
 from .search import Candidate
 from .solution import Solution
+from .stability import unbounded_sentence
 
 
 def with_solution(model: Model, problem: Problem, solution: Solution) -> Model:
@@ -53,7 +54,13 @@ def outcome(
         options: dict[str, Any] = {"constraints": problem.constraints, "noise": problem.noise, "scale": problem.scale}
         judged = Problem(fitted, recordings, engine=problem.engine, **options)
     theta = solution.theta
-    told = (note, open_memory_sentence(judged, theta), reached_gain_sentence(problem, theta))
+    values = problem.model.parameters.unpack(problem.parameters(theta))
+    told = (
+        note,
+        open_memory_sentence(judged, theta),
+        reached_gain_sentence(problem, theta),
+        unbounded_sentence(structure, problem.constraints, values),
+    )
     note = "; ".join(part for part in told if part)
     at_bound = [
         f"{label} = {value:g}"

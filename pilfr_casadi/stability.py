@@ -6,32 +6,74 @@ Frobenius).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from .combined import element_slopes, unknown_slope
 from .constraints import BeyondRadius, Constraint, linear_part, stable
 from .elements import PrandtlIshlinskii
 from .lfr import PILFR
+from .operators import GeneralizedPlay
 from .parameters import ParameterSet
 from .recording import InputError
 
 
+@dataclass(frozen=True)
+class WithElement:
+    """`A + B_w S C_z` with one of an element's slopes S; a class, so that it can be sent to other processes."""
+
+    element: Any
+    slope: str
+
+    def __call__(self, p: Mapping[str, Any]) -> Any:
+        """The expression for named parameters p."""
+        return p["A"] + p["B_w"] @ element_slopes(self.element, p)[self.slope] @ p["C_z"]
+
+
 def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tuple[Constraint, ...]:
-    """Bounds on the spectral radius of A, and of A + B_w diag(Σw) C_z: no operator slips, or all (stops: sticks)."""
+    """Bounds on the spectral radius of A, and of A + B_w S C_z with each slope S that the element has (`slopes`).
+
+    With plays no operator slips, or all do (with stops: sticks).
+    """
     if structure.nx == 0:
         return ()
     limits: tuple[Constraint, ...] = (stable(radius, exact=exact),)
     element = structure.element
-    if isinstance(element, PrandtlIshlinskii):
-        limits += (stable(radius, _with_element, "spectral radius with the element's full slope", exact=exact),)
+    if element is not None:
+        symbols = {name: ca.MX.sym(name, *p.shape) for name, p in element.parameters().items()}
+        for slope in element_slopes(element, symbols):
+            name = f"spectral radius with the element's {slope}"
+            limits += (stable(radius, WithElement(element, slope), name, exact=exact),)
     return limits
 
 
-def _with_element(p: Any) -> Any:
-    return p["A"] + p["B_w"] @ ca.diag(ca.sum2(p["w"])) @ p["C_z"]
+def unbounded_sentence(structure: PILFR | None, constraints: Iterable[Constraint], p: Mapping[str, Any]) -> str:
+    """What bounds on spectral radii leave open of an element that is fed back, p named numbers; empty where nothing."""
+    radii = [c.check.radius for c in constraints if isinstance(c.check, BeyondRadius)]
+    element = structure.element if structure else None
+    if element is None or not radii or not np.any(np.sum(np.abs(p["C_z"]), axis=1) * np.sum(np.abs(p["B_w"]), axis=0)):
+        return ""
+    if unknown_slope(element, p):
+        return (
+            "the spectral radius is bounded for the linear part alone: how steep the element is that is fed back is "
+            "not known, as with envelopes of your own, so judge stability by simulations beyond the recorded amplitudes"
+        )
+    if not isinstance(element, PrandtlIshlinskii) or not isinstance(element.operator, GeneralizedPlay):
+        return ""
+    worst = 0.0
+    for side in "lr":
+        slope = np.diag(np.sum(p["w"], axis=1) * element.operator.steepest(side, p))
+        worst = max(worst, float(np.max(np.abs(np.linalg.eigvals(p["A"] + p["B_w"] @ slope @ p["C_z"])))))
+    if worst <= min(radii):
+        return ""
+    return (
+        f"where an envelope is steepest the spectral radius is {worst:.4g}, above its bound of {min(radii):g}, which "
+        "holds far out: small motions there may grow until the envelope is flatter"
+    )
 
 
 def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
