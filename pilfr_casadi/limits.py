@@ -6,15 +6,15 @@ over the output's deviation) would fall if the limit were moved outwards: it say
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from .constraints import TOLERATED, BeyondRadius
 from .problem import Problem
-from .solution import Solution
+from .solution import Solution, Status
 
 AT_RADIUS = 1e-3  # share of a bound by which a radius that it holds may lie inside
 FELT = 1e-3  # multiplier next to the logarithm of a radius, in units of the objective, from which a bound holds it
@@ -35,7 +35,7 @@ class Limit:
         itself, by the eigenvalues of the result, and what it is to be at most.
     multiplier : float
         Fall of the objective for each unit that the limit is moved outwards; 0 where it is not active, nan where the
-        solver gave none.
+        solver gave none, or ended where the error has a kink (`Status.SMALL_STEP`): there is no such rate there.
     active : bool
         Whether the value is at a limit.
     met : bool
@@ -61,6 +61,27 @@ class Limit:
 
 def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
     """All general constraints and the bounds that are active, as they are at a solution."""
+    limits = _limits_of(problem, solution)
+    if solution.status is not Status.SMALL_STEP:
+        return limits
+    return tuple(replace(limit, multiplier=np.nan) if limit.active else limit for limit in limits)
+
+
+def unknown_multipliers(limits: Sequence[Limit]) -> str:
+    """That multipliers of active constraints are not known, empty where they are."""
+    names = [
+        limit.name for limit in limits if limit.kind == "constraint" and limit.active and np.isnan(limit.multiplier)
+    ]
+    if not names:
+        return ""
+    return (
+        f"multipliers are not known ({', '.join(names)}): the solver ended in steps too small to matter, as at a kink "
+        "of the error, where no rate holds on both sides"
+    )
+
+
+def _limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
+    """The same with the multipliers of the solver's last step, wherever it was."""
     theta, n = solution.theta, problem.size
     known = len(solution.multipliers) == n + len(problem.g_lower)
     size = np.abs(solution.multipliers) if known else np.full(n + len(problem.g_lower), np.nan)
