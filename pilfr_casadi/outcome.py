@@ -37,8 +37,11 @@ def outcome(
     note: str = "",
     linear_nrmse: tuple[float, ...] = (),
     engine: str = "auto",
+    minimum: bool = True,
 ) -> Fit:
     """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
+
+    Standard errors are those of a `minimum` of the simulation error; where it is none there are none.
 
     Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the standard
     errors know of them. The note also says which memory a periodic steady state leaves open (`open_memory`), and
@@ -77,7 +80,7 @@ def outcome(
         train_nrmse=tuple(problem.nrmse(theta)),
         initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
         labels=problem.labels,
-        errors=standard_errors(judged, theta, structure),
+        errors=standard_errors(judged, theta, structure) if minimum else {},
         active=tuple(at_bound),
         candidates=candidates,
         linear=linear,
