@@ -135,7 +135,7 @@ class _Run:
             with handled_interrupt(self._interrupt):  # casadi may swallow a KeyboardInterrupt
                 status = self._iterate()
                 for k in range(RETURNS):
-                    if self.penalty.shrink(self.theta):
+                    if status in ENDED and self.penalty.shrink(self.theta):
                         self.best = Feasible(self.options.tolerance)
                     elif self._strayed(status):
                         self._back()
