@@ -7,14 +7,14 @@ over the output's deviation) would fall if the limit were moved outwards: it say
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from .constraints import TOLERATED, BeyondRadius
 from .problem import Problem
-from .solution import Solution, Status
+from .solution import Solution
 
 AT_RADIUS = 1e-3  # share of a bound by which a radius that it holds may lie inside
 FELT = 1e-3  # multiplier next to the logarithm of a radius, in units of the objective, from which a bound holds it
@@ -35,7 +35,7 @@ class Limit:
         itself, by the eigenvalues of the result, and what it is to be at most.
     multiplier : float
         Fall of the objective for each unit that the limit is moved outwards; 0 where it is not active, nan where the
-        solver gave none, or ended where the error has a kink (`Status.SMALL_STEP`): there is no such rate there.
+        solver gave none, or ended at a kink of the error, where there is no such rate.
     active : bool
         Whether the value is at a limit.
     met : bool
@@ -59,14 +59,6 @@ class Limit:
         return f"{self.name}: {self.value:.9g}, {f'active{cost}' if self.active else 'not active'}"
 
 
-def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
-    """All general constraints and the bounds that are active, as they are at a solution."""
-    limits = _limits_of(problem, solution)
-    if solution.status is not Status.SMALL_STEP:
-        return limits
-    return tuple(replace(limit, multiplier=np.nan) if limit.active else limit for limit in limits)
-
-
 def unknown_multipliers(limits: Sequence[Limit]) -> str:
     """That multipliers of active constraints are not known, empty where they are."""
     names = [
@@ -80,8 +72,8 @@ def unknown_multipliers(limits: Sequence[Limit]) -> str:
     )
 
 
-def _limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
-    """The same with the multipliers of the solver's last step, wherever it was."""
+def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
+    """All general constraints and the bounds that are active, as they are at a solution."""
     theta, n = solution.theta, problem.size
     known = len(solution.multipliers) == n + len(problem.g_lower)
     size = np.abs(solution.multipliers) if known else np.full(n + len(problem.g_lower), np.nan)
@@ -97,7 +89,8 @@ def _limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
         values = problem.model.parameters.unpack(problem.parameters(theta))
         for i, (name, check) in enumerate(zip(problem.g_labels, checks, strict=True)):
             if isinstance(check, BeyondRadius):
-                out.append(_radius(name, check, values, float(size[n + i]), solution.cost))
+                felt = not known or bool(size[n + i] > FELT * solution.cost)
+                out.append(_radius(name, check, values, float(size[n + i]), felt))
                 continue
             numbers = float(g[i]), float(low[i]), float(high[i]), float(size[n + i] if active[i] else 0.0)
             out.append(Limit(name, "constraint", *numbers, active=bool(active[i]), met=bool(met[i])))
@@ -108,9 +101,9 @@ def _limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
     return tuple(out)
 
 
-def _radius(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, cost: float) -> Limit:
-    """A bound on a spectral radius; `force` is its multiplier next to the logarithm."""
+def _radius(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, felt: bool) -> Limit:
+    """A bound on a spectral radius; `force` is its multiplier next to the logarithm, `felt` if that counts."""
     excess, bound = check(values), check.radius
-    active = -excess <= AT_RADIUS * bound and (not force <= FELT * cost or -excess <= 10 * TOLERATED * bound)
+    active = -excess <= AT_RADIUS * bound and (felt or -excess <= 10 * TOLERATED * bound)
     multiplier = force / bound if active else 0.0
     return Limit(name, "constraint", excess + bound, -np.inf, bound, multiplier, active, met=excess <= 0)
