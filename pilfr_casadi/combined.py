@@ -132,6 +132,20 @@ class Combined:
             following.append(after)
         return ca.vertcat(*w), ca.vertcat(*following)
 
+    def slopes(self, p: Mapping[str, Any]) -> dict[str, Any]:
+        """Slopes of w over z (channels, channels) of all parts together, as of each alone; bounded parts add none."""
+        known = [(part, element_slopes(part.element, _Own(p, part))) for part in self.parts]
+        names = max((tuple(slopes) for _, slopes in known), key=len)
+        out = {}
+        for k, name in enumerate(names):
+            total: Any = ca.DM(self.channels, self.channels)
+            for part, slopes in known:
+                if slopes:
+                    own = list(slopes.values())[min(k, len(slopes) - 1)]
+                    total = total + _placed(self.channels, part.writes) @ own @ _placed(self.channels, part.reads).T
+            out[name] = total
+        return out
+
     def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
         """Largest |w| of each channel where |z| is at most `size`, (channels,); infinite where a part is unbounded."""
         out = np.zeros(self.channels)
@@ -161,3 +175,22 @@ def element_bound(element: Element, p: Mapping[str, Any], size: np.ndarray) -> n
     """Largest |w| of each channel of an element whose signals are at most `size`, (channels,); infinite if unknown."""
     bound = getattr(element, "bound", None)
     return np.full(element.channels, np.inf) if bound is None else np.asarray(bound(p, size), dtype=float)
+
+
+def element_slopes(element: Element, p: Mapping[str, Any]) -> dict[str, Any]:
+    """Slopes of an element, (channels, channels) each, by what they are the slopes of; none where none is known."""
+    slopes = getattr(element, "slopes", None)
+    return {} if slopes is None else dict(slopes(p))
+
+
+def unknown_slope(element: Element, p: Mapping[str, Any]) -> bool:
+    """Whether an element of the named numbers p may grow with its signals and how steeply is not known."""
+    if isinstance(element, Combined):
+        return any(unknown_slope(part.element, _Own(p, part)) for part in element.parts)
+    bounded = bool(np.all(np.isfinite(element_bound(element, p, np.full(element.channels, np.inf)))))
+    return not bounded and not element_slopes(element, p)
+
+
+def _placed(channels: int, at: tuple[int, ...]) -> ca.DM:
+    """A matrix (channels, k) of zeros and ones that puts k signals where they belong."""
+    return ca.DM(np.eye(channels)[:, list(at)])

@@ -35,7 +35,9 @@ from .sensitivities import Engine, VirtualMachine, linearize
 # without contraction the generated step gives the very numbers of the virtual machine: what slips, slips in both
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 FLAGS = (("-march=native", *COMMON), COMMON)  # the second where the first is not understood
-PLAIN, LOOPS = "-O1", "-O2"  # long straight lines take seconds to optimise and gain nothing from it, unlike the loops
+# long straight lines take seconds to optimise and gain nothing from it, unlike the loops; each output is asked whether
+# it is wanted, and to thread thousands of such jumps takes GCC minutes
+PLAIN, LOOPS = ("-O1", "-fno-thread-jumps"), ("-O2",)
 KEPT = 40  # libraries in each of the cache's 256 folders: some hundred megabytes
 WRITTEN = 64  # states with memory up to which slopes written out fit the nearest cache
 PATIENCE = 600.0  # seconds for one compilation
@@ -113,13 +115,13 @@ def _thin(shelf: Path) -> None:
             library.unlink()
 
 
-def _compile(cc: str, source: str, key: str, level: str) -> Path:
+def _compile(cc: str, source: str, key: str, level: tuple[str, ...]) -> Path:
     """Compile under another name first, so that a library is never half there."""
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
         c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
         c_file.write_text(source, encoding="utf-8")
-        for flags in FLAGS:
-            command = [cc, level, *flags, str(c_file), "-o", str(partial), "-lm"]
+        for some, flags in zip((level, level[:1]), FLAGS, strict=True):
+            command = [cc, *some, *flags, str(c_file), "-o", str(partial), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
             if not done.returncode and partial.exists():
                 library = _shelf(key) / f"{key}-{_digest(partial)}.so"
@@ -130,7 +132,7 @@ def _compile(cc: str, source: str, key: str, level: str) -> Path:
     raise OSError((done.stderr.strip().splitlines() or ["it wrote no library"])[0][:300])
 
 
-def build(source: str, level: str = PLAIN) -> Path:
+def build(source: str, level: tuple[str, ...] = PLAIN) -> Path:
     """The library of a source, from the cache or compiled.
 
     Raises
@@ -141,7 +143,7 @@ def build(source: str, level: str = PLAIN) -> Path:
     cc = compiler()
     if cc is None:
         raise InputError("No C compiler was found; install one (cc, gcc or clang) or use engine='vm'.")
-    key = hashlib.sha256("\n".join((source, level, _machine(cc))).encode()).hexdigest()[:32]
+    key = hashlib.sha256("\n".join((source, *level, _machine(cc))).encode()).hexdigest()[:32]
     for library in _shelf(key).glob(f"{key}-*.so"):
         if library.stem == f"{key}-{_digest(library)}":
             with contextlib.suppress(OSError):

@@ -24,6 +24,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from .expressions import numbers_or_nan
 from .parameters import ParameterSet
 from .recording import InputError
 
@@ -177,12 +178,12 @@ class Rows:
         check_free(self.function, self._slope, parameters.free, p, self.lower, self.upper, self.labels, held, logs)
 
     def values(self, p: np.ndarray) -> np.ndarray:
-        """Shape (n_g,)."""
-        return np.asarray(self.function(p)).ravel()
+        """Shape (n_g,); nan where they cannot be computed, such as a gain where a pole is 1 to the last digit."""
+        return numbers_or_nan(self.function, p).ravel()
 
     def slope(self, p: np.ndarray) -> np.ndarray:
         """Shape (n_g, n_p)."""
-        return np.asarray(self._slope(p))
+        return numbers_or_nan(self._slope, p)
 
 
 def compile_constraints(
@@ -281,8 +282,8 @@ def check_free(
         With its name, its value and its limits.
     """
     reach = np.asarray(ca.DM(g.jac_sparsity(0, 0), 1).full(), dtype=bool).reshape(len(labels), len(p))
-    value = np.asarray(g(p)).ravel()
-    steep = np.asarray(slope(p)).reshape(len(labels), len(p))[:, free]
+    value = numbers_or_nan(g, p).ravel()
+    steep = numbers_or_nan(slope, p).reshape(len(labels), len(p))[:, free]
     for i in np.flatnonzero(~np.isfinite(value) | ~np.all(np.isfinite(steep), axis=1)):
         what, shown = ("value", value[i]) if not np.isfinite(value[i]) else ("slope", np.nan)
         raise InputError(

@@ -14,7 +14,7 @@ from .gauss_newton import GaussNewton
 from .model import Model
 from .problem import Problem
 from .recording import InputError, Recording
-from .solution import Solution, Status
+from .solution import Progress, Solution, Status
 
 PATIENCE = 20  # points in a row that do not improve on the best
 
@@ -81,10 +81,12 @@ class Watch:
         return self.failed >= self.patience
 
 
-def solve_watched(solver: GaussNewton, problem: Problem, held: Problem, start: np.ndarray) -> Solution:
+def solve_watched(
+    solver: GaussNewton, problem: Problem, held: Problem, start: np.ndarray, progress: Progress | None = None
+) -> Solution:
     """The solver's solution, moved back to the point with the smallest error on `held`."""
     watch = Watch(held)
-    solution = solver.solve(problem, start, None, watch)
+    solution = solver.solve(problem, start, progress, watch)
     if not watch.theta.size or solution.status is Status.INTERRUPTED:
         return solution
     if watch(solution.theta) or watch.failed:

@@ -99,6 +99,18 @@ class PrandtlIshlinskii:
         w = [sum(w_out[i * self.n + 1 : (i + 1) * self.n], w_out[i * self.n]) for i in range(self.channels)]
         return ca.vertcat(*w), ca.vertcat(*s_out)
 
+    def slopes(self, p: Mapping[str, Any]) -> dict[str, Any]:
+        """Slopes of w over z (channels, channels) in large motions, of stops in small ones, by what they belong to.
+
+        `Σ w` of plays, which all slip then, and of stops, which all stick; of generalized plays that times the slope of
+        each envelope network far out. None is known of envelopes of one's own.
+        """
+        full, operator = ca.sum2(p["w"]), self.operator
+        if not isinstance(operator, GeneralizedPlay):
+            return {"full slope": ca.diag(full)}
+        sides = {"lower": "l", "upper": "r"} if operator.networks else {}
+        return {f"{which} envelope far out": ca.diag(full * operator.far_slope(s, p)) for which, s in sides.items()}
+
     def bound(self, p: Mapping[str, Any], size: np.ndarray) -> np.ndarray:
         """Largest |w| of each channel where |z| is at most `size` (channels,), from memory zero.
 

@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .constraints import TOLERATED
+
 if TYPE_CHECKING:
     from .lifted import Lifted
     from .problem import Problem
 
+SHRUNK = 1e-2  # share of its first unit below which a constraint's unit is taken anew
+
 
 class ExactPenalty:
-    """The constraints of a problem, measured once and for all where each first has a slope.
+    """The constraints of a problem, measured where each first has a slope, and where a run ends (`shrink`).
 
     Attributes
     ----------
@@ -38,6 +42,18 @@ class ExactPenalty:
             first = ~self._known & (unit > 0)
             self.unit[first], self._known[first] = unit[first], True
 
+    def shrink(self, theta: np.ndarray) -> bool:
+        """Take units at θ that are far smaller than they were; whether these alone tell of a violation.
+
+        Where a constraint has a pole nearby, such as a gain beside an integrator, its first unit may be immense.
+        """
+        if not len(self.unit):
+            return False
+        unit, before = self.problem.constraint_units(theta), self.violations(theta)
+        smaller = self._known & (unit > 0) & (unit < SHRUNK * self.unit)
+        self.unit = np.where(smaller, unit, self.unit)
+        return bool(np.any((before <= TOLERATED) & (self.violations(theta) > TOLERATED)))
+
     def values(self, theta: np.ndarray) -> np.ndarray:
         """The constraints in their units, shape (n_g,)."""
         return self.problem.constraint(theta) / self.unit if len(self.unit) else np.zeros(0)
@@ -51,11 +67,12 @@ class ExactPenalty:
         return self.problem.g_lower / self.unit - values, self.problem.g_upper / self.unit - values
 
     def violations(self, theta: np.ndarray) -> np.ndarray:
-        """Violation of each constraint in its unit, shape (n_g,)."""
+        """Violation of each constraint in its unit, shape (n_g,); infinite where it has no value."""
         if not len(self.unit):
             return np.zeros(0)
         low, high = self.room(self.values(theta))
-        return np.maximum(np.maximum(low, -high), 0.0)
+        over = np.maximum(np.maximum(low, -high), 0.0)
+        return np.where(np.isnan(over), np.inf, over)
 
     def violation(self, theta: np.ndarray) -> float:
         """Their sum."""

@@ -1,10 +1,16 @@
-"""Functions of a user's own, called with the symbols that they name: `x.<state>`, `u.<input>`, `p.<parameter>`."""
+"""Functions of a user's own, called with the symbols that they name: `x.<state>`, `u.<input>`, `p.<parameter>`.
+
+What they amount to may have no value at some numbers (`numbers_or_nan`).
+"""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
+
+import casadi as ca
+import numpy as np
 
 from .recording import InputError
 
@@ -62,3 +68,11 @@ def call(function: Expression, what: str, **available: Any) -> Any:
                 "use casadi.if_else, casadi.fmin and casadi.fmax."
             ) from error
         raise InputError(f"The {what} fails: {type(error).__name__}: {error}.") from error
+
+
+def numbers_or_nan(function: ca.Function, *arguments: Any) -> np.ndarray:
+    """The first output of a function, nan where CasADi gives none: its linear solvers raise at a singular matrix."""
+    try:
+        return np.asarray(function.call(arguments)[0])
+    except RuntimeError:
+        return np.full(function.size_out(0), np.nan)

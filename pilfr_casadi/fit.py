@@ -36,7 +36,7 @@ from .penalty import check_penalty
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings, check_for_identification
 from .solution import Status
-from .stability import stability_limits
+from .stability import check_room, stability_limits
 from .threads import one_blas_thread
 from .ways import at_values, from_starts, from_values, linear_only
 
@@ -94,8 +94,10 @@ def fit(
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
         exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one. A number below
-        1 is a least rate of decay; False is no bound. The slope is that of plays and stops, `Σ w`: the envelopes of
-        generalized plays and other elements are not looked at, of which the linear part alone is bounded.
+        1 is a least rate of decay; False is no bound. The slope is `Σ w` of plays and stops, and that times the slope
+        far out of each envelope of generalized plays, also where they are parts of a `Combined`; where an envelope is
+        so steep in between that small motions there grow, the fit says so. Of elements with bounded forces the linear
+        part decides; of envelopes of your own no slope is known, which the fit says.
     constraints
         See `Problem`.
     noise : float, optional
@@ -188,6 +190,7 @@ def _fit(
         model = at_values(model, as_recordings(train)[0], start)
     if not isinstance(model, PILFR):
         given = model.model if isinstance(model, Fit) else model
+        check_room(given.parameters, job.limits)
         job = replace(job, recordings=check_for_identification(train, int(given.parameters.free.sum()) + 2))
         return from_values(given, structure, job, model if isinstance(model, Fit) else None)
     if not isinstance(model.element, PrandtlIshlinskii | StaticNetwork | None):
@@ -196,6 +199,7 @@ def _fit(
         )
     first = as_recordings(train)[0]
     shape = model.model(first.n_u, first.n_y).parameters
+    check_room(shape, job.limits)
     if job.l1:
         check_penalty(job.l1, shape, model.element is None)
     assert isinstance(start, str)

@@ -14,7 +14,7 @@ import numpy as np
 from .compiled import make_engine
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
-from .limits import Limit
+from .limits import Limit, unknown_multipliers
 from .metrics import nrmse, rmse_per_output
 from .model import Model
 from .problem import Problem
@@ -233,7 +233,8 @@ class Fit:
             rows = [limit.name.partition("[")[0] for limit in idle if "[" in limit.name]
             shown += [f"{len(rows)} not active ({', '.join(dict.fromkeys(rows))})"] if rows else []
             lines.append(f"constraints: {'; '.join(shown)}")
-        return "\n".join(lines)
+            lines.append(unknown_multipliers(self.limits) if self.status is Status.SMALL_STEP else "")
+        return "\n".join(line for line in lines if line)
 
     __repr__ = __str__
 

@@ -11,9 +11,8 @@ alone; λ follows the gain ratio (Nielsen 1999). General constraints, in units o
 (`Problem.constraint_units`), enter an exact penalty `μ Σ violation`, with a second-order correction when a step along
 their tangent violates them.
 
-A penalty is exact only nearby, and a run may stray to where violating the constraints pays and linear steps do not lead
-back. So the cheapest feasible point is kept: a run that ends worse goes on from there, with more damping and a penalty
-under which nothing that it has seen is better (`feasible`).
+A run may stray to where violating the constraints pays and linear steps do not lead back: one that ends worse than the
+cheapest feasible point goes on from there, with more damping and under a larger penalty (`feasible`).
 """
 
 from __future__ import annotations
@@ -39,7 +38,9 @@ from .solution import Iteration, Progress, Solution, Status
 
 FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
 RETURNS = 4  # times that a run which has strayed goes on from the best feasible point
+ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # as far as a run gets
 Watch = Callable[[np.ndarray], bool]
+KINK = 1e-3  # share of the cost that a step promises in vain, from which multipliers mean nothing
 NOTHING = 1e-24  # a cost that is rounding: outputs are off by 1e-12 of their size
 
 
@@ -50,7 +51,7 @@ class GaussNewton:
     Parameters
     ----------
     max_iterations : int
-        Accepted and rejected steps together.
+        Steps, the rejected ones too.
     tolerance : float
         Stop when the cost improved by less than this share over `patience` iterations, or the model predicts less.
     damping : float
@@ -134,32 +135,36 @@ class _Run:
             with handled_interrupt(self._interrupt):  # casadi may swallow a KeyboardInterrupt
                 status = self._iterate()
                 for k in range(RETURNS):
-                    if not self._strayed(status):
+                    if status in ENDED and self.penalty.shrink(self.theta):
+                        self.best = Feasible(self.options.tolerance)
+                    elif self._strayed(status):
+                        self._back()
+                        self.penalty.raise_to(2.0 * self.best.tempting)
+                    else:
                         break
-                    self._back()
-                    self.penalty.raise_to(2.0 * self.best.tempting)
                     self.damping, self.growth = self.options.damping * 10.0**k, 2.0
                     status = self._iterate()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
-        limited = status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
-        if self.best.better(self.cost, self.penalty.violation(self.theta)) and not (limited and unfinished):
+        goes_on = unfinished and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
+        if not goes_on and self.best.better(self.cost, self.penalty.violation(self.theta)):
             status = Status.SOLVER_FAILED if self._strayed(status) else status
             self._back()
+        self.penalty.shrink(self.theta)
+        if status in ENDED and np.any(self.penalty.violations(self.theta) > TOLERATED):
+            status = Status.INFEASIBLE
         return self._finish(status)
 
     def _strayed(self, status: Status) -> bool:
         """Whether it ended of itself, and worse than a feasible point that it has seen."""
-        ended = status in (Status.CONVERGED, Status.SMALL_STEP, Status.INFEASIBLE)
-        return ended and self.best.better(self.cost, self.penalty.violation(self.theta))
+        return status in (*ENDED, Status.INFEASIBLE) and self.best.better(self.cost, self.penalty.violation(self.theta))
 
     def _back(self) -> None:
         self.cost, self.theta, self.multipliers = self.best.cost, self.best.theta, self.best.multipliers
         self._accepted(0.0)
 
     def _accepted(self, length: float) -> None:
-        seconds = time.perf_counter() - self.began
-        self.history.append(Iteration(self.tried, self.cost, seconds, length, self.damping))
+        self.history.append(Iteration(self.tried, self.cost, time.perf_counter() - self.began, length, self.damping))
 
     def _interrupt(self) -> None:
         self.interrupted = True
@@ -210,7 +215,8 @@ class _Run:
                 self.damping *= self.growth
                 self.growth *= 2.0
                 if self.damping > 1e12:
-                    return Status.INFEASIBLE if violation > TOLERATED else Status.SMALL_STEP
+                    stalled = self._stalled(hessian, floor, gradient, slope)
+                    return Status.INFEASIBLE if violation > TOLERATED else stalled
         return Status.MAX_ITERATIONS
 
     def _calm(self, recent: list[tuple[float, float]]) -> bool:
@@ -228,11 +234,14 @@ class _Run:
         return max(violation, left) <= FEASIBLE and cost - now < options.tolerance * abs(now)
 
     def _stalled(self, hessian: np.ndarray, floor: np.ndarray, gradient: np.ndarray, slope: np.ndarray) -> Status:
-        """What it means that a step promises nothing: a minimum, unless only its damping makes it so small."""
+        """What it means that a step promises nothing: a minimum, unless only its damping makes it so small.
+
+        Multipliers are those of a step with little damping, and none at a kink, where it promises much in vain.
+        """
         step = self._step(hessian + min(self.damping, self.options.damping) * np.diag(floor), gradient, slope)
-        promised = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d)
-        small = step.good and promised < self.options.tolerance * abs(self.cost)
-        return Status.CONVERGED if small else Status.SMALL_STEP
+        promised = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d) if step.good else np.inf
+        self.multipliers = step.multipliers * (1.0 if promised < KINK * abs(self.cost) else np.nan)
+        return Status.CONVERGED if promised < self.options.tolerance * abs(self.cost) else Status.SMALL_STEP
 
     def _step(
         self, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, correction: np.ndarray | None = None

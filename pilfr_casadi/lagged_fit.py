@@ -19,6 +19,7 @@ from .compiled import make_engine
 from .early_stopping import held_problem, hold_back, solve_watched
 from .fitted import Fit, first_state
 from .gauss_newton import GaussNewton
+from .ipopt import Ipopt
 from .job import Job
 from .lfr import PILFR
 from .model import Model
@@ -30,6 +31,7 @@ from .search import Candidate, run_tasks
 from .sensitivities import Engine
 from .solution import Solution, Status
 from .threads import one_blas_thread
+from .told import iterations
 
 SHARES = (1.0, 0.3, 0.1, 0.0)  # of the measured output that a NOE reads while it is trained, stage by stage
 
@@ -90,7 +92,8 @@ def fit_lagged(
     job = replace(job, recordings=check_for_identification(train, wanted.unknowns(first.n_u, first.n_y) + 2))
     structure = wanted.structure(first.n_u, first.n_y)
     split = hold_back(job.recordings, wanted.validation) if wanted.validation else (job.recordings, ())
-    search = LaggedSearch(wanted, structure, replace(job, progress=None), *split)
+    told = job.progress if executor is None else None  # a callable stays in its process
+    search = LaggedSearch(wanted, structure, replace(job, progress=told), *split)
 
     def report(found: list[Candidate], total: int) -> None:
         if job.progress:
@@ -107,8 +110,8 @@ def fit_lagged(
         )
     best = min(usable, key=lambda c: c.error)
     solution = replace(best.solution, status=Status.INTERRUPTED) if stopped else best.solution
-    result = job.result(best.model, search.structure, job.problem(best.model), solution, candidates=tuple(found))
-    return replace(result, errors={})  # theirs are those of a minimum of the simulation error, which this need not be
+    more: dict[str, Any] = {"candidates": tuple(found), "minimum": False}
+    return job.result(best.model, search.structure, job.problem(best.model), solution, **more)
 
 
 @one_blas_thread
@@ -127,12 +130,15 @@ def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequ
         begin = problem.start if solution is None else solution.theta
         if solution is not None and not np.isfinite(problem.cost(begin)):
             break
-        if share != shares[-1]:
-            solution = EXPLORE.solve(problem, begin)
-        elif search.held:
-            solution = solve_watched(search.job.solver, problem, held_problem(trained, search.held, problem), begin)
+        solver = EXPLORE if share != shares[-1] else search.job.solver
+        told: dict[str, Any] = {}
+        if isinstance(solver, GaussNewton | Ipopt):
+            told["progress"] = iterations(search.job.progress, "steps", solver.max_iterations)
+        if search.held and solver is search.job.solver:
+            held = held_problem(trained, search.held, problem)
+            solution = solve_watched(solver, problem, held, begin, **told)
         else:
-            solution = search.job.solver.solve(problem, begin)
+            solution = solver.solve(problem, begin, **told)
         if solution.status is Status.INTERRUPTED:
             break
     assert solution is not None

@@ -6,7 +6,7 @@ over the output's deviation) would fall if the limit were moved outwards: it say
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +35,7 @@ class Limit:
         itself, by the eigenvalues of the result, and what it is to be at most.
     multiplier : float
         Fall of the objective for each unit that the limit is moved outwards; 0 where it is not active, nan where the
-        solver gave none.
+        solver gave none, or ended at a kink of the error, where there is no such rate.
     active : bool
         Whether the value is at a limit.
     met : bool
@@ -59,6 +59,19 @@ class Limit:
         return f"{self.name}: {self.value:.9g}, {f'active{cost}' if self.active else 'not active'}"
 
 
+def unknown_multipliers(limits: Sequence[Limit]) -> str:
+    """That multipliers of active constraints are not known, empty where they are."""
+    names = [
+        limit.name for limit in limits if limit.kind == "constraint" and limit.active and np.isnan(limit.multiplier)
+    ]
+    if not names:
+        return ""
+    return (
+        f"multipliers are not known ({', '.join(names)}): the solver ended in steps too small to matter, as at a kink "
+        "of the error, where no rate holds on both sides"
+    )
+
+
 def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
     """All general constraints and the bounds that are active, as they are at a solution."""
     theta, n = solution.theta, problem.size
@@ -76,7 +89,8 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
         values = problem.model.parameters.unpack(problem.parameters(theta))
         for i, (name, check) in enumerate(zip(problem.g_labels, checks, strict=True)):
             if isinstance(check, BeyondRadius):
-                out.append(_radius(name, check, values, float(size[n + i]), solution.cost))
+                felt = not known or bool(size[n + i] > FELT * solution.cost)
+                out.append(_radius(name, check, values, float(size[n + i]), felt))
                 continue
             numbers = float(g[i]), float(low[i]), float(high[i]), float(size[n + i] if active[i] else 0.0)
             out.append(Limit(name, "constraint", *numbers, active=bool(active[i]), met=bool(met[i])))
@@ -87,9 +101,9 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
     return tuple(out)
 
 
-def _radius(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, cost: float) -> Limit:
-    """A bound on a spectral radius; `force` is its multiplier next to the logarithm."""
+def _radius(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, felt: bool) -> Limit:
+    """A bound on a spectral radius; `force` is its multiplier next to the logarithm, `felt` if that counts."""
     excess, bound = check(values), check.radius
-    active = -excess <= AT_RADIUS * bound and (not force <= FELT * cost or -excess <= 10 * TOLERATED * bound)
+    active = -excess <= AT_RADIUS * bound and (felt or -excess <= 10 * TOLERATED * bound)
     multiplier = force / bound if active else 0.0
     return Limit(name, "constraint", excess + bound, -np.inf, bound, multiplier, active, met=excess <= 0)

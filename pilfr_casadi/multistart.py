@@ -93,7 +93,9 @@ def drawn(structure: Any, start: str, seed: int) -> bool:
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:
     e = problem.residual(solution.theta)
-    error = float(np.sqrt(e @ e / e.size)) if np.all(np.isfinite(e)) else np.inf
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = float(np.sqrt(e @ e / e.size))
+    error = error if np.isfinite(error) else np.inf
     return Candidate(seed, model, solution.theta, error, solution, note)
 
 
@@ -193,7 +195,7 @@ def search_starts(
         return found, None, True
     if not usable:
         raise InputError(
-            "No start gave a finite simulation; check units and the initial state, or choose another order."
+            "No start gave a finite simulation; check units, initial state and bounds on A, or choose another order."
         )
     if search.start != "grid" or stopped:
         return found, usable[0], stopped

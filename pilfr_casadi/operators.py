@@ -169,6 +169,22 @@ class GeneralizedPlay:
             out = out + a[channel, j] * tanh(b[channel, j] * z + d[channel, j])
         return out
 
+    def far_slope(self, side: str, p: Any) -> Any:
+        """Slope of the network γ_l or γ_r where its neurons are saturated, `a_0` of each channel: (channels, 1)."""
+        return p[f"gamma_{side}_a0"]
+
+    def steepest(self, side: str, p: Any) -> np.ndarray:
+        """Largest slope of the network γ_l or γ_r of named numbers p, each channel: (channels,)."""
+        a0, a, b, d = (np.asarray(p[f"gamma_{side}_{k}"], dtype=float) for k in ("a0", "a", "b", "d"))
+        out = []
+        for i in range(len(a0)):
+            at = [(np.linspace(-2, 2, 81) - shift) / rate for rate, shift in zip(b[i], d[i], strict=True) if rate > 0]
+            z = np.concatenate([np.zeros(1), *at])[:, None]
+            out.append(
+                a0[i, 0] + np.max(np.sum(a[i] * b[i] / np.cosh(np.clip(b[i] * z + d[i], -300, 300)) ** 2, axis=1))
+            )
+        return np.array(out)
+
     def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0, channel: int = 0) -> tuple[Any, Any]:
         """One step: (output, next memory)."""
         v = generalized_play(

@@ -13,9 +13,11 @@ from .model import Model
 from .multistart import PRIOR
 from .open_memory import open_memory_sentence
 from .problem import Problem
+from .reached_gain import reached_gain_sentence
 from .recording import Recording
 from .search import Candidate
 from .solution import Solution
+from .stability import unbounded_sentence
 
 
 def with_solution(model: Model, problem: Problem, solution: Solution) -> Model:
@@ -35,11 +37,15 @@ def outcome(
     note: str = "",
     linear_nrmse: tuple[float, ...] = (),
     engine: str = "auto",
+    minimum: bool = True,
 ) -> Fit:
     """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
 
+    Standard errors are those of a `minimum` of the simulation error; where it is none there are none.
+
     Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the standard
-    errors know of them. The note also says which memory a periodic steady state leaves open (`open_memory`).
+    errors know of them. The note also says which memory a periodic steady state leaves open (`open_memory`), and
+    which DC gain holds beyond the recordings alone (`reached_gain`).
     """
     fitted = with_solution(model, problem, solution)
     judged = problem
@@ -51,7 +57,14 @@ def outcome(
         options: dict[str, Any] = {"constraints": problem.constraints, "noise": problem.noise, "scale": problem.scale}
         judged = Problem(fitted, recordings, engine=problem.engine, **options)
     theta = solution.theta
-    note = "; ".join(part for part in (note, open_memory_sentence(judged, theta)) if part)
+    values = problem.model.parameters.unpack(problem.parameters(theta))
+    told = (
+        note,
+        open_memory_sentence(judged, theta),
+        reached_gain_sentence(problem, theta),
+        unbounded_sentence(structure, problem.constraints, values),
+    )
+    note = "; ".join(part for part in told if part)
     at_bound = [
         f"{label} = {value:g}"
         for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
@@ -67,7 +80,7 @@ def outcome(
         train_nrmse=tuple(problem.nrmse(theta)),
         initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
         labels=problem.labels,
-        errors=standard_errors(judged, theta, structure),
+        errors=standard_errors(judged, theta, structure) if minimum else {},
         active=tuple(at_bound),
         candidates=candidates,
         linear=linear,

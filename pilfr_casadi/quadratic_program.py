@@ -61,6 +61,9 @@ class QuadraticProgram:
             slack = a @ d
             if np.all((lba <= slack) & (slack <= uba)):
                 return d, np.zeros(len(d) + len(slack)), True
+        low, high = np.concatenate([lbx, lba]), np.concatenate([ubx, uba])
+        if not np.all((low < np.inf) & (high > -np.inf)):  # too far away for numbers, or none: a plugin would raise
+            return np.zeros(len(g)), np.zeros(len(g) + len(a)), False
         out = self._solve(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
         d = np.asarray(out["x"]).ravel()
         multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])

@@ -228,6 +228,8 @@ def regrid(
     """
     grid = np.linspace(0.0, beyond * reach, 600)
     d = density(r, w, grid, smooth * reach)
+    if d.max() <= 1e-200 * np.sum(w):  # all of them rest far beyond what is visited: evenly
+        d = np.full_like(grid, np.sum(w) / grid[-1])
     tail = (grid >= 0.4 * reach) & (grid <= 0.85 * reach)
     log_d = np.log(d + 1e-6 * d.max())
     slope = min(float(np.polyfit(grid[tail], log_d[tail], 1)[0]), 0.0)

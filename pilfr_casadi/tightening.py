@@ -92,12 +92,17 @@ def at_bounds(problem: Problem, theta: Array) -> bool:
 
 def _beats(problem: Problem, theta: Array, found: Solution) -> bool:
     """Whether θ is inside every constraint, and better than what was found."""
+    if found.status is Status.INTERRUPTED or not _met(problem, theta):
+        return False
+    return found.status is Status.INFEASIBLE or problem.cost(theta) < found.cost
+
+
+def _met(problem: Problem, theta: Array) -> bool:
+    """Whether θ is inside every constraint."""
     g, unit = problem.constraint(theta), problem.constraint_units(theta)
     over = np.maximum(problem.g_lower - g, g - problem.g_upper) > TOLERATED * np.where(unit > 0, unit, 1.0)
     own = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)  # these have a check of their own
-    if beyond(problem, theta) or np.any(over & ~own) or found.status is Status.INTERRUPTED:
-        return False
-    return found.status is Status.INFEASIBLE or problem.cost(theta) < found.cost
+    return not beyond(problem, theta) and not np.any(over & ~own)
 
 
 def _until(ends: float, solver: GaussNewton) -> GaussNewton:
@@ -120,7 +125,7 @@ def tighten(problem: Problem, theta: Array, last: GaussNewton, progress: Progres
         theta = found.theta if found.status is not Status.INFEASIBLE else theta
     theta = _scaled(problem, theta)
     best, coordinates, iterations = _unsolved(problem, theta, Status.RESTORED), True, 0
-    if beyond(problem, theta):
+    if not _met(problem, theta):
         best = replace(best, status=Status.INFEASIBLE)
     for _ in range(ROUNDS):
         found = _inside(problem, theta, last, ends, coordinates, progress)

@@ -6,7 +6,7 @@ A fit from values is that of an earlier fit, of a closed model of one's own, or 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
@@ -16,11 +16,11 @@ import numpy as np
 from .checks import numbers
 from .exactness import beyond
 from .fitted import Fit
-from .job import Job, interrupted, penalised, rms_error
+from .job import Job, Stage, interrupted, penalised, rms_error
 from .known_blocks import known_entries
 from .lfr import PILFR
 from .model import Model
-from .multistart import search_starts
+from .multistart import KEEP, search_starts
 from .penalty import check_penalty
 from .problem import Problem
 from .recording import InputError, Recording
@@ -123,8 +123,9 @@ def from_starts(
             latest = interrupted(*latest)
         elif start == "grid" or beyond(problem, best.theta):
             latest = model, problem, job.solve(problem, "solve", best.theta), note
+        model, problem, result, note = latest = _from_others(latest, candidates, job)
         if structure.priors and not stopped:
-            problem, result = job.settled(problem, latest[2], "solve")
+            problem, result = job.settled(problem, result, "solve")
             latest = model, problem, result, note
         if l1:
             latest = penalised(model, problem, latest[2], job, problem.noise)
@@ -132,3 +133,16 @@ def from_starts(
         latest = interrupted(*latest)
     model, problem, result, note = latest
     return job.result(model, structure, problem, result, candidates=tuple(candidates), note=note, **compared)
+
+
+def _from_others(latest: Stage, candidates: Sequence[Candidate], job: Job) -> Stage:
+    """The same or, where its last solve misses the constraints, that from the best start which had met them."""
+    usable = [c for c in candidates if c.solution.status is not Status.INFEASIBLE and np.isfinite(c.error)]
+    for other in sorted(usable, key=lambda c: c.error)[:KEEP]:
+        if latest[2].status is not Status.INFEASIBLE:
+            break
+        problem = job.problem(other.model, other.error)
+        found = job.solve(problem, "solve", other.theta)
+        if found.status is not Status.INFEASIBLE:
+            return other.model, problem, found, other.note
+    return latest

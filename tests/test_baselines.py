@@ -322,3 +322,28 @@ def test_too_many_lags_are_refused_before_the_model_is_built(monkeypatch):
     monkeypatch.setattr(pilfr.NARX, "structure", lambda *_: pytest.fail("built"))
     with pytest.raises(InputError, match="scored samples"):
         pilfr.fit(pilfr.NARX(2000), train)
+
+
+@pytest.mark.parametrize(
+    "wanted, stages", [(pilfr.NARX(2, 2), 1), (pilfr.NOE(2, 2), 4), (pilfr.NOE(2, 2, validation=0.0), 4)]
+)
+def test_every_step_of_a_start_is_told(wanted, stages):
+    model = truth("NARX")
+    record = recordings(model, length=300)[0]
+    seen, told = [], []
+    fit = pilfr.fit(wanted, record, starts=2, progress=lambda *report: seen.append(report))
+    steps = [done for stage, done, *_ in seen if stage == "steps"]
+    assert steps.count(0) >= 2 * stages and len(steps) > 4 * stages
+    assert [done for stage, done, *_ in seen if stage == "starts"] == [0, 1, 2]
+    assert fit.errors == {}  # they would be those of a minimum of the simulation error
+    if not wanted.validation:
+        pilfr.fit(wanted, record, starts=1, solver=Own(), progress=lambda *report: told.append(report))
+        assert told[-1][0] == "standard errors"
+
+
+class Own:
+    """A solver of a user's own, which tells nothing."""
+
+    def solve(self, problem, start=None):
+        """As the package's own."""
+        return pilfr.GaussNewton(max_iterations=2).solve(problem, start)

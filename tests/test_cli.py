@@ -403,6 +403,10 @@ def test_a_model_that_misses_its_constraints_is_no_usable_result(capsys, tmp_pat
     data = fit_arguments(tmp_path / "train.csv", tmp_path)
     says = ("'spectral radius <= 1' is infeasible", "gives 2, limits 0 and 1")
     refused(capsys, *data, "--fix", "A=2", says=says)
-    status, _, err = run(capsys, *data, "--bound", "A=1.01:2")
-    assert status == 1 and err.startswith("pilfr: The model does not meet its constraints: spectral radius <= 1"), err
+    refused(capsys, *data, "--bound", "A=1.01:2", says=("bounds of A, 1.01 to 2, allow no", "widen the bounds of A"))
+    loop = [option for name in ("B_w", "C_z", "w") for option in ("--bound", f"{name}=0.4:2")]
+    status, _, err = run(capsys, *data, "--bound", "A=0.9:0.95", *loop)
+    assert status == 1 and err.startswith("pilfr: The model does not meet its constraints: spectral radius with the"), (
+        err
+    )
     assert err.count("\n") == 1 and "off by" in err

@@ -1,5 +1,7 @@
 """Constrained and regularized fits: exact to the last digit, multipliers told, sparse where the truth is."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -115,6 +117,22 @@ def test_a_known_gain_and_its_multiplier(record):
     # the multiplier is the slope of the objective over the limit
     slope = (fits[1].solution.cost - fits[0].solution.cost) / (0.001 * wanted)
     assert limit.multiplier == pytest.approx(slope, rel=0.1)
+
+
+def test_at_a_kink_multipliers_are_not_known(record, tmp_path):
+    """The last step's are those of its damping: they are told in no print, file or report."""
+    fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, constraints=dc_gain(1.1))
+    assert fit.status is Status.CONVERGED and "not known" not in str(fit)
+    problem = Problem(fit.model, record, constraints=(dc_gain(1.1),))
+    ended = replace(fit.solution, status=Status.SMALL_STEP, multipliers=np.full(problem.size + 1, np.nan))
+    limits = limits_of(problem, ended)
+    assert all(np.isnan(limit.multiplier) for limit in limits if limit.active)
+    stuck = replace(fit, solution=ended, limits=limits)
+    assert "multipliers are not known (DC gain = 1.1)" in str(stuck)
+    stuck.save(tmp_path / "m.json")
+    assert np.isnan(pilfr.load(tmp_path / "m.json").limits[0].multiplier)
+    page = pilfr.fit_report(stuck, record, (), tmp_path / "report").read_text()
+    assert "Multipliers are not known (DC gain = 1.1)" in page
 
 
 def test_a_second_fit_under_the_same_constraint_is_never_worse():

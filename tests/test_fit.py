@@ -262,6 +262,13 @@ def test_an_indefinite_or_broken_matrix_is_left_to_the_solver():
     assert unconstrained(np.full((2, 2), np.nan), np.ones(2)) is None
 
 
+def test_limits_too_far_away_for_numbers_are_no_step():
+    h, g, a, low, high = np.eye(1), np.ones(1), np.ones((1, 1)), np.full(1, -np.inf), np.full(1, np.inf)
+    for upper in (-np.inf, np.nan):
+        d, multipliers, good = QuadraticProgram(1, 1, "daqp")(h, g, low, high, a, low, np.full(1, upper))
+        assert not good and np.all(d == 0) and multipliers.shape == (2,)
+
+
 # ---- workers ----
 
 SCRIPT = """

@@ -145,7 +145,7 @@ class Wavy(Scalar):
     def constraint_jacobian(self, theta):
         return (0.3 + np.sin(theta)).reshape(1, 1)
 
-    def constraint_units(self, theta, squares):
+    def constraint_units(self, theta, squares=None):
         return np.ones(1)
 
 
@@ -175,7 +175,8 @@ def test_no_limit_ends_a_run_worse_than_a_feasible_point_it_has_seen(most):
 
 def test_what_only_damping_makes_small_is_no_minimum():
     wall = Scalar(lambda x: 1.0 if x == 0 else 2.0, lambda x: -1.0)  # every trial is worse, whatever the slope promises
-    assert GaussNewton().solve(wall).status is Status.SMALL_STEP
+    stuck = GaussNewton().solve(wall)
+    assert stuck.status is Status.SMALL_STEP and np.all(np.isnan(stuck.multipliers))  # at a kink there are none
     valley = Scalar(lambda x: 1.0 + x**2, lambda x: 2 * x)
     assert GaussNewton().solve(valley).status is Status.CONVERGED
 

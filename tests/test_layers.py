@@ -93,6 +93,7 @@ LAYERS = {
         "job",
         "outcome",
         "open_memory",
+        "reached_gain",
         "linear_model",
         "lagged_fit",
         "early_stopping",

@@ -2,17 +2,20 @@
 
 import os
 import threading
+import time
 
 import numpy as np
 import pytest
 
 from pilfr_casadi import compiled
+from pilfr_casadi.baselines import NARX, reading_output
 from pilfr_casadi.compiled import Compiled, cache_directory, compiler, make_engine
 from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi.generated import source_code
 from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.operators import Play
 from pilfr_casadi.recording import InputError
-from pilfr_casadi.sensitivities import VirtualMachine
+from pilfr_casadi.sensitivities import VirtualMachine, linearize
 from problems import speed
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
@@ -240,3 +243,24 @@ def test_threads_share_an_engine(model, kind):
         for result in results:
             for a, b in zip(right, result, strict=True):
                 np.testing.assert_array_equal(a, b)
+
+
+@needs_compiler
+def test_many_lags_compile_in_proportion_to_their_code(tmp_path, monkeypatch):
+    """Jumps of thousands of outputs, threaded, would take twenty times as long for three times the code."""
+    monkeypatch.setattr(compiled, "cache_directory", lambda: tmp_path)
+    sources = []
+    for lags in (10, 20):
+        model = reading_output(NARX(lags, 10).structure(1, 1).model(1, 1), 1.0)
+        sources.append(source_code(linearize(model, staged=model.n_state <= compiled.WRITTEN)))
+    more = len(sources[1]) / len(sources[0])
+
+    def ratio():
+        taken = []
+        for source in sources:
+            began = time.perf_counter()
+            compiled.build(f"{source}\n/* {began} */")
+            taken.append(time.perf_counter() - began)
+        return taken[1] / taken[0] / more
+
+    assert min(ratio() for _ in range(2)) < 2.5

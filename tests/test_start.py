@@ -226,3 +226,8 @@ def test_a_network_begins_as_the_linear_model(structure):
     assert np.all(np.abs(bent - z.mean(axis=0)[:, None]) <= 1.5 * z.std(axis=0)[:, None] + 1e-9)
     again = network_start(structure, blocks, [u], states, np.random.default_rng(0))
     np.testing.assert_array_equal(again["bias"], values["bias"])
+
+
+def test_operators_that_all_rest_far_beyond_what_is_visited_are_spread_evenly():
+    r, w = regrid(np.array([1e6, 2e6, 3e6]), np.array([1.0, 2.0, 3.0]), 1.0)
+    assert np.all(np.diff(r) > 0) and r[-1] < 1.3 and np.ptp(np.diff(r)) < 1e-6 and w.sum() == pytest.approx(6.0)

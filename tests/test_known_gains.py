@@ -1,0 +1,92 @@
+"""A known DC gain: met beside poles of 1, and told where it holds beyond the recordings alone."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from random_models import coupled_plays
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.exact_penalty import ExactPenalty
+from pilfr_casadi.known import Gain, dc_gain
+from pilfr_casadi.problem import Problem
+from pilfr_casadi.reached_gain import reached_gain_sentence
+from pilfr_casadi.recording import InputError
+from problems.constrained import three_plays
+
+PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return three_plays(0, 1200)
+
+
+@pytest.mark.parametrize("seed, gain", [(5, 2.0), (8, 2.0), (10, 2.0), (11, 1.0)])
+def test_a_gain_far_from_the_machines_own_is_met(seed, gain):
+    """Beside a slow pole a gain has immense slopes, at a pole of 1 no value; one start may miss it, another not."""
+    fit = pilfr.fit(pilfr.PILFR(2, PLAYS), coupled_plays(seed), starts=4, constraints=[dc_gain(gain)])
+    assert fit.status.converged and all(limit.met for limit in fit.limits)
+
+
+def test_a_gain_at_an_integrator_has_no_value(record):
+    model = pilfr.PILFR(1, bounds={"A": (0.0, 1.0)}).model(1, 1, {"A": [[1.0]], "B_u": [[1.0]], "C_y": [[1.0]]})
+    with pytest.raises(InputError, match="'DC gain = 1' has no finite value at the start values"):
+        Problem(model, record, constraints=[dc_gain(1.0)])
+    model = model.with_parameters(model.parameters.change(A={"value": [[0.9]]}))
+    problem = Problem(model, record, constraints=[dc_gain(1.0)])
+    penalty = ExactPenalty(problem)
+    assert penalty.violations(np.array([0.9, 1.0, 1.0, 0.0, 0.0]))[0] == pytest.approx(9.0)
+    assert penalty.violations(np.array([1.0, 1.0, 1.0, 0.0, 0.0]))[0] == np.inf
+
+
+def test_a_unit_from_beside_a_pole_is_taken_anew(record):
+    model = pilfr.PILFR(1).model(1, 1, {"A": [[1 - 1e-9]], "B_u": [[1.0]], "C_y": [[1.0]]})
+    problem = Problem(model, record, constraints=[dc_gain(1.0)])
+    penalty, away = ExactPenalty(problem), np.array([0.9, 1.0, 1.0, 0.0, 0.0])
+    penalty.measure(problem.start, np.ones(problem.size))
+    assert penalty.unit[0] > 1e15 and penalty.violation(away) < 1e-12  # off by 9, and it seems nothing
+    assert penalty.shrink(away) and penalty.unit[0] < 200 and penalty.violation(away) > 0.05
+    assert not penalty.shrink(away)
+
+
+@pytest.mark.parametrize(
+    "gain, says", [(1.0, ""), (3.0, "1 of 3 operators never slip in them; within them it comes to 1.0")]
+)
+def test_a_gain_that_plays_reach_beyond_the_recording_alone_is_told(record, gain, says):
+    fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=2, constraints=[dc_gain(gain)])
+    assert fit.limits[-1].met and (says in str(fit) if says else "beyond the recordings" not in str(fit))
+    beyond_z = fit.parameters["r"] > np.max(np.abs(fit.signals(record)["z"]))
+    assert np.any(beyond_z & (fit.parameters["w"] > 0.1)) == bool(says)
+
+
+def test_a_gain_that_a_slow_pole_reaches_is_told(record):
+    slow = pilfr.PILFR(2, fixed={"A": np.diag([0.8, 1 - 1e-5])})
+    known = {"A": slow.fixed["A"], "B_u": [[0.2], [1e-5]], "C_y": [[1.0, 1.0]]}
+    problem = Problem(slow.model(1, 1, known), record, constraints=[dc_gain(2.0)])
+    assert reached_gain_sentence(problem, problem.start) == (
+        "DC gain = 2 holds only beyond the recordings: it settles over more than their 1200 samples; within them it "
+        "comes to 1.01"
+    )
+    fast = Problem(slow.model(1, 1, {**known, "C_y": [[2.0, 0.0]]}), record, constraints=[dc_gain(2.0)])
+    assert reached_gain_sentence(fast, fast.start) == ""
+
+
+@pytest.mark.parametrize(
+    "operator, slope, r, says",
+    [
+        (pilfr.Play, 0.0, [0.0, 9.0], "1 of 2 operators have no threshold"),
+        (pilfr.Play, 0.0, [1e-3, 9.0], ""),
+        (pilfr.Stop, 1.0, [0.0, 9.0], "1 of 2 operators have no threshold"),
+        (pilfr.Stop, 0.0, [1e-3, 9.0], "1 of 2 operators never slip"),
+        (pilfr.Stop, 0.0, [1e-3, 1e-3], ""),
+        (pilfr.Play, 0.5, [0.0, 9.0], ""),
+    ],
+)
+def test_which_operators_keep_a_gain_beyond_the_recording(record, operator, slope, r, says):
+    structure = pilfr.hammerstein(0, pilfr.PrandtlIshlinskii(operator, 2))
+    model = structure.model(1, 1, {"D_yw": [[1.0]], "w": [[0.5, 0.5]], "r": [r]})
+    free = Problem(model, record)
+    gain = float(Gain(slope)({k: ca.DM(v) for k, v in model.parameters.unpack(free.parameters(free.start)).items()}))
+    problem = Problem(model, record, constraints=[dc_gain(gain, slope=slope)])
+    told = reached_gain_sentence(problem, problem.start)
+    assert says in told if says else told == ""
