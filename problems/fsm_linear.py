@@ -182,11 +182,7 @@ def in_modes(A: Array, B: Array, C: Array, *rows: Array) -> tuple[Array, ...]:
 
 
 def first_modes(spectra: Spectra, period: int, order: int = 48, least_damping: float = 2.5e-3) -> dict[str, Array]:
-    """Subspace identification at one level, without the modes that are hardly damped.
-
-    Real poles stay, the negative ones too: they are what happens near half the sampling rate, and without them the
-    lines above 3520 have twice the error.
-    """
+    """Subspace identification at one level, without the modes that are hardly damped or beyond the excited lines."""
     G = np.empty((len(LINES), 3, 3), dtype=complex)
     for k in range(len(LINES)):
         G[k] = (spectra.Y[k] * spectra.weight) @ np.linalg.pinv(spectra.U[k] * spectra.weight)
@@ -195,7 +191,7 @@ def first_modes(spectra: Spectra, period: int, order: int = 48, least_damping: f
     values = np.array([np.linalg.eigvals(A[np.ix_(row, row)])[0] for row in mask])
     logarithm = np.log(values.astype(complex))
     damping = -logarithm.real / np.abs(logarithm)
-    keep = (mask.sum(axis=1) == 1) | (damping > least_damping)
+    keep = np.where(mask.sum(axis=1) == 2, damping > least_damping, values.real > -0.7)
     square = np.ix_(keep, keep)
     return {"mask": mask[square], "A": A[square], "B": B[keep], "C": C[:, keep], "D": np.asarray(system.D)}
 

@@ -6,7 +6,7 @@ import pytest
 from pilfr_casadi import load, response_bound
 from pilfr_casadi.cli import main
 from problems.fsm import COMBINED, HELD, ITERATIONS, LEVELS, PERIOD, PUBLISHED, Mirror, noise_table, run
-from problems.fsm_linear import Levels, Spectra, first_modes, fitted_levels, in_modes, normal, simulated
+from problems.fsm_linear import Levels, Spectra, fitted_levels, in_modes, normal, simulated
 from problems.fsm_model import combined, envelope_alone, pure
 from problems.measured_data import measured
 
@@ -89,15 +89,7 @@ def test_noisy_realizations_are_found_and_kept():
     last = noise_table(mirror.data)[-1]
     assert "100 mV, 2" in last and "100 mV, 3" in last and last.count("mV") == 2
     quiet, noisy = mirror.weights[0][[0, 4]], mirror.weights[0][[1, 2]]
-    assert 0 < noisy.max() < 0.95 * quiet.min()
-
-
-@needs_mirror
-def test_what_happens_near_half_the_sampling_rate_is_modelled():
-    mirror = Mirror(FOLDER, 1)
-    start = first_modes(mirror.spectra[1], PERIOD)
-    single = start["mask"].sum(axis=1) == 1
-    assert np.sum(np.diag(start["A"])[single] < -0.5) == 2
+    assert 0 < noisy.max() < 0.8 * quiet.min()
 
 
 @needs_mirror
