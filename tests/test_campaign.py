@@ -179,6 +179,15 @@ def test_an_interrupted_campaign_goes_on(folder, serial, capsys):
     assert compared(out) == serial
 
 
+@pytest.fixture
+def heard():
+    """Ctrl-C is heard, even where a shell runs the tests in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heard")
 def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
     begin, ended = hand.Hand.__init__, threading.Event()
 
@@ -197,6 +206,7 @@ def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
     with pytest.raises(RunInterrupted), time_limit(0.5, Clock()):
         pilfr.campaign(folder / "mine.py")
     assert ended.is_set() and not hand._hands
+    assert not [t for t in threading.enumerate() if t.name.startswith("ThreadPoolExecutor")]  # nor can one begin later
 
 
 @pytest.mark.parametrize(
