@@ -123,7 +123,7 @@ class PrandtlIshlinskii:
         rest = np.asarray(p["eps"], dtype=float) / 4 if self.rounded else 0.0
         z = z[:, None]
         largest = np.minimum(r, 2 * z) if isinstance(self.operator, Stop) else np.maximum(z - r, 0.0)
-        return np.asarray(np.sum(w * np.where(w > 0, largest + rest, 0.0), axis=1))
+        return np.asarray(np.sum(np.abs(w) * np.where(w != 0, largest + rest, 0.0), axis=1))
 
 
 @dataclass(frozen=True)

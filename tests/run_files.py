@@ -83,11 +83,12 @@ def changed(folder, *changes, text=CAMPAIGN):
     return folder / "rig.toml"
 
 
-def command(folder, kind, *more):
-    """The command in a process of its own."""
-    code = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
+def command(folder, kind, *more, run_file="rig.toml"):
+    """The command in a process of its own, which hears Ctrl-C even where a shell runs the tests in the background."""
+    hears = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    code = f"{hears}; import sys; from pilfr_casadi.cli import main; sys.exit(main())"
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(pilfr.__file__).parent.parent)}
-    arguments = [sys.executable, "-c", code, kind, "rig.toml", *more]
+    arguments = [sys.executable, "-c", code, kind, run_file, *more]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(arguments, cwd=folder, env=environment, **pipes)
 

@@ -1,10 +1,12 @@
 """Campaigns: the same numbers over any executor, nothing lost or doubled when workers or the driver are killed."""
 
 import csv
+import importlib
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -17,7 +19,9 @@ from test_cli import write_csv
 import pilfr_casadi as pilfr
 from pilfr_casadi import hand
 from pilfr_casadi.cli import main
+from pilfr_casadi.interrupts import Clock, time_limit
 from pilfr_casadi.recording import InputError
+from pilfr_casadi.runs.execute import RunInterrupted
 from pilfr_casadi.runs.folds import fold
 from pilfr_casadi.runs.manifest import Manifest
 
@@ -163,14 +167,46 @@ def test_processes_are_killed_and_none_is_left_behind(folder, serial):
 
 
 def test_an_interrupted_campaign_goes_on(folder, serial, capsys):
-    out, driver = folder / "rig-campaign", command(folder, "campaign")
-    wait_for(lambda: len(list(out.glob("jobs/*/model.json"))) >= 1)
-    driver.send_signal(signal.SIGINT)
+    path, out = folder / "mine.py", folder / "mine-campaign"
+    path.write_text(SLOW.replace("TROUBLE", "time.sleep(600)").replace("FOLDER", str(folder)).replace("10.0", "600.0"))
+    driver = command(folder, "campaign", run_file=path.name)
+    wait_for(lambda: (folder / "taken").exists() and list(out.glob("jobs/*/model.json")))
+    driver.send_signal(signal.SIGINT)  # one job is done at least, and one hangs: the campaign cannot have ended
     _, err = driver.communicate(timeout=30)
     assert driver.returncode == 130 and "goes on" in err and err.count("\n") == 1, err
-    assert main(["campaign", str(folder / "rig.toml")]) == 0
+    assert main(["campaign", str(path)]) == 0
     assert "jobs done before" in capsys.readouterr().out
     assert compared(out) == serial
+
+
+@pytest.fixture
+def heard():
+    """Ctrl-C is heard, even where a shell runs the tests in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heard")
+def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
+    begin, ended = hand.Hand.__init__, threading.Event()
+
+    def late(self):
+        assert ended.wait(60)
+        begin(self)
+
+    def ends():
+        close()
+        ended.set()
+
+    close = hand.close_hands
+    monkeypatch.setattr(hand.Hand, "__init__", late)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.runs.campaign"), "close_hands", ends)
+    (folder / "mine.py").write_text(SLOW.replace("TROUBLE", "time.sleep(600)").replace("FOLDER", str(folder)))
+    with pytest.raises(RunInterrupted), time_limit(0.5, Clock()):
+        pilfr.campaign(folder / "mine.py")
+    assert ended.is_set() and not hand._hands
+    assert not [t for t in threading.enumerate() if t.name.startswith("ThreadPoolExecutor")]  # nor can one begin later
 
 
 @pytest.mark.parametrize(

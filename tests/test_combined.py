@@ -95,6 +95,10 @@ def test_bounds_of_a_layer():
     assert element_bound(PrandtlIshlinskii(Play, 2), p, every) == np.inf
     assert element_bound(PrandtlIshlinskii(Play, 2), p, two) == 0.5
     assert element_bound(PrandtlIshlinskii(GeneralizedPlay, 2), p, two) == np.inf
+    negative = {**p, "w": -p["w"]}  # where the user's bounds let them
+    for layer in (PrandtlIshlinskii(Stop, 2), PrandtlIshlinskii(Play, 2)):
+        for size in (two, every):
+            assert element_bound(layer, negative, size) == element_bound(layer, p, size)
 
 
 # ---- products ----

@@ -7,6 +7,7 @@ from run_files import DATA
 from test_cli import fit_arguments, refused, run, write_csv
 
 import pilfr_casadi as pilfr
+from pilfr_casadi.cli import main
 from pilfr_casadi.recording import InputError
 from pilfr_casadi.runs.described import read_run
 from pilfr_casadi.structures import ANY, STRUCTURES, TAKES, named_structure
@@ -80,6 +81,43 @@ def test_a_campaign_compares_structures_and_each_takes_what_is_its_own(folder):
     assert len({s.nrmse for s in pilfr.campaign(folder / "two.toml").scores if s.role == "train"}) == 2
 
 
+def test_combinations_that_mean_the_same_model_are_one_cell(folder):
+    grid = """[grid]
+structure = ["lfr", "hammerstein", "ssnn", "narx"]
+nx = [1, 2]
+operator = ["play", "generalized_play"]
+operators = [0, 3]
+neurons = [2, 4]
+hidden = [2]
+lags = [1, 2]
+start = ["plain", "grid"]
+"""
+    cells = read_run(written(folder, "offset = false", grid)).cells
+    assert len({(repr(cell.model), str(cell.search)) for cell in cells}) == len(cells)
+    counts = {s: sum(cell.values["structure"] == s for cell in cells) for s in ("lfr", "hammerstein", "ssnn", "narx")}
+    # with 3 operators: plays, or generalized plays of 2 or 4 neurons, from 2 starts; linear models are in the first
+    assert counts == {"lfr": 2 * (1 + 3 * 2), "hammerstein": 2 * 3 * 2, "ssnn": 2 * 2, "narx": 2}
+    assert {"structure": "lfr", "nx": 2, "operators": 0} in [cell.values for cell in cells]
+    assert {"structure": "narx", "hidden": 2, "lags": 2} in [cell.values for cell in cells]
+
+
+def test_a_campaign_does_each_model_once_and_leaves_columns_empty(folder, capsys):
+    grid = '[grid]\nstructure = ["narx", "lfr", "wiener"]\noperators = [0, 2]\n'
+    grid += 'operator = ["play", "stop"]\nlags = [1, 2]\n'
+    path = written(folder, "nx = 1\nhidden = 2", grid)
+    assert main(["campaign", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "7 cells x 1 seeds" in said and "7 jobs done now" in said
+    rows = list(csv.DictReader((folder / "rig-campaign" / "results.csv").read_text().splitlines()))
+    assert [k for k in rows[0] if k in ("structure", "operator", "operators", "lags")] == list(list(rows[0])[3:7])
+    linear = {tuple(r[k] for k in ("structure", "operator", "lags")) for r in rows if r["operators"] == "0"}
+    assert linear == {("lfr", "", "")}
+    assert {(r["lags"], r["operators"]) for r in rows if r["structure"] == "narx"} == {("1", ""), ("2", "")}
+    summary = list(csv.DictReader((folder / "rig-campaign" / "summary.csv").read_text().splitlines()))
+    assert len(summary) == 2 * 7 and {r["jobs"] for r in summary} == {"1"}
+    assert pilfr.campaign(path).done == ()
+
+
 @pytest.mark.parametrize(
     "model, says",
     [
@@ -101,7 +139,8 @@ def test_a_campaign_compares_structures_and_each_takes_what_is_its_own(folder):
         ('structure = "narx"\nlags = 2\n[regularization]\nl1 = 1e-3', "leave l1 out"),
         ('structure = "ssnn"\nnx = 1\nhidden = 2\n[regularization]\nl1 = 1e-3', "'w'"),
         ('structure = "noe"\nlags = 2\n[grid]\nlags = [1, "two"]', "'lags' in [model] is 'two'"),
-        ('[grid]\nstructure = ["narx", "lfr"]\nlags = [1, 2]\nnx = [1]', "'nx' in [model] is not for structure"),
+        ('[grid]\nstructure = ["narx", "noe"]\nlags = [1, 2]\nnx = [1]', "'nx' in [model] is not for structure"),
+        ('[grid]\noperator = ["play", "stop"]\nnx = [1]\nneurons = [2]', "'neurons' in [model] goes with operator"),
     ],
 )
 def test_bad_options_get_one_sentence(folder, model, says):

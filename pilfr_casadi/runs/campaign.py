@@ -7,6 +7,7 @@ its worker is a result too, the table of errors can be read while it is at work,
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
@@ -108,8 +109,18 @@ def _perform(
         try:
             yield from side_by_side(function, jobs, pool, ahead=2 * given.workers, **options)
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-            close_hands()
+            _end(pool)
     else:
         for job in jobs:
             yield [(job, attempt(given, recordings, job))]
+
+
+def _end(pool: ThreadPoolExecutor) -> None:
+    """End a pool and its hands, those too that its threads have just been about to begin."""
+    pool.shutdown(wait=False, cancel_futures=True)
+    ending = threading.Thread(target=pool.shutdown, daemon=True)
+    ending.start()
+    while ending.is_alive():
+        close_hands()
+        ending.join(0.02)
+    close_hands()

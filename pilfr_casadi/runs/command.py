@@ -19,7 +19,7 @@ from .campaign import campaign
 from .described import ROLES, Run, read_run
 from .execute import NoModel, RunInterrupted, RunResult, run
 from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own
-from .grid import Cell
+from .grid import Cell, grid_keys
 from .results import reasons
 from .side_by_side import AHEAD
 
@@ -95,13 +95,13 @@ def _print_summary(result: RunResult) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    keys = list(result.summary[0].cell)
+    keys = grid_keys(s.cell for s in result.summary)
     table = Table(box=None, header_style="bold", pad_edge=False)
     for name in ("recording", *keys, "jobs", "failed", "25 %", "median", "75 %", "s a job"):
         table.add_column(name, justify="left" if name == "recording" else "right", no_wrap=True)
     for s in result.summary:
         quartiles = [f"{q:.4f}" for q in s.quartiles[1:4]]
-        cell = [str(s.cell[k]) for k in keys]
+        cell = [str(s.cell.get(k, "-")) for k in keys]
         counts = [str(s.jobs), f"{100 * s.failure_rate:.0f} %"]
         table.add_row(f"{s.recording} ({s.role})", *cell, *counts, *quartiles, f"{s.seconds:.1f}")
     Console(highlight=False, width=WIDE).print(table)

@@ -1,20 +1,21 @@
 """The grid of a run file: every combination of the values listed in `[grid]` is a cell, and every seed a job in it.
 
 A run without a grid has one cell. Keys of the grid are those of `[model]` and `[solver]` that a study varies; what it
-does not list is as these tables say.
+does not list is as these tables say. A cell has the keys that matter to its model (a NARX has lags and no operators);
+combinations that differ in nothing else are one cell.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from ..baselines import Lagged
 from ..lfr import PILFR
 from ..model import Model
-from ..structures import ANY, LAGGED, TAKES
+from ..structures import ANY, HYSTERETIC, LAGGED, TAKES
 from .tables import Table, as_plain, shown
 
 MODEL_KEYS = ("structure", "nx", "operator", "operators", "channels", "neurons", "hidden", "lags")
@@ -28,7 +29,7 @@ class Cell:
     Attributes
     ----------
     values : dict
-        Key of the grid -> value; empty where there is no grid.
+        Key of the grid -> value, of the keys that matter to the cell; empty where there is no grid.
     model : PILFR, NARX, NOE or Model
     search : dict
         `starts` and `start`.
@@ -60,25 +61,50 @@ def cells_of(
         return (Cell({}, model, search, as_plain({"model": model, "solver": solver})[0]),), found
     axes = _axes(top.table("grid"))
     base = {"model": Table(top.file, "model", model).content, "solver": Table(top.file, "solver", solver).content}
-    cells: list[Cell] = []
+    cells: dict[str, Cell] = {}
     for values in itertools.product(*axes.values()):
         cell = dict(zip(axes, values, strict=True))
         said = {
             "model": base["model"] | {k: v for k, v in cell.items() if k in MODEL_KEYS},
             "solver": base["solver"] | {k: v for k, v in cell.items() if k in SOLVER_KEYS},
         }
-        if "operator" in axes and cell["operator"] != "generalized_play" and "neurons" not in axes:
-            said["model"].pop("neurons", None)
-        if cell.get("structure") in TAKES:  # leave out what the file says for other structures
-            others = ANY.difference(TAKES[cell["structure"]], axes)
-            said["model"] = {k: v for k, v in said["model"].items() if k not in others}
-            if cell["structure"] in LAGGED and "start" not in axes:
-                said["solver"].pop("start", None)
+        idle = _idle(said["model"], axes)
+        said = {table: {k: v for k, v in content.items() if k not in idle} for table, content in said.items()}
         found, search = solver_of(Table(top.file, "solver", said["solver"]))
         built = model_of(Table(top.file, "model", said["model"]))
         _check_start(top, built, search)
-        cells.append(Cell(cell, built, search, as_plain(said)[0]))
-    return tuple(cells), found
+        plain = as_plain(said)[0]
+        form = "linear" if _linear(said["model"]) else said["model"].get("structure", "lfr")
+        meaning = str({**plain, "model": {**plain["model"], "structure": form}})
+        cells.setdefault(meaning, Cell({k: v for k, v in cell.items() if k not in idle}, built, search, plain))
+    return tuple(cells.values()), found
+
+
+def _linear(model: Mapping[str, Any]) -> bool:
+    """Whether a [model] table says a linear model: no operators."""
+    return TAKES.get(model.get("structure", "lfr")) == HYSTERETIC and model.get("operators") == 0
+
+
+def _idle(model: Mapping[str, Any], axes: Mapping[str, list[Any]]) -> set[str]:
+    """Keys that say nothing of this cell: other structures of the grid take them, or its model is the same without."""
+    structure, out = model.get("structure", "lfr"), set[str]()
+    if "structure" in axes and structure in TAKES:
+        others = {name for s in axes["structure"] for name in TAKES.get(s, ())}
+        out = {k for k in ANY.difference(TAKES[structure]) if k not in axes or k in others}
+        if structure in LAGGED and ("start" not in axes or not LAGGED.keys() >= set(axes["structure"])):
+            out.add("start")
+    kinds = axes.get("operator", [])
+    if kinds and model.get("operator") != "generalized_play" and ("neurons" not in axes or "generalized_play" in kinds):
+        out.add("neurons")
+    if axes and _linear(model):
+        out |= {"operator", "neurons", "channels", *(k for k in SOLVER_KEYS if k in axes)}
+    return out
+
+
+def grid_keys(found: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Keys of the grid that any cell has, in the order of the grid."""
+    given = {k for values in found for k in values}
+    return [k for k in (*MODEL_KEYS, *SOLVER_KEYS) if k in given]
 
 
 def _check_start(top: Table, model: PILFR | Lagged | Model, search: Mapping[str, Any]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..recording import Recording
 from .described import ROLES, Run
+from .grid import grid_keys
 from .jobs import Recordings, RunJob
 
 
@@ -44,7 +45,7 @@ def chosen(scores: Sequence[Score], jobs: Sequence[str]) -> str:
 
 def table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapping[str, Any], best: str) -> str:
     """results.csv: one row a job and recording, numbers to the last digit; one row for a job without a model."""
-    keys = list(dict.fromkeys(k for job in jobs for k in job.parameters if k != "seed"))
+    keys = grid_keys(job.parameters for job in jobs) + ["fold"] * any(job.fold is not None for job in jobs)
     by_job: dict[str, list[Score]] = {}
     for s in scores:
         by_job.setdefault(s.job, []).append(s)

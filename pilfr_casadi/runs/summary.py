@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .described import Run
-from .grid import Cell
+from .grid import Cell, grid_keys
 from .jobs import RunJob
 from .results import Score
 
@@ -89,12 +89,12 @@ def summarised(
 
 def summary_table(run: Run, summary: Sequence[CellSummary]) -> str:
     """summary.csv: one row a recording and cell, numbers to the last digit."""
-    keys = list(run.cells[0].values)
+    keys = grid_keys(cell.values for cell in run.cells)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["role", "recording", *keys, "jobs", "failed", "failure_rate", *QUARTILES])
     for s in summary:
-        about = [s.role, s.recording, *(s.cell[k] for k in keys), s.jobs, s.failed, repr(s.failure_rate)]
+        about = [s.role, s.recording, *(s.cell.get(k, "") for k in keys), s.jobs, s.failed, repr(s.failure_rate)]
         writer.writerow([*about, *map(repr, s.quartiles)])
     return text.getvalue()
 
@@ -103,7 +103,8 @@ def box_plots(run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]) -> byte
     """Box plots of all cells, one picture a recording, as PNG."""
     from ..plots import compared_spread
 
-    keys = [k for k in run.cells[0].values if len({cell.values[k] for cell in run.cells}) > 1]
+    cells = [cell.values for cell in run.cells]
+    keys = [k for k in grid_keys(cells) if len({values.get(k) for values in cells}) > 1]
     found = errors_by_cell(run, jobs, scores)
     if any(role == "held" for role, _ in found):  # the models on all of the training are those of one cell
         found = {key: cells for key, cells in found.items() if key[1] == FOLDS}
@@ -117,4 +118,4 @@ def box_plots(run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]) -> byte
 
 
 def _label(cell: Cell, keys: Sequence[str]) -> str:
-    return "\n".join(str(cell.values[k]) for k in keys) or "all jobs"
+    return "\n".join(str(cell.values.get(k, "-")) for k in keys) or "all jobs"
