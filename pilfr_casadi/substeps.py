@@ -46,6 +46,16 @@ def fastest(simulator: Simulator, x: np.ndarray, u: np.ndarray, p: np.ndarray) -
     return out
 
 
+def growth(simulator: Simulator, recording: Recording) -> float:
+    """Largest real part of the eigenvalues of ∂f/∂x where a recording begins, 1/s; none where there is no state."""
+    if not simulator.states or simulator.discrete:
+        return 0.0
+    p = ParameterSet(dict(simulator.parameters)).start
+    flow, start = _flow(simulator, len(p)), _start(simulator, recording)
+    a = np.asarray(flow(np.append(start, np.zeros(flow.size1_in(0) - len(start))), recording.u[0], p)[1])
+    return float(np.max(np.linalg.eigvals(a).real)) if np.all(np.isfinite(a)) else 0.0
+
+
 def wanted_substeps(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[int, float]:
     """Sub-steps a sample that keep |λ| h below `REACH`, and the largest |λ|, rad/s; see `choose_substeps`."""
     p, first = ParameterSet(dict(simulator.parameters)).start, recordings[0]

@@ -141,7 +141,7 @@ BAD_SIMULATORS = {
     "recording lacks an output": (("dict(position=x.pos)", "dict(place=x.pos)"), ("'place'", "--column place=COLUMN")),
     "diverging simulator": (
         ("- p.d * x.vel", "+ 1e3 * x.vel"),
-        ("diverges", "position is out", "s into"),
+        ("diverges", "position is out", "s into", "it is unstable", "put the controller into the simulator"),
     ),
     "decides by a symbol": (("p.k * x.pos", "p.k * max(x.pos, 0)"), ("casadi.if_else", "casadi.fmax")),
     "math's functions": (("p.k * x.pos", "p.k * __import__('math').sin(x.pos)"), ("equation of 'vel'", "ca.sin")),

@@ -18,12 +18,13 @@ from ..problem import Problem
 from ..recording import InputError, Recording
 from ..sensitivities import Engine
 from ..simulator import Simulator
-from ..substeps import MOST, REACH, choose_substeps, fastest, wanted_substeps
+from ..substeps import MOST, REACH, choose_substeps, fastest, growth, wanted_substeps
 from ..threads import one_at_a_time
 from .arranged import arranged
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 HUGE, ENDLESS = 1e6, 1e20  # times the largest measured value, and mean square error, of what grows without end
+BEYOND = 20.0  # e-folds within a recording that no estimate of a state survives
 FINER = 4  # times as many sub-steps for a law at most
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
 
@@ -175,10 +176,9 @@ class Workbench:
             if found is not None and (best is None or found[0] < best[0]):
                 best = found
         if best is None:
-            at = self._lost(model, engine, starts[0])
             raise InputError(
-                f"The simulation diverges at the start values{at}; "
-                "check the parameters' values and units, and the hold."
+                f"The simulation diverges at the start values{self._lost(model, engine, starts[0])}; "
+                + (self._unstable(simulator) or "check the parameters' values and units, and the hold.")
             )
         _, theta, problem = best
         values = model.parameters.unpack(problem.parameters(theta))
@@ -197,6 +197,16 @@ class Workbench:
                 name = self.simulator.output_names[int(np.argmax(off[k]))]
                 return f" ({name} is out of all bounds {k * r.dt:.3g} s into {r.label})"
         return ""
+
+    def _unstable(self, simulator: Simulator) -> str:
+        """What to do about a simulator that no recording of a controlled machine can be followed with, or nothing."""
+        rate = growth(simulator, self.recordings[0])
+        if rate * max(len(r) for r in self.recordings) * self.dt < BEYOND:
+            return ""
+        return (
+            f"it is unstable (it grows e-fold in {1 / rate:.2g} s) and cannot be run by its own inputs alone: put the "
+            "controller into the simulator, with its reference as the input."
+        )
 
     def _as_it_is(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
         """Nothing to estimate: the simulator as it stands."""
