@@ -151,3 +151,15 @@ def test_what_moves_memory_twice_by_the_same_signal_changes_nothing():
 def test_the_catalogue_has_no_law_twice():
     assert len({(kind.id, kind.form, kind.places) for kind in CATALOGUE}) == len(CATALOGUE)
     assert set(laws.__all__) >= {"CATALOGUE", "Law"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "doubtful"),
+    [
+        (laws.Power, {"a": 37.0, "n": 1.002}, True),
+        (laws.Power, {"a": 0.2, "n": 0.5}, False),
+        (laws.Orifice, {"a": 0.2, "z_t": 0.1}, False),
+    ],
+)
+def test_a_power_of_one_is_a_gain_and_no_curve(kind, values, doubtful):
+    assert kind().doubtful(values) is doubtful

@@ -70,13 +70,17 @@ class Candidate:
     @property
     def doubtful(self) -> bool:
         """Whether the law at its fitted values is hardly what its name says."""
-        prefix = self.fitted.simulator.elements[-1].prefix
-        return self.law.doubtful({k.removeprefix(prefix): self.fitted.values[k] for k in self._own})
+        return self.law.doubtful({k.removeprefix(self._prefix): self.fitted.values[k] for k in self._own})
 
     @property
     def _own(self) -> list[str]:
-        prefix = self.fitted.simulator.elements[-1].prefix
-        return [k for k in self.fitted.model.parameters if k.startswith(prefix)]
+        return [k for k in self.fitted.model.parameters if k.startswith(self._prefix)]
+
+    @property
+    def _prefix(self) -> str:
+        """Of the law's parameters; another effect may stand behind it."""
+        elements = self.fitted.simulator.elements[::-1]
+        return next((e for e in elements if e.port == self.port and type(e.law) is type(self.law)), elements[0]).prefix
 
 
 def heads(recordings: Sequence[Recording]) -> tuple[Recording, ...]:

@@ -19,8 +19,8 @@ from ..threads import side_by_side
 from .workbench import QUICK, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]
-# metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches, psi
-UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 6894.757)
+# metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
+UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
 FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 # mean square error that a wrong unit of time leaves at least, and where it has driven parameters to their bounds

@@ -10,6 +10,8 @@ import numpy as np
 
 from .base import Law, Local, grid
 
+STRAIGHT = 0.03  # difference of a power from one that is no curve
+
 
 class Polynomial(Law):
     """A memoryless curve: quadratic and cubic terms."""
@@ -83,6 +85,10 @@ class Power(Polynomial):
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"n": (0.3, 5.0)}
 
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """A power of one is no curve: a gain, as from a wrong unit."""
+        return bool(abs(values["n"] - 1) < STRAIGHT)
+
 
 class PowerWithGain(Power):
     """A signed power beside an error of the gain, which the simulator has no parameter for."""
@@ -118,6 +124,10 @@ class Orifice(Root):
     source = "Borutzky, Barnard & Thoma (2002), Simulation Modelling Practice and Theory 10"
     sentence = "a memoryless curve: flow through an orifice, laminar below z_t and turbulent beyond"
     units: ClassVar[Mapping[str, str]] = {"a": "w/z^0.5", "z_t": "z"}
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Its power is given."""
+        return False
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a * z / (z**2 + p.z_t**2) ** 0.25
