@@ -18,6 +18,7 @@ from .concealed_truth import Effect, Motion, Plant, pick, refit, simulate
 Array = np.ndarray
 LEAST, MOST = 3.3, 90.0  # refit's error over the noise
 TRIES = 12
+SAME = 0.9  # correlation beyond which two coordinates move alike
 
 
 class Unsuited(Exception):
@@ -150,13 +151,18 @@ class Draw:
     def _into(self, port: str) -> dict[str, float]:
         return dict(pick(self.plant.ports[port].into, p=SimpleNamespace(**self.values)))
 
-    def draft(self, port: str, law: str, scale: Scale) -> Draft:
+    def draft(self, port: str, law: str, scale: Scale, bare: Motion) -> Draft:
         """An effect without its strength."""
         series = ":" in port
         if law == "outside":
-            others = [s for s in self.rig.states if s not in self.rig.outputs][1:]
+            others = [] if series else self.apart(port, bare)
             return outside(self.rng, scale, series, str(self.rng.choice(others)) if others else None)
         return (SERIES if series else PARALLEL)[law](self.rng, scale)
+
+    def apart(self, port: str, bare: Motion) -> list[str]:
+        """States that do not move as a port's own coordinate does: with one that does, a product is its square."""
+        own = [np.corrcoef(x, bare.z[port])[0, 1] for x in np.cumsum(bare.derivative, axis=0).T]
+        return [name for name, r in zip(self.rig.states, own, strict=True) if abs(r) < SAME]
 
     def pairs(self) -> list[tuple[str, str]]:
         """Where this case hides something: one or two (port, law)."""
@@ -183,7 +189,7 @@ class Draw:
     def effect(self, port: str, law: str, bare: Motion, item: Any) -> tuple[Effect, float]:
         """An effect with a strength that its refit leaves visible, and that refit's NRMSE."""
         scale = self.scale(port, bare, item[1])
-        draft, strength = self.draft(port, law, scale), 0.0
+        draft, strength = self.draft(port, law, scale, bare), 0.0
         strength, warm = draft.start, item[2]
         target = float(np.exp(self.rng.uniform(np.log(0.01), np.log(0.2))))
         free, lower, upper = self.bounds()

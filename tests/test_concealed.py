@@ -17,6 +17,7 @@ from problems.concealed_case import _Draw
 from problems.concealed_noise import FAULTS, LOUDEST, QUIETEST, draw_fault
 from problems.concealed_rigs_more import RIGS, places
 from problems.concealed_score import line, summary
+from problems.concealed_series import outside
 
 LAWS = {
     "cubic_stiffness", "quadratic_stiffness", "piecewise_stiffness", "clearance", "coulomb_friction",
@@ -126,6 +127,20 @@ def test_scores(cases):
 
 def test_kinds_are_shares():
     assert sum(KINDS.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("seed", "own"), [(2862, {"a1", "a2"}), (2972, {"y"})])
+def test_a_product_outside_the_catalogue_is_no_square(monkeypatch, seed, own):
+    """A product of a coordinate with one that moves alike is a quadratic stiffness, which the catalogue has."""
+    drawn = []
+
+    def spy(rng, scale, series, other):
+        drawn.append(other)
+        return outside(rng, scale, series, other)
+
+    monkeypatch.setattr("problems.concealed_draw.outside", spy)
+    case(seed)
+    assert drawn[-1] not in own
 
 
 def test_exported_files_are_read_back(tmp_path, cases):
