@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from .elements import PrandtlIshlinskii
-from .fit import constraint_list
 from .fit import fit as identify
 from .fitted import Fit, fingerprint
 from .interrupts import Progress
@@ -30,7 +29,6 @@ from .multistart import POLISH, polish
 from .recording import InputError, Recording, as_recordings
 from .search import Candidate, Search
 from .solution import Status
-from .stability import stability_limits
 from .thinning import thinned
 
 LAYER = ("w", "r")
@@ -94,7 +92,8 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     train : Recording or sequence of Recording
         What it was fitted to.
     options
-        As for `fit`: `solver`, `stable`, `constraints`, `engine`, ...
+        As for `fit`: `solver`, `stable`, `constraints`, `noise`, `engine`. What is left out of `stable` and
+        `constraints` is as the fit has it.
 
     Returns
     -------
@@ -147,8 +146,8 @@ def polished(
     train: Recording | Sequence[Recording],
     *,
     solver: Any = None,
-    stable: bool | float = True,
-    constraints: Any = (),
+    stable: bool | float | None = None,
+    constraints: Any = None,
     noise: float | None = None,
     engine: str = "auto",
 ) -> Fit:
@@ -158,7 +157,8 @@ def polished(
     """
     structure, recordings, solver = fit.structure, as_recordings(train), solver or POLISH
     assert structure is not None
-    limits = (*stability_limits(structure, stable), *constraint_list(constraints))
+    asked = fit.asked.but(stable, constraints)
+    limits = asked.limits(structure)
     search = Search(
         structure, recordings, {}, solver, limits, engine, noise=noise, level=float(np.mean(fit.train_nrmse))
     )
@@ -169,7 +169,7 @@ def polished(
     best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))
     if best.model is fit.model and best.error >= error:
         return fit
-    job = Job(recordings, solver, limits, {}, noise, engine, None)
+    job = Job(recordings, solver, limits, {}, noise, engine, None, asked=asked)
     problem = job.problem(best.model, best.error)
     solution = job.solve(problem, "solve", best.theta)
     found = job.result(best.model, structure, problem, solution, note=best.note)
@@ -207,7 +207,8 @@ def regularization_path(
     progress : callable
         Gets ("path", done, total, smallest validation error so far).
     options
-        As for `fit`: `solver`, `stable`, `constraints`, `engine`, ...
+        As for `fit`: `solver`, `stable`, `constraints`, `noise`, `engine`. What is left out of `stable` and
+        `constraints` is as the fit has it.
 
     Returns
     -------
