@@ -307,3 +307,12 @@ def test_spawned_workers(call, tmp_path):
         assert lines[0].startswith("InputError:") and '`if __name__ == "__main__":`' in lines[0]
     else:
         assert float(lines[0].strip("(),")) < 1
+
+
+def test_start_values_are_not_stretched_to_a_shape():
+    recording = pilfr_casadi.Recording(np.sin(np.arange(80.0)), np.cos(np.arange(80.0)), 0.1)
+    structure = pilfr_casadi.PILFR(2, pilfr_casadi.PrandtlIshlinskii(pilfr_casadi.Play, 3))
+    with pytest.raises(
+        pilfr_casadi.InputError, match=r"The start of 'A' has the shape \(1, 2\); give a number or an array"
+    ):
+        pilfr_casadi.fit(structure, recording, start={"A": [[0.9, 0.1]]})
