@@ -42,6 +42,11 @@ def whole(value: Any, what: str, least: int) -> int:
     return int(value)
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is one real number."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
 def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infinite: bool = False) -> np.ndarray:
     """Return finite real numbers as an array; of a shape, to which it is broadcast, where one is given.
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from .checks import is_number
 from .elements import PrandtlIshlinskii
 from .fit import fit as identify
 from .fitted import Fit, fingerprint
@@ -228,12 +229,14 @@ def regularization_path(
         raise InputError("A validation recording is a training recording too; give one that was not fitted.")
     scale = fit.solution.cost if priors is None else 1.0
     given = [scale * s for s in STRENGTHS] if priors is None else [0.01, 0.1, 1.0, 10.0, 100.0]
-    given = sorted(set(given if strengths is None else strengths))
-    if not given or not all(0 < s < np.inf for s in given) or not 0 <= margin < np.inf:
+    asked: Any = given if strengths is None else strengths
+    listed = isinstance(asked, Sequence | np.ndarray) and all(is_number(s) and 0 < s < np.inf for s in asked)
+    if not (listed and len(asked) and is_number(margin) and 0 <= margin < np.inf):
         raise InputError(
-            f"strengths = {given} and margin = {margin} were given; give one strength or more, all above zero, and a "
-            "margin of zero or more."
+            f"strengths = {asked!r} and margin = {margin!r} were given; give one strength or more, all above zero, and "
+            "a margin of zero or more."
         )
+    given = sorted({float(s) for s in asked})
     fits, errors = [fit], [fit.nrmse(judged)]
     thin: dict[int, tuple[Fit, ...]] = {}
     for i, strength in enumerate(given):

@@ -20,7 +20,7 @@ from .job import Job
 from .multistart import POLISH, PRIOR, held_near
 from .recording import Recording, as_recordings
 from .solution import Status
-from .start import regrid
+from .start import is_density, regrid
 
 LAYER = ("w", "r")
 WAYS = tuple(
@@ -60,7 +60,7 @@ def thinned(
         job = Job(recordings, solver, asked.limits(smaller), {}, noise, engine, None, asked=asked)
         rows = [
             regrid(r, w, float(top), beyond=beyond, spacing=spacing, count=n)
-            if w.sum() > 0 and top > 0
+            if is_density(w) and top > 0
             else (r[:n], w[:n])
             for r, w, top in zip(fit.parameters["r"], fit.parameters["w"], reach, strict=True)
         ]

@@ -271,6 +271,11 @@ def test_a_path_over_priors(record, full):
         ({"strengths": (0.0,)}, "all above zero"),
         ({"strengths": ()}, "give one strength or more"),
         ({"margin": -1.0}, "margin of zero or more"),
+        ({"margin": "a"}, "margin = 'a' were given"),
+        ({"margin": None}, "margin = None were given"),
+        ({"strengths": 5}, "strengths = 5 and"),
+        ({"strengths": ("a",)}, r"strengths = \('a',\) and"),
+        ({"strengths": (True,)}, r"strengths = \(True,\) and"),
     ],
 )
 def test_what_cannot_be_a_path(record, full, options, says):
@@ -302,6 +307,14 @@ def test_validation_is_no_training(record, full):
         (lambda: dc_gain(1.0, within=-1.0), "of 0 or more"),
         (lambda: dc_gain(1.0, slope=2.0), "from 0 to 1"),
         (lambda: ordered(gap=-1.0), "gap"),
+        (lambda: ordered("r", "a"), "The gap between the entries of 'r' is a; give a number"),
+        (lambda: ordered("r", [0.1, 0.2]), r"The gap .* has the shape \(2,\); give a number"),
+        (lambda: dc_gain("a"), "The value of a dc_gain cannot be 'a'; give numbers"),
+        (lambda: dc_gain(None), "The value of a dc_gain"),
+        (lambda: dc_gain([[1, 2], [3]]), "The value of a dc_gain"),
+        (lambda: dc_gain(1, within="a"), "within of a dc_gain is a; give a number"),
+        (lambda: dc_gain([1, 2], within=[1, 2, 3]), r"within of a dc_gain has the shape \(3,\)"),
+        (lambda: dc_gain(1, slope="a"), "slope of a dc_gain is a; give a number"),
     ],
 )
 def test_what_cannot_be_known(make, says):
