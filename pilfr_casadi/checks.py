@@ -42,6 +42,11 @@ def whole(value: Any, what: str, least: int) -> int:
     return int(value)
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is one real number."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
 def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infinite: bool = False) -> np.ndarray:
     """Return finite real numbers as an array; of a shape, to which it is broadcast, where one is given.
 
@@ -62,6 +67,45 @@ def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infini
     if np.any(np.isnan(found)) or not (infinite or np.all(np.isfinite(found))):
         raise InputError(f"{what} holds a value that is not finite (nan or infinite); give finite numbers.")
     return found
+
+
+def filled(
+    values: Any, what: str, shape: tuple[int | str, ...], nan: bool = False, infinite: bool = False
+) -> np.ndarray:
+    """Return an array of a shape from one number for all of it, or from an array of just this shape.
+
+    Nothing else is stretched: a row given for a matrix is more likely a mistake than every row of it.
+
+    Parameters
+    ----------
+    values : float or array
+    what : str
+        Begins the sentence.
+    shape : tuple
+        A name in place of a length stands for one that is not known yet; a single number stays as it is then.
+    nan, infinite : bool
+        Whether such entries have a meaning.
+
+    Raises
+    ------
+    InputError
+        If something else is given.
+    """
+    wanted = f"a number or an array of shape ({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
+    try:
+        given = np.asarray(values)
+        if given.dtype.kind not in "biuf":
+            raise TypeError
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{what} is {str(values)[:60]}; give {wanted if shape else 'a number'}.") from None
+    found = given.astype(float)
+    known = tuple(k if isinstance(n, str) else n for n, k in zip(shape, found.shape, strict=False))
+    if found.ndim and (len(shape), known) != (found.ndim, found.shape):
+        raise InputError(f"{what} has the shape {found.shape}; give {wanted if shape else 'a number'}.")
+    if (np.any(np.isnan(found)) and not nan) or (np.any(np.isinf(found)) and not infinite):
+        raise InputError(f"{what} holds a value that is not finite; give {wanted if shape else 'a number'}, finite.")
+    lengths = [n for n in shape if not isinstance(n, str)]
+    return np.broadcast_to(found, lengths) if len(lengths) == len(shape) else found
 
 
 def signal(

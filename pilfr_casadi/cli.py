@@ -12,9 +12,11 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 DONE, NO_RESULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+EVERY_KEY = "demo_data/every_key.toml"
 # keyword arguments of Python that the package's messages name, and that are options here under the same name
 KEYWORDS = ("dt", "time_tolerance", "period", "hold", "initial", "skip", "starts", "seed", "workers", "engine")
 
@@ -150,6 +152,7 @@ def _parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     for parser_of, name in ((run, "run"), (campaign, "campaign")):
+        parser_of.epilog = f"Every key of a run file, in one that runs: {Path(__file__).parent / EVERY_KEY}"
         add = parser_of.add_argument
         add("run_file", metavar="RUN.toml", help="what to do (.toml, or .py that sets `run`)")
         add("--out", metavar="DIR", help=f"folder of the results (default: as the file says, else RUN-{name})")

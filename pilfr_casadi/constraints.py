@@ -229,17 +229,13 @@ def compile_constraints(
 
 
 def _expression(c: Constraint, named: Mapping[str, Any], parameters: ParameterSet) -> Any:
-    """The constraint's expression as a column.
-
-    Raises
-    ------
-    InputError
-        If it fails or names an unknown parameter.
-    """
+    """The constraint's expression as a column; an `InputError` if it fails or names an unknown parameter."""
     try:
         g = ca.vec(c.expression(named))
         if not isinstance(g, ca.MX):
             g = ca.MX(ca.DM(g))
+    except InputError:
+        raise
     except KeyError as e:
         raise InputError(
             f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(parameters)}."

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from .asked import Asked
 from .baselines import Lagged
 from .constraints import Constraint, loosened
 from .elements import PrandtlIshlinskii, StaticNetwork
@@ -60,8 +61,8 @@ def fit(
     seed: int = 0,
     start: str | Mapping[str, Any] = "grid",
     linear: Any = None,
-    stable: bool | float = True,
-    constraints: Sequence[Constraint] = (),
+    stable: bool | float | None = None,
+    constraints: Sequence[Constraint] | None = None,
     l1: dict[str, float] | None = None,
     noise: float | None = None,
     weights: Sequence[float] | np.ndarray | None = None,
@@ -94,12 +95,13 @@ def fit(
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
         exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one. A number below
-        1 is a least rate of decay; False is no bound. The slope is `Σ w` of plays and stops, and that times the slope
-        far out of each envelope of generalized plays, also where they are parts of a `Combined`; where an envelope is
-        so steep in between that small motions there grow, the fit says so. Of elements with bounded forces the linear
-        part decides; of envelopes of your own no slope is known, which the fit says.
-    constraints
-        See `Problem`.
+        1 is a least rate of decay; False is no bound. Left out, an earlier fit keeps its own. The slope is `Σ w` of
+        plays and stops, and that times the slope far out of each envelope of generalized plays, also where they are
+        parts of a `Combined`; where an envelope is so steep in between that small motions there grow, the fit says so.
+        Of elements with bounded forces the linear part decides; of envelopes of your own no slope is known, which the
+        fit says.
+    constraints : sequence of Constraint, optional
+        See `Problem`. Left out, an earlier fit keeps its own; `()` is none.
     noise : float, optional
         Standard deviation of the noise relative to the output's, which priors are weighed against. By default the noise
         is estimated wherever there are priors: the problem is solved, the noise set to the error that was reached, and
@@ -143,7 +145,7 @@ def fit(
         raise SystemExit(1)  # a spawned worker that runs the script again; the first process says what to do
     if l1 is not None and not isinstance(l1, dict):
         raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
-    further = constraint_list(constraints)
+    asked = (model.asked if isinstance(model, Fit) else Asked()).but(stable, constraints)
     if progress is True:
         from .progress import progress_bar
 
@@ -152,9 +154,10 @@ def fit(
         shown = nullcontext(progress or None)
     pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and search else None
     with shown as report:
-        job = Job((), solver, further, dict(l1 or {}), noise, engine, report, weights, 1 if search else workers)
+        threads = 1 if search else workers
+        job = Job((), solver, (), dict(l1 or {}), noise, engine, report, weights, threads, asked)
         try:
-            return _fit(model, train, job, stable, starts, seed, start, executor or pool, linear)
+            return _fit(model, train, job, starts, seed, start, executor or pool, linear)
         except BrokenProcessPool:
             spawned = pool is not None and multiprocessing.get_start_method() != "fork"
             raise InputError(NO_GUARD if spawned else DEAD_WORKER) from None
@@ -168,7 +171,6 @@ def _fit(
     model: PILFR | Lagged | Model | Fit,
     train: Recording | Sequence[Recording],
     job: Job,
-    stable: bool | float,
     starts: int,
     seed: int,
     start: str | Mapping[str, Any],
@@ -179,13 +181,13 @@ def _fit(
         raise InputError("A linear model to begin with goes with a PILFR; any other model has its own values.")
     if isinstance(start, Mapping) and not isinstance(model, PILFR):
         raise InputError("Values to start from go with a PILFR; a Model and a Fit have their own.")
-    check_gain(job.limits, (model.model if isinstance(model, Fit) else model).element)
+    asked = job.asked
+    check_gain(asked.constraints, (model.model if isinstance(model, Fit) else model).element)
     if isinstance(model, Lagged):
-        check_lagged_options(model, stable, start)
-        return fit_lagged(model, train, job, starts, seed, executor)
+        check_lagged_options(model, asked.stable, start)
+        return fit_lagged(model, train, replace(job, limits=asked.constraints), starts, seed, executor)
     structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
-    limits = stability_limits(structure, stable) if structure else ()
-    job = replace(job, limits=(*limits, *job.limits))
+    job = replace(job, limits=asked.limits(structure))
     if isinstance(model, PILFR) and isinstance(start, Mapping):
         model = at_values(model, as_recordings(train)[0], start)
     if not isinstance(model, PILFR):
@@ -205,15 +207,16 @@ def _fit(
     assert isinstance(start, str)
     fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
     job = replace(job, recordings=check_for_identification(train, fewest))
+    radius = loosened(stability_limits(model, asked.stable)[:1])
     linear, problem, solution = linear_model(
-        job.recordings, model, engine=job.engine, constraints=loosened(limits[:1]), progress=job.progress, given=given
+        job.recordings, model, engine=job.engine, constraints=radius, progress=job.progress, given=given
     )
     if solution.status is Status.INTERRUPTED:
         return job.result(linear, model.linear(), problem, solution)
     fitted = in_known_coordinates(model, with_solution(linear, problem, solution), job)
     if model.element is None:
         bounded = Problem(linear, job.recordings, engine=problem.engine, constraints=job.limits)
-        more = model.fixed or model.bounds or model.priors or job.limits[1:] or solution.status is Status.INFEASIBLE
+        more = model.fixed or model.bounds or model.priors or asked.constraints or solution.status is Status.INFEASIBLE
         if not (more or beyond(bounded, solution.theta)) and job.solver == POLISH:
             return job.result(linear, model, bounded, solution)  # nothing that the linear model has not seen
         return linear_only(model, fitted, job)
@@ -233,15 +236,6 @@ def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any
             raise InputError(f"{name} = {value!r} was given; give a whole number, {least} or more.")
     if progress is not None and not isinstance(progress, bool) and not callable(progress):
         raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
-
-
-def constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
-    """One constraint, or several, as several."""
-    if isinstance(given, Constraint):
-        return (given,)
-    if not isinstance(given, Sequence) or not all(isinstance(c, Constraint) for c in given):
-        raise InputError(f"constraints = {given!r} was given; give a Constraint, or a list of them.")
-    return tuple(given)
 
 
 def _leave_interrupts() -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from .asked import Asked
 from .compiled import make_engine
+from .gauge import unknown_sentences
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .limits import Limit, unknown_multipliers
@@ -23,8 +25,6 @@ from .search import Candidate
 from .sensitivities import Engine
 from .slopes import settled
 from .solution import Solution, Status
-
-STATES = ("A", "B_u", "B_w", "C_y", "C_z")  # blocks that a change of coordinates of the states changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +56,8 @@ class Fit:
         The linear model that the search began with, `linear_nrmse` its NRMSE on each training recording.
     candidates : tuple of Candidate
         Every start that was tried.
+    asked : Asked
+        The bound on spectral radii and the constraints, which fits made from this one hold too.
     """
 
     model: Model
@@ -75,6 +77,7 @@ class Fit:
     note: str = ""
     linear_nrmse: tuple[float, ...] = ()
     limits: tuple[Limit, ...] = ()
+    asked: Asked = Asked()  # noqa: RUF009  (frozen)
 
     @property
     def status(self) -> Status:
@@ -237,20 +240,6 @@ class Fit:
         return "\n".join(line for line in lines if line)
 
     __repr__ = __str__
-
-
-def unknown_sentences(errors: Mapping[str, np.ndarray]) -> list[str]:
-    """What it means that standard errors are infinite, none where none is."""
-    count = {name: int(np.sum(np.isinf(e))) for name, e in errors.items()}
-    turned = [name for name in STATES if count.get(name)]
-    others = [f"{count[k]} of {np.size(e)} entries of {k}" for k, e in errors.items() if count[k] and k not in turned]
-    out = [f"the data alone says nothing about {', '.join(others)}"] if others else []
-    if turned:
-        out.append(
-            f"entries of {', '.join(turned)} have no standard error of their own: others, as in other coordinates of "
-            "the states, give the same outputs; judge poles, zeros and responses instead"
-        )
-    return out
 
 
 def fingerprint(recording: Recording) -> str:

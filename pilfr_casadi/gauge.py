@@ -16,6 +16,8 @@ simple, or another minimum. A gauge-invariant function f (an eigenvalue, a stati
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from .lfr import PILFR
@@ -25,6 +27,7 @@ from .problem import Problem
 from .residual_noise import gradient_covariance
 
 Array = np.ndarray
+STATES = ("A", "B_u", "B_w", "C_y", "C_z")  # blocks that a change of coordinates of the states changes
 FADED = 1e-30  # share of its matrix's largest sensitivity below which an entry counts as not seen
 
 
@@ -193,3 +196,17 @@ def _snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, toleranc
         theta[far] = given[far]
         held &= ~far
     return held
+
+
+def unknown_sentences(errors: Mapping[str, np.ndarray]) -> list[str]:
+    """What it means that standard errors are infinite, none where none is."""
+    count = {name: int(np.sum(np.isinf(e))) for name, e in errors.items()}
+    turned = [name for name in STATES if count.get(name)]
+    others = [f"{count[k]} of {np.size(e)} entries of {k}" for k, e in errors.items() if count[k] and k not in turned]
+    out = [f"the data alone says nothing about {', '.join(others)}"] if others else []
+    if turned:
+        out.append(
+            f"entries of {', '.join(turned)} have no standard error of their own: others, as in other coordinates of "
+            "the states, give the same outputs; judge poles, zeros and responses instead"
+        )
+    return out

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .asked import Asked
 from .constraints import Constraint
 from .exactness import exactly
 from .fitted import Fit
@@ -42,6 +43,7 @@ class Job:
     progress: Progress | None
     weights: Sequence[float] | np.ndarray | None = None
     threads: int = 1
+    asked: Asked = Asked()  # noqa: RUF009  (frozen)
     began: float = field(default_factory=time.perf_counter)
 
     def problem(self, model: Model, noise: float = 1.0, **options: Any) -> Problem:
@@ -75,7 +77,7 @@ class Job:
     def result(self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, **more: Any) -> Fit:
         """What a solution of a problem amounts to; Ctrl-C waits until it is known, and is told by the status."""
         found: list[Fit] = []
-        given = {"engine": self.engine, **more}
+        given = {"engine": self.engine, "asked": self.asked, **more}
         try:
             with deferred_interrupt():
                 solution = exactly(problem, solution)

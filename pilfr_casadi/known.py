@@ -18,6 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from .checks import filled, numbers
 from .constraints import Constraint
 from .elements import PrandtlIshlinskii
 from .operators import Play, Stop
@@ -26,9 +27,14 @@ from .recording import InputError
 
 @dataclass(frozen=True)
 class Gain:
-    """The steady gain from inputs to outputs (n_y, n_u), the element moving along its slope; see above."""
+    """The steady gain from inputs to outputs, the element moving along its slope; see above.
+
+    What it gives is transposed, (n_u, n_y), so that its entries follow each other row by row of the gain. `shape` is
+    that of the values it is compared with, none where one number stands for all.
+    """
 
     slope: float = 1.0
+    shape: tuple[int, ...] = ()
 
     def __call__(self, p: Mapping[str, Any]) -> Any:
         """The expression for named parameters p."""
@@ -37,7 +43,13 @@ class Gain:
             s = self.slope * ca.diag(ca.sum2(p["w"]))
             a, b = a + p["B_w"] @ s @ p["C_z"], b + p["B_w"] @ s @ p["D_zu"]
             c, d = c + p["D_yw"] @ s @ p["C_z"], d + p["D_yw"] @ s @ p["D_zu"]
-        return c @ ca.solve(ca.DM.eye(a.shape[0]) - a, b) + d if a.shape[0] else d
+        wanted = tuple(d.shape)
+        if self.shape not in ((), wanted, *([(max(wanted),)] if min(wanted) == 1 else [])):
+            raise InputError(
+                f"The values of dc_gain have the shape {self.shape}; give one number, or one for each output (row) and "
+                f"input (column), of shape {wanted}."
+            )
+        return (c @ ca.solve(ca.DM.eye(a.shape[0]) - a, b) + d if a.shape[0] else d).T
 
 
 @dataclass(frozen=True)
@@ -60,8 +72,8 @@ def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
     Parameters
     ----------
     value : float or array, (n_y, n_u)
-        The gain, in units of the outputs over those of the inputs.
-    within : float or array
+        The gain, in units of the outputs over those of the inputs; a plain list will do for one output or one input.
+    within : float or array, as the value
         Largest deviation from it; 0 for an equation.
     slope : float
         How much of the element's slope Σw counts: 1 for large motions of plays (all slip) and small ones of stops, 0
@@ -70,18 +82,21 @@ def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
     Raises
     ------
     InputError
-        If the value is not finite, the deviation negative, or the slope outside 0 ... 1.
+        If the value is not finite, the deviation negative or of another shape, or the slope outside 0 ... 1; with a
+        model, if it has other numbers of outputs and inputs.
     """
-    gain, room = np.asarray(value, dtype=float), np.asarray(within, dtype=float)
-    if not (np.all(np.isfinite(gain)) and np.all(room >= 0) and 0 <= slope <= 1):
+    gain = numbers(value, "The value of a dc_gain")
+    room = filled(within, "within of a dc_gain", gain.shape, infinite=True)
+    share = float(filled(slope, "slope of a dc_gain", ()))
+    if not (np.all(room >= 0) and 0 <= share <= 1):
         raise InputError(
             f"A gain of {value} within {within} at a slope of {slope} was asked for; give finite numbers, a deviation "
             "of 0 or more, and a slope from 0 to 1."
         )
-    both = np.broadcast_shapes(gain.shape, room.shape)
-    flat, room = (np.broadcast_to(a, both).ravel(order="F") for a in (gain, room))
-    shown = ", ".join(f"{g:g}" for g in flat) + ("" if not np.any(room) else f" ± {np.max(room):g}")
-    return Constraint(Gain(slope), flat - room, flat + room, f"DC gain = {shown}", exact=bool(np.all(room > 0)))
+    rows = [", ".join(f"{g:g}" for g in row) for row in np.atleast_2d(gain)]
+    shown = "; ".join(rows) + ("" if not np.any(room) else f" ± {np.max(room):g}")
+    low, high = (gain - room).ravel(), (gain + room).ravel()
+    return Constraint(Gain(share, gain.shape), low, high, f"DC gain = {shown}", exact=bool(np.all(room > 0)))
 
 
 def check_gain(constraints: Iterable[Constraint], element: Any) -> None:
@@ -110,6 +125,7 @@ def ordered(name: str = "r", gap: float = 0.0) -> Constraint:
     InputError
         If the gap is negative or not finite.
     """
+    gap = float(filled(gap, f"The gap between the entries of {name!r}", (), infinite=True))
     if not 0 <= gap < np.inf:
         raise InputError(f"A gap of {gap} between the entries of {name!r} was asked for; give a number of 0 or more.")
     return Constraint(Steps(name), lower=float(gap), name=f"{name} ascending", exact=True)

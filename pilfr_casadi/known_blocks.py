@@ -22,6 +22,7 @@ from .lfr import PILFR
 from .modal import is_modal
 from .model import Model
 from .outcome import with_solution
+from .stability import stability_limits
 from .start import states_of
 
 COORDINATES = ("A", "B_u", "C_y")
@@ -43,7 +44,7 @@ def in_known_coordinates(structure: PILFR, linear: Model, job: Job) -> Model:
     blocks = nearest_basis(_scaled(blocks, np.concatenate([r.u for r in job.recordings])), known)
     alone = replace(structure.linear(), fixed=known)
     model = alone.model(linear.n_u, linear.n_y, blocks, inputs=linear.inputs, outputs=linear.outputs)
-    problem = replace(job, limits=job.limits[:1]).problem(model)
+    problem = replace(job, limits=stability_limits(structure, job.asked.stable)[:1]).problem(model)
     if not np.isfinite(problem.cost(problem.start)):
         return model
     return with_solution(model, problem, job.solve(problem, "linear model"))

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from .checks import filled
 from .elements import Element
 from .model import Model, close_loop, open_model
 from .parameters import Parameter, ParameterSet
@@ -22,8 +23,8 @@ from .recording import InputError
 BLOCKS = ("A", "B_u", "B_w", "C_y", "D_yu", "D_yw", "C_z", "D_zu", "y_0")
 
 
-def block_shapes(nx: int, n_u: int, n_y: int, n_w: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the linear blocks."""
+def block_shapes(nx: int, n_u: Any, n_y: Any, n_w: int) -> dict[str, tuple[Any, ...]]:
+    """Shapes of the linear blocks; names in place of n_u and n_y, where these are not known, stay names."""
     return {
         "A": (nx, nx),
         "B_u": (nx, n_u),
@@ -48,8 +49,9 @@ class PILFR:
     element : Element or None
         The element in the loop, usually `PrandtlIshlinskii`; None for a linear model.
     fixed : mapping
-        Blocks held at a value, for example `{"D_yu": 0.0}`; a scalar fills the block, entries that are nan stay free:
-        `{"A": [[0.9, nan], [0.0, nan]]}` says what is known of the physics.
+        Blocks held at a value, for example `{"D_yu": 0.0}`; a number fills the block, an array has its shape, entries
+        that are nan stay free: `{"A": [[0.9, nan], [0.0, nan]]}` says what is known of the physics. Of `B_w` and `D_yw`
+        a row of zeros and nan, one for each channel of the element, says which channels enter.
     bounds : mapping
         `(lower, upper)` by parameter name, for example `{"w": (0, 2)}`.
     priors : mapping
@@ -60,8 +62,8 @@ class PILFR:
     Raises
     ------
     InputError
-        If nx is no whole number of 0 or more, the element is none, a fixed, bounded or prior parameter is unknown, or
-        a bound or prior is no pair of numbers.
+        If nx is no whole number of 0 or more, the element is none, a fixed, bounded or prior parameter is unknown, a
+        bound or prior is no pair, or what is given is neither a number nor an array of the parameter's shape.
     """
 
     nx: int
@@ -90,11 +92,40 @@ class PILFR:
             _check_pair(f"bounds of {name!r}", pair, "(lower, upper), with -numpy.inf or numpy.inf for none")
         for name, pair in self.priors.items():
             _check_pair(f"prior of {name!r}", pair, "(mean, std)")
+        elements = self.element.parameters() if self.element else {}
+        shapes = {**block_shapes(self.nx, "n_u", "n_y", self.n_w), **{k: p.value.shape for k, p in elements.items()}}
+        for name, shape in shapes.items():
+            self._given(name, shape)
 
     @property
     def n_w(self) -> int:
         """Channels of the element."""
         return 0 if self.element is None else self.element.channels
+
+    def _given(self, name: str, shape: tuple[Any, ...]) -> dict[str, Any]:
+        """What is said of a parameter, filled to its shape: `fixed`, `bounds`, `prior`, as far as they are given.
+
+        Raises
+        ------
+        InputError
+            If something is neither a number nor an array of this shape.
+        """
+        out: dict[str, Any] = {}
+        if name in self.fixed:
+            value = self.fixed[name]
+            if name in ("B_w", "D_yw") and _says_which(value, self.n_w):
+                value = np.tile(value, (shape[0], 1)) if isinstance(shape[0], int) else np.nan
+            out["fixed"] = filled(value, f"What {name!r} is fixed at", shape, nan=True)
+        if name in self.bounds:
+            low, high = self.bounds[name]
+            ends = ((low, "lower"), (high, "upper"))
+            out["bounds"] = tuple(filled(v, f"The {end} bound of {name!r}", shape, infinite=True) for v, end in ends)
+        if name in self.priors:
+            mean, std = self.priors[name]
+            filled(mean, f"The mean of the prior of {name!r}", shape)
+            filled(std, f"The standard deviation of the prior of {name!r}", shape, infinite=True)
+            out["prior"] = self.priors[name]
+        return out
 
     def model(
         self,
@@ -106,9 +137,9 @@ class PILFR:
         outputs: tuple[str, ...] = (),
     ) -> Model:
         """The closed model for n_u inputs and n_y outputs, blocks starting at `values` (zero where not given)."""
-        values, fixed = dict(values or {}), dict(self.fixed) if self.offset else {"y_0": 0.0, **self.fixed}
+        values = dict(values or {})
         for name, count, what in (("D_zu", n_u, "input"), ("D_yw", n_y, "output")):
-            if _is_identity(fixed.get(name), self.n_w) and count != self.n_w:
+            if _is_identity(self.fixed.get(name), self.n_w) and count != self.n_w:
                 raise InputError(
                     f"{name} is fixed to the identity (as in a Hammerstein or Wiener model) with {self.n_w} channel(s) "
                     f"of the element, but there are {count} {what}(s); give channels={count} to the element."
@@ -120,16 +151,17 @@ class PILFR:
             model = close_loop(model, self.element)
         changes: dict[str, dict[str, Any]] = {}
         for name, p in model.parameters.items():
-            value = _shaped(name, fixed.get(name, values.get(name, p.value)), p.value.shape)
-            low, high = (_shaped(name, bound, p.value.shape) for bound in self.bounds.get(name, p.bounds))
-            if name in fixed:
-                free = np.isnan(value)
-                begin = np.clip(_shaped(name, values.get(name, p.value), p.value.shape), low, high)
-                changes[name] = {"value": np.where(free, begin, value), "bounds": (low, high), "fixed": ~free}
-            else:
-                changes[name] = {"value": np.clip(value, low, high), "bounds": (low, high)}
-            if name in self.priors:
-                changes[name]["prior"] = self.priors[name]
+            told, shape = self._given(name, p.value.shape), p.value.shape
+            low, high = told.get("bounds", p.bounds)
+            begin = np.clip(filled(values.get(name, p.value), f"The value of {name!r}", shape), low, high)
+            changes[name] = {"value": begin, "bounds": (low, high)}
+            if name == "y_0" and not self.offset:
+                told.setdefault("fixed", np.zeros(shape))
+            if "fixed" in told:
+                free = np.isnan(told["fixed"])
+                changes[name] |= {"value": np.where(free, begin, told["fixed"]), "fixed": ~free}
+            if "prior" in told:
+                changes[name]["prior"] = told["prior"]
         return model.with_parameters(model.parameters.change(**changes))
 
     def linear(self) -> PILFR:
@@ -156,18 +188,13 @@ def _check_pair(what: str, given: Any, wanted: str) -> None:
         raise InputError(f"{given!r} was given as {what}; give a pair of numbers {wanted}.")
 
 
+def _says_which(value: Any, n: int) -> bool:
+    """Whether a value is a row of n zeros and nan."""
+    return isinstance(value, np.ndarray) and value.shape == (n,) and bool(np.all(np.isnan(value) | (value == 0)))
+
+
 def _is_identity(value: Any, n: int) -> bool:
     return n > 0 and np.shape(value) == (n, n) and bool(np.all(np.asarray(value) == np.eye(n)))
-
-
-def _shaped(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        return np.broadcast_to(np.asarray(value, dtype=float), shape)
-    except (TypeError, ValueError):
-        given = np.shape(value)
-        raise InputError(
-            f"What is given for {name!r} has the shape {given}; expected a number or an array {shape}."
-        ) from None
 
 
 def _step(x: Any, u: Any, w: Any, p: dict[str, Any]) -> tuple[Any, Any]:

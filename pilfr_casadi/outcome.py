@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from .asked import Asked
 from .fitted import Fit, fingerprint
 from .gauge import standard_errors
 from .lfr import PILFR
@@ -38,6 +39,7 @@ def outcome(
     linear_nrmse: tuple[float, ...] = (),
     engine: str = "auto",
     minimum: bool = True,
+    asked: Asked | None = None,
 ) -> Fit:
     """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
 
@@ -50,9 +52,9 @@ def outcome(
     fitted = with_solution(model, problem, solution)
     judged = problem
     if note == PRIOR:
-        asked = structure.priors if structure else {}
+        priors = structure.priors if structure else {}
         fitted = fitted.with_parameters(
-            fitted.parameters.change(**{name: {"prior": asked.get(name)} for name in ("w", "r")})
+            fitted.parameters.change(**{name: {"prior": priors.get(name)} for name in ("w", "r")})
         )
         options: dict[str, Any] = {"constraints": problem.constraints, "noise": problem.noise, "scale": problem.scale}
         judged = Problem(fitted, recordings, engine=problem.engine, **options)
@@ -90,4 +92,5 @@ def outcome(
         linear_nrmse=linear_nrmse,
         engine=engine,
         limits=limits,
+        asked=asked or Asked(),
     )

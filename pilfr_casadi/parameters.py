@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from .checks import filled
 from .recording import InputError
 
 Array = np.ndarray
@@ -58,15 +59,15 @@ class Parameter:
             raise InputError(f"A parameter has {value.ndim} dimensions; give a scalar, a vector or a matrix.")
         if not np.all(np.isfinite(value)):
             raise InputError("A parameter's value is not finite; give a number.")
-        lower, upper = (_filled(bound, value.shape, "bounds") for bound in _pair(self.bounds, "bounds (lower, upper)"))
-        fixed = _filled(self.fixed, value.shape, "fixed flags").astype(bool)
+        lower, upper = (_filled(bound, value.shape, "A bound") for bound in _pair(self.bounds, "bounds (lower, upper)"))
+        fixed = _filled(self.fixed, value.shape, "A fixed flag").astype(bool)
         between = f"({self.bounds[0]}, {self.bounds[1]})"
         if not np.all(lower <= upper):
             raise InputError(f"The bounds {between} are infeasible: the lower one must not exceed the upper one.")
         if np.any((value < lower) | (value > upper)):
             raise InputError(f"The value {self.value} lies outside its bounds {between}; move it inside or widen them.")
         if self.prior is not None:
-            mean, std = (_filled(part, value.shape, "prior") for part in _pair(self.prior, "prior (mean, std)"))
+            mean, std = (_filled(part, value.shape, "The prior") for part in _pair(self.prior, "prior (mean, std)"))
             if not (np.all(np.isfinite(mean)) and np.all(std > 0)):
                 raise InputError(f"The prior {self.prior} needs a finite mean and a positive standard deviation.")
         for array in (value, lower, upper, fixed):
@@ -97,12 +98,7 @@ def _pair(given: Any, what: str) -> tuple[Any, Any]:
 
 def _filled(given: Any, shape: tuple[int, ...], what: str) -> Array:
     """Numbers of a parameter's shape, a copy."""
-    try:
-        return np.array(np.broadcast_to(np.asarray(given, dtype=float), shape))
-    except (TypeError, ValueError):
-        raise InputError(
-            f"The {what} {given!r} do not fit a parameter of shape {shape}; give a number or such an array."
-        ) from None
+    return np.array(filled(given, f"{what} of a parameter", shape, nan=True, infinite=True))
 
 
 @dataclass(frozen=True, eq=False)

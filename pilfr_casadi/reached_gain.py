@@ -91,7 +91,7 @@ def weights(element: object, values: Mapping[str, Array], slope: float, moved: A
 
 
 def gain_over(values: Mapping[str, Array], weight: Array, samples: int | None) -> Array:
-    """Gain (n_y n_u,), column by column, with Σw of each channel, after a number of samples or (None) in the end."""
+    """Gain (n_y n_u,), row by row, with Σw of each channel, after a number of samples or (None) in the end."""
     a, b, c, d = (values[k] for k in ("A", "B_u", "C_y", "D_yu"))
     if len(weight):
         s = np.diag(weight)
@@ -104,4 +104,4 @@ def gain_over(values: Mapping[str, Array], weight: Array, samples: int | None) -
         else:
             step = np.block([[a, b], [np.zeros((b.shape[1], n)), np.eye(b.shape[1])]])
             state = np.linalg.matrix_power(step, samples)[:n, n:]
-        return np.asarray(c @ state + d).ravel(order="F")
+        return np.asarray(c @ state + d).ravel()

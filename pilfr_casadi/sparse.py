@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from .checks import is_number
 from .elements import PrandtlIshlinskii
-from .fit import constraint_list
 from .fit import fit as identify
 from .fitted import Fit, fingerprint
 from .interrupts import Progress
@@ -30,7 +30,6 @@ from .multistart import POLISH, polish
 from .recording import InputError, Recording, as_recordings
 from .search import Candidate, Search
 from .solution import Status
-from .stability import stability_limits
 from .thinning import thinned
 
 LAYER = ("w", "r")
@@ -94,7 +93,8 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     train : Recording or sequence of Recording
         What it was fitted to.
     options
-        As for `fit`: `solver`, `stable`, `constraints`, `engine`, ...
+        As for `fit`: `solver`, `stable`, `constraints`, `noise`, `engine`. What is left out of `stable` and
+        `constraints` is as the fit has it.
 
     Returns
     -------
@@ -147,8 +147,8 @@ def polished(
     train: Recording | Sequence[Recording],
     *,
     solver: Any = None,
-    stable: bool | float = True,
-    constraints: Any = (),
+    stable: bool | float | None = None,
+    constraints: Any = None,
     noise: float | None = None,
     engine: str = "auto",
 ) -> Fit:
@@ -158,7 +158,8 @@ def polished(
     """
     structure, recordings, solver = fit.structure, as_recordings(train), solver or POLISH
     assert structure is not None
-    limits = (*stability_limits(structure, stable), *constraint_list(constraints))
+    asked = fit.asked.but(stable, constraints)
+    limits = asked.limits(structure)
     search = Search(
         structure, recordings, {}, solver, limits, engine, noise=noise, level=float(np.mean(fit.train_nrmse))
     )
@@ -169,7 +170,7 @@ def polished(
     best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))
     if best.model is fit.model and best.error >= error:
         return fit
-    job = Job(recordings, solver, limits, {}, noise, engine, None)
+    job = Job(recordings, solver, limits, {}, noise, engine, None, asked=asked)
     problem = job.problem(best.model, best.error)
     solution = job.solve(problem, "solve", best.theta)
     found = job.result(best.model, structure, problem, solution, note=best.note)
@@ -207,7 +208,8 @@ def regularization_path(
     progress : callable
         Gets ("path", done, total, smallest validation error so far).
     options
-        As for `fit`: `solver`, `stable`, `constraints`, `engine`, ...
+        As for `fit`: `solver`, `stable`, `constraints`, `noise`, `engine`. What is left out of `stable` and
+        `constraints` is as the fit has it.
 
     Returns
     -------
@@ -227,12 +229,14 @@ def regularization_path(
         raise InputError("A validation recording is a training recording too; give one that was not fitted.")
     scale = fit.solution.cost if priors is None else 1.0
     given = [scale * s for s in STRENGTHS] if priors is None else [0.01, 0.1, 1.0, 10.0, 100.0]
-    given = sorted(set(given if strengths is None else strengths))
-    if not given or not all(0 < s < np.inf for s in given) or not 0 <= margin < np.inf:
+    asked: Any = given if strengths is None else strengths
+    listed = isinstance(asked, Sequence | np.ndarray) and all(is_number(s) and 0 < s < np.inf for s in asked)
+    if not (listed and len(asked) and is_number(margin) and 0 <= margin < np.inf):
         raise InputError(
-            f"strengths = {given} and margin = {margin} were given; give one strength or more, all above zero, and a "
-            "margin of zero or more."
+            f"strengths = {asked!r} and margin = {margin!r} were given; give one strength or more, all above zero, and "
+            "a margin of zero or more."
         )
+    given = sorted({float(s) for s in asked})
     fits, errors = [fit], [fit.nrmse(judged)]
     thin: dict[int, tuple[Fit, ...]] = {}
     for i, strength in enumerate(given):

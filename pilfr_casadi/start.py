@@ -194,6 +194,11 @@ def density(r: np.ndarray, w: np.ndarray, grid: np.ndarray, width: float) -> np.
     return np.asarray(kernels @ w) / (width * np.sqrt(2 * np.pi))
 
 
+def is_density(w: np.ndarray) -> bool:
+    """Whether weights (N,) are a density: bounds of the user's own may let some of them be negative."""
+    return bool(np.all(w >= 0) and np.sum(w) > 0)
+
+
 def regrid(
     r: np.ndarray,
     w: np.ndarray,
@@ -250,7 +255,7 @@ def regridded(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray,
     """The values with every channel's thresholds and weights placed anew; z (M, n_w) is the fitted model's signal."""
     reaches = [reach(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
     rows = [
-        regrid(r, w, most, beyond=beyond) if w.sum() > 0 and most > 0 else (r, w)
+        regrid(r, w, most, beyond=beyond) if is_density(w) and most > 0 else (r, w)
         for r, w, most in zip(values["r"], values["w"], reaches, strict=True)
     ]
     return {**values, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}

@@ -15,14 +15,12 @@ from typing import Any
 import numpy as np
 
 from .elements import PrandtlIshlinskii
-from .fit import constraint_list
 from .fitted import Fit
 from .job import Job
 from .multistart import POLISH, PRIOR, held_near
 from .recording import Recording, as_recordings
 from .solution import Status
-from .stability import stability_limits
-from .start import regrid
+from .start import is_density, regrid
 
 LAYER = ("w", "r")
 WAYS = tuple(
@@ -37,13 +35,14 @@ def thinned(
     n: int,
     *,
     solver: Any = None,
-    stable: bool | float = True,
-    constraints: Any = (),
+    stable: bool | float | None = None,
+    constraints: Any = None,
     noise: float | None = None,
     engine: str = "auto",
 ) -> tuple[Fit, ...]:
     """Fits with n operators a channel, spread in several ways over the density of weights that a fit had.
 
+    They hold what the fit was asked to hold, where nothing else is given.
     None where weights or thresholds are fixed, bounded or have a prior.
     """
     structure, recordings, solver = fit.structure, as_recordings(train), solver or POLISH
@@ -53,15 +52,15 @@ def thinned(
     smaller, old = replace(structure, element=replace(structure.element, n=n)), fit.model
     z = np.concatenate([fit.signals(r)["z"] for r in recordings])
     reach = np.max(np.abs(z), axis=0)
-    limits = (*stability_limits(structure, stable), *constraint_list(constraints))
+    asked = fit.asked.but(stable, constraints)
     states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
     states = [np.concatenate([s[: old.n_x], np.zeros(n * structure.element.channels)]) for s in states]
     found: list[Fit] = []
     for beyond, spacing in WAYS:
-        job = Job(recordings, solver, limits, {}, noise, engine, None)
+        job = Job(recordings, solver, asked.limits(smaller), {}, noise, engine, None, asked=asked)
         rows = [
             regrid(r, w, float(top), beyond=beyond, spacing=spacing, count=n)
-            if w.sum() > 0 and top > 0
+            if is_density(w) and top > 0
             else (r[:n], w[:n])
             for r, w, top in zip(fit.parameters["r"], fit.parameters["w"], reach, strict=True)
         ]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .checks import numbers
+from .checks import filled
 from .exactness import beyond
 from .fitted import Fit
 from .job import Job, Stage, interrupted, penalised, rms_error
@@ -39,7 +39,7 @@ def at_values(structure: PILFR, first: Recording, values: Mapping[str, Any]) -> 
     changes = {}
     for name, value in values.items():
         p = model.parameters[name]
-        given = numbers(value, f"The start of {name!r}", p.value.shape)
+        given = filled(value, f"The start of {name!r}", p.value.shape)
         changes[name] = {"value": np.where(p.fixed & (name in structure.fixed), p.value, np.clip(given, *p.bounds))}
     return model.with_parameters(model.parameters.change(**changes))
 

@@ -271,6 +271,11 @@ def test_a_path_over_priors(record, full):
         ({"strengths": (0.0,)}, "all above zero"),
         ({"strengths": ()}, "give one strength or more"),
         ({"margin": -1.0}, "margin of zero or more"),
+        ({"margin": "a"}, "margin = 'a' were given"),
+        ({"margin": None}, "margin = None were given"),
+        ({"strengths": 5}, "strengths = 5 and"),
+        ({"strengths": ("a",)}, r"strengths = \('a',\) and"),
+        ({"strengths": (True,)}, r"strengths = \(True,\) and"),
     ],
 )
 def test_what_cannot_be_a_path(record, full, options, says):
@@ -302,6 +307,14 @@ def test_validation_is_no_training(record, full):
         (lambda: dc_gain(1.0, within=-1.0), "of 0 or more"),
         (lambda: dc_gain(1.0, slope=2.0), "from 0 to 1"),
         (lambda: ordered(gap=-1.0), "gap"),
+        (lambda: ordered("r", "a"), "The gap between the entries of 'r' is a; give a number"),
+        (lambda: ordered("r", [0.1, 0.2]), r"The gap .* has the shape \(2,\); give a number"),
+        (lambda: dc_gain("a"), "The value of a dc_gain cannot be 'a'; give numbers"),
+        (lambda: dc_gain(None), "The value of a dc_gain"),
+        (lambda: dc_gain([[1, 2], [3]]), "The value of a dc_gain"),
+        (lambda: dc_gain(1, within="a"), "within of a dc_gain is a; give a number"),
+        (lambda: dc_gain([1, 2], within=[1, 2, 3]), r"within of a dc_gain has the shape \(3,\)"),
+        (lambda: dc_gain(1, slope="a"), "slope of a dc_gain is a; give a number"),
     ],
 )
 def test_what_cannot_be_known(make, says):
@@ -341,7 +354,6 @@ def test_a_sparse_fit_halves_the_operators():
     ("given", "says"),
     [
         ({"stable": "a"}, "stable = 'a'"),
-        ({"stable": None}, "stable = None"),
         ({"stable": np.inf}, "stable = inf"),
         ({"constraints": [3]}, "a Constraint"),
         ({"constraints": 3}, "a Constraint"),
@@ -366,3 +378,55 @@ def test_what_bounds_nothing_is_refused(record, given, says):
 def test_a_gain_is_refused_where_its_formula_does_not_hold(record, model, kind):
     with pytest.raises(InputError, match=f"plays and stops, and the model has a {kind}"):
         pilfr.fit(model, record, starts=1, constraints=dc_gain(2.0))
+
+
+@pytest.fixture(scope="module")
+def bounded(record):
+    """A fit with a bound and a constraint that hold it, and what the data alone would have gone to."""
+    model = pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 6))
+    return pilfr.fit(model, record, starts=1, stable=0.78, constraints=[ordered(gap=0.05)])
+
+
+def holds(fit):
+    return radius(fit) <= 0.78 and np.all(np.diff(fit.parameters["r"]) >= 0.05)
+
+
+def test_what_is_made_from_a_fit_holds_what_the_fit_was_asked_to_hold(record, bounded):
+    assert holds(bounded)
+    for fit in (pilfr.fit(bounded, record), pilfr.prune(bounded, record), *thinned(bounded, record, 3)):
+        assert holds(fit) and fit.asked.stable == 0.78
+    path = pilfr.regularization_path(bounded, record, three_plays(1, 600), strengths=(1e-5, 1e-3))
+    assert all(holds(fit) for fit in path.fits)
+    assert all(any(limit.name == "spectral radius <= 0.78" for limit in fit.limits) for fit in path.fits)
+    priors = {"w": (0.0, 1.0)}
+    assert all(
+        holds(f)
+        for f in pilfr.regularization_path(bounded, record, three_plays(1, 600), priors=priors, strengths=(1.0,)).fits
+    )
+
+
+def test_what_is_given_wins_over_what_the_fit_was_asked_to_hold(record, bounded):
+    again = pilfr.prune(bounded, record, stable=0.7)
+    assert radius(again) <= 0.7 and np.all(np.diff(again.parameters["r"]) >= 0.05)
+    free = pilfr.fit(bounded, record, stable=True, constraints=())
+    assert radius(free) > 0.78 and not free.asked.constraints
+    assert next(limit.name for limit in free.limits if limit.kind == "constraint") == "spectral radius <= 1"
+
+
+def test_a_loaded_fit_keeps_its_bound_and_asks_for_its_constraints(record, bounded, tmp_path):
+    bounded.save(tmp_path / "m.json")
+    loaded = pilfr.load(tmp_path / "m.json")
+    assert loaded.asked.stable == 0.78
+    for again in (pilfr.fit, pilfr.prune):
+        with pytest.raises(InputError, match=r"cannot hold \(r ascending\); give them again"):
+            again(loaded, record)
+    assert holds(pilfr.prune(loaded, record, constraints=[ordered(gap=0.05)]))
+    assert radius(pilfr.fit(loaded, record, constraints=())) <= 0.78
+    pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, stable=False).save(tmp_path / "free.json")
+    assert pilfr.load(tmp_path / "free.json").asked.stable is False
+
+
+def test_constraints_hold_a_linear_model_without_a_bound_on_its_radius(record):
+    gain = float(Gain()({k: ca.DM(v) for k, v in pilfr.fit(pilfr.PILFR(2), record).parameters.items()}))
+    fit = pilfr.fit(pilfr.PILFR(2), record, stable=False, constraints=[dc_gain(1.2 * gain)])
+    assert float(Gain()({k: ca.DM(v) for k, v in fit.parameters.items()})) == pytest.approx(1.2 * gain, rel=1e-5)

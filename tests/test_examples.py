@@ -52,6 +52,41 @@ def test_run_files_of_the_readme(tmp_path, command, text, files):
     assert len(RUN_FILES) == 2 and "count = 100" not in text
 
 
+def test_the_run_file_with_every_key_has_every_key_and_runs(tmp_path, monkeypatch):
+    from pilfr_casadi.runs.described import read_run
+    from pilfr_casadi.runs.tables import Table
+
+    copy_demo_data(tmp_path)
+    path = tmp_path / "every_key.toml"
+    tables = []
+    begin = Table.__init__
+    monkeypatch.setattr(Table, "__init__", lambda self, *given: (begin(self, *given), tables.append(self))[0])
+    read_run(path)
+    text = path.read_text()
+    assert len(tables) > 8 and max(map(len, text.splitlines())) <= 120
+    for table in tables:
+        if table.name in ("data.columns", "seeds", "grid"):
+            continue
+        part = text.split(f"[{table.name}]")[1].partition("\n[")[0] if table.name else text.partition("\n[")[0]
+        for key in table.known:
+            assert re.search(rf"^(# )?{key} = |^(# )?\[{key}\]", text if not table.name else part, re.M), key
+    code = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "run", path.name], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and (tmp_path / "every_key-run" / "report.html").exists(), done.stderr
+
+
+@pytest.mark.parametrize("command", ["run", "campaign"])
+def test_the_help_names_the_run_file_with_every_key(capsys, command):
+    from pilfr_casadi.cli import main
+
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    shown = "".join(capsys.readouterr().out.partition("Every key")[2].partition(":")[2].split())
+    assert Path(shown).samefile(ROOT / "pilfr_casadi" / "demo_data" / "every_key.toml")
+
+
 def test_snippets_of_the_readme(tmp_path):
     copy_demo_data(tmp_path)
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)

@@ -27,6 +27,17 @@ def refused(call, words=None):
     return text
 
 
+@pytest.mark.parametrize("eps", [1e200, np.inf, -1.0, "a", None, True])
+def test_rounding_that_cannot_be_used(eps):
+    refused(lambda: some_fit().export(smooth=eps), "give a number, from zero to 1e\\+100")
+
+
+def test_what_cannot_be_bounded_has_no_bound():
+    found = some_fit().export(smooth=1e100)
+    states, outputs = found.bound(np.full(len(found.states), 1e200), [1e200])
+    assert not np.any(np.isnan(states)) and not np.any(np.isnan(outputs))
+
+
 @pytest.mark.parametrize("path", NOT_PATHS, ids=[str(k) for k in range(len(NOT_PATHS))])
 def test_paths_that_are_none(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

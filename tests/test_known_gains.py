@@ -90,3 +90,40 @@ def test_which_operators_keep_a_gain_beyond_the_recording(record, operator, slop
     problem = Problem(model, record, constraints=[dc_gain(gain, slope=slope)])
     told = reached_gain_sentence(problem, problem.start)
     assert says in told if says else told == ""
+
+
+def two_by_two(n=300):
+    """Two outputs of two inputs without dynamics worth naming."""
+    rng = np.random.default_rng(2)
+    u, x = rng.normal(size=(n, 2)), np.zeros(2)
+    y = np.empty((n, 2))
+    for k in range(n):
+        y[k] = x
+        x = 0.5 * x + 0.5 * u[k] @ np.array([[2.0, -0.2], [0.4, 1.0]])
+    return pilfr.Recording(u, y + 1e-3 * rng.normal(size=y.shape), 0.01, initial="zero")
+
+
+def test_gains_of_several_channels_are_named_and_held_row_by_row():
+    wanted = np.array([[2.0, 0.4], [-0.2, 1.0]])
+    fit = pilfr.fit(pilfr.PILFR(2), two_by_two(), constraints=[dc_gain(wanted, within=1e-3)])
+    limits = [limit for limit in fit.limits if limit.name.startswith("DC gain")]
+    assert [limit.name for limit in limits] == [f"DC gain = 2, 0.4; -0.2, 1 ± 0.001[{i}]" for i in range(4)]
+    assert np.allclose([limit.value for limit in limits], wanted.ravel(), atol=1.01e-3)
+    assert np.allclose([limit.lower for limit in limits], wanted.ravel() - 1e-3)
+
+
+@pytest.mark.parametrize("value", [[1.0, 2.0, 3.0, 4.0], [[1.0, 2.0]], [[1.0], [2.0]], [1.0, 2.0], np.ones((1, 1))])
+def test_a_gain_of_another_shape_is_refused(value):
+    shape = str(np.shape(value)).replace("(", r"\(").replace(")", r"\)")
+    with pytest.raises(InputError, match=rf"dc_gain have the shape {shape}; give one number.* of shape \(2, 2\)\.$"):
+        pilfr.fit(pilfr.PILFR(2), two_by_two(), constraints=[dc_gain(value, within=0.1)])
+
+
+def test_a_plain_list_will_do_for_one_output():
+    record = two_by_two()
+    one = pilfr.Recording(record.u, record.y[:, 0], 0.01, initial="zero")
+    for value in ([2.0, 0.4], [[2.0, 0.4]]):
+        fit = pilfr.fit(pilfr.PILFR(2), one, constraints=[dc_gain(value, within=0.01)])
+        assert all(limit.met for limit in fit.limits)
+    with pytest.raises(InputError, match=r"of shape \(1, 2\)"):
+        pilfr.fit(pilfr.PILFR(2), one, constraints=[dc_gain([2.0, 0.4, 1.0])])

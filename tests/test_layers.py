@@ -87,6 +87,7 @@ LAYERS = {
         "limits",
     ),
     6: (
+        "asked",
         "fit",
         "ways",
         "fitted",

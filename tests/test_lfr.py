@@ -179,3 +179,45 @@ def test_values_move_into_their_bounds_and_fixed_ones_stay():
 def test_what_cannot_be_a_structure(make, words):
     with pytest.raises(InputError, match=words):
         make()
+
+
+ONE = PrandtlIshlinskii(Play, 3)
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"fixed": {"A": [[0.9, 0.1]]}}, r"'A' is fixed at has the shape \(1, 2\); give a number .* shape \(2, 2\)"),
+        ({"fixed": {"A": [[0.9], [0.1]]}}, r"'A' is fixed at has the shape \(2, 1\)"),
+        ({"fixed": {"A": [0.9, 0.1]}}, r"'A' is fixed at has the shape \(2,\)"),
+        ({"fixed": {"A": [[0.9, 0.1], [1.0]]}}, r"'A' is fixed at is \[\[0.9, 0.1\], \[1.0\]\]; give a number"),
+        ({"fixed": {"A": None}}, "'A' is fixed at is None; give a number"),
+        ({"fixed": {"A": "0.9"}}, "'A' is fixed at is 0.9; give a number"),
+        ({"fixed": {"A": np.inf}}, "'A' is fixed at holds a value that is not finite"),
+        ({"fixed": {"B_w": np.array([1.0])}}, r"'B_w' is fixed at has the shape \(1,\)"),
+        ({"fixed": {"B_u": [[1.0, 0.0]]}}, r"shape \(1, 2\); give a number or an array of shape \(2, n_u\)"),
+        ({"fixed": {"r": [0.1, 0.2]}}, r"'r' is fixed at has the shape \(2,\); give a number .* shape \(1, 3\)"),
+        ({"bounds": {"w": ([[0.0, 0.0]], 1.0)}}, r"The lower bound of 'w' has the shape \(1, 2\)"),
+        ({"bounds": {"A": (-1.0, [1.0, 1.0])}}, r"The upper bound of 'A' has the shape \(2,\)"),
+        ({"bounds": {"A": ([[0, 1], [2]], 1.0)}}, "bounds of 'A'; give a pair"),
+        ({"priors": {"A": ([[0.9, 0.1]], 1.0)}}, r"The mean of the prior of 'A' has the shape \(1, 2\)"),
+        ({"priors": {"A": (np.inf, 1.0)}}, "The mean of the prior of 'A' holds a value that is not finite"),
+        ({"priors": {"w": (0.0, [1.0, 1.0])}}, r"The standard deviation of the prior of 'w' has the shape \(2,\)"),
+        ({"priors": {"w": (0.0, None)}}, "prior of 'w'; give a pair"),
+    ],
+)
+def test_nothing_is_stretched_to_a_shape(given, says):
+    with pytest.raises(InputError, match=says) as caught:
+        PILFR(2, ONE, **given)
+    assert str(caught.value).count(". ") == 0
+
+
+def test_shapes_that_data_tells_are_checked_with_it():
+    structure = PILFR(2, ONE, fixed={"B_u": [[1.0], [0.0]], "A": [[0.9, NAN], [0.0, NAN]]})
+    p = structure.model(1, 1).parameters
+    assert p["A"].fixed.tolist() == [[True, False], [True, False]] and p["B_u"].fixed.all()
+    with pytest.raises(InputError, match=r"'B_u' is fixed at has the shape \(2, 1\); give .* shape \(2, 2\)"):
+        structure.model(2, 1)
+    with pytest.raises(InputError, match=r"The value of 'A' has the shape \(1, 2\)"):
+        structure.model(1, 1, {"A": [[0.9, 0.1]]})

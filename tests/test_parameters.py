@@ -52,7 +52,7 @@ def test_labels_say_where_an_entry_is():
 
 
 def test_bounds_and_flags_fill_the_shape():
-    p = Parameter([[1.0, 2.0]], bounds=(0.0, [5.0, 6.0]), fixed=[[True, False]])
+    p = Parameter([[1.0, 2.0]], bounds=(0.0, [[5.0, 6.0]]), fixed=[[True, False]])
     parameters = ParameterSet({"a": p, "b": Parameter(3.0)})
     assert parameters.lower.tolist() == [0, 0, -np.inf]
     assert parameters.upper.tolist() == [5, 6, np.inf]
@@ -111,14 +111,17 @@ def test_sets_travel_between_processes():
         (lambda: Parameter(1.0, bounds=(2.0, 0.0)), "infeasible"),
         (lambda: Parameter(1.0, bounds=(0.0, np.nan)), "infeasible"),
         (lambda: Parameter(1.0, bounds=(2.0, 3.0)), "lies outside its bounds"),
-        (lambda: Parameter([1.0, 2.0], bounds=(np.zeros(3), 5.0)), "bounds .* do not fit a parameter of shape"),
+        (
+            lambda: Parameter([1.0, 2.0], bounds=(np.zeros(3), 5.0)),
+            r"A bound .* has the shape \(3,\); give a number or an array of shape \(2,\)",
+        ),
         (lambda: Parameter(1.0, bounds=0.0), "give a pair"),
-        (lambda: Parameter(1.0, bounds=("low", "high")), "do not fit"),
-        (lambda: Parameter(1.0, fixed=[True, False]), "fixed flags"),
+        (lambda: Parameter(1.0, bounds=("low", "high")), "A bound of a parameter is low; give a number"),
+        (lambda: Parameter(1.0, fixed=[True, False]), "A fixed flag of a parameter has the shape"),
         (lambda: Parameter(1.0, prior=(0.0, 0.0)), "positive standard deviation"),
         (lambda: Parameter(1.0, prior=(np.inf, 1.0)), "finite mean"),
         (lambda: Parameter(1.0, prior=3.0), "give a pair"),
-        (lambda: Parameter([1.0, 2.0], prior=(np.zeros(3), 1.0)), "prior .* do not fit"),
+        (lambda: Parameter([1.0, 2.0], prior=(np.zeros(3), 1.0)), "The prior of a parameter has the shape"),
     ],
 )
 def test_what_cannot_be_a_parameter(make, words):

@@ -3,6 +3,8 @@
 import json
 import shutil
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -191,6 +193,14 @@ def test_a_missing_model_is_made_again(folder):
         ("[solver]", "[constraints]\nown = [1]\n[solver]", "'own'"),
         ("[solver]", "[regularization]\nl1 = -1\n[solver]", "'l1'"),
         ("[solver]", "[regularization]\npath = 3\n[solver]", "'path'"),
+        ("[solver]", "[regularization]\npath = [true]\n[solver]", "'path' in [regularization] is [True]"),
+        ("[solver]", "[regularization]\npath = [0.0]\n[solver]", "strengths above zero"),
+        ("nx = 1", "nx = 1\nfix = { A = [[0.9, 0.1]] }", "'A' is fixed at has the shape (1, 2)"),
+        ("nx = 1", "nx = 1\nbounds = { w = [[0.0, 0.1], 1.0] }", "The lower bound of 'w' has the shape (2,)"),
+        ("nx = 1", "nx = 1\npriors = { A = [[0.9, 0.1], 1.0] }", "The mean of the prior of 'A' has the shape (2,)"),
+        ("[solver]", "[constraints]\ndc_gain = [1.0, 2.0]\n[solver]", "dc_gain have the shape (2,)"),
+        ("[solver]", "[constraints]\ndc_gain = { value = 1.0, slope = 'a' }\n[solver]", "slope of a dc_gain is a"),
+        ("[solver]", "[constraints]\nordered_thresholds = [1]\n[solver]", "ordered_thresholds"),
         ('validation = ["held.csv"]', "regularisation = 3", "unknown key 'regularisation'"),
         ("operators = 3", "operators = 3\nbounds = { w = [2, 1] }", "infeasible"),
         ("operators = 3", "operators = 3\nfix = { E = 1.0 }", "'E'"),
@@ -322,3 +332,14 @@ def test_regularization_in_a_run(folder):
     assert pilfr.run(folder / "rig.toml").done == ()  # a path never looks at the test
     write_csv(folder / "held.csv", seed=6, m=400)
     assert pilfr.run(folder / "rig.toml").done == ("seed-0",)  # but at the validation
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "null", "{", '"text"'])
+@pytest.mark.parametrize("optimised", [[], ["-O"]])
+def test_a_manifest_that_is_none_gets_one_sentence(folder, content, optimised):
+    place = folder / "rig-run"
+    place.mkdir()
+    (place / "manifest.json").write_text(content)
+    code = "from pathlib import Path; from pilfr_casadi.runs.manifest import Manifest; Manifest.found(Path('rig-run'))"
+    done = subprocess.run([sys.executable, *optimised, "-c", code], cwd=folder, capture_output=True, text=True)
+    assert "InputError: " in done.stderr and "manifest.json is not a manifest of a run; restore it" in done.stderr

@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..checks import numbers
+from ..checks import LARGEST, numbers
 from ..compiled import make_engine
 from ..fitted import Fit, first_state
 from ..integration import discretise
@@ -63,8 +63,10 @@ def exported(
         If something is missing or does not fit; one sentence says what.
     """
     check_name(name)
-    if isinstance(smooth, bool) or not isinstance(smooth, int | float) or not 0 <= smooth < np.inf:
-        raise InputError(f"smooth = {smooth!r} was given; give a number, zero or more, in units of the signals.")
+    if isinstance(smooth, bool) or not isinstance(smooth, int | float) or not 0 <= smooth <= LARGEST:
+        raise InputError(
+            f"smooth = {smooth!r} was given; give a number, from zero to {LARGEST:g}, in the signals' units."
+        )
     units: dict[str, str] = {}
     rhs = None
     if isinstance(model, Fit | Model):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..asked import Asked, asked_by
 from ..lfr import PILFR, block_shapes
 from ..limits import Limit
 from ..model import Model
@@ -67,7 +68,9 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
         file.damaged(f"the step dt is {dt:g} s")
     structure, start = _equations(file, names, model)
     fitted = _with_values(file, start, structure)
+    rest = _training(file, training, fitted)
     return Fit(
+        asked=asked_by(rest["limits"], structure) if "limits" in training else Asked(),
         model=fitted,
         structure=structure,
         dt=dt,
@@ -75,7 +78,7 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
         errors=_errors(file, fitted),
         initial=_initial_states(file, fitted.n_x + fitted.n_s),
         units={channel["name"]: channel["unit"] for key in names for channel in signals[key] if channel["unit"]},
-        **_training(file, training, fitted),
+        **rest,
     )
 
 

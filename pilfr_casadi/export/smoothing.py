@@ -80,7 +80,10 @@ def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) 
 
     def apply(op: str, code: int, a: Interval, b: Interval | None = None) -> Interval:
         with np.errstate(all="ignore"):
-            low, high = _unary(op, a, eps) if b is None else _binary(op, a, b, eps)
+            try:
+                low, high = _unary(op, a, eps) if b is None else _binary(op, a, b, eps)
+            except OverflowError:
+                return EVERYTHING
         return EVERYTHING if math.isnan(low) or math.isnan(high) else (float(low), float(high))
 
     return _walk(function, list(arguments), apply, lambda value: (float(value), float(value)))

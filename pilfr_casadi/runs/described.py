@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..baselines import Lagged
+from ..checks import is_number
 from ..constraints import Constraint
 from ..gauss_newton import GaussNewton
 from ..ipopt import Ipopt
@@ -275,10 +276,10 @@ def _regularization(table: Table, files: Mapping[str, tuple[str, ...]]) -> dict[
     table.done()
     if path is not False:
         usable = path is True or (
-            isinstance(path, list | tuple) and all(isinstance(s, int | float) for s in path) and path
+            isinstance(path, list | tuple) and path and all(is_number(s) and 0 < s < float("inf") for s in path)
         )
         if not usable:
-            table.fail(f"'path' in [regularization] is {shown(path)}; give true, or a list of strengths")
+            table.fail(f"'path' in [regularization] is {shown(path)}; give true, or a list of strengths above zero")
         if l1 is not None:
             table.fail("'path' and 'l1' in [regularization] exclude each other; leave one out")
         if not files["validation"]:

@@ -73,9 +73,10 @@ class Manifest:
         advice = "restore it, or give --overwrite to compute everything again"
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            assert isinstance(content, dict)
-        except (OSError, ValueError, AssertionError, RecursionError):
-            raise InputError(f"{path} is not a manifest of a run; {advice}.") from None
+        except (OSError, ValueError, RecursionError):
+            content = None
+        if not isinstance(content, dict):
+            raise InputError(f"{path} is not a manifest of a run; {advice}.")
         if content.get("format") != FORMAT or content.get("version") != VERSION:
             raise InputError(f"{path} is not a manifest that this release writes; {advice}.")
         said = content.pop("sha256", None)
