@@ -15,7 +15,7 @@ import numpy as np
 from ..checks import numbers
 from ..recording import InputError
 from .asked import asked, planned_with
-from .mpc import PENALTY
+from .mpc_cost import PENALTY
 
 Array = np.ndarray
 MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
