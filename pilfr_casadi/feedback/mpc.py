@@ -69,8 +69,8 @@ class PredictiveController:
         outputs: tuple[Any, Any] | None = None,
         rate: Any = None,
         move: float = 1e-3,
-        y_scale: Any = 1.0,
-        u_scale: Any = 1.0,
+        y_scale: Any = None,
+        u_scale: Any = None,
         solver: str = "sqp",
         iterations: int = 5,
     ) -> None:
