@@ -59,9 +59,7 @@ def asked(
     low, high = _pair(inputs, "inputs", (horizon, n_u))
     limits = (-ENORMOUS, ENORMOUS) if outputs is None else outputs
     low_y, high_y = _pair(limits, "outputs", (horizon, n_y))
-    u_size = (
-        scale_of_inputs(low, high) if u_scale is None else numbers(u_scale, "u_scale", (horizon, n_u)).ravel()
-    )
+    u_size = scale_of_inputs(low, high) if u_scale is None else numbers(u_scale, "u_scale", (horizon, n_u)).ravel()
     if y_scale is None:
         middle = np.clip(0.0, low, high)
         ends = np.maximum(low, middle - 2 * u_size), np.minimum(high, middle + 2 * u_size)

@@ -3,10 +3,13 @@
     minimise   Σ |(y_k - r_k) / y_scale|² + move |(u_k - u_{k-1}) / u_scale|² + penalty of s
     subject to low_u <= u_k <= high_u,   |u_k - u_{k-1}| <= rate,   low_y - s <= y_k <= high_y + s,   s >= 0,
 
-over N samples from a state x with memory. Two ways lead to the same optimum: `"sqp"`, states eliminated, Gauss-Newton
-steps from a dense QP (`ca.conic`), warm-started by the shifted plan, fast enough for sample times below a millisecond;
-and `"ipopt"`, multiple shooting with a variable for each state, by `ca.nlpsol`. Between kinks the model is linear in
-x and u, so the Gauss-Newton Hessian is the exact one for plays and stops.
+over N samples from a state x with memory. Two ways to solve it: `"sqp"`, states eliminated, Gauss-Newton steps from a
+dense QP (`mpc_sqp`), warm-started by the shifted plan, fast enough for sample times below a millisecond; and `"ipopt"`,
+multiple shooting with a variable for each state (`mpc_ipopt`), some 50 times slower. Kinks make the problem one of many
+pieces with local optima; from 150 random states and inputs of a model with eight plays no plan by SQP was more than one
+percent worse than that by IPOPT, and a few were better. A plan that says it has NOT converged lies in a kink, usually
+an optimum that the slopes of one side cannot confirm, or was cut short by `iterations`; it keeps the limits of inputs
+and rates like any other.
 """
 
 from __future__ import annotations
@@ -46,12 +49,14 @@ class PredictiveController:
         both cannot be kept, the first change is as large as it takes.
     move : float
         Weight of changes of the inputs.
-    y_scale, u_scale : float or array
-        What counts as one.
+    y_scale, u_scale : float or array, optional
+        What counts as one. By default half of the width between the limits of an input and of an output, and no more
+        than the output can range over within the horizon; a tenth of that range where no output limits are given
+        (`mpc_scales`). What was taken is in `controller.y_scale` and `u_scale`, and the same in each call.
     solver : {"sqp", "ipopt"}
         See above.
     iterations : int
-        Most Gauss-Newton steps a call; the first call, which starts from a held input, may take ten times as many.
+        Most Gauss-Newton steps a call (IPOPT has its own limits); the first call, which starts from a held input, may take ten times as many.
 
     Raises
     ------

@@ -7,11 +7,11 @@ import numpy as np
 from .asked import Asked
 
 Array = np.ndarray
-PENALTY = 30.0  # of a violated output limit, per y_scale and sample of the horizon
+PENALTY = 30.0  # of a violated output limit, per y_scale
 
 
 class Cost:
-    """`Σ |(y_k - r_k) / y_scale|² + move |(u_k - u_{k-1}) / u_scale|² + 30 N s / y_scale` of a task.
+    """`Σ |(y_k - r_k) / y_scale|² + move |(u_k - u_{k-1}) / u_scale|² + 30 s / y_scale` of a task.
 
     Attributes
     ----------
@@ -23,7 +23,7 @@ class Cost:
 
     def __init__(self, task: Asked) -> None:
         n_u = task.function.size1_in(1)
-        self.task, self.penalty = task, PENALTY * task.horizon
+        self.task, self.penalty = task, PENALTY
         self.differences = np.eye(task.horizon * n_u) - np.eye(task.horizon * n_u, k=-n_u)
         self.weighted = np.sqrt(task.move) * self.differences / task.u_scale[:, None]
         self._root = np.abs(np.diag(self.weighted))
@@ -32,9 +32,7 @@ class Cost:
         """Cost of inputs u and outputs y, sample by sample."""
         moves, scale = self.weighted @ u - self.moved(before), self.task.y_scale
         over = self._beyond(y) / scale
-        return float(
-            np.sum(((y - wanted) / scale) ** 2) + np.sum(moves**2) + self.penalty * np.max(over, initial=0.0)
-        )
+        return float(np.sum(((y - wanted) / scale) ** 2) + np.sum(moves**2) + self.penalty * np.max(over, initial=0.0))
 
     def offset(self, before: Array) -> Array:
         """What the previous input contributes to the changes."""

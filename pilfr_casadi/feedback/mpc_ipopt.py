@@ -19,8 +19,8 @@ from .asked import ENORMOUS, Asked
 from .mpc_cost import Cost
 
 Array = np.ndarray
-OPTIONS = {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 100, "warm_start_init_point": "yes", "mu_init": 1e-4}
-EXACT = 40  # iterations of the model as it is
+OPTIONS = {"print_level": 0, "sb": "yes", "tol": 1e-9, "warm_start_init_point": "yes", "mu_init": 1e-4}
+EXACT, ROUND = 40, 100  # most iterations with the model as it is, and rounded
 ROUNDED = 0.02  # of y_scale, by which rounding may change the outputs
 ALIKE = 1e-3  # of the cost
 
@@ -77,7 +77,7 @@ class Shooting:
                 return None
             y = np.asarray(function.mapaccum("rounded", task.horizon)(rest, probe)[1]).ravel(order="F")
             if np.max(np.abs(y - own) / task.y_scale) < ROUNDED:
-                return self._solver(function, OPTIONS["max_iter"])
+                return self._solver(function, ROUND)
         return None
 
     def solve(

@@ -82,9 +82,7 @@ class GaussNewton:
                     break
         return best, at_best, converged
 
-    def _step(
-        self, u: Array, y: Array, jac: Array, wanted: Array, before: Array, rate: Array
-    ) -> Array | None:
+    def _step(self, u: Array, y: Array, jac: Array, wanted: Array, before: Array, rate: Array) -> Array | None:
         """Gauss-Newton step inside the limits, the QP in units of u_scale; None where the solver finds none."""
         task, cost = self._task, self._cost
         if not (np.all(np.isfinite(y)) and np.all(np.isfinite(jac))):

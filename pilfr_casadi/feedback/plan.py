@@ -32,7 +32,9 @@ class Plan:
     def __str__(self) -> str:
         how = "converged" if self.converged else "NOT converged"
         applied = ", ".join(f"{v:.5g}" for v in self.u)
-        limits = f"; outputs beyond their limits by {self.slack:.3g}" if self.slack > 0 else "; outputs within their limits"
+        limits = (
+            f"; outputs beyond their limits by {self.slack:.3g}" if self.slack > 0 else "; outputs within their limits"
+        )
         return (
             f"plan over {len(self.inputs)} samples, {how} in {1e3 * self.seconds:.2f} ms, cost {self.cost:.5g}\n"
             f"input to apply now: {applied}{limits if self.limited else ''}"
