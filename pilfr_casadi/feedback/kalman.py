@@ -202,7 +202,7 @@ def observed(function: ca.Function, observer: Any, recording: Recording) -> ca.F
         x, u = size * rng.standard_normal(n), size * rng.standard_normal(function.size1_in(1))
         own, other = function(x, u), theirs(np.append(x, np.zeros(extra)), u)
         pairs = (own[0], other[0][:n]), (own[1], other[1])
-        same = same and all(np.allclose(a, b, rtol=1e-9, atol=0.0) for a, b in pairs)
+        same = same and all(np.allclose(np.asarray(a), np.asarray(b), rtol=1e-9, atol=0.0) for a, b in pairs)
     if not same:
         raise InputError("The observer is one of another model; give a kalman_filter of the same fit.")
     return theirs

@@ -5,11 +5,11 @@
 
 over N samples from a state x with memory. Two ways to solve it: `"sqp"`, states eliminated, Gauss-Newton steps from a
 dense QP (`mpc_sqp`), warm-started by the shifted plan, fast enough for sample times below a millisecond; and `"ipopt"`,
-multiple shooting with a variable for each state (`mpc_ipopt`), some 50 times slower. Kinks make the problem one of many
-pieces with local optima; from 150 random states and inputs of a model with eight plays no plan by SQP was more than one
-percent worse than that by IPOPT, and a few were better. A plan that says it has NOT converged lies in a kink, usually
-an optimum that the slopes of one side cannot confirm, or was cut short by `iterations`; it keeps the limits of inputs
-and rates like any other.
+multiple shooting with a variable for each state (`mpc_ipopt`), some 30 times slower. Kinks make the problem one of many
+pieces with local optima, so the two can differ: from 150 random states and inputs of a model with eight plays no plan
+by one was more than one percent worse than that by the other. A plan that has NOT converged was cut short by
+`iterations`, or lies in a kink: often an optimum that the slopes of one side cannot confirm (43 of those 150 by SQP,
+each a first plan; 8 by IPOPT, which rounds the kinks). Like any other it keeps the limits of inputs and rates.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ class PredictiveController:
     solver : {"sqp", "ipopt"}
         See above.
     iterations : int
-        Most Gauss-Newton steps a call (IPOPT has its own limits); the first call, which starts from a held input, may take ten times as many.
+        Most Gauss-Newton steps a call; the first call, which starts from a held input, may take ten times as many.
+        IPOPT has its own limits.
 
     Raises
     ------
