@@ -90,7 +90,8 @@ class Shooting:
         rounded = self._solved(self._rounded, x, wanted, before, u, rate)
         costs = [self._cost(*plan[:2], wanted, before) for plan in (exact, rounded)]
         if not costs[1] <= costs[0]:
-            return *exact[:2], rounded[2] and costs[1] <= (1 + ALIKE) * costs[0]
+            near = costs[1] <= (1 + ALIKE) * costs[0] + ROUNDED**2 * len(wanted)  # apart by no more than rounding does
+            return *exact[:2], rounded[2] and bool(near)
         return rounded
 
     def _solved(
