@@ -9,7 +9,7 @@ multiple shooting with a variable for each state (`mpc_ipopt`), some 30 times sl
 pieces with local optima, so the two can differ: from 150 random states and inputs of a model with eight plays no plan
 by one was more than one percent worse than that by the other. A plan that has NOT converged was cut short by
 `iterations`, or lies in a kink: often an optimum that the slopes of one side cannot confirm (43 of those 150 by SQP,
-each a first plan; 8 by IPOPT, which rounds the kinks). Like any other it keeps the limits of inputs and rates.
+each a first plan; 2 by IPOPT, which rounds the kinks). Like any other it keeps the limits of inputs and rates.
 """
 
 from __future__ import annotations
