@@ -52,7 +52,7 @@ def small_model():
     return ca.Function("F", [x, u], model.closed(x, u, ca.DM(model.parameters.start)))
 
 
-OPTIONS = {"inputs": (-1.0, 1.0), "outputs": (-3.0, 3.5), "move": 1e-2}
+OPTIONS = {"inputs": (-1.0, 1.0), "outputs": (-3.0, 3.5), "move": 1e-2, "y_scale": 1.0, "u_scale": 1.0}
 
 
 def inputs_of_both(theirs, horizon=8, samples=25):

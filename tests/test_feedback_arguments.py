@@ -49,7 +49,9 @@ def test_what_the_observer_cannot_use(small):
     refused(lambda: pilfr.kalman_filter(None, record), "give a Fit")
     refused(lambda: pilfr.kalman_filter(fit.model, record), "give a Fit")
     refused(lambda: pilfr.kalman_filter(fit, record.u), "give a Recording")
-    for P0 in (np.eye(3), "a", np.full((5, 5), np.nan), -np.eye(5), np.triu(np.ones((5, 5)))):
+    indefinite = np.eye(5) + 2 * (np.eye(5, k=1) + np.eye(5, k=-1))
+    empty = np.diag([0.0, 1, 1, 1, 1]) + 0.1 * (np.eye(5, k=1) + np.eye(5, k=-1))
+    for P0 in (np.eye(3), "a", np.full((5, 5), np.nan), -np.eye(5), np.triu(np.ones((5, 5))), indefinite, empty):
         refused(lambda P0=P0: observer.run(u, y, None, P0), "P0")
     for pair in ((None, y), (u, None), ("a", y), ([], []), (3.0, 4.0), (u, y[:10]), (u, np.where(y > 0, y, np.nan))):
         refused(lambda pair=pair: observer.run(*pair))
@@ -65,6 +67,27 @@ def test_a_model_that_diverges_is_neither_observed_nor_inverted(small):
     wild = fit.model.with_parameters(fit.model.parameters.change(A={"value": 3 * np.eye(2)}))
     for verb in (pilfr.kalman_filter, pilfr.feedforward):
         refused(lambda verb=verb: verb(replace(fit, model=wild), record), "diverges along the recording")
+
+
+def test_covariances_of_states_of_unlike_sizes_are_taken(small):
+    _, record, observer = small
+    for P0 in (np.zeros((5, 5)), np.diag([1e-20, 1.0, 1e9, 0.0, 1e-6]), np.ones((5, 5)), observer.P0):
+        assert np.all(np.isfinite(observer.run(record.u[:5], record.y[:5], None, P0)[1]))
+
+
+def test_what_a_compensator_cannot_work_on(small):
+    fit, record, observer = small
+    made = pilfr.feedforward(fit, record)
+    refused(lambda: made.inputs(np.ones(9), np.zeros(3)), "A state of 3 numbers .* give 5, memory included")
+    for thing in (3, "a", fit, observer.step):
+        refused(lambda thing=thing: pilfr.feedforward(fit, record, observer=thing), "give a kalman_filter of this fit")
+    changed = fit.model.parameters.change(w={"value": [[0.5, 0.3, 0.21]]})
+    for other in (replace(fit, model=fit.model.with_parameters(changed)), fitted(pilfr.PILFR(3), {})[0]):
+        theirs = pilfr.kalman_filter(other, record, share=1e-3)
+        refused(lambda theirs=theirs: pilfr.feedforward(fit, record, observer=theirs), "one of another model")
+    with_disturbance = pilfr.kalman_filter(fit, record, share=1e-3, disturbance=True)
+    for own, n in ((observer, 5), (with_disturbance, 6)):
+        assert pilfr.feedforward(fit, record, observer=own).step.size1_in(0) == n
 
 
 def test_two_inputs_and_outputs_are_observed(square):

@@ -11,6 +11,7 @@ import numpy as np
 from ..checks import numbers
 from ..fitted import Fit
 from ..recording import InputError
+from .mpc_scales import scale_of_inputs, scale_of_outputs
 
 Array = np.ndarray
 ENORMOUS = 1e20  # stands for no limit
@@ -41,8 +42,8 @@ def asked(
     outputs: Any = None,
     rate: Any = None,
     move: Any = 1e-3,
-    y_scale: Any = 1.0,
-    u_scale: Any = 1.0,
+    y_scale: Any = None,
+    u_scale: Any = None,
 ) -> Asked:
     """Check the arguments of a predictive controller.
 
@@ -58,7 +59,14 @@ def asked(
     low, high = _pair(inputs, "inputs", (horizon, n_u))
     limits = (-ENORMOUS, ENORMOUS) if outputs is None else outputs
     low_y, high_y = _pair(limits, "outputs", (horizon, n_y))
-    scales = numbers(y_scale, "y_scale", (horizon, n_y)).ravel(), numbers(u_scale, "u_scale", (horizon, n_u)).ravel()
+    u_size = scale_of_inputs(low, high) if u_scale is None else numbers(u_scale, "u_scale", (horizon, n_u)).ravel()
+    if y_scale is None:
+        middle = np.clip(0.0, low, high)
+        ends = np.maximum(low, middle - 2 * u_size), np.minimum(high, middle + 2 * u_size)
+        y_size = scale_of_outputs(function, low_y, high_y, ends)
+    else:
+        y_size = numbers(y_scale, "y_scale", (horizon, n_y)).ravel()
+    scales = y_size, u_size
     rates = numbers(np.inf if rate is None else rate, "rate", (horizon, n_u), infinite=True).ravel()
     weight = float(numbers(move, "move", ()))
     if any(np.any(size <= 0) for size in (*scales, rates)) or weight < 0:

@@ -27,11 +27,11 @@ import numpy as np
 from ..checks import numbers
 from ..model import Model
 from ..recording import InputError, Recording
+from .kalman import KalmanFilter, observed
 from .reach import Reach, reach
 
 if TYPE_CHECKING:
     from ..fit import Fit
-    from .kalman import KalmanFilter
 
 Array = np.ndarray
 FARTHEST = 12  # samples of look-ahead that are tried, from the delay on
@@ -78,8 +78,13 @@ class Feedforward:
         if path.size < 1 or path.size != max(path.shape, default=0):
             raise InputError(f"A path of the shape {path.shape} was given; give one output over at least one sample.")
         path = path.ravel()
+        n = int(self.step.size1_in(0))
+        start = np.zeros(n) if x0 is None else numbers(x0, "The state").ravel()
+        if len(start) != n:
+            raise InputError(
+                f"A state of {len(start)} numbers was given to the compensator; give {n}, memory included."
+            )
         shifted = np.concatenate([path[self.ahead :], np.full(min(self.ahead, len(path)), path[-1])])
-        start = np.zeros(self.step.size1_in(0)) if x0 is None else numbers(x0, "The state").ravel()
         x, before, wanted_then = ca.MX.sym("x", len(start)), ca.MX.sym("before"), ca.MX.sym("wanted")
         following, u = self.step(x, before, wanted_then)
         both = ca.Function("both", [ca.vertcat(x, before), wanted_then], [ca.vertcat(following, u), u])
@@ -118,8 +123,8 @@ def feedforward(
     Raises
     ------
     InputError
-        If the model cannot be inverted: more outputs than inputs or more than one, an input that does not reach the
-        output, or not within the look-ahead asked for, or no stable inverse.
+        If the observer is none of this model, or the model cannot be inverted: more outputs than inputs or more than
+        one, an input that does not reach the output, or not within the look-ahead asked for, or no stable inverse.
     """
     if not isinstance(getattr(fit, "model", None), Model):
         raise InputError(f"A {type(fit).__name__} was given to feedforward; give a Fit.")
@@ -146,10 +151,11 @@ def feedforward(
             f"Limits of the input of {given[:60]} were given; give (low, high), finite, with low below high."
         )
     function = fit.to_casadi()
+    planned = function if observer is None else observed(function, observer, recording)
     away = reach(fit, function, recording)
     found, why = _look_ahead(function, recording, away, ahead)
     delay, ends = away.delay or 0, (float(low), float(high))
-    step = inverse_step(function if observer is None else observer.function, found, ends, delay)
+    step = inverse_step(planned, found, ends, delay)
     return Feedforward(step, found, ends, delay, _outside(away), _note(found, delay, why))
 
 

@@ -1,7 +1,7 @@
 """A fitted model in do-mpc (Fiedler et al. 2023, Control Engineering Practice 140), which is an optional extra.
 
 The same problem as `PredictiveController`, states in, multiple shooting by IPOPT; where no output limit has to be given
-up the optimum is the same.
+up the problem is the same. IPOPT is handed the model with its kinks, and may stop at one.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 from ..checks import numbers
 from ..recording import InputError
-from .asked import asked, planned_with
-from .mpc import PENALTY
+from .asked import ENORMOUS, asked, planned_with
+from .mpc_cost import PENALTY
 
 Array = np.ndarray
 MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
@@ -76,8 +76,8 @@ def do_mpc_controller(
     inputs: tuple[Any, Any],
     outputs: tuple[Any, Any] | None = None,
     move: float = 1e-3,
-    y_scale: float = 1.0,
-    u_scale: float = 1.0,
+    y_scale: Any = None,
+    u_scale: Any = None,
 ) -> Any:
     """A `do_mpc.controller.MPC` that follows a reference; the arguments are those of `PredictiveController`.
 
@@ -105,19 +105,22 @@ def do_mpc_controller(
     path = path[:, None] if path.ndim == 1 else path
     if path.ndim != 2 or not len(path) or path.shape[1] != n_y:
         raise InputError(f"The reference has the shape {path.shape}; give (samples, {n_y}), a row a sample.")
+    low, high, u_size = (_constant(v, horizon) for v in (task.low, task.high, task.u_scale))
+    low_y, high_y, y_size = (_constant(v, horizon) for v in (task.low_y, task.high_y, task.y_scale))
     do_mpc = imported()
     model = do_mpc_model(function)
     mpc = do_mpc.controller.MPC(model)
     quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.tol": 1e-9}
     mpc.set_param(n_horizon=horizon, t_step=1.0, store_full_solution=False, nlpsol_opts=quiet)
-    error = (model.aux["y"] - model.tvp["r"]) / y_scale
+    error = (model.aux["y"] - model.tvp["r"]) / y_size
     mpc.set_objective(lterm=ca.sumsqr(error), mterm=ca.SX(0))
-    mpc.set_rterm(u=move / u_scale**2)
-    mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = inputs
-    if outputs is not None:
-        soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": PENALTY}
-        mpc.set_nl_cons("above", (model.aux["y"] - outputs[1]) / y_scale, **soft)
-        mpc.set_nl_cons("below", (outputs[0] - model.aux["y"]) / y_scale, **soft)
+    mpc.set_rterm(u=task.move / u_size**2)
+    mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = low, high
+    soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": PENALTY}
+    for name, side, limit in (("above", 1, high_y), ("below", -1, low_y)):
+        held = np.flatnonzero(np.abs(limit) < ENORMOUS)
+        if len(held):
+            mpc.set_nl_cons(name, side * (model.aux["y"] - limit)[held] / y_size[held], **soft)
     template = mpc.get_tvp_template()
 
     def wanted(now: float) -> Any:
@@ -128,3 +131,14 @@ def do_mpc_controller(
     mpc.set_tvp_fun(wanted)
     mpc.setup()
     return mpc
+
+
+def _constant(values: Array, samples: int) -> Array:
+    """One value for each signal, of values over the horizon."""
+    each = values.reshape(samples, -1)
+    if np.any(each != each[0]):
+        raise InputError(
+            "A limit or a scale changes over the horizon, which do-mpc cannot take here; give one for each signal, or "
+            "use PredictiveController."
+        )
+    return np.asarray(each[0])

@@ -15,7 +15,7 @@ problems.observer`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 TENTH = 0.1
+PROBES = 5  # states and inputs at which an observer's model is compared with a fit
 SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # process noise a step, as shares of the states' spread
 
 
@@ -87,8 +88,11 @@ class KalmanFilter:
             raise InputError("There are no samples to filter; give at least one.")
         u, y = u.reshape(len(u), -1), y.reshape(len(y), -1)
         P = self.P0 if P0 is None else numbers(P0, "P0")
-        if P.shape != (n, n) or not np.allclose(P, P.T) or np.min(np.diag(P), initial=0.0) < 0:
-            raise InputError(f"P0 of the shape {P.shape} was given; give a covariance, ({n}, {n}) and symmetric.")
+        if P.shape != (n, n) or not np.allclose(P, P.T) or not _semidefinite(P):
+            raise InputError(
+                f"P0 of the shape {P.shape} was given; give a covariance, ({n}, {n}), symmetric and with no negative "
+                "eigenvalue."
+            )
         x = self.x0 if x0 is None else numbers(x0, "The state").ravel()
         n_u, n_y = int(self.step.size1_in(2)), int(self.step.size1_in(3))
         if len(u) != len(y) or u.shape[1] != n_u or y.shape[1] != n_y or len(x) != n:
@@ -99,6 +103,15 @@ class KalmanFilter:
         steps = self.step.mapaccum("run", len(u), 2)
         xs, ps, predicted = (np.asarray(v) for v in steps(x, P, u.T, y.T))
         return np.vstack([x, xs.T]), predicted.T, ps[:, -n:]
+
+
+def _semidefinite(P: Array) -> bool:
+    """Whether no direction has a negative variance; in units of each state's own, as states differ by decades."""
+    size = np.sqrt(np.maximum(np.diag(P), 0.0))
+    if np.any(np.diag(P) < 0) or np.any(P[size == 0] != 0):
+        return False
+    size = np.where(size > 0, size, 1.0)
+    return bool(np.min(np.linalg.eigvalsh(P / np.outer(size, size)), initial=0.0) >= -1e-9)
 
 
 def kalman_filter(
@@ -169,6 +182,30 @@ def disturbed(function: ca.Function) -> ca.Function:
     following, y = function(x, u)
     names = ["x", "u"], ["x_next", "y"]
     return ca.Function("disturbed", [ca.vertcat(x, d), u], [ca.vertcat(following, d), y + d], *names)
+
+
+def observed(function: ca.Function, observer: Any, recording: Recording) -> ca.Function:
+    """The function of an observer, which has to be one of this model, with or without disturbances behind its state.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    if not isinstance(observer, KalmanFilter):
+        raise InputError(f"A {type(observer).__name__} was given as the observer; give a kalman_filter of this fit.")
+    theirs, n = observer.function, function.size1_in(0)
+    extra = theirs.size1_in(0) - n
+    same = extra in (0, function.size1_out(1)) and theirs.size1_in(1) == function.size1_in(1)
+    rng, size = np.random.default_rng(0), float(np.max(np.abs(recording.u)))
+    for _ in range(PROBES if same else 0):
+        x, u = size * rng.standard_normal(n), size * rng.standard_normal(function.size1_in(1))
+        own, other = function(x, u), theirs(np.append(x, np.zeros(extra)), u)
+        pairs = (own[0], other[0][:n]), (own[1], other[1])
+        same = same and all(np.allclose(np.asarray(a), np.asarray(b), rtol=1e-9, atol=0.0) for a, b in pairs)
+    if not same:
+        raise InputError("The observer is one of another model; give a kalman_filter of the same fit.")
+    return theirs
 
 
 def ekf_step(function: ca.Function, Q: Array, R: Array) -> ca.Function:
