@@ -97,6 +97,7 @@ LAYERS = {
         "linear_model",
         "lagged_fit",
         "early_stopping",
+        "repetition",
         "penalty",
         "thinning",
         "sparse",
