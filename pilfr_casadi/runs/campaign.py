@@ -20,7 +20,7 @@ from ..lfr import PILFR
 from ..multistart import drawn
 from ..recording import InputError
 from .described import Run, read_run
-from .execute import RunResult, carried_out
+from .execute import RunResult, carried_out, check_executor
 from .jobs import Batch, Recordings, RunJob, attempt
 from .side_by_side import AHEAD, Sent, side_by_side
 
@@ -76,9 +76,10 @@ def campaign(
     """
     given = path if isinstance(path, Run) else read_run(path, "campaign")
     if workers is not None:
-        if not isinstance(workers, int) or workers < 1:
+        if not isinstance(workers, int) or isinstance(workers, bool) or workers < 1:
             raise InputError(f"workers = {workers!r} was given; give a whole number, 1 or more.")
         given = replace(given, workers=workers)
+    check_executor(executor)
     _check_seeds(given)
     perform = functools.partial(_perform, executor, ahead)
     return carried_out(given, perform, out, overwrite, progress, tell, campaign=True)
