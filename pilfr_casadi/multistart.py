@@ -10,7 +10,9 @@
    last run without the prior shows what it costs. With the prior wins over without when it is within 10 %.
 
 With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start.
-With "plain" it goes through 2 alone, which is the paper's protocol to the letter. Elements without memory have their
+With "plain" it goes through 2 alone: the paper's protocol where the linear model that is given is the best linear
+approximation (the paper's beginning), while 1 begins at the minimum of the output error, where more starts get stuck.
+Elements without memory have their
 own start values (`start.network_start`) and nothing to re-grid; with either of these each start is run to the end.
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.

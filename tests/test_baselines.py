@@ -245,7 +245,7 @@ def test_early_stopping_takes_the_best_point_on_what_is_held_back():
     train, _ = recordings(truth("network_lfr"), noise=0.3, length=160)
     structure = pilfr.network_lfr(2, 6)
     model = pilfr.fit(structure, train, starts=1, start="plain", solver=pilfr.GaussNewton(max_iterations=1)).model
-    (kept,), (held,), told = hold_back([train], 0.4)
+    (kept,), (held,), _ = hold_back([train], 0.4)
     problem, judged = Problem(model, kept, engine="vm"), Problem(model, held, engine="vm")
     seen = []
     free = pilfr.GaussNewton().solve(problem, watch=lambda theta: seen.append(judged.cost(theta)) or False)

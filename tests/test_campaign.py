@@ -22,7 +22,6 @@ from pilfr_casadi.cli import main
 from pilfr_casadi.interrupts import Clock, time_limit
 from pilfr_casadi.recording import InputError
 from pilfr_casadi.runs.execute import RunInterrupted
-from pilfr_casadi.runs.folds import fold
 from pilfr_casadi.runs.manifest import Manifest
 
 SLOW = """
@@ -276,23 +275,6 @@ def test_a_validation_recording_recommends_one_too(folder):
     result = pilfr.campaign(changed(folder, ('test = "test.csv"', 'validation = "held.csv"'), ("[1, 3]", "[0, 2, 6]")))
     assert result.selection.names[result.selection.cell] == "operators 2"
     assert result.chosen.startswith("operators-2")
-
-
-def test_folds_hold_out_every_sample_once(folder):
-    r = pilfr.read(folder / "train.csv", "u", "y", initial="zero")
-    seen = []
-    for k in range(4):
-        train, held = fold([r], k, 4)
-        assert sum(map(len, train)) + sum(map(len, held)) == len(r)
-        assert all(np.isin(part.u[0], r.u).all() for part in train) and train[0].initial == (
-            "zero" if k else "estimate"
-        )
-        seen.append(held[0].u)
-    assert np.array_equal(np.concatenate(seen), r.u)
-    three = [r.with_(name=str(k), u=np.random.default_rng(k).normal(size=len(r))) for k in range(3)]
-    assert [[part.name for part in fold(three, k, 2)[1]] for k in range(2)] == [["0", "2"], ["1"]]
-    with pytest.raises(InputError, match="too few for 30 folds"):
-        fold([r], 0, 30)
 
 
 def test_objects_of_a_python_file_are_sent(folder, monkeypatch):

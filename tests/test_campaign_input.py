@@ -5,19 +5,16 @@ import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 
-import numpy as np
 import pytest
 from run_files import changed, prepared
-from test_cli import refused, write_csv
+from test_cli import refused
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import hand
 from pilfr_casadi.cli import main
 from pilfr_casadi.recording import InputError
-from pilfr_casadi.repetition import repeats_itself, same_input
 from pilfr_casadi.runs import cluster, side_by_side
 from pilfr_casadi.runs.command import _alike
-from pilfr_casadi.runs.folds import fold
 from pilfr_casadi.runs.grid import Cell
 from pilfr_casadi.runs.manifest import Manifest
 from pilfr_casadi.runs.results import reasons
@@ -58,23 +55,6 @@ def test_bad_workers_get_one_sentence(folder):
             call(folder / "rig.toml", executor=5)
     with pytest.raises(InputError, match="workers = True was given"):
         pilfr.campaign(folder / "rig.toml", workers=True)
-
-
-def test_folds_of_steady_periods_are_refused(capsys, folder):
-    """Whatever block is held out, the others have its input: it would prove nothing."""
-    wave = np.random.default_rng(3).normal(size=100)
-    write_csv(folder / "train.csv", m=300, u=np.tile(wave, 3))
-    once = ("report = false", "report = false\nfolds = 3")
-    for path in (changed(folder, once), changed(folder, once, ('"zero"', '"periodic"\nperiod = 100'))):
-        refused(capsys, "campaign", path, says=("folds = 3 was given", "proves nothing; give other realizations"))
-    r = pilfr.read(folder / "train.csv", "u", "y", initial="periodic", period=100)
-    other = r.with_(u=np.tile(np.random.default_rng(4).normal(size=100), 3), name="other")
-    with pytest.raises(InputError, match="give folds = 2, other realizations"):
-        fold([r, other, r], 0, 3)
-    dealt = [fold([r, other, r], k, 2) for k in range(2)]  # records of one input are held out together
-    assert [[len(part) for part in parts] for parts in dealt] == [[1, 2], [2, 1]]
-    assert not repeats_itself(r.slice(0, 140)) and repeats_itself(r.slice(0, 160)) and not same_input(r, other)
-    assert same_input(r.slice(0, 100), r.slice(30, 280))
 
 
 def test_bad_folders_and_places_get_one_sentence(capsys, folder, monkeypatch):

@@ -20,9 +20,9 @@ from ..lfr import PILFR
 from ..multistart import drawn
 from ..recording import InputError
 from .described import Run, read_run
-from .execute import RunResult, carried_out, check_executor
+from .execute import RunResult, carried_out
 from .jobs import Batch, Recordings, RunJob, attempt
-from .side_by_side import AHEAD, Sent, side_by_side
+from .side_by_side import AHEAD, Sent, check_executor, side_by_side
 
 
 def campaign(

@@ -32,6 +32,7 @@ from .jobs import Batch, Recordings, RunJob, input_digests, jobs_of, outcome
 from .manifest import alone, digest
 from .results import Score, chosen, reasons, table
 from .selection import Selection, select
+from .side_by_side import check_executor
 from .store import Store
 from .summary import CellSummary, box_plots, summarised, summary_table
 
@@ -95,18 +96,6 @@ class RunResult:
     summary: tuple[CellSummary, ...] = ()
     selection: Selection | None = None
     note: str = ""
-
-
-def check_executor(executor: Any) -> None:
-    """Refuse what no job can be given to.
-
-    Raises
-    ------
-    InputError
-        That says what was given.
-    """
-    if executor is not None and not callable(getattr(executor, "submit", None)):
-        raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")
 
 
 def run(
