@@ -37,7 +37,7 @@ from .problem import Problem
 from .recording import InputError
 from .search import Candidate, Search, run_tasks
 from .solution import Solution, Status
-from .start import grid_start, network_start, paper_start, regridded, unit_states
+from .start import direction_fixed, fixed_whole, grid_start, network_start, paper_start, regridded, unit_states
 from .threads import one_blas_thread
 from .tightening import at_bounds
 
@@ -87,10 +87,13 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
 
 
 def drawn(structure: Any, start: str, seed: int) -> bool:
-    """Whether a start has anything random in it: with the grid, the direction of z where it is free."""
-    fixed = {k for k, v in structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))}
-    network = isinstance(structure.element, StaticNetwork)
-    return start != "grid" or network or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
+    """Whether a start has anything random in it: with the grid, the direction of z where it is free, or thresholds."""
+    element = structure.element
+    network, several = (
+        isinstance(element, StaticNetwork),
+        "r" not in fixed_whole(structure) and getattr(element, "n", 1) > 1,
+    )
+    return start != "grid" or network or (seed >= len(PLACES) and (several or not direction_fixed(structure)))
 
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:
