@@ -1,6 +1,7 @@
 """Early stopping: a part of the training data is held back, and the point is taken where its error is smallest.
 
-Of one recording the end is held back, and simulated from the beginning; of several the last ones.
+Of one recording the end is held back, and simulated from the beginning; of several the last ones, with all that have
+their inputs. Of steady periods the end would have the input of what is trained on, so the mean period is cut in time.
 """
 
 from __future__ import annotations
@@ -12,15 +13,27 @@ import numpy as np
 
 from .gauss_newton import GaussNewton
 from .model import Model
+from .periods import mean_period
 from .problem import Problem
-from .recording import InputError, Recording
+from .recording import Recording
+from .repetition import by_input, repeats_itself
 from .solution import Progress, Solution, Status
 
 PATIENCE = 20  # points in a row that do not improve on the best
+CUT = (
+    "the input repeats, so of the mean period the last {:.0f} % stopped the training and the rest was trained on; "
+    "validation=0 trains on all, another realization is better"
+)
+SAME = (
+    "the input repeats, so what stopped the training has the input of what was trained on, which proves little; give "
+    "another realization"
+)
 
 
-def hold_back(recordings: Sequence[Recording], share: float) -> tuple[tuple[Recording, ...], tuple[Recording, ...]]:
-    """What is trained on, and what is looked at only to stop: the same, but scored on the part held back.
+def hold_back(
+    recordings: Sequence[Recording], share: float
+) -> tuple[tuple[Recording, ...], tuple[Recording, ...], str]:
+    """What is trained on, what is looked at only to stop (scored on the part held back), and a sentence to tell, or "".
 
     Parameters
     ----------
@@ -28,27 +41,31 @@ def hold_back(recordings: Sequence[Recording], share: float) -> tuple[tuple[Reco
         Training data.
     share : float
         Share to hold back, above 0 and below 1.
-
-    Raises
-    ------
-    InputError
-        If a single recording in periodic steady state has one period, which cannot be cut.
     """
-    if len(recordings) > 1:
-        n = min(max(1, round(share * len(recordings))), len(recordings) - 1)
-        return tuple(recordings[:-n]), tuple(_from_rest(r) for r in recordings[-n:])
-    (r,) = recordings
-    cut = r.skip + round((1 - share) * (len(r) - r.skip))
+    groups = by_input(recordings)
+    if len(groups) > 1:
+        wanted, last = max(1, round(share * len(recordings))), set(groups[-1])
+        for group in reversed(groups[1:-1]):
+            last |= set(group) if len(last) + len(group) <= wanted else set()
+        kept = tuple(r for i, r in enumerate(recordings) if i not in last)
+        return kept, tuple(_from_rest(recordings[i]) for i in sorted(last)), ""
+    pairs = [_cut(r, share) for r in recordings]
+    told = ""
+    if any(repeats_itself(r) or (r.begins == "periodic" and r.period) for r in recordings):
+        told = CUT.format(100 * share) if all(r.begins == "periodic" for r in recordings) else SAME
+    return tuple(kept for kept, _ in pairs), tuple(held for _, held in pairs), told
+
+
+def _cut(r: Recording, share: float) -> tuple[Recording, Recording]:
+    """One recording cut in time: what comes first, and the whole scored behind the cut."""
     if r.begins == "periodic" and r.period:
-        periods = len(r) // r.period
-        cut = (periods - max(1, round(share * periods))) * r.period
-        if cut < r.skip + r.period:
-            raise InputError(
-                "Early stopping holds back a part of the recording, which has one period only; give several "
-                "recordings or periods, or validation=0."
-            )
-    cut = min(max(cut, r.skip + 2), len(r) - 1)
-    return (r.slice(0, cut),), (_scored_from(r, cut),)
+        whole = (len(r) - r.skip) // r.period * r.period
+        mean = mean_period(r.slice(r.skip, r.skip + whole))
+        cut = min(max(round((1 - share) * len(mean)), 2), len(mean) - 1)
+        twice = mean.with_(u=np.tile(mean.u, (2, 1)), y=np.tile(mean.y, (2, 1)), initial="zero")
+        return mean.slice(0, cut), _scored_from(twice, len(mean) + cut)  # a period from rest, and then what is scored
+    cut = min(max(r.skip + round((1 - share) * (len(r) - r.skip)), r.skip + 2), len(r) - 1)
+    return r.slice(0, cut), _scored_from(r, cut)
 
 
 def _from_rest(recording: Recording) -> Recording:

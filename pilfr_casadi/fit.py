@@ -87,7 +87,8 @@ def fit(
         and at the input, whatever the seed; more are drawn. More starts with the same seed hold those of fewer.
     start : {"grid", "paper", "plain"} or mapping
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
-        solved and re-gridded, or, "plain", solved and no more, as in the paper.
+        solved and re-gridded, which the paper does not do, or, "plain", solved and no more; with `linear` the best
+        linear approximation "plain" is the paper's protocol.
         A mapping of values by parameter name is the one start of a PI-LFR with any element.
     linear : control.StateSpace, optional
         Linear model that the search for a PI-LFR begins with, such as `frequency_subspace` of a BLA, which is the

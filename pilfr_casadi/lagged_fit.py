@@ -91,9 +91,10 @@ def fit_lagged(
     first = as_recordings(train)[0]
     job = replace(job, recordings=check_for_identification(train, wanted.unknowns(first.n_u, first.n_y) + 2))
     structure = wanted.structure(first.n_u, first.n_y)
-    split = hold_back(job.recordings, wanted.validation) if wanted.validation else (job.recordings, ())
+    whole = job.recordings, (), ""
+    kept, held, note = hold_back(job.recordings, wanted.validation) if wanted.validation else whole
     told = job.progress if executor is None else None  # a callable stays in its process
-    search = LaggedSearch(wanted, structure, replace(job, progress=told), *split)
+    search = LaggedSearch(wanted, structure, replace(job, progress=told), kept, held)
 
     def report(found: list[Candidate], total: int) -> None:
         if job.progress:
@@ -110,7 +111,7 @@ def fit_lagged(
         )
     best = min(usable, key=lambda c: c.error)
     solution = replace(best.solution, status=Status.INTERRUPTED) if stopped else best.solution
-    more: dict[str, Any] = {"candidates": tuple(found), "minimum": False}
+    more: dict[str, Any] = {"candidates": tuple(found), "minimum": False, "note": note}
     return job.result(best.model, search.structure, job.problem(best.model), solution, **more)
 
 
@@ -150,15 +151,23 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
     engine = make_engine(model, search.job.engine)
     problem = Problem(model, search.job.recordings, engine=engine)
     theta = solution.theta
-    if problem.size > len(theta):  # the initial states of the recordings held back
-        fitted = with_solution(model, problem, solution)
-        others = [r for r in search.job.recordings[len(search.kept) :] if r.begins == "estimate"]
-        theta = np.concatenate([theta, *(first_state(fitted, engine, r) for r in others)])
-        more = np.zeros(len(theta) - len(solution.theta))
-        multipliers = np.insert(solution.multipliers, len(solution.theta), more)
-        solution = replace(solution, multipliers=multipliers)
+    known = [r for k, r in zip(search.kept, search.job.recordings, strict=False) if _begins_alike(k, r)]
+    known = known if len(known) == len(search.kept) else []
+    if problem.size > len(theta) or not known:  # the initial states of what was held back, or began elsewhere
+        fitted, n = with_solution(model, problem, solution), int(problem.free.sum())
+        others = [r for r in search.job.recordings[len(known) :] if r.begins == "estimate"]
+        after = theta if known else theta[:n]
+        theta = np.concatenate([after, *(first_state(fitted, engine, r) for r in others)])
+        bounds, rest = np.split(solution.multipliers, [len(solution.theta)])
+        bounds = np.concatenate([bounds[: len(after)], np.zeros(len(theta) - len(after))])
+        solution = replace(solution, multipliers=np.concatenate([bounds, rest]))
     with np.errstate(over="ignore", invalid="ignore"):
         e = problem.residual(theta)
         error = float(np.sqrt(np.mean(e**2)))
     error = error if np.isfinite(error) else np.inf
     return Candidate(seed, model, theta, error, replace(solution, theta=theta))
+
+
+def _begins_alike(kept: Recording, given: Recording) -> bool:
+    """Whether what was trained on is a recording, or the beginning of one."""
+    return kept.begins == given.begins and np.array_equal(kept.y, given.y[: len(kept)])

@@ -10,7 +10,9 @@
    last run without the prior shows what it costs. With the prior wins over without when it is within 10 %.
 
 With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start.
-With "plain" it goes through 2 alone, which is the paper's protocol to the letter. Elements without memory have their
+With "plain" it goes through 2 alone: the paper's protocol where the linear model that is given is the best linear
+approximation (the paper's beginning), while 1 begins at the minimum of the output error, where more starts get stuck.
+Elements without memory have their
 own start values (`start.network_start`) and nothing to re-grid; with either of these each start is run to the end.
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
@@ -35,7 +37,7 @@ from .problem import Problem
 from .recording import InputError
 from .search import Candidate, Search, run_tasks
 from .solution import Solution, Status
-from .start import grid_start, network_start, paper_start, regridded, unit_states
+from .start import direction_fixed, fixed_whole, grid_start, network_start, paper_start, regridded, unit_states
 from .threads import one_blas_thread
 from .tightening import at_bounds
 
@@ -85,10 +87,13 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
 
 
 def drawn(structure: Any, start: str, seed: int) -> bool:
-    """Whether a start has anything random in it: with the grid, the direction of z where it is free."""
-    fixed = {k for k, v in structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))}
-    network = isinstance(structure.element, StaticNetwork)
-    return start != "grid" or network or (seed >= len(PLACES) and not {"C_z", "D_zu"} <= fixed)
+    """Whether a start has anything random in it: with the grid, the direction of z where it is free, or thresholds."""
+    element = structure.element
+    network, several = (
+        isinstance(element, StaticNetwork),
+        "r" not in fixed_whole(structure) and getattr(element, "n", 1) > 1,
+    )
+    return start != "grid" or network or (seed >= len(PLACES) and (several or not direction_fixed(structure)))
 
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:

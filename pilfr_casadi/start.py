@@ -84,7 +84,8 @@ def grid_start(
     Places of the element, of which the last two stand for the commonest structures (backlash or friction in what drives
     a linear system, or in what it drives):
 
-    - "random": a random direction in states and inputs, each in units of its deviation; `B_w = D_yw = 0`;
+    - "random": a random direction in states and inputs, each in units of its deviation; `B_w = D_yw = 0`; where the
+      structure fixes the direction, random thresholds in place of the grid;
     - "output": z is the linear model's output, half of which is read through the element;
     - "input": z is the input, half of which reaches the linear model through the element.
 
@@ -95,9 +96,22 @@ def grid_start(
     element = _layer(structure)
     blocks, z = _placed(structure, element, linear, inputs, states, rng, place)
     widest = np.max(np.abs(z), axis=0)
-    blocks["r"] = 0.9 * widest[:, None] * np.arange(element.n) / element.n
+    grid = np.tile(np.arange(element.n) / element.n, (element.channels, 1))
+    if place == "random" and direction_fixed(structure):
+        grid[:, 1:] = np.sort(rng.uniform(size=(element.channels, element.n - 1)), axis=1)
+    blocks["r"] = 0.9 * widest[:, None] * grid
     blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
     return blocks
+
+
+def direction_fixed(structure: PILFR) -> bool:
+    """Whether z is fixed by the structure, so that no direction is left to draw."""
+    return {"C_z", "D_zu"} <= set(fixed_whole(structure))
+
+
+def fixed_whole(structure: PILFR) -> list[str]:
+    """Blocks that are fixed to the last entry."""
+    return [k for k, v in structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))]
 
 
 def network_start(

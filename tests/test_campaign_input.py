@@ -34,6 +34,7 @@ def folder(tmp_path):
         ("[1, 3]", "[3, 3]", "different values"),
         ("[1, 3]", "[3, 'many']", "'operators' in [model] is 'many'"),
         ("[1, 3]", "[]", "list of different values"),
+        ('structure = "hammerstein"', 'structure = "lti"', "for a linear model give 'lfr' with operators = 0"),
         ("count = 4", "number = 4", "unknown key 'number'"),
         ("count = 4", "count = 0", "'count' in [seeds] is 0"),
         ("[grid]", "[campaign]\nlimit = 3\n[grid]", "unknown key 'limit'"),
@@ -46,6 +47,14 @@ def folder(tmp_path):
 )
 def test_bad_input_gets_one_sentence(capsys, folder, old, new, says):
     refused(capsys, "campaign", changed(folder, (old, new), ("workers = 2", "workers = 1")), says=says)
+
+
+def test_bad_workers_get_one_sentence(folder):
+    for call in (pilfr.campaign, pilfr.run):
+        with pytest.raises(InputError, match="executor = 5 was given"):
+            call(folder / "rig.toml", executor=5)
+    with pytest.raises(InputError, match="workers = True was given"):
+        pilfr.campaign(folder / "rig.toml", workers=True)
 
 
 def test_bad_folders_and_places_get_one_sentence(capsys, folder, monkeypatch):
@@ -108,8 +117,8 @@ def test_reasons_are_grouped():
     [
         ("lfr", 4, ""),
         ("lfr", 2, "every seed gives the same model; use one seed, or 3 starts or more"),
-        ("hammerstein", 2, "every seed gives the same model; use one seed"),
-        ("hammerstein", 4, "every seed gives the same model; use one seed"),
+        ("hammerstein", 2, "every seed gives the same model; use one seed, or 3 starts or more"),
+        ("hammerstein", 4, ""),
         ("ssnn", 1, ""),
     ],
 )

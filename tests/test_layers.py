@@ -98,6 +98,7 @@ LAYERS = {
         "linear_model",
         "lagged_fit",
         "early_stopping",
+        "repetition",
         "penalty",
         "thinning",
         "sparse",

@@ -231,3 +231,20 @@ def test_a_network_begins_as_the_linear_model(structure):
 def test_operators_that_all_rest_far_beyond_what_is_visited_are_spread_evenly():
     r, w = regrid(np.array([1e6, 2e6, 3e6]), np.array([1.0, 2.0, 3.0]), 1.0)
     assert np.all(np.diff(r) > 0) and r[-1] < 1.3 and np.ptp(np.diff(r)) < 1e-6 and w.sum() == pytest.approx(6.0)
+
+
+def test_where_no_direction_is_left_to_draw_thresholds_are():
+    """Starts of a Hammerstein model with the same grid would all be one."""
+    m = 200
+    u, structure = np.random.default_rng(0).standard_normal((m, 1)), hammerstein(1, PrandtlIshlinskii(Play, 4))
+    linear = {"A": [[0.5]], "B_u": [[1.0]], "C_y": [[1.0]], "D_yu": [[0.0]], "y_0": [0.0]}
+    linear = {k: np.array(v) for k, v in linear.items()}
+    found = [grid_start(structure, linear, [u], [np.zeros((m, 1))], np.random.default_rng(k)) for k in range(3)]
+    for values in found:
+        r = values["r"][0]
+        assert r[0] == 0 and np.all(np.diff(r) > 0) and r[-1] < np.max(np.abs(u))
+    assert not np.allclose(found[0]["r"], found[1]["r"]) and not np.allclose(found[1]["r"], found[2]["r"])
+    placed = [
+        grid_start(structure, linear, [u], [np.zeros((m, 1))], np.random.default_rng(k), "input")["r"] for k in range(2)
+    ]
+    assert np.array_equal(*placed)

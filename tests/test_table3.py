@@ -11,7 +11,19 @@ from pilfr_casadi.modal import is_modal
 from problems.measured_data import measured
 from problems.piezo_platform import PERIODS, Platform, measure
 from problems.piezo_stack import recordings
-from problems.table3 import Row, identify, lti, main, pi_hammerstein, pi_lfr, rows, ss_nn, stack_rows, table
+from problems.table3 import (
+    Row,
+    by_training,
+    identify,
+    lti,
+    main,
+    pi_hammerstein,
+    pi_lfr,
+    rows,
+    ss_nn,
+    stack_rows,
+    table,
+)
 from problems.table3_figures import quietened
 
 SMALL = Platform(
@@ -70,6 +82,20 @@ def test_the_table_has_every_row_of_the_paper():
     published += [f"{kind} nx={nx} N={n}" for kind in ("PI-Hamm", "PI-LFR") for nx, n in sizes]
     assert [name for name, row in found.items() if row.published] == published
     assert all(is_modal(r.model.fixed, r.model.nx) for r in found.values() if isinstance(r.model, PILFR))
+
+
+def test_the_better_row_is_the_one_of_the_smaller_training_error():
+    class Told:  # the data are the errors: larger in training, smaller on the test
+        def __init__(self, train, test):
+            self.errors = {"train": train, "test": test}
+
+        def nrmse(self, which):
+            return self.errors[which]
+
+    fits = {"LTI nx=8": Told(3, 3), "NOE lags=8 n=10": Told(2, 1), "NOE lags=8 n=20": Told(1, 2)}
+    said = by_training(fits, "train", "test", 0.5)
+    assert said.endswith("LTI nx=8 6.000, NOE lags=8 n=20 4.000")
+    assert len(by_training(dict.fromkeys(rows(), Told(1, 1)), "train", "test", 1.0).split(",")) == 2 + 4 * 2 + 1
 
 
 def test_networks_of_a_small_platform():

@@ -22,7 +22,7 @@ from ..recording import InputError
 from .described import Run, read_run
 from .execute import RunResult, carried_out
 from .jobs import Batch, Recordings, RunJob, attempt
-from .side_by_side import AHEAD, Sent, side_by_side
+from .side_by_side import AHEAD, Sent, check_executor, side_by_side
 
 
 def campaign(
@@ -76,9 +76,10 @@ def campaign(
     """
     given = path if isinstance(path, Run) else read_run(path, "campaign")
     if workers is not None:
-        if not isinstance(workers, int) or workers < 1:
+        if not isinstance(workers, int) or isinstance(workers, bool) or workers < 1:
             raise InputError(f"workers = {workers!r} was given; give a whole number, 1 or more.")
         given = replace(given, workers=workers)
+    check_executor(executor)
     _check_seeds(given)
     perform = functools.partial(_perform, executor, ahead)
     return carried_out(given, perform, out, overwrite, progress, tell, campaign=True)

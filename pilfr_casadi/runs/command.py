@@ -36,6 +36,8 @@ def run_command(options: argparse.Namespace) -> int:
             result = run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=_tell)
     except RunInterrupted as stop:
         return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
+    except KeyboardInterrupt:
+        return say("Interrupted; what is done stays, the same command goes on from there.", INTERRUPTED)
     except NoModel as missed:
         return say(str(missed), NO_RESULT)
     return _told(given, result, TABLE, MODEL)
@@ -72,6 +74,8 @@ def campaign_command(options: argparse.Namespace) -> int:
             )
     except RunInterrupted as stop:
         return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
+    except KeyboardInterrupt:
+        return say("Interrupted; what is done stays, the same command goes on from there.", INTERRUPTED)
     except NoModel as missed:
         return say(str(missed), NO_RESULT)
     _print_summary(result)
@@ -117,6 +121,8 @@ def _told(given: Run, result: RunResult, *files: str) -> int:
                 print(f"NRMSE on {s.recording} ({role}): {s.nrmse:.4f}")
     failed = f", {len(result.failed)} of them without a model" if result.failed else ""
     print(f"chosen: {result.chosen}; {len(result.done)} jobs done now, {len(result.skipped)} before{failed}")
+    if result.note:
+        print(result.note)
     for line in reasons(result.manifest["jobs"], result.failed):
         print(f"without a model: {line}")
     if len(given.seeds) > 1:

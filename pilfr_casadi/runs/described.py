@@ -183,6 +183,9 @@ def _check_files(top: Table, files: Mapping[str, tuple[str, ...]]) -> None:
 
 
 def _model(table: Table) -> PILFR | Lagged:
+    if table.content.get("structure") in ("lti", "linear"):
+        given_as = table.content["structure"]
+        table.fail(f"'structure' in [model] is {given_as!r}; for a linear model give 'lfr' with operators = 0")
     structure = table.choice("structure", STRUCTURES, "lfr")
     numbers = {"nx": 0, "operators": 0, "channels": 1, "neurons": 0, "hidden": 1, "lags": 1, "input_lags": 1}
     read: dict[str, Any] = {key: table.number(key, None, least, whole=True) for key, least in numbers.items()}

@@ -32,9 +32,11 @@ from .jobs import Batch, Recordings, RunJob, input_digests, jobs_of, outcome
 from .manifest import alone, digest
 from .results import Score, chosen, reasons, table
 from .selection import Selection, select
+from .side_by_side import check_executor
 from .store import Store
 from .summary import CellSummary, box_plots, summarised, summary_table
 
+FITTED = "the structure is chosen on what was fitted, which favours the larger; add folds or validation recordings"
 Tell = Callable[[str], None]
 Perform = Callable[[Run, Recordings, Sequence[RunJob]], Iterator[Batch]]
 
@@ -79,6 +81,8 @@ class RunResult:
         Quartiles and failures of every cell of the grid on every recording.
     selection : Selection or None
         The structure that is recommended, where there are several and recordings or folds to judge them by.
+    note : str
+        What to know of the choice: that it was made among structures by what they were fitted to.
     """
 
     folder: Path
@@ -91,6 +95,7 @@ class RunResult:
     manifest: dict[str, Any]
     summary: tuple[CellSummary, ...] = ()
     selection: Selection | None = None
+    note: str = ""
 
 
 def run(
@@ -136,6 +141,7 @@ def run(
     """
     given = path if isinstance(path, Run) else read_run(path)
     given = given if engine is None else replace(given, engine=engine)
+    check_executor(executor)
 
     def in_turn(given: Run, recordings: Recordings, jobs: Sequence[RunJob]) -> Iterator[Batch]:
         for job in jobs:
@@ -182,12 +188,20 @@ class _Execution:
         self.place, self.perform, self.progress, self.tell = place, perform, progress, tell
         self.done: list[str] = []
         self.skipped: list[str] = []
+        self.total = 0
 
     def carry_out(self) -> RunResult:
+        try:
+            return self._carried_out()
+        except KeyboardInterrupt:
+            raise RunInterrupted(len(self.done) + len(self.skipped), self.total) from None
+
+    def _carried_out(self) -> RunResult:
         place, given = self.place, self.place.run
         held: tuple[RunJob, ...] = ()
         selection = None
         jobs = jobs_of(given, place.inputs)
+        self.total = len(jobs)
         if given.folds:
             held = jobs_of(given, place.inputs, folds=True)
             self._all(held)
@@ -200,7 +214,8 @@ class _Execution:
 
     def _all(self, jobs: Sequence[RunJob], before: Sequence[RunJob] = ()) -> None:
         """Do those jobs that are not complete."""
-        place, total = self.place, len(before) + len(jobs)
+        place = self.place
+        self.total = total = len(before) + len(jobs)
         ready = [j for j in jobs if place.complete(j)]
         self.skipped += [j.id for j in ready]
         if place.campaign and ready:
@@ -212,16 +227,17 @@ class _Execution:
             for batch in self.perform(place.run, place.recordings, [j for j in jobs if j not in ready]):
                 with deferred_interrupt():  # what has been done is not to be lost
                     place.note(batch)
+                    ready += [job for job, _ in batch]
+                    self.done += [job.id for job, _ in batch]
                 for job, found in batch:
-                    ready.append(job)
-                    self.done.append(job.id)
                     none = f"no model ({found.entry['status'].lower().replace('_', ' ')})"
                     self.tell(f"{job.id}: {found.entry['sentence'] if place.ended_well(job) else none}")
                 place.write_table((*before, *ready))
                 best = min(place.entries[j.id].get("train", np.inf) for j in ready)
                 self.progress("jobs", len(before) + len(ready), total, best)
-        except KeyboardInterrupt:
-            raise RunInterrupted(len(self.done) + len(self.skipped), total) from None
+        finally:
+            with deferred_interrupt():  # however it ends, the table has all that is done
+                place.write_table((*before, *ready), last=True)
 
     def _finished(self, jobs: Sequence[RunJob], selection: Selection | None) -> RunResult:
         """Errors, tables, and model and page of the job that is chosen."""
@@ -242,6 +258,10 @@ class _Execution:
         fit = replace(self._model(job), engine=given.engine)
         summary = summarised(given, jobs, scores, times)
         manifest.content["chosen"] = best
+        manifest.content.pop("choice", None)
+        note = FITTED if len(given.cells) > 1 and selection is None else ""
+        if note:
+            manifest.content["choice"] = note
         manifest.put(TABLE, table(scores, jobs, entries, best))
         manifest.put(MODEL, (place.path / job.model_file).read_text(encoding="utf-8"))
         if place.campaign:
@@ -261,7 +281,7 @@ class _Execution:
         failed = tuple(j.id for j in jobs if not place.ended_well(j))
         fit = replace(fit, seconds=times.get(best, 0.0))
         parts = tuple(self.done), tuple(self.skipped), failed
-        return RunResult(place.path, *parts, best, tuple(scores), fit, manifest.content, summary, selection)
+        return RunResult(place.path, *parts, best, tuple(scores), fit, manifest.content, summary, selection, note)
 
     def _model(self, job: RunJob) -> Fit:
         own = self.place.run.cells[job.cell].model

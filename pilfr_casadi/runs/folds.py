@@ -1,8 +1,9 @@
 """Cross-validation: the training recordings in parts, each held out once.
 
-With at least as many recordings as folds, whole recordings are dealt out in turn. With fewer, every recording is cut
-into as many blocks as there are folds; the state at the beginning of what follows a cut is estimated, and in a block
-held out the samples it is estimated from are not scored (`Fit.scored_from`).
+With at least as many different inputs as folds, whole recordings are dealt out in turn, those of one input together.
+With fewer, every recording is cut into as many blocks as there are folds; the state at the beginning of what follows a
+cut is estimated, and in a block held out the samples it is estimated from are not scored (`Fit.scored_from`). Where an
+input repeats, as in steady periods, blocks would hold out what the rest shows: that is refused.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..recording import InputError, Recording
+from ..repetition import by_input, repeats_itself
 
 LEAST = 20  # samples of a piece of training
 
@@ -20,17 +22,25 @@ def fold(recordings: Sequence[Recording], k: int, folds: int) -> tuple[tuple[Rec
     Raises
     ------
     InputError
-        If the recordings are too short to be cut.
+        If the recordings are too short to be cut, or a block of one has the same input as its other blocks.
     """
-    if len(recordings) >= folds:
+    groups = by_input(recordings)
+    if len(groups) >= folds:
+        out = {i for number, group in enumerate(groups) if number % folds == k for i in group}
         dealt = list(enumerate(recordings))
-        return tuple(r for i, r in dealt if i % folds != k), tuple(r for i, r in dealt if i % folds == k)
+        return tuple(r for i, r in dealt if i not in out), tuple(r for i, r in dealt if i in out)
     train: list[Recording] = []
     held: list[Recording] = []
     for r in recordings:
         first, last = (r.skip + round(share * (len(r) - r.skip) / folds) for share in (k, k + 1))
         if last - first < LEAST:
             raise InputError(f"{r.label} has {len(r)} samples, too few for {folds} folds; give fewer folds.")
+        if repeats_itself(r):
+            fewer = f"folds = {len(groups)}, " if len(groups) > 1 else ""
+            raise InputError(
+                f"folds = {folds} was given and the input of {r.label} repeats, so whatever block is held out has the "
+                f"input of what is fitted and proves nothing; give {fewer}other realizations, or validation data."
+            )
         held.append(r.slice(first, last))
         if k > 0:
             train.append(r.slice(0, first))

@@ -20,6 +20,18 @@ from .manifest import versions
 AHEAD = 64  # jobs that an executor is given at a time
 
 
+def check_executor(executor: Any) -> None:
+    """Refuse what no job can be given to.
+
+    Raises
+    ------
+    InputError
+        That says what was given.
+    """
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")
+
+
 def side_by_side(
     function: Callable[[RunJob], Outcome],
     jobs: Sequence[RunJob],

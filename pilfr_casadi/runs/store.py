@@ -104,9 +104,9 @@ class Store:
         reading = {k: str(v) for k, v in self.run.reading.items()}
         return digest({"model": model, "data": self.inputs[name], "reading": reading})
 
-    def write_table(self, jobs: Sequence[RunJob]) -> None:
-        """The errors so far, for readers of a campaign that is at work."""
-        if not self.campaign or time.monotonic() < self.written + PAUSE or not jobs:
+    def write_table(self, jobs: Sequence[RunJob], last: bool = False) -> None:
+        """The errors so far, for readers of a campaign that is at work; not too often, but for the last time."""
+        if not self.campaign or (not last and time.monotonic() < self.written + PAUSE) or not jobs:
             return
         self.manifest.put(TABLE, table(self.scores(jobs), jobs, self.entries, ""))
         self.written = time.monotonic()

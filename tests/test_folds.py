@@ -1,0 +1,50 @@
+"""Cross-validation: every sample is held out once, and nothing whose input is in what is fitted."""
+
+import numpy as np
+import pytest
+from run_files import changed, prepared
+from test_cli import refused, write_csv
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.recording import InputError
+from pilfr_casadi.repetition import repeats_itself, same_input
+from pilfr_casadi.runs.folds import fold
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return prepared(tmp_path)
+
+
+def test_folds_hold_out_every_sample_once(folder):
+    r = pilfr.read(folder / "train.csv", "u", "y", initial="zero")
+    seen = []
+    for k in range(4):
+        train, held = fold([r], k, 4)
+        assert sum(map(len, train)) + sum(map(len, held)) == len(r)
+        assert all(np.isin(part.u[0], r.u).all() for part in train) and train[0].initial == (
+            "zero" if k else "estimate"
+        )
+        seen.append(held[0].u)
+    assert np.array_equal(np.concatenate(seen), r.u)
+    three = [r.with_(name=str(k), u=np.random.default_rng(k).normal(size=len(r))) for k in range(3)]
+    assert [[part.name for part in fold(three, k, 2)[1]] for k in range(2)] == [["0", "2"], ["1"]]
+    with pytest.raises(InputError, match="too few for 30 folds"):
+        fold([r], 0, 30)
+
+
+def test_folds_of_steady_periods_are_refused(capsys, folder):
+    """Whatever block is held out, the others have its input: it would prove nothing."""
+    wave = np.random.default_rng(3).normal(size=100)
+    write_csv(folder / "train.csv", m=300, u=np.tile(wave, 3))
+    once = ("report = false", "report = false\nfolds = 3")
+    for path in (changed(folder, once), changed(folder, once, ('"zero"', '"periodic"\nperiod = 100'))):
+        refused(capsys, "campaign", path, says=("folds = 3 was given", "proves nothing; give other realizations"))
+    r = pilfr.read(folder / "train.csv", "u", "y", initial="periodic", period=100)
+    other = r.with_(u=np.tile(np.random.default_rng(4).normal(size=100), 3), name="other")
+    with pytest.raises(InputError, match="give folds = 2, other realizations"):
+        fold([r, other, r], 0, 3)
+    dealt = [fold([r, other, r], k, 2) for k in range(2)]  # records of one input are held out together
+    assert [[len(part) for part in parts] for parts in dealt] == [[1, 2], [2, 1]]
+    assert not repeats_itself(r.slice(0, 140)) and repeats_itself(r.slice(0, 160)) and not same_input(r, other)
+    assert same_input(r.slice(0, 100), r.slice(30, 280))
