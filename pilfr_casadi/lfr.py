@@ -153,7 +153,8 @@ class PILFR:
         for name, p in model.parameters.items():
             told, shape = self._given(name, p.value.shape), p.value.shape
             low, high = told.get("bounds", p.bounds)
-            begin = np.clip(filled(values.get(name, p.value), f"The value of {name!r}", shape), low, high)
+            given = values.get(name, p.value) if p.value.size else p.value  # of a larger structure: it has no such block
+            begin = np.clip(filled(given, f"The value of {name!r}", shape), low, high)
             changes[name] = {"value": begin, "bounds": (low, high)}
             if name == "y_0" and not self.offset:
                 told.setdefault("fixed", np.zeros(shape))

@@ -13,7 +13,7 @@ from pilfr_casadi.model import Model
 from pilfr_casadi.multisines import multisine
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import Recording
-from pilfr_casadi.start import grid_start, unit_states
+from pilfr_casadi.start import direction_fixed, grid_start, unit_states
 from pilfr_casadi.subspace import subspace_matrices
 
 Blocks = dict[str, np.ndarray]
@@ -99,4 +99,6 @@ def identified(structure: PILFR, record: Recording, rng: np.random.Generator) ->
     linear = {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": np.zeros(record.n_y)}
     scaled, states = unit_states(linear, [record.u])
     values = grid_start(structure, scaled, [record.u], states, rng)
+    if direction_fixed(structure):  # then it is thresholds that are drawn
+        values["r"] = grid_start(structure, scaled, [record.u], states, rng, "input")["r"]
     return structure.model(record.n_u, record.n_y, values, inputs=record.inputs, outputs=record.outputs)
