@@ -153,7 +153,7 @@ class PILFR:
         for name, p in model.parameters.items():
             told, shape = self._given(name, p.value.shape), p.value.shape
             low, high = told.get("bounds", p.bounds)
-            given = values.get(name, p.value) if p.value.size else p.value  # of a larger structure: it has no such block
+            given = values.get(name, p.value) if p.value.size else p.value  # a larger structure has more blocks
             begin = np.clip(filled(given, f"The value of {name!r}", shape), low, high)
             changes[name] = {"value": begin, "bounds": (low, high)}
             if name == "y_0" and not self.offset:
