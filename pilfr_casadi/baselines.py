@@ -20,6 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from .checks import is_number
 from .elements import StaticNetwork
 from .lfr import PILFR
 from .model import Model
@@ -88,7 +89,7 @@ class Lagged:
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise InputError(f"{name} = {value!r} was given; give a whole number, 1 or more.")
         share = self.validation
-        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
+        if not is_number(share) or not 0 <= share < 1:
             raise InputError(f"validation = {share!r} was given; give the share to hold back, 0 or more and below 1.")
 
     @property

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
@@ -42,7 +42,7 @@ def whole(value: Any, what: str, least: int) -> int:
     return int(value)
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Any) -> TypeGuard[float]:
     """Whether a value is one real number."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 

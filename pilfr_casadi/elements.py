@@ -18,6 +18,8 @@ from .operators import GeneralizedPlay, Play, Stop
 from .parameters import Parameter, ParameterSet
 from .recording import InputError
 
+LAYER = ("w", "r")  # parameters of a Prandtl-Ishlinskii layer that have an entry for each operator
+
 
 class Element(Protocol):
     """What `close_loop` needs of an element."""

@@ -29,7 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from .elements import PrandtlIshlinskii
+from .checks import is_number
+from .elements import LAYER, PrandtlIshlinskii
 from .model import Model
 from .operators import Play, Stop
 from .parameters import Parameter, ParameterSet
@@ -37,7 +38,6 @@ from .problem import Problem
 from .recording import InputError
 from .solution import Solution
 
-LAYER = ("w", "r")
 SLACK = 0.02  # share of the objective that merging operators may cost before the last solve
 
 
@@ -53,7 +53,7 @@ def check_penalty(l1: dict[str, float], parameters: ParameterSet, linear: bool) 
         raise InputError("An L1 penalty was asked for on a linear model; it acts on an element's weights, give one.")
     for name, weight in l1.items():
         lower = parameters.lower[parameters.position(name)]
-        if isinstance(weight, bool) or not isinstance(weight, int | float | np.number) or not 0 <= weight < np.inf:
+        if not is_number(weight) or not 0 <= weight < np.inf:
             raise InputError(f"The L1 weight of {name!r} is {weight!r}; give a number, 0 or more.")
         if np.any(lower < 0):
             raise InputError(f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior.")

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from .checks import is_number
-from .elements import PrandtlIshlinskii
+from .elements import LAYER, PrandtlIshlinskii
 from .fit import fit as identify
 from .fitted import Fit, fingerprint
 from .interrupts import Progress
@@ -32,7 +32,6 @@ from .search import Candidate, Search
 from .solution import Status
 from .thinning import thinned
 
-LAYER = ("w", "r")
 STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of L1, in units of the objective that is reached without
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .elements import PrandtlIshlinskii
+from .elements import LAYER, PrandtlIshlinskii
 from .fitted import Fit
 from .job import Job
 from .multistart import POLISH, PRIOR, held_near
@@ -22,7 +22,6 @@ from .recording import Recording, as_recordings
 from .solution import Status
 from .start import is_density, regrid
 
-LAYER = ("w", "r")
 WAYS = tuple(
     (beyond, spacing) for beyond in (1.0, 1.15, 1.3) for spacing in (0.25, 0.4)
 )  # to spread operators, `regrid`

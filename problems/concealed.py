@@ -1,7 +1,7 @@
 """Concealed cases on which `diagnose` has to find the physics that was left out of a simulator.
 
 `case(seed)` draws a rig, what it hides, and its recordings; `score` judges a diagnosis. Truths are simulated apart from
-the package and, mostly, by formulas that are not the catalogue's. Seeds 0 to 2599 are for development; results are
+the package and, mostly, by formulas that are not the catalogue's. Seeds 0 to 2859 are for development; results are
 reported on seeds from 2860 on.
 
     python -m problems.concealed --cases 200 --first-seed 2860 --workers 2

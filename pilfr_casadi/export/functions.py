@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..checks import LARGEST, numbers
+from ..checks import LARGEST, is_number, numbers
 from ..compiled import make_engine
 from ..fitted import Fit, first_state
 from ..integration import discretise
@@ -63,7 +63,7 @@ def exported(
         If something is missing or does not fit; one sentence says what.
     """
     check_name(name)
-    if isinstance(smooth, bool) or not isinstance(smooth, int | float) or not 0 <= smooth <= LARGEST:
+    if not is_number(smooth) or not 0 <= smooth <= LARGEST:
         raise InputError(
             f"smooth = {smooth!r} was given; give a number, from zero to {LARGEST:g}, in the signals' units."
         )
@@ -141,7 +141,7 @@ def to_casadi(model: Any, name: str = "model", **options: Any) -> ca.Function:
 
 
 def _duration(dt: float | None) -> float:
-    if not isinstance(dt, int | float) or isinstance(dt, bool) or not 0 < dt < np.inf:
+    if not is_number(dt) or not 0 < dt < np.inf:
         raise InputError(f"dt = {dt!r} was given; give the duration of a step in s, above zero.")
     return float(dt)
 
