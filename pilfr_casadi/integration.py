@@ -164,8 +164,8 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
     at = ca.Function("at", [*now.values(), u0, u1, vector], [f, y, after, z])  # written out once, called at every stage
 
-    def k(state: Any, u: Any, time: Any) -> Any:
-        return at(state, seen, u, time, u0, u1, vector)[0]
+    def k(state: Any, u: Any, c: float) -> Any:
+        return at(state, seen + c * later, u, t + c * h, u0, u1, vector)[0]
 
     _, _, begun, z = at(x, s, u0, t, u0, u1, vector)
     # a shift register takes in the signal at the step's begin, where it is measured; others have moved on with it when
@@ -173,6 +173,8 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     moved = ca.SX.sym("moved", s.numel())
     shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
     seen = ca.vertcat(ca.SX(0, 1), *(s[i] if shift else moved[i] for i, shift in enumerate(shifts)))
+    # within the step what a register holds stays where inputs are held, and moves on with inputs that do
+    later = (moved - seen) * (hold == "linear")
     k1, y, _, _ = at(x, seen, u0, t, u0, u1, vector)
     n_own = len(simulator.states)
     stages: tuple[Any, ...] | None = None
@@ -180,16 +182,16 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
         x_next = ca.vertcat(k1[:n_own], x[n_own:] + h * k1[n_own:])
     else:
         c2 = x + h / 2 * k1
-        k2 = k(c2, middle, t + h / 2)
+        k2 = k(c2, middle, 0.5)
         c3 = x + h / 2 * k2
-        k3 = k(c3, middle, t + h / 2)
+        k3 = k(c3, middle, 0.5)
         c4 = x + h * k3
-        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k(c4, end, t + h))
+        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k(c4, end, 1.0))
         if n_x:  # the same by way of the three states at which the stages are evaluated
             c = ca.SX.sym("c", 3 * n_x)
             s2, s3, s4 = ca.vertsplit(c, n_x)
-            by_c = ca.vertcat(c2, x + h / 2 * k(s2, middle, t + h / 2), x + h * k(s3, middle, t + h / 2))
-            stages = c, ca.vertcat(c2, c3, c4), by_c, (s2 + 2 * s3 + s4 - x) / 3 + h / 6 * k(s4, end, t + h)
+            by_c = ca.vertcat(c2, x + h / 2 * k(s2, middle, 0.5), x + h * k(s3, middle, 0.5))
+            stages = c, ca.vertcat(c2, c3, c4), by_c, (s2 + 2 * s3 + s4 - x) / 3 + h / 6 * k(s4, end, 1.0)
     reads, columns = ["u"], [u0]
     if hold == "linear":
         reads, columns = [*reads, "next"], [*columns, u1]

@@ -10,13 +10,15 @@ from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.gates import Gate
 from pilfr_casadi.diagnose.passed_over import passed_over
+from pilfr_casadi.diagnose.screen import Scored
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.timing import timing
 from pilfr_casadi.diagnose.verdict import choose, strained
 from pilfr_casadi.diagnose.workbench import Workbench
+from pilfr_casadi.laws.dynamic import Delay, Resonance
 from pilfr_casadi.parameters import Parameter
 from pilfr_casadi.recording import Recording
-from pilfr_casadi.simulator import Port, Simulator
+from pilfr_casadi.simulator import Placed, Port, Simulator
 
 
 def searching(bench, said=True):
@@ -75,6 +77,18 @@ def test_a_law_that_can_imitate_others_is_put_up_against_them():
     tried = SimpleNamespace(port="a", law=Looser())
     assert [s.law.id for s in passed_over([flexible, tried], scored)] == ["delay"]
     assert passed_over([candidate("a", "cubic_stiffness", 0.1)], scored) == []
+
+
+def test_where_a_delay_comes_near_damped_resonances_as_late_are_tried():
+    law = Delay(values={"T": 0.02})
+    late = candidate("a", "delay", 0.1)
+    late.law, late.size = law, 1
+    late.fitted = SimpleNamespace(values={"a.T": 0.02}, simulator=SimpleNamespace(elements=[Placed("a", law, "a.")]))
+    scored = [Scored(port, Resonance(), 0.1, ({"W": 3.0, "D": 0.05},), None) for port in ("a", "b")]
+    (more,) = [s for s in passed_over([late], scored) if s.port == "a"]
+    assert [2 * v["D"] / v["W"] == pytest.approx(0.02) for v in more.starts] == [True, True, False]
+    best = candidate("b", "cubic_stiffness", 0.01)
+    assert passed_over([best, late], scored) == []
 
 
 def spring():

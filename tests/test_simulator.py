@@ -215,6 +215,24 @@ def test_a_delay_between_samples_is_that_of_a_held_input(record):
     assert errors[1] < 2e-4 and errors[0] > 3 * errors[1]
 
 
+def test_a_delay_between_samples_is_that_of_an_interpolated_input(record):
+    steps, k = 1.3, np.arange(M)
+    u = record.u[:, :1] * np.minimum(k / 20, 1)[:, None]  # from nothing, as the register begins
+    given = record.with_(u=np.column_stack([u, np.zeros(M)]), hold="linear")
+
+    def late(t, s):
+        return linear_rates(t, s, [np.interp(t / DT - steps, k, u[:, 0], left=0.0), 0.0])
+
+    s, expected = np.zeros(2), []
+    for i in range(M):
+        expected.append(s[0])
+        for a, b in pairwise((i * DT, (i + steps % 1) * DT, (i + 1) * DT)):
+            s = solve_ivp(late, (a, b), s, rtol=1e-10, atol=1e-12).y[:, -1]
+    law = Delay(values={"T": steps * DT}, limits={"T": (0.0, 0.2)})
+    found = run(rig().with_element("actuator:force", law), given, "linear", law.substeps)[:, 0]
+    assert np.max(np.abs(found - expected)) < 5e-4 * np.max(np.abs(expected))
+
+
 def test_one_way_to_close_a_loop(record):
     """`close_loop` puts a law into a simulator's port, and the layer of the PI-LFR as well."""
     law = CubicStiffness(values={"k_3": 700.0})

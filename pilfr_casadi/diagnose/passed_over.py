@@ -2,7 +2,8 @@
 
 A flexible law may have taken the place of a simpler one at its port. And a resonance whose frequency is found at the
 wrong port is found at the right one from there: a small mass that is carried along is felt in a narrow band, between
-whose neighbours on the grid the screen may miss it.
+whose neighbours on the grid the screen may miss it. A damped resonance, too, slips between the lightly damped ones of
+the grid; the delay or the lag that comes near in its place says at which frequency it would be as late.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..laws.dynamic import Attached
+from ..laws.dynamic import Attached, Delay, Lag, Resonance
 from .candidate import Candidate
 from .kinship import CONTAINS, FLEXIBLE
 from .screen import Scored
 
 IMITATED = 3  # simpler laws put up against one that can imitate others
 AHEAD = 1.5  # times the best error of a carried mass that is worth another start
+BEHIND = 3.0  # times the best error of a delay or a lag that may stand for a resonance
+DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in its place
 
 
 def passed_over(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
@@ -31,7 +34,7 @@ def passed_over(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> li
     if best.law.id in FLEXIBLE:
         plain = [type(s.law) for s in other if s.law.id not in FLEXIBLE]
         chosen += list(dict.fromkeys(plain))[:IMITATED]
-    return [*(s for s in other if type(s.law) in chosen), *_carried(candidates, scored)]
+    return [*(s for s in other if type(s.law) in chosen), *_carried(candidates, scored), *_late(candidates, scored)]
 
 
 def _carried(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
@@ -46,4 +49,19 @@ def _carried(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[
     for s in scored:
         if isinstance(s.law, Attached) and s.port not in near and s.port not in out:
             out[s.port] = replace(s, starts=(*({**start, **found} for start in s.starts), *s.starts))
+    return list(out.values())
+
+
+def _late(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
+    """Damped resonances where a delay or a lag of T came near: at low frequencies they are 2 D / W late."""
+    late: dict[str, float] = {}
+    for c in candidates:
+        if isinstance(c.law, Delay | Lag) and c.error < BEHIND * candidates[0].error and c.port not in late:
+            late[c.port] = float(np.ravel(c.fitted.values[f"{c.fitted.simulator.elements[-1].prefix}T"])[0])
+    out: dict[tuple[str, type], Scored] = {}
+    for s in scored:
+        key = s.port, type(s.law)
+        if isinstance(s.law, Resonance) and s.port in late and key not in out:
+            found = [{"W": 2 * damping / late[s.port], "D": damping} for damping in DAMPED]
+            out[key] = replace(s, starts=(*({**start, **w} for start in s.starts[:1] for w in found), *s.starts[:1]))
     return list(out.values())
