@@ -38,7 +38,7 @@ def test_behind_a_free_integrator_no_sensor_is_blamed_for_what_is_left(port, rem
     assert search._only_drifts(SimpleNamespace(winner=winner, remains=remains)) is drifts
 
 
-def candidate(port, law, error, size=2, at_bound=False):
+def candidate(port, law, error, size=2, at_bound=False, doubtful=False):
     """What the choice reads of a fitted candidate."""
     return SimpleNamespace(
         port=port,
@@ -46,6 +46,7 @@ def candidate(port, law, error, size=2, at_bound=False):
         error=error,
         size=size,
         at_bound=at_bound,
+        doubtful=doubtful,
         name=(port, law),
     )
 
@@ -56,6 +57,15 @@ def test_of_two_that_do_as_well_the_one_that_no_bound_holds_back_is_taken():
     assert choice.winner is free and choice.alike == (held,)
     worse = candidate("sensor:x", "extra_mode", 0.2)
     assert choose([held, worse], (1.0, 1.0), 1e-4, 500.0).winner is held
+
+
+def test_what_is_hardly_what_its_name_says_gives_way_to_what_is():
+    named = dict(port="sensor:x", law="saturation", error=0.1)
+    thin, plain = candidate(**named, doubtful=True), candidate("sensor:x", "dead_zone", 0.108)
+    assert choose([thin, plain], (1.0, 1.0), 1e-8, 500.0).winner is plain
+    assert choose([candidate(**named), plain], (1.0, 1.0), 1e-8, 500.0).winner is not plain
+    far, elsewhere = candidate("sensor:x", "dead_zone", 0.12), candidate("guide", "dead_zone", 0.105)
+    assert choose([thin, far, elsewhere], (1.0, 1.0), 1e-8, 500.0).winner is thin
 
 
 class Loose:

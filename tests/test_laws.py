@@ -11,7 +11,16 @@ import pilfr_casadi.laws as laws
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi.compiled import compiler, make_engine
 from pilfr_casadi.integration import discretise
-from pilfr_casadi.laws import CATALOGUE, FINER, BoucWen, CubicStiffness, Delay, StopHysteresis, readable_unit
+from pilfr_casadi.laws import (
+    CATALOGUE,
+    FINER,
+    BoucWen,
+    CubicStiffness,
+    Delay,
+    GeneralizedHysteresis,
+    StopHysteresis,
+    readable_unit,
+)
 from pilfr_casadi.laws.base import Local
 from pilfr_casadi.laws.trace import columns, trace
 from pilfr_casadi.observer import led
@@ -163,3 +172,11 @@ def test_the_catalogue_has_no_law_twice():
 )
 def test_a_power_of_one_is_a_gain_and_no_curve(kind, values, doubtful):
     assert kind().doubtful(values) is doubtful
+
+
+def test_plays_beside_a_bend_that_does_it_all_are_hardly_a_hysteresis():
+    law = GeneralizedHysteresis().at({}, {"r": (1e-5, 0.97)})
+    plays = {"r": np.linspace(0.0, 0.9, 6), "a_2": 0.0, "a_3": 0.0, "b_2": 0.3}
+    assert law.doubtful({**plays, "w": np.full(6, 0.005)})
+    assert not law.doubtful({**plays, "w": np.full(6, 0.1)})
+    assert law.doubtful({**plays, "w": np.full(6, 0.1), "r": np.full(6, 0.97)})  # plays that never move

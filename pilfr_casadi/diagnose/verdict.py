@@ -46,6 +46,7 @@ MOST_OPEN = 0.4  # share of the excess that no named law may leave
 # rivals whose error is within this share, and which take away this share of the mean square that the winner does,
 # cannot be told apart: under loud noise the first alone would hold for nearly any
 LIKE, AS_MUCH = 0.03, 0.995
+NEARLY = 1.1  # times the error of a law that is hardly what its name says, of one that is
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +105,9 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     free = [c for c in as_small if _near(c, winner, before) or _fits(c, winner)]
     if winner.at_bound and free:  # what does as well without being held back
         winner = min(free, key=lambda c: (c.size, key(c)))
+    plain = [c for c in ranked if c.port == winner.port and not c.doubtful and c.error < NEARLY * winner.error]
+    if winner.doubtful and plain:  # what does nearly as well and is what its name says
+        winner = plain[0]
     for rival in ranked[1:]:
         if imitates(winner, rival, floor):
             winner = rival

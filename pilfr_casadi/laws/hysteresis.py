@@ -13,6 +13,7 @@ from ..parameters import Parameter
 from .base import Law, Local, grid
 
 PARTS = 4  # of a step of a held signal
+THIN = 0.1  # widest loop over the bend beside it that leaves a curve without memory
 
 
 class StopHysteresis(Law):
@@ -113,6 +114,12 @@ class GeneralizedHysteresis(PlayHysteresis):
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         bend = {"a_2": (-0.4 / local.reach, 0.4 / local.reach), "a_3": (-0.2 / local.reach**2, 0.5 / local.reach**2)}
         return {**super().bounds(local), **bend}
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Whether the loops are thin beside the memoryless part: it is hardly a hysteresis then."""
+        reach = self.parameters()["r"].bounds[1]
+        wide = np.abs(values["w"]) * np.clip(np.minimum(values["r"], reach - values["r"]), 0.0, None)
+        return bool(np.sum(wide) < THIN * np.max(reach) ** 2 * abs(values["b_2"]))
 
 
 class BoucWen(Law):
