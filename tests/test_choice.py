@@ -44,6 +44,7 @@ def candidate(port, law, error, size=2, at_bound=False, doubtful=False):
         port=port,
         law=SimpleNamespace(id=law, form="", units={}),
         error=error,
+        full=error,
         size=size,
         at_bound=at_bound,
         doubtful=doubtful,
