@@ -65,7 +65,7 @@ def test_what_is_hardly_what_its_name_says_gives_way_to_what_is():
     thin, plain = candidate(**named, doubtful=True), candidate("sensor:x", "dead_zone", 0.108)
     assert choose([thin, plain], (1.0, 1.0), 1e-8, 500.0).winner is plain
     assert choose([candidate(**named), plain], (1.0, 1.0), 1e-8, 500.0).winner is not plain
-    far, elsewhere = candidate("sensor:x", "dead_zone", 0.12), candidate("guide", "dead_zone", 0.105)
+    far, elsewhere = candidate("sensor:x", "dead_zone", 0.13), candidate("guide", "dead_zone", 0.105)
     assert choose([thin, far, elsewhere], (1.0, 1.0), 1e-8, 500.0).winner is thin
 
 

@@ -18,7 +18,9 @@ from pilfr_casadi.laws import (
     CubicStiffness,
     Delay,
     GeneralizedHysteresis,
+    PreslidingStribeckFriction,
     StopHysteresis,
+    StribeckFriction,
     readable_unit,
 )
 from pilfr_casadi.laws.base import Local
@@ -180,3 +182,9 @@ def test_plays_beside_a_bend_that_does_it_all_are_hardly_a_hysteresis():
     assert law.doubtful({**plays, "w": np.full(6, 0.005)})
     assert not law.doubtful({**plays, "w": np.full(6, 0.1)})
     assert law.doubtful({**plays, "w": np.full(6, 0.1), "r": np.full(6, 0.97)})  # plays that never move
+
+
+@pytest.mark.parametrize("kind", (StribeckFriction, PreslidingStribeckFriction))
+def test_friction_that_falls_over_all_speeds_is_hardly_larger_at_rest(kind):
+    law = kind().at({}, {"v_s": (0.01, 2.0)})
+    assert law.doubtful({"v_s": 2.0, "v_0": 0.01}) and not law.doubtful({"v_s": 0.5, "v_0": 0.01})

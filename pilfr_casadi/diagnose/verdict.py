@@ -46,7 +46,7 @@ MOST_OPEN = 0.4  # share of the excess that no named law may leave
 # rivals whose error is within this share, and which take away this share of the mean square that the winner does,
 # cannot be told apart: under loud noise the first alone would hold for nearly any
 LIKE, AS_MUCH = 0.03, 0.995
-NEARLY = 1.1  # times the error of a law that is hardly what its name says, of one that is
+NEARLY = 1.25  # times the error of a law that is hardly what its name says, of one that is
 
 
 @dataclass(frozen=True, eq=False)

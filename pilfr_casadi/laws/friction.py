@@ -110,8 +110,11 @@ class StribeckFriction(CoulombFriction):
         return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (2e-3 * local.speed, 0.3 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """A knee as wide as the range over which friction falls: at rest there is none that is larger."""
-        return bool(values["v_0"] > KNEE * values["v_s"])
+        """A knee as wide as the range over which friction falls, or a fall that goes on over all speeds.
+
+        At rest there is none that is larger then.
+        """
+        return bool(values["v_0"] > KNEE * values["v_s"]) or _falls_everywhere(self, values)
 
 
 class PreslidingStribeckFriction(PreslidingFriction):
@@ -136,6 +139,14 @@ class PreslidingStribeckFriction(PreslidingFriction):
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {**super().bounds(local), "v_s": (4e-3 * local.speed, 0.8 * local.speed)}
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """A fall that goes on over all speeds: at rest there is no friction that is larger."""
+        return _falls_everywhere(self, values)
+
+
+def _falls_everywhere(law: Law, values: Mapping[str, Any]) -> bool:
+    return bool(values["v_s"] >= law.parameters()["v_s"].bounds[1])
 
 
 class ViscousDamping(Law):
