@@ -59,3 +59,16 @@ def test_a_given_state_is_neither_periodic_nor_in_the_way():
     kept, gates = without_transients([r])
     assert not gates and kept[0] is r
     assert measured_floor([r, r.with_(y=r.y + 1e-3)]).source == "repeats"
+
+
+def test_repeats_that_began_in_other_states_are_compared_late():
+    """The way from another state is no noise; recordings may leave out different numbers of samples at the begin."""
+    rng, t = np.random.default_rng(0), np.arange(4000)
+    u = rng.standard_normal((4000, 1))
+    one, other = (
+        pilfr.Recording(u, (a * np.exp(-t / 100.0) + 0.01 * rng.standard_normal(4000))[:, None], 1e-3, skip=skip)
+        for a, skip in ((1.0, 0), (-1.0, 50))
+    )
+    assert measured_floor([one, other]).deviation[0] == pytest.approx(0.01, rel=0.1)
+    at_rest = measured_floor([r.with_(initial="zero") for r in (one, other)])
+    assert at_rest.deviation[0] > 0.1

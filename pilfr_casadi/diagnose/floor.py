@@ -38,10 +38,17 @@ def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
     groups: dict[bytes, list[Recording]] = {}
     for r in recordings:
         groups.setdefault(r.u.tobytes(), []).append(r)
-    repeats = [np.std([r.y[r.skip :] for r in g], axis=0, ddof=1) for g in groups.values() if len(g) > 1]
+    repeats = [np.std([r.y[_settled(g) :] for r in g], axis=0, ddof=1) for g in groups.values() if len(g) > 1]
     if repeats:
         return Floor(np.sqrt(np.mean(np.concatenate(repeats) ** 2, axis=0)), "repeats")
     return None
+
+
+def _settled(group: Sequence[Recording]) -> int:
+    """Sample from which recordings of one input are compared: late, where they may have begun in different states."""
+    first = max(r.skip for r in group)
+    alike = all(r.begins in ("zero", "periodic") for r in group)
+    return first if alike else max(first, len(group[0]) // 2)
 
 
 def _from_periods(r: Recording) -> np.ndarray | None:
