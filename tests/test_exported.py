@@ -128,7 +128,7 @@ def test_a_real_diagnosis_exports_what_it_judged():
             x, y = found.step(x, u)
             rows.append(np.asarray(y).ravel())
         error = nrmse(recording.y, np.array(rows))
-        assert error == pytest.approx(diagnosis.errors[kind]["after"], rel=1e-9 if kind == "test" else 0.05)
+        assert error == pytest.approx(diagnosis.errors[kind]["after"], rel=1e-6)
 
 
 READER = """

@@ -56,7 +56,7 @@ def prepare(
     gates = [*spikes, *transients, *stale_samples(recordings), *gates]
     between, notes = choose_hold(simulator, bench.recordings, hold, engine)
     bench = Workbench.of(simulator, bench.recordings, between, engine)
-    nominal = errors_of(bench, simulator)
+    nominal = errors_of(bench, bench.model(simulator))
     without = refitted(bench)
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     if without.cost > SUSPECT * float(np.mean((first.deviation / bench.scale) ** 2)) and without.cost > LEAST:

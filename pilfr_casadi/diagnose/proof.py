@@ -10,6 +10,7 @@ import numpy as np
 from ..compiled import make_engine
 from ..fitted import first_state, samples_for_state
 from ..metrics import nrmse
+from ..model import Model
 from ..parameters import ParameterSet
 from ..recording import Recording
 from ..simulator import Simulator
@@ -24,12 +25,11 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
     return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
 
 
-def errors_of(bench: Workbench, simulator: Simulator) -> float:
-    """NRMSE at given parameters; infinite where the simulation diverges.
+def errors_of(bench: Workbench, model: Model) -> float:
+    """NRMSE of a model as it stands; infinite where the simulation diverges.
 
     Initial states that are to be estimated are fitted to the first part of each recording, which is not scored then.
     """
-    model = bench.model(simulator)
     engine = make_engine(model, bench.engine)
     errors = []
     for r in bench.recordings:
@@ -50,16 +50,19 @@ def test_errors(
     tests: Sequence[Recording],
     gates: Sequence[Gate],
     simulator: Simulator,
-    without: Simulator,
-    after: Simulator,
+    without: Fitted,
+    after: Fitted,
 ) -> dict[str, float]:
-    """As recorded for the nominal simulator; what the gates put right is put right here too for the others."""
-    out = {"nominal": errors_of(bench.on(tests), simulator)}
+    """As recorded for the nominal simulator; what the gates put right is put right here too for the others.
+
+    Fits are judged on the sub-steps that they were fitted on.
+    """
+    out = {"nominal": errors_of(bench.on(tests), bench.on(tests).model(simulator))}
     for g in gates:
         if g.change is not None:
             tests = [g.change(r) for r in tests]
     for name, one in (("before", without), ("after", after)):
-        out[name] = errors_of(bench.on(tests), one)
+        out[name] = errors_of(bench.on(tests), one.model.with_parameters(one.model.parameters.at(one.vector)))
     return out
 
 

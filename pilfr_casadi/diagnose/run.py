@@ -121,7 +121,7 @@ def diagnose(
     searched_at = time.perf_counter()
     errors = {
         "train": {"nominal": ready.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
-        "test": test_errors(bench, tests, gates, simulator, without.corrected(), after.corrected()) if tests else None,
+        "test": test_errors(bench, tests, gates, simulator, without, after) if tests else None,
     }
     effects_found = tuple(_effect(search, p, after, std) for p in accepted) if explained else ()
     experiment = _next(search, accepted, limits) if explained else None
