@@ -15,6 +15,7 @@ from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.timing import timing
 from pilfr_casadi.diagnose.verdict import choose, strained
 from pilfr_casadi.diagnose.workbench import Workbench
+from pilfr_casadi.laws import CubicStiffness, LinearStiffness
 from pilfr_casadi.laws.dynamic import Delay, Resonance
 from pilfr_casadi.parameters import Parameter
 from pilfr_casadi.recording import Recording
@@ -85,9 +86,18 @@ def test_a_law_that_can_imitate_others_is_put_up_against_them():
     scored = [SimpleNamespace(port=port, law=law) for port in ("a", "b") for law in (Loose(), Looser())]
     flexible = candidate("a", "extra_mode", 0.1)
     assert [(s.port, s.law.id) for s in passed_over([flexible], scored)] == [("a", "delay"), ("a", "backlash")]
-    tried = SimpleNamespace(port="a", law=Looser())
+    tried = SimpleNamespace(port="a", law=Looser(), error=0.1)
     assert [s.law.id for s in passed_over([flexible, tried], scored)] == ["delay"]
     assert passed_over([candidate("a", "cubic_stiffness", 0.1)], scored) == []
+
+
+def test_a_special_case_that_was_left_after_a_few_steps_is_fitted_again():
+    scored = [Scored("a", law, 0.1, ({},), None) for law in (LinearStiffness(), CubicStiffness())]
+    flexible, left = candidate("a", "extra_mode", 0.1), candidate("a", "linear_stiffness", 0.5)
+    left.law = LinearStiffness()
+    assert [s.law.id for s in passed_over([flexible, left], scored)][0] == "linear_stiffness"
+    left.error = 0.11
+    assert "linear_stiffness" not in [s.law.id for s in passed_over([flexible, left], scored)]
 
 
 def test_where_a_delay_comes_near_damped_resonances_as_late_are_tried():

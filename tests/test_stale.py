@@ -25,7 +25,7 @@ def test_stale_samples_are_told_and_where():
     assert found.verdict == "complete" and "stale" in [g.finding for g in found.gates]
 
 
-@pytest.mark.parametrize("kind", ["clean", "coarse", "resting"])
+@pytest.mark.parametrize("kind", ["clean", "coarse", "resting", "clipped", "encoder"])
 def test_a_converter_and_a_rest_are_not_stale(kind):
     (r,) = recordings(count=1)
     y = np.array(r.y)
@@ -33,4 +33,8 @@ def test_a_converter_and_a_rest_are_not_stale(kind):
         y = np.round(y / np.std(y), 1) * np.std(y)
     if kind == "resting":
         y[:400] = y[400]
+    if kind == "clipped":
+        y = np.clip(y, *np.quantile(y, [0.05, 0.95]))
+    if kind == "encoder":  # more levels than half of the samples, and slow ways between them
+        y = np.round(np.linspace(0, 1, len(y))[:, None] ** 4 + 0.01 * y / np.std(y), 3)
     assert not stale_samples([r.with_(y=y)])

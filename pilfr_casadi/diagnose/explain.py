@@ -95,6 +95,9 @@ def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, gain: 
             if i == 0:
                 led += [starts[-1]] if entry.source == "observer" else []
                 starts.append({**nominal, **named})
+    if set(first.law.parameters()) == set(first.law.strength):  # with nothing of it the simulator is as it was
+        _, named = closed(without.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
+        starts.append({**without.values, **named})
     best, *rest = by_cost(bench, model, engine, starts, without)
     ranked = [best, *(s for s in led if s is not best), *(s for s in rest if not any(s is o for o in led))]
     brief = attempt(bench, placed, ranked[:1], states=without.begin, solver=BRIEF, model=model, engine=engine)

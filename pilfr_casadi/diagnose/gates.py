@@ -1,4 +1,4 @@
-"""The dull causes, looked at first: sign, unit, time unit, alignment, clock, offset, hold.
+"""The dull causes, looked at first: sign, unit, exchanged channels, time unit, alignment, clock, offset, hold.
 
 Each is a change of the recordings; it counts when the simulator, refitted, follows the changed recordings far better
 than the given ones.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,17 @@ def scaled(kind: str, index: int, factor: float) -> Change:
     def change(r: Recording) -> Recording:
         values = np.array(getattr(r, kind))
         values[:, index] *= factor
+        return r.with_(**{kind: values})
+
+    return change
+
+
+def exchanged(kind: str, one: int, other: int) -> Change:
+    """Exchange two channels."""
+
+    def change(r: Recording) -> Recording:
+        values = np.array(getattr(r, kind))
+        values[:, [one, other]] = values[:, [other, one]]
         return r.with_(**{kind: values})
 
     return change
@@ -196,10 +208,10 @@ def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine:
         raise error
 
 
-def wrong_scale(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Sign and unit slips of each channel, and of the time, looked at `workers` at a time."""
+def slips(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Sign and unit slips of each channel and of the time, and exchanged channels, `workers` at a time."""
     best, found = plain, None
-    trials: list[tuple[str, str, float, Change]] = []
+    trials: list[tuple[str, str, Any, Change]] = []
     sizes, lost = _sizes(bench), plain.cost > 1  # a size says nothing where a simulator has left its working range
     for i, name in enumerate(bench.simulator.output_names):
         trials.append((name, "sign", -1.0, scaled("y", i, -1.0)))
@@ -207,10 +219,13 @@ def wrong_scale(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbenc
     for i, name in enumerate(bench.simulator.inputs):
         trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
         trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if lost or any(_near(v / f) for v in sizes)]
+    for kind, names in (("y", bench.simulator.output_names), ("u", bench.simulator.inputs)):
+        for i, j in combinations(range(len(names)), 2) if plain.cost > STRAINED else ():
+            trials.append((f"{names[i]}, {names[j]}", "exchange", [names[i], names[j]], exchanged(kind, i, j)))
     for factor in (1e-3, 1e3, 60.0, 1 / 60) if plain.cost > (STRAINED if plain.at_bounds > 0.3 else HOPELESS) else ():
         trials.append(("time", "time-unit", factor, slower_by(factor)))
 
-    def tried(trial: tuple[str, str, float, Change]) -> tuple[Workbench, Fitted | None]:
+    def tried(trial: tuple[str, str, Any, Change]) -> tuple[Workbench, Fitted | None]:
         other: Workbench = changed(bench, trial[3])
         same: Fitted | None = plain
         if trial[1] == "time-unit":
@@ -227,11 +242,13 @@ def wrong_scale(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbenc
     if found is None or best.cost > CURED * plain.cost or best.cost > 0.3:
         return bench, plain, []
     name, finding, value, change, other = found
-    words = {
-        "sign": f"{name} has the wrong sign",
-        "unit": f"{name} is off by a factor of {1 / value:.4g}, as from a wrong unit",
-        "time-unit": f"the time is off by a factor of {1 / value:.4g}, as from a wrong unit",
-    }[finding]
+    if finding == "sign":
+        words = f"{name} has the wrong sign"
+    elif finding == "exchange":
+        words = f"{value[0]} and {value[1]} are exchanged"
+    else:
+        what = name if finding == "unit" else "the time"
+        words = f"{what} is off by a factor of {1 / value:.4g}, as from a wrong unit"
     sentence = (
         f"In the recordings {words}: with it corrected the refitted simulator's error falls from "
         f"{np.sqrt(plain.cost):.3g} to {np.sqrt(best.cost):.3g} of the outputs' deviation."

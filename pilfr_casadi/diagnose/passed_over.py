@@ -19,7 +19,7 @@ from .kinship import CONTAINS, FLEXIBLE
 from .screen import Scored
 
 IMITATED = 3  # simpler laws put up against one that can imitate others
-AHEAD = 1.5  # times the best error of a carried mass that is worth another start
+AHEAD = 1.5  # times the best error beyond which a carried mass, or a special case, is worth another start
 BEHIND = 3.0  # times the best error of a delay or a lag that may stand for a resonance
 DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in its place
 
@@ -29,8 +29,11 @@ def passed_over(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> li
     if not candidates:
         return []
     best, tried = candidates[0], {(c.port, type(c.law)) for c in candidates}
-    other = [s for s in scored if s.port == best.port and (s.port, type(s.law)) not in tried]
+    near = {(c.port, type(c.law)) for c in candidates if c.error < AHEAD * best.error}
+    other = [s for s in scored if s.port == best.port and (s.port, type(s.law)) not in near]
+    # a special case of what came out best may have been left where a few steps led
     chosen = [type(s.law) for s in other if s.law.id in CONTAINS.get(best.law.id, ())]
+    other = [s for s in other if (s.port, type(s.law)) not in tried or type(s.law) in chosen]
     if best.law.id in FLEXIBLE:
         plain = [type(s.law) for s in other if s.law.id not in FLEXIBLE]
         chosen += list(dict.fromkeys(plain))[:IMITATED]

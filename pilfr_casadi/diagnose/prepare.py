@@ -11,7 +11,7 @@ from ..recording import InputError, Recording
 from ..simulator import Simulator
 from .clipping import unclip
 from .floor import Floor, measured_floor, white_part
-from .gates import Gate, choose_hold, hold_note, opened, said_hold, wrong_scale
+from .gates import Gate, choose_hold, hold_note, opened, said_hold, slips
 from .glitches import without_glitches
 from .linearise import along, linearised, observer_gain
 from .offset import offsets
@@ -60,7 +60,7 @@ def prepare(
     without = refitted(bench)
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     if without.cost > SUSPECT * float(np.mean((first.deviation / bench.scale) ** 2)) and without.cost > LEAST:
-        bench, without, more = wrong_scale(bench, without, workers)
+        bench, without, more = slips(bench, without, workers)
         gates = [*gates, *more]
         if more:  # what looked better on wrong data says nothing
             between, notes = choose_hold(simulator, bench.recordings, hold, engine)

@@ -19,6 +19,7 @@ from .candidate import Candidate
 from .clipping import clipped_input
 from .experiment import next_experiment, placebo
 from .gates import Gate, hold_note, said_hold
+from .held import held_value
 from .mismatch import mismatch
 from .offset import without_idle_offsets
 from .prepare import Prepared, prepare
@@ -106,6 +107,9 @@ def diagnose(
     search.base = without_idle_offsets(bench, search.base)
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
+    held = held_value(search) if verdict == "missing-physics" else None
+    if held is not None:
+        verdict, sentence = "complete", held.sentence
     if (lost := _lost_input(search, verdict)) is not None:
         verdict, sentence, gates = "recording-fault", lost.sentence, (*gates, lost)
     elif verdict == "unexplained":
@@ -116,7 +120,7 @@ def diagnose(
             f"{without.cost**0.5:.3g} of the outputs' deviation."
         )
     explained = verdict == "missing-physics"
-    after = search.base if explained else without
+    after = search.base if explained else held.fitted if held else without
     std = deviations(bench, after)
     searched_at = time.perf_counter()
     errors = {

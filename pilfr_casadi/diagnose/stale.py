@@ -1,6 +1,7 @@
 """Gate of stale samples: a channel that repeats its last value now and then, where it otherwise never does.
 
-A coarse converter repeats values too, but has few of them; a machine at rest repeats one for long.
+A coarse converter repeats values too, but has few of them, and an encoder where it moves by no more than its step; a
+machine at rest repeats one for long, and a clipped channel its limit.
 """
 
 from __future__ import annotations
@@ -13,15 +14,18 @@ from ..recording import Recording
 from .gates import Gate
 
 SHARE, DISTINCT, LONGEST = 0.01, 0.5, 5  # of the samples that repeat, values that differ, and samples of one repeat
+SLOW = 4.5  # steps of an encoder in a sample, after which it may still have stood
 
 
 def stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
     """A note for each output that repeats samples."""
     found = []
     for i, name in enumerate(recordings[0].outputs):
-        repeated = float(np.mean(np.concatenate([_repeated(r.y[r.skip :, i]) for r in recordings])))
         values = np.concatenate([r.y[r.skip :, i] for r in recordings])
-        if repeated > SHARE and len(np.unique(values)) > DISTINCT * len(values):
+        levels = np.unique(values)
+        step = np.min(np.diff(levels), initial=np.inf)
+        repeated = float(np.mean(np.concatenate([_repeated(r.y[r.skip :, i], step) for r in recordings])))
+        if repeated > SHARE and len(levels) > DISTINCT * len(values):
             sentence = (
                 f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples; the "
                 "error that this makes is taken for noise: record again, or leave them out."
@@ -30,11 +34,11 @@ def stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
     return found
 
 
-def _repeated(y: np.ndarray) -> np.ndarray:
-    """Which samples repeat the one before, in runs that are not long."""
-    same = np.append(False, y[1:] == y[:-1])
+def _repeated(y: np.ndarray, step: float) -> np.ndarray:
+    """Which samples repeat the one before away from the limits, in runs that are not long and followed by a jump."""
+    same = np.append(False, y[1:] == y[:-1]) & (y > np.min(y)) & (y < np.max(y))
     edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
     for begin, end in edges.reshape(-1, 2):
-        if end - begin > LONGEST:
+        if end - begin > LONGEST or abs(y[min(end, len(y) - 1)] - y[begin]) <= SLOW * step:
             same[begin:end] = False
     return same

@@ -182,7 +182,10 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     if not accepted:
         own = ringing(search.bench, search.without)
         rings = (
-            f"; what is left swings at the simulator's own {own:.3g} Hz, as from a force not recorded" if own else ""
+            f"; what is left swings at the simulator's own {own:.3g} Hz, as from a force not recorded or a value that "
+            "varies in time"
+            if own
+            else ""
         )
         at = f"; a force at {where} could explain {open_now:.0%} of the rest" if open_now > HINT else ""
         return "unexplained", (

@@ -1,0 +1,46 @@
+"""Channels that were exchanged."""
+
+import numpy as np
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import Parameter, Recording, Simulator
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.integration import discretise
+
+DT, M = 0.05, 1200
+
+
+def tanks(off=1.0):
+    """Two lags in a row, each with an input of its own."""
+    return Simulator(
+        lambda x, u, p: {"h1": (u.q1 - x.h1) / p.T1, "h2": (x.h1 + u.q2 - x.h2) / p.T2},
+        lambda x: {"upper": x.h1, "lower": x.h2},
+        states=("h1", "h2"),
+        inputs=("q1", "q2"),
+        parameters={"T1": Parameter(0.5 * off, bounds=(0.1, 5)), "T2": Parameter(1.3 * off, bounds=(0.1, 5))},
+    )
+
+
+def recorded():
+    """Inputs (M, 2) and noisy outputs (M, 2) of the tanks."""
+    rng, model = np.random.default_rng(0), discretise(tanks(), DT)
+    u = np.column_stack([pilfr.multisine(M, f_max=1.5, fs=1 / DT, rng=rng) for _ in range(2)])
+    r = Recording(u, np.zeros((M, 2)), DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
+    y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
+    return u, y + 2e-3 * rng.standard_normal(y.shape)
+
+
+@pytest.mark.parametrize("exchanged", ["outputs", "inputs", "nothing"])
+def test_exchanged_channels_are_told(exchanged):
+    u, y = recorded()
+    u, y = (u[:, ::-1] if exchanged == "inputs" else u), (y[:, ::-1] if exchanged == "outputs" else y)
+    r = Recording(u, y, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
+    found = pilfr.diagnose(tanks(1.15), r)
+    if exchanged == "nothing":
+        assert found.verdict == "complete" and not found.gates
+        return
+    channels = ["upper", "lower"] if exchanged == "outputs" else ["q1", "q2"]
+    assert found.verdict == "recording-fault"
+    assert [(g.channel, g.finding, g.value) for g in found.gates] == [(", ".join(channels), "exchange", channels)]
+    assert found.errors["train"]["after"] < 0.01 and "are exchanged" in found.sentence
