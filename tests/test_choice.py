@@ -95,7 +95,7 @@ def test_a_special_case_that_was_left_after_a_few_steps_is_fitted_again():
     scored = [Scored("a", law, 0.1, ({},), None) for law in (LinearStiffness(), CubicStiffness())]
     flexible, left = candidate("a", "extra_mode", 0.1), candidate("a", "linear_stiffness", 0.5)
     left.law = LinearStiffness()
-    assert [s.law.id for s in passed_over([flexible, left], scored)][0] == "linear_stiffness"
+    assert "linear_stiffness" in [s.law.id for s in passed_over([flexible, left], scored)]
     left.error = 0.11
     assert "linear_stiffness" not in [s.law.id for s in passed_over([flexible, left], scored)]
 

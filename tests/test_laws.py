@@ -18,6 +18,7 @@ from pilfr_casadi.laws import (
     CubicStiffness,
     Delay,
     GeneralizedHysteresis,
+    Mode,
     PreslidingStribeckFriction,
     StopHysteresis,
     StribeckFriction,
@@ -188,3 +189,8 @@ def test_plays_beside_a_bend_that_does_it_all_are_hardly_a_hysteresis():
 def test_friction_that_falls_over_all_speeds_is_hardly_larger_at_rest(kind):
     law = kind().at({}, {"v_s": (0.01, 2.0)})
     assert law.doubtful({"v_s": 2.0, "v_0": 0.01}) and not law.doubtful({"v_s": 0.5, "v_0": 0.01})
+
+
+def test_a_mode_that_cannot_swing_is_hardly_a_mode():
+    law = Mode().at({}, {"D": (1e-3, 1.0)})
+    assert law.doubtful({"D": 1.0}) and not law.doubtful({"D": 0.4})

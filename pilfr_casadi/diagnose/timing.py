@@ -25,6 +25,7 @@ LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
 FAR = 0.04  # mean square error of a refit that may have gone astray
 PROMISING = 0.7  # share of the remainder that a shift or clock rate worth a refit leaves
 NOTHING = 0.02  # share of the mean square that a late channel which is all that is wrong leaves at most
+ALONE = 5.0  # times the noise that a shift or a clock leaves which is not all that is wrong
 DROP = 0.3  # share of the mean square that has to be left at most
 
 Trial = tuple[float, str, str, float, str, tuple[int, ...]]  # share left, channel, what, value, "u" or "y", columns
@@ -82,7 +83,7 @@ def timing(bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0) ->
     relative, name, what, value, other, found, change = best
     if what == "alignment" and value > 0 and relative > max(NOTHING * plain.cost, 9 * noise2):
         return bench, plain, []  # what comes late, next to something else that is wrong, may be physics
-    gate = _gate(name, what, value, dt, plain.cost, relative, change, part)
+    gate = _gate(name, what, value, dt, plain.cost, relative, change, part, noise2)
     return (other, found, [gate]) if gate else (bench, plain, [])
 
 
@@ -195,9 +196,22 @@ def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
 
 
 def _gate(
-    name: str, what: str, value: float, dt: float, before: float, after: float, change: Change, part: float
+    name: str,
+    what: str,
+    value: float,
+    dt: float,
+    before: float,
+    after: float,
+    change: Change,
+    part: float,
+    noise2: float,
 ) -> Gate | None:
     fall = f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
+    if after > ALONE**2 * noise2:
+        fall += (
+            f", still {(after / max(noise2, 1e-300)) ** 0.5:.2g} times the noise: more is wrong, with the time "
+            "(samples that were lost, say) or otherwise"
+        )
     if what == "clock":
         sentence = f"The clock of {name} runs {value * 100:+.3g} % off the others'; with it corrected {fall}."
         return Gate(name, "clock", value, sentence, True, True, change, left=after / before)

@@ -213,6 +213,10 @@ class Mode(Resonance):
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c_1 * q[0] + p.c_2 * q[1]
 
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """As much damping as there can be: two lags that follow anything linear, no mode."""
+        return bool(values["D"] >= self.parameters()["D"].bounds[1])
+
 
 class Attached(Resonance):
     """A small mass on a spring and a damper, carried along (a tuned absorber, a loose part)."""

@@ -217,10 +217,9 @@ def usage(diagnosis: Diagnosis) -> str:
     laws: dict[str, set[str]] = {}
     for e in simulator.elements:
         laws.setdefault(_home(type(e.law)), set()).add(type(e.law).__name__)
-    lines = ["import numpy as np", "import pilfr_casadi as pilfr", "from pilfr_casadi.compiled import make_engine"]
-    lines += ["from pilfr_casadi.diagnose.workbench import Workbench"]
+    lines = ["import numpy as np", "import pilfr_casadi as pilfr"]
     lines += [f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(laws.items())]
-    lines += ["from rig import simulator  # your simulator", ""]
+    lines += ["from your_file import simulator  # the one that was diagnosed", ""]
     for e in simulator.elements:
         own = {k.removeprefix(e.prefix): v for k, v in fitted.items() if k.startswith(e.prefix)}
         limits = {k: tuple(map(_literal, v)) for k, v in e.law.limits.items()}
@@ -235,10 +234,14 @@ def usage(diagnosis: Diagnosis) -> str:
     lines += ["corrected = simulator.with_parameters(own.at(own.pack(values)))", ""]
     inputs = f"inputs={list(simulator.inputs)!r}, outputs={list(simulator.output_names)!r}"
     lines += [f'recording = pilfr.read_csv("new.csv", {inputs})']
-    lines += [f"model = Workbench.of(corrected, [recording], {diagnosis.hold!r}).model(corrected)"]
-    lines += ["x0 = np.zeros(model.n_state)  # states, then the laws' memory"]
-    lines += ["y = make_engine(model).simulate(model.drive(recording), model.parameters.start, x0)[0]"]
-    return "\n".join([*lines, "step = model.closed  # casadi.Function (x, u, p) -> (x_next, y), for controllers"])
+    exact = f"dt=recording.dt, hold={diagnosis.hold!r}, substeps={diagnosis.substeps}"
+    lines += [f"step = pilfr.exported(corrected, {exact}).step  # casadi.Function (x, u) -> (x_next, y)"]
+    linear = diagnosis.hold == "linear"
+    lines += [
+        "u = np.hstack([recording.u, np.vstack([recording.u[1:], recording.u[-1:]])])" if linear else "u = recording.u"
+    ]
+    lines += ["x0 = np.zeros(step.numel_in(0))  # states, then the laws' own"]
+    return "\n".join([*lines, 'y = np.array(step.mapaccum("run", len(u))(x0, u.T)[1]).T'])
 
 
 def _home(law: type) -> str:
