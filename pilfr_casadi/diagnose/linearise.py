@@ -31,6 +31,7 @@ from .workbench import FINER, Fitted, Workbench
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
 BLOCK = 256  # samples propagated at a time
+CHUNK = 300  # samples linearised at a time
 FEW = 60  # samples of a run at which the user's equations are looked at
 
 
@@ -160,10 +161,16 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     else:
         seen = led(model, gain)
         states = states_along(seen, seen.drive(r), np.append(p, 1.0), x)
-    y, a, b, c, d = mapped(probe.step, states, drive)
-    mean = a.mean(axis=0), b.mean(axis=0), c.mean(axis=0)
-    if gain is not None:
-        a, b = a - gain @ c, b - gain @ d
+    parts, means = [], []
+    for begin in range(0, len(states), CHUNK * n):  # matrices of all sub-steps would be large
+        now = slice(begin, begin + CHUNK * n)
+        y, a, b, c, d = mapped(probe.step, states[now], drive[now])
+        means.append([len(y) * v.mean(axis=0) for v in (a, b, c)])
+        if gain is not None:
+            a, b = a - gain @ c, b - gain @ d
+        parts.append((*over_samples(a, b, n), c[::n], d[::n], y[::n, :, 0]))
+    a, b, c, d, y = (np.concatenate(v) for v in zip(*parts, strict=True))
+    mean = tuple(sum(v) / len(states) for v in zip(*means, strict=True))
     u = r.u
     slope = np.gradient(u, r.dt, axis=0) if bench.hold == "linear" and len(u) > 2 else np.zeros_like(u)
     own = p[: len(p) - len(probe.ports)]
@@ -172,8 +179,7 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     moved, sign = np.abs(lift).max(axis=0) > 0, -np.sign(np.median(push, axis=0))
     sense = {"sign": np.where(moved, 0.0, sign), "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign)}
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
-    a, b = over_samples(a, b, n)
-    return Run(a, b, c[::n], d[::n], mean, error=y[::n, :, 0] - r.y, z=z, dz=dz, u=u, **sense, **felt)
+    return Run(a, b, c, d, mean, error=y - r.y, z=z, dz=dz, u=u, **sense, **felt)
 
 
 def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
