@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .candidate import Candidate
+from .every_sensor import every_sensor
 from .floor import swells_with
 from .gates import Gate
 from .kinship import CONTAINS, handicap, imitates
@@ -140,12 +141,12 @@ def _like_noise(search: Search, times: float) -> bool:
     return times < SOMEWHAT or (times < COLOURED and unexplained and search.without.cost < LOUD**2)
 
 
-def _shaped(search: Search) -> bool:
-    """Whether the residual swells with the inputs, the outputs or their rates, or swings as the simulator does."""
+def _swells(search: Search) -> bool:
+    """Whether the residual swells with the inputs, the outputs or their rates."""
     records = search.bench.recordings
     signals = [np.column_stack([r.u, r.y, np.gradient(r.y, axis=0)])[r.skip :] for r in records]
     rest = [e[r.skip :] for e, r in zip(search.without.residual, records, strict=True)]
-    return swells_with(rest, signals) or ringing(search.bench, search.without) is not None
+    return swells_with(rest, signals)
 
 
 def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
@@ -158,6 +159,8 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         return "recording-fault", faults[0].sentence
     if accepted and explains(accepted, remains, still):
         words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
+        common = next((e for e in (every_sensor(c, search) for c in accepted) if e is not None), None)
+        words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
         sure = min(confidence(c, search) for c in accepted) > UNSURE
         return "missing-physics", (
             f"The simulator leaves out {words}."
@@ -167,7 +170,8 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
     open_now = max(search.open_before.values(), default=0.0)
-    bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and not _shaped(search))
+    own = ringing(search.bench, search.without)
+    bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and own is None and not _swells(search))
     if faults and (bare or (open_now < HINT and not accepted) or cured):
         return "recording-fault", faults[0].sentence
     if bare and open_now < HINT:
@@ -176,7 +180,6 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
             f"deviation, and no force at any port explains any of the rest."
         )
     if not accepted:
-        own = ringing(search.bench, search.without)
         rings = (
             f"; what is left swings at the simulator's own {own:.3g} Hz, as from a force not recorded" if own else ""
         )
