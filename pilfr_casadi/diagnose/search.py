@@ -19,6 +19,7 @@ from ..laws import Law
 from ..recording import InputError
 from ..simulator import Placed
 from .candidate import Candidate, heads, judged, polish
+from .exchange import exchange
 from .explain import explain
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
@@ -138,6 +139,7 @@ class Search:
             put_more_finely(self)
             if number:
                 look_back(self)
+                exchange(self)
                 if self._mends(before):
                     self.base, self.passes = before, [*passes, replace(found, accepted=False)]
                     break
