@@ -26,6 +26,7 @@ from .prepare import Prepared, prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import MISHELD, Pass, Search
+from .tones import tones
 from .undeclared import beyond_the_ports
 from .verdict import UNSURE, confidence, judge
 from .workbench import Fitted
@@ -103,8 +104,9 @@ def diagnose(
     search = Search(ready.bench, ready.without, ready.floor, laws, workers, say, said).run(effects)
     if not said and (search.misheld > MISHELD or search.unsure()) and not search.interrupted:
         ready, search = _otherwise_held(simulator, recordings, engine, ready, search, effects)
-    bench, without, gates = ready.bench, ready.without, ready.gates
+    bench, without = ready.bench, ready.without
     search.base = without_idle_offsets(bench, search.base)
+    gates = (*ready.gates, *tones(bench, search.base))
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
     if (lost := _lost_input(search, verdict)) is not None:

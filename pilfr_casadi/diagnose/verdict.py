@@ -170,14 +170,16 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
     open_now = max(search.open_before.values(), default=0.0)
-    own = ringing(search.bench, search.without)
-    bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and own is None and not _swells(search))
+    own, hum = ringing(search.bench, search.without), [g for g in gates if g.finding == "tone" and not accepted]
+    quiet = error * max(1 - sum(1 - g.left for g in hum), 0.0) ** 0.5
+    bare = quiet < AT_FLOOR * floor or (_like_noise(search, quiet / floor) and own is None and not _swells(search))
     if faults and (bare or (open_now < HINT and not accepted) or cured):
         return "recording-fault", faults[0].sentence
     if bare and open_now < HINT:
+        beside = f" but a steady tone in {' and '.join(g.channel for g in hum)}" if hum else ""
         return "complete", (
-            f"Nothing is missing: refitted, the simulator follows the recordings to {error:.3g} of the outputs' "
-            f"deviation, and no force at any port explains any of the rest."
+            f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {error:.3g} of the "
+            f"outputs' deviation, and no force at any port explains any of the rest."
         )
     if not accepted:
         rings = (
