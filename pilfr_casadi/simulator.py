@@ -218,13 +218,6 @@ class Simulator:
         read = ca.vertcat(self.derivatives(x, u, p, t), *self.measured(x, u, p, t).values())
         return tuple(name for name in self.inputs if not ca.depends_on(read, u[name]))
 
-    @cached_property
-    def linear(self) -> bool:
-        """Whether the equations, elements left out, are affine in states, inputs and time."""
-        x, u, p, t = self._symbols()
-        found = ca.vertcat(self.derivatives(x, u, p, t), *self.measured(x, u, p, t).values())
-        return not any(ca.which_depends(found, ca.vertcat(*x._values.values(), *u._values.values(), t), 2))
-
     def with_parameters(self, parameters: Mapping[str, Parameter]) -> Simulator:
         """The same equations with other parameters of the same names."""
         return replace(self, parameters=ParameterSet(dict(parameters)))

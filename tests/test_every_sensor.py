@@ -20,11 +20,12 @@ def both(simulator):
     return replace(simulator, outputs=lambda x: {"x1": x.p1, "x2": x.p2})
 
 
-def filtered(order, cutoff, outputs=(0, 1)):
-    """A recording with the same low-pass filter in some of its two sensors."""
+def filtered(order, cutoff, outputs=(0, 1), law=None):
+    """A recording with the same low-pass filter in some of its two sensors, and a law between ground and m1."""
     rng = np.random.default_rng(4)
     (r,) = recordings(count=1, hold="zero")
-    model = discretise(both(rig()), r.dt, "zero", 4)
+    true = both(rig()) if law is None else both(rig()).with_element("ground-m1", law)
+    model = discretise(true, r.dt, "zero", 8)
     y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
     for i in outputs:
         y[:, i] = lfilter(*butter(order, cutoff, fs=1 / r.dt), y[:, i])
@@ -50,8 +51,12 @@ def test_a_filter_in_one_sensor_of_two_is_told_from_that():
     assert effect.confidence > 0.9
 
 
-def test_what_is_linear():
-    assert both(rig()).linear
-    assert not replace(rig(), outputs=lambda x: {"x2": x.p2 + x.p2**2}).linear
-    assert not replace(rig(), outputs=lambda x, t: {"x2": x.p2 * t}).linear
-    assert replace(rig(), outputs=lambda x, t: {"x2": x.p2 + 9.81}).linear
+def test_beside_friction_filters_in_all_sensors_are_told_from_one_at_the_actuator():
+    friction = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
+    tried = [laws.Lag, laws.Resonance, laws.CoulombFriction]
+    found = pilfr.diagnose(both(rig(OFF)), filtered(2, 12.0, law=friction), laws=tried)
+    named = {(e.port, e.law) for e in found.effects}
+    assert named == {("sensor:x1", "extra_mode"), ("sensor:x2", "extra_mode"), ("ground-m1", "coulomb_friction")}
+    assert found.errors["train"]["after"] < 1.2 * found.floor["nrmse"]
+    for e in found.effects[:2]:
+        assert e.parameters["W"]["value"] == pytest.approx(2 * np.pi * 12, rel=0.05)

@@ -17,7 +17,6 @@ from ..threads import one_blas_thread, processors
 from .arranged import arranged
 from .candidate import Candidate
 from .clipping import clipped_input
-from .every_sensor import every_sensor
 from .experiment import next_experiment, placebo
 from .gates import Gate, hold_note, said_hold
 from .mismatch import mismatch
@@ -205,7 +204,6 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
     if port.series:  # what it is in series with
         channel = port.name.partition(":")[2]
         w_unit = z_unit = bench.recordings[0].units.get(channel) or f"[{channel}]"
-    common = every_sensor(choice, search)  # two readings, as likely: of several ports none is the place
     values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
     shown: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
@@ -218,11 +216,11 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
     return Effect(
         port=winner.port,
         law=winner.law.id,
-        confidence=confidence(choice, search) / (2 if common else 1),
+        confidence=confidence(choice, search) / (2 if choice.common else 1),  # two readings, as likely
         sentence=winner.law.sentence,
         equation=winner.law.equation,
         parameters=shown,
-        indistinguishable=(*([common] if common else []), *(c.name for c in choice.alike)),
+        indistinguishable=(*([choice.common] if choice.common else []), *(c.name for c in choice.alike)),
         form=winner.law.form,
         placebo={"own": own, "unrelated": unrelated},
     )
@@ -249,9 +247,9 @@ def _next(search: Search, accepted: Sequence[Pass], limits: Mapping[str, float] 
     """The experiment that would separate the first tie, where there is one."""
     for found in accepted:
         choice = found.choice
-        if choice is not None and (common := every_sensor(choice, search)) is not None:
-            sentence = "No input separates them; look up how the sensors are filtered and sampled."
-            return {"between": [list(choice.winner.name), list(common)], "sentence": sentence}
+        if choice is not None and choice.common:
+            sentence = "These inputs do not separate them; look up how the sensors are filtered and sampled."
+            return {"between": [list(choice.winner.name), list(choice.common)], "sentence": sentence}
         if choice is not None and choice.alike:
             one, other = choice.winner, choice.alike[0]
             best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits)

@@ -19,6 +19,7 @@ from ..laws import Law
 from ..recording import InputError
 from ..simulator import Placed
 from .candidate import Candidate, heads, judged, polish
+from .every_sensor import every_sensor
 from .exchange import exchange
 from .explain import explain
 from .flexible import explainable
@@ -111,6 +112,7 @@ class Search:
         self.base = self.without
         try:
             self._run(effects)
+            every_sensor(self)
         except KeyboardInterrupt:
             self.interrupted = True
         return self

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .candidate import Candidate
-from .every_sensor import every_sensor
 from .floor import swells_with
 from .gates import Gate
 from .kinship import CONTAINS, handicap, imitates
@@ -61,6 +60,8 @@ class Choice:
         Share of the excess over the floor that the winner leaves.
     margin : float
         Smallest ratio of a true rival's error to the winner's.
+    common : tuple of str, optional
+        All sensors and the law, where the same in each of them does as well as the winner.
     """
 
     winner: Candidate
@@ -68,6 +69,7 @@ class Choice:
     gain: float
     remains: float
     margin: float
+    common: tuple[str, str] | None = None
 
 
 def _near(candidate: Candidate, winner: Candidate, before: float) -> bool:
@@ -159,7 +161,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         return "recording-fault", faults[0].sentence
     if accepted and explains(accepted, remains, still):
         words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
-        common = next((e for e in (every_sensor(c, search) for c in accepted) if e is not None), None)
+        common = next((c.common for c in accepted if c.common), None)
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
         sure = min(confidence(c, search) for c in accepted) > UNSURE
         return "missing-physics", (
