@@ -172,9 +172,11 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
     open_now = max(search.open_before.values(), default=0.0)
-    own, hum = ringing(search.bench, search.without), [g for g in gates if g.finding == "tone" and not accepted]
+    hum = [g for g in gates if g.finding == "tone" and not accepted]
     quiet = error * max(1 - sum(1 - g.left for g in hum), 0.0) ** 0.5
-    bare = quiet < AT_FLOOR * floor or (_like_noise(search, quiet / floor) and own is None and not _swells(search))
+    like_noise = _like_noise(search, quiet / floor)
+    own = ringing(search.bench, search.without) if like_noise or not accepted else None
+    bare = quiet < AT_FLOOR * floor or (like_noise and own is None and not _swells(search))
     if faults and (bare or (open_now < HINT and not accepted) or cured):
         return "recording-fault", faults[0].sentence
     if bare and open_now < HINT:
