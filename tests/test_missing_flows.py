@@ -159,7 +159,7 @@ def test_a_fit_goes_on_from_given_states():
 def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
     judged = {"error": 0.4, "head": 0.16, "tail": 0.16, "held_back": False, "doubtful": False}
     winner = SimpleNamespace(port="guide", law=SimpleNamespace(id="coulomb_friction"), **judged)
-    choice = SimpleNamespace(winner=winner, margin=margin, alike=())
+    choice = SimpleNamespace(winner=winner, margin=margin, alike=(), common=None)
     found = SimpleNamespace(accepted=True, choice=choice, before=(1.0, 1.0))
     search = SimpleNamespace(
         passes=[found],

@@ -26,6 +26,7 @@ from .prepare import Prepared, prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import MISHELD, Pass, Search
+from .tones import tones
 from .undeclared import beyond_the_ports
 from .verdict import UNSURE, confidence, judge
 from .workbench import Fitted
@@ -103,8 +104,9 @@ def diagnose(
     search = Search(ready.bench, ready.without, ready.floor, laws, workers, say, said).run(effects)
     if not said and (search.misheld > MISHELD or search.unsure()) and not search.interrupted:
         ready, search = _otherwise_held(simulator, recordings, engine, ready, search, effects)
-    bench, without, gates = ready.bench, ready.without, ready.gates
+    bench, without = ready.bench, ready.without
     search.base = without_idle_offsets(bench, search.base)
+    gates = (*ready.gates, *tones(bench, search.base))
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
     held = held_value(search) if verdict == "missing-physics" else None
@@ -218,11 +220,11 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
     return Effect(
         port=winner.port,
         law=winner.law.id,
-        confidence=confidence(choice, search),
+        confidence=confidence(choice, search) / (2 if choice.common else 1),  # two readings, as likely
         sentence=winner.law.sentence,
         equation=winner.law.equation,
         parameters=shown,
-        indistinguishable=tuple(c.name for c in choice.alike),
+        indistinguishable=(*([choice.common] if choice.common else []), *(c.name for c in choice.alike)),
         form=winner.law.form,
         placebo={"own": own, "unrelated": unrelated},
     )
@@ -249,6 +251,9 @@ def _next(search: Search, accepted: Sequence[Pass], limits: Mapping[str, float] 
     """The experiment that would separate the first tie, where there is one."""
     for found in accepted:
         choice = found.choice
+        if choice is not None and choice.common:
+            sentence = "These inputs do not separate them; look up how the sensors are filtered and sampled."
+            return {"between": [list(choice.winner.name), list(choice.common)], "sentence": sentence}
         if choice is not None and choice.alike:
             one, other = choice.winner, choice.alike[0]
             best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits)

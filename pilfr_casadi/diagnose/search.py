@@ -19,6 +19,8 @@ from ..laws import Law
 from ..recording import InputError
 from ..simulator import Placed
 from .candidate import Candidate, heads, judged, polish
+from .every_sensor import every_sensor
+from .exchange import exchange
 from .explain import explain
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
@@ -110,6 +112,7 @@ class Search:
         self.base = self.without
         try:
             self._run(effects)
+            every_sensor(self)
         except KeyboardInterrupt:
             self.interrupted = True
         return self
@@ -138,6 +141,7 @@ class Search:
             put_more_finely(self)
             if number:
                 look_back(self)
+                exchange(self)
                 if self._mends(before):
                     self.base, self.passes = before, [*passes, replace(found, accepted=False)]
                     break

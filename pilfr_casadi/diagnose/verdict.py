@@ -61,6 +61,8 @@ class Choice:
         Share of the excess over the floor that the winner leaves.
     margin : float
         Smallest ratio of a true rival's error to the winner's.
+    common : tuple of str, optional
+        All sensors and the law, where the same in each of them does as well as the winner.
     """
 
     winner: Candidate
@@ -68,6 +70,7 @@ class Choice:
     gain: float
     remains: float
     margin: float
+    common: tuple[str, str] | None = None
 
 
 def _near(candidate: Candidate, winner: Candidate, before: float) -> bool:
@@ -144,12 +147,12 @@ def _like_noise(search: Search, times: float) -> bool:
     return times < SOMEWHAT or (times < COLOURED and unexplained and search.without.cost < LOUD**2)
 
 
-def _shaped(search: Search) -> bool:
-    """Whether the residual swells with the inputs, the outputs or their rates, or swings as the simulator does."""
+def _swells(search: Search) -> bool:
+    """Whether the residual swells with the inputs, the outputs or their rates."""
     records = search.bench.recordings
     signals = [np.column_stack([r.u, r.y, np.gradient(r.y, axis=0)])[r.skip :] for r in records]
     rest = [e[r.skip :] for e, r in zip(search.without.residual, records, strict=True)]
-    return swells_with(rest, signals) or ringing(search.bench, search.without) is not None
+    return swells_with(rest, signals)
 
 
 def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
@@ -162,6 +165,8 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         return "recording-fault", faults[0].sentence
     if accepted and explains(accepted, remains, still):
         words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
+        common = next((c.common for c in accepted if c.common), None)
+        words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
         sure = min(confidence(c, search) for c in accepted) > UNSURE
         return "missing-physics", (
             f"The simulator leaves out {words}."
@@ -171,16 +176,20 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
     open_now = max(search.open_before.values(), default=0.0)
-    bare = error < AT_FLOOR * floor or (_like_noise(search, error / floor) and not _shaped(search))
+    hum = [g for g in gates if g.finding == "tone" and not accepted]
+    quiet = error * max(1 - sum(1 - g.left for g in hum), 0.0) ** 0.5
+    like_noise = _like_noise(search, quiet / floor)
+    own = ringing(search.bench, search.without) if like_noise or not accepted else None
+    bare = quiet < AT_FLOOR * floor or (like_noise and own is None and not _swells(search))
     if faults and (bare or (open_now < HINT and not accepted) or cured):
         return "recording-fault", faults[0].sentence
     if bare and open_now < HINT:
+        beside = f" but a steady tone in {' and '.join(g.channel for g in hum)}" if hum else ""
         return "complete", (
-            f"Nothing is missing: refitted, the simulator follows the recordings to {error:.3g} of the outputs' "
-            f"deviation, and no force at any port explains any of the rest."
+            f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {error:.3g} of the "
+            f"outputs' deviation, and no force at any port explains any of the rest."
         )
     if not accepted:
-        own = ringing(search.bench, search.without)
         rings = (
             f"; what is left swings at the simulator's own {own:.3g} Hz, as from a force not recorded or a value that "
             "varies in time"

@@ -43,15 +43,14 @@ from .limits import (
     SkewSaturation,
     SoftSaturation,
 )
+from .periodic import HarmonicForce, PeriodicForce, Ripple
 from .stiffness import (
     Clearance,
     CubicStiffness,
     GeometricStiffness,
-    HarmonicForce,
     HertzContact,
     LinearStiffness,
     OffCentreClearance,
-    PeriodicForce,
     PiecewiseStiffness,
     PiecewiseStiffnessBelow,
     PowerStiffness,
@@ -118,6 +117,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     Swing,
     PeriodicForce,
     HarmonicForce,
+    Ripple,
     Lag,
     Resonance,
     Mode,

@@ -1,4 +1,4 @@
-"""Memoryless laws of the local coordinate: stiffnesses, contacts, gaps, curves, and forces periodic in position."""
+"""Memoryless laws of the local coordinate: stiffnesses, contacts, gaps and curves."""
 
 from __future__ import annotations
 
@@ -248,37 +248,3 @@ class OffCentreClearance(Clearance):
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         k = local.stiffest
         return {"g": (1e-3 * local.half, local.half), "m": (local.low, local.high), "k_g": (-k, k)}
-
-
-class PeriodicForce(Law):
-    """A force that repeats with position: cogging, ripple of a screw or gear (Hanselman 2006)."""
-
-    id = "periodic_force"
-    equation = "w = a sin(2 pi z / L) + b cos(2 pi z / L)"
-    source = "Hanselman (2006), Brushless Permanent Magnet Motor Design, sec. 8.3"
-    sentence = "a force that repeats with position, as from cogging or the pitch of a screw or gear"
-    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "L": "z"}
-    strength: ClassVar[tuple[str, ...]] = ("a", "b")
-
-    def force(self, z: Any, p: Any) -> Any:
-        angle = 2 * np.pi * z / p.L
-        return p.a * ca.sin(angle) + p.b * ca.cos(angle)
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(L=2 * local.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 60.1, 1.0)]))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"L": (2 * local.half / 60, 2 * local.half / 1.5)}
-
-
-class HarmonicForce(PeriodicForce):
-    """A force that repeats with position, its second harmonic included."""
-
-    form = "harmonics"
-    equation = "w = a sin(q) + b cos(q) + a_2 sin(2 q) + b_2 cos(2 q),  q = 2 pi z / L"
-    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "a_2": "w", "b_2": "w", "L": "z"}
-    strength: ClassVar[tuple[str, ...]] = ("a", "b", "a_2", "b_2")
-
-    def force(self, z: Any, p: Any) -> Any:
-        twice = 4 * np.pi * z / p.L
-        return super().force(z, p) + p.a_2 * ca.sin(twice) + p.b_2 * ca.cos(twice)
