@@ -39,8 +39,8 @@ def held_value(search: Search) -> Held | None:
     bench, without = search.bench, search.without
     best: tuple[str, Fitted] | None = None
     for name, p in bench.simulator.parameters.items():
-        kept = np.all(p.fixed) or np.all(without.at_bound(name))
-        if p.size != 1 or not kept or float(p.value) == 0:  # what is nothing is not there
+        stays = bool(np.all(p.fixed) or np.all(without.at_bound(name)))
+        if p.size != 1 or not stays or float(p.value) == 0:  # what is nothing is not there
             continue
         free = replace(p, fixed=False, bounds=(0.0 if float(p.value) > 0 else -np.inf, np.inf))
         simulator = bench.simulator.with_parameters({**bench.simulator.parameters, name: free})
