@@ -90,9 +90,10 @@ def fit(
         solved and re-gridded, which the paper does not do, or, "plain", solved and no more; with `linear` the best
         linear approximation "plain" is the paper's protocol.
         A mapping of values by parameter name is the one start of a PI-LFR with any element.
-    linear : control.StateSpace, optional
+    linear : control.StateSpace or "bla", optional
         Linear model that the search for a PI-LFR begins with, such as `frequency_subspace` of a BLA, which is the
-        paper's; by default subspace identification refined by output error.
+        paper's, or "bla": just that, of training recordings that are periodic; by default subspace identification
+        refined by output error.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
         exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one. A number below

@@ -5,6 +5,7 @@ import pytest
 from random_models import random_input, random_lfr
 
 from pilfr_casadi.baselines import NARX, network_lfr, ssnn
+from pilfr_casadi.bla import robust_bla
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.fit import fit
@@ -15,7 +16,7 @@ from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import InputError, Recording
 from pilfr_casadi.stability import stability
 from pilfr_casadi.start import grid_start, network_start, paper_start, regrid, unit_states
-from pilfr_casadi.subspace import time_subspace
+from pilfr_casadi.subspace import frequency_subspace, time_subspace
 
 NX, N = 2, 5
 LINEAR = {
@@ -174,6 +175,14 @@ def hysteretic_record():
     return Recording(u, y, 0.1, initial="zero")
 
 
+def steady_record(seed):
+    u = np.tile(random_input(seed, 100), (4, 1))
+    structure, values = random_lfr(2, nx=2, n=3)
+    model = structure.model(1, 1, values)
+    y = make_engine(model, "vm").simulate(u, model.parameters.start, np.zeros(model.n_x + model.n_s))[0]
+    return Recording(u, y, 0.1, initial="zero", period=100, skip=200)
+
+
 def test_plain_starts_are_solved_once_from_the_linear_model_that_is_given():
     record, structure = hysteretic_record(), PILFR(2, PrandtlIshlinskii(Play, 3))
     given = time_subspace([record], 2)
@@ -212,6 +221,27 @@ def test_a_linear_model_that_does_not_fit_is_refused():
         fit(structure, record, start="letter")
     one, two = (fit(PILFR(2), record, linear=linear).train_nrmse[0] for linear in (good, None))
     assert one == pytest.approx(two, rel=1e-3)  # refined, where there is nothing else to fit
+
+
+def test_the_best_linear_approximation_by_name():
+    records = [steady_record(seed) for seed in range(2)]
+    structure = PILFR(2, PrandtlIshlinskii(Play, 3))
+    named, given = (
+        fit(structure, records, start="plain", starts=1, linear=linear)
+        for linear in ("bla", frequency_subspace(robust_bla(records), 2))
+    )
+    for name in ("A", "B_u", "C_y", "D_yu", "y_0"):
+        np.testing.assert_array_equal(named.linear.parameters[name].value, given.linear.parameters[name].value)
+    np.testing.assert_array_equal(named.solution.theta, given.solution.theta)
+    assert fit(structure, records, start="plain", starts=1).linear_nrmse < named.linear_nrmse  # another linear model
+    static = fit(PILFR(0, PrandtlIshlinskii(Play, 3)), records, start="plain", starts=1, linear="bla")
+    u, y = ([x - x.mean() for x in (getattr(r, name)[r.skip :, 0] for r in records)] for name in "uy")
+    gain = np.ravel(u) @ np.ravel(y) / np.sum(np.square(u))
+    assert static.linear.parameters["D_yu"].value[0, 0] == pytest.approx(gain)
+    with pytest.raises(InputError, match="the period of recording .b. is not known"):
+        fit(structure, [records[0], records[1].with_(period=None, name="b", initial="zero")], linear="bla")
+    with pytest.raises(InputError, match="not whole periods of 90 samples"):
+        fit(structure, [r.with_(period=90, initial="zero") for r in records], linear="bla")
 
 
 @pytest.mark.parametrize("structure", [ssnn(NX, 3), network_lfr(NX, 4)])
