@@ -84,7 +84,8 @@ def fit(
         holds the solution, a Gauss-Newton SQP has the last word (see `tightening`).
     starts, seed : int
         Number of starts and the seed of all of them. With `start="grid"` the first two have the element at the output
-        and at the input, whatever the seed; more are drawn. More starts with the same seed hold those of fewer.
+        and at the input, whatever the seed (of Hammerstein and Wiener models it is one); more are drawn. More starts
+        with the same seed hold those of fewer.
     start : {"grid", "paper", "plain"} or mapping
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
         solved and re-gridded, which the paper does not do, or, "plain", solved and no more; with `linear` the best
