@@ -14,10 +14,10 @@ Where figures differ from the published ones, trials say why:
 
 - All rows: the phases drawn, as `--seed 101` and others show; in record 100 the linear model's errors are on the low
   side.
-- PI-LFR: a start at the minimum of the linear output error, instead of the best linear approximation, gets stuck there
-  in 17 / 25 / 42 % of 24 starts with N = 5 / 10 / 20, instead of 8 %; tolerance, damping and the bound on the spectral
-  radius change nothing about it. Of 100 starts 2 to 4 do; re-gridding frees every one. With N = 10 the plain starts are
-  above the published 25th percentile on both tests (by 3 and 22 %).
+- PI-LFR: starts at the minimum of the linear output error (`--linear output-error`), instead of the best linear
+  approximation, get stuck there in 20 / 29 / 31 / 36 of 100 cases with N = 5 / 10 / 15 / 20, instead of 2 to 4;
+  re-gridding frees every one. With N = 10 the plain starts are above the published 25th percentile on both tests (by 3
+  and 22 %).
 - PI-Hammerstein: the linear model's error is all that it reaches, since the hysteresis is not at the input.
 - SS-NN: the paper's text has 10 to 20 neurons, its table 5 and 10. What decides is where neurons begin: nearly flat
   ones (the default, chosen by training error on records 200 and 201) end lower than more iterations alone. None
