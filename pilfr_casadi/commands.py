@@ -22,6 +22,7 @@ from .gauss_newton import GaussNewton
 from .interrupts import Clock, deferred_interrupt, insistent, time_limit, worker_pool
 from .ipopt import Ipopt
 from .lfr import PILFR
+from .metrics import NOTHING_SENTENCE, explains_nothing
 from .option_values import bounds, name_list, number, pairs
 from .order_selection import select_order
 from .progress import progress_bar
@@ -125,11 +126,7 @@ def fit(options: argparse.Namespace) -> int:
     if result.status is Status.INFEASIBLE:
         missed = "; ".join(str(limit) for limit in result.limits if not limit.met)
         return say(f"The model does not meet its constraints: {missed}.", NO_RESULT)
-    return (
-        DONE
-        if min(result.train_nrmse) < 1.0
-        else say("The model explains nothing of the training recording.", NO_RESULT)
-    )
+    return say(NOTHING_SENTENCE, NO_RESULT) if explains_nothing(result.train_nrmse) else DONE
 
 
 def simulate(options: argparse.Namespace) -> int:

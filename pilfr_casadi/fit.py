@@ -84,15 +84,17 @@ def fit(
         holds the solution, a Gauss-Newton SQP has the last word (see `tightening`).
     starts, seed : int
         Number of starts and the seed of all of them. With `start="grid"` the first two have the element at the output
-        and at the input, whatever the seed; more are drawn. More starts with the same seed hold those of fewer.
+        and at the input, whatever the seed (of Hammerstein and Wiener models it is one); more are drawn. More starts
+        with the same seed hold those of fewer.
     start : {"grid", "paper", "plain"} or mapping
         Thresholds on a grid, every start explored and the best polished; or the paper's start (Eq. 22-24), every start
         solved and re-gridded, which the paper does not do, or, "plain", solved and no more; with `linear` the best
         linear approximation "plain" is the paper's protocol.
         A mapping of values by parameter name is the one start of a PI-LFR with any element.
-    linear : control.StateSpace, optional
+    linear : control.StateSpace or "bla", optional
         Linear model that the search for a PI-LFR begins with, such as `frequency_subspace` of a BLA, which is the
-        paper's; by default subspace identification refined by output error.
+        paper's, or "bla": just that, of training recordings that are periodic; by default subspace identification
+        refined by output error.
     stable : bool or float
         Bound on the spectral radius of a PI-LFR's linear part, and of it with the element's full slope, which holds
         exactly, by the eigenvalues of the result. True, the default, is 1: an integrator is let be one. A number below

@@ -17,7 +17,7 @@ from .gauge import unknown_sentences
 from .gauss_newton import GaussNewton
 from .lfr import PILFR
 from .limits import Limit, unknown_multipliers
-from .metrics import nrmse, rmse_per_output
+from .metrics import NOTHING_SENTENCE, explains_nothing, nrmse, rmse_per_output
 from .model import Model
 from .problem import Problem
 from .recording import InputError, Recording, as_recordings
@@ -213,6 +213,8 @@ class Fit:
             f"NRMSE on the training recording{'s' if len(self.train_nrmse) > 1 else ''}: {errors}",
             f"{self.solution.iterations} iterations in the last solve{spent}",
         ]
+        if explains_nothing(self.train_nrmse):
+            lines.insert(1, NOTHING_SENTENCE)
         if self.candidates:
             reached = sorted(c.error for c in self.candidates)
             some = f"{len(reached)} starts" if len(reached) > 1 else "1 start"

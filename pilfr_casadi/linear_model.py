@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from .bla import robust_bla
 from .constraints import Constraint
 from .gauss_newton import GaussNewton
 from .interrupts import Progress
@@ -24,9 +25,11 @@ from .problem import Problem
 from .recording import InputError, Recording
 from .solution import Solution, Status
 from .subspace import subspace_matrices
+from .subspace_frequency import FrequencyProblem
 from .told import iterations
 
 Array = np.ndarray
+BLA = "bla"
 
 
 def linear_model(
@@ -49,9 +52,10 @@ def linear_model(
         what else it fixes are left aside.
     engine, constraints
         As for `Problem`.
-    given : control.StateSpace
-        A linear model in discrete time to take in place of the subspace's. In the search for an element it stays as it
-        is: at the minimum of the linear error the slope of half of the parameters has vanished, and starts get stuck.
+    given : control.StateSpace or "bla"
+        A linear model in discrete time to take in place of the subspace's, or the best linear approximation. In the
+        search for an element it stays as it is: at the minimum of the linear error the slope of half of the parameters
+        has vanished, and starts get stuck.
     progress : callable
         Called with ("subspace" or "linear model", done, total, smallest error so far).
 
@@ -63,11 +67,14 @@ def linear_model(
     Raises
     ------
     InputError
-        If the recordings are too short for the order, or the model given does not fit them.
+        If the recordings are too short for the order, the model given does not fit them, or there is no best linear
+        approximation because they are not periodic.
     """
     first, solver = recordings[0], GaussNewton(tolerance=1e-4)
     if given is None:
         a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset, progress=progress)
+    elif isinstance(given, str) and given == BLA:
+        a, b, c, d = best_approximation(recordings, structure.nx)
     else:
         a, b, c, d = matrices_of(given, structure.nx, first)
     offset = _offset(recordings, a, b, c, d) if structure.offset else np.zeros(first.n_y)
@@ -93,6 +100,28 @@ def linear_model(
     return model, problem, min(found, key=lambda s: (s.status is Status.INFEASIBLE, s.cost))
 
 
+def best_approximation(recordings: Sequence[Recording], nx: int) -> tuple[Array, Array, Array, Array]:
+    """The matrices of the best linear approximation from periodic recordings, Krikelis et al. (2024), Sec. 5.3.
+
+    Of order 0 it is the static gain of least squares about the means.
+
+    Raises
+    ------
+    InputError
+        If the period of a recording is not known, or as `robust_bla` and `frequency_subspace`.
+    """
+    for r in recordings:
+        if r.period is None:
+            raise InputError(
+                f"linear = 'bla' was given, and the period of {r.label} is not known; give periodic recordings with "
+                "their period in samples, or leave it out."
+            )
+    if nx == 0:
+        return subspace_matrices(recordings, nx, offset=True)
+    model = FrequencyProblem(robust_bla(recordings), True).solve([nx], None)[0]
+    return model.A, model.B, model.C, model.D
+
+
 def matrices_of(given: Any, nx: int, recording: Recording) -> tuple[Array, Array, Array, Array]:
     """The matrices of a `control.StateSpace` that is to begin with.
 
@@ -102,7 +131,7 @@ def matrices_of(given: Any, nx: int, recording: Recording) -> tuple[Array, Array
         If it is none, or has other sizes or another step than wanted.
     """
     if not all(hasattr(given, name) for name in ("A", "B", "C", "D", "dt")):
-        raise InputError(f"A {type(given).__name__} was given as linear model; give a control.StateSpace.")
+        raise InputError(f"A {type(given).__name__} was given as linear model; give a control.StateSpace or 'bla'.")
     a, b, c, d = (np.asarray(getattr(given, name), dtype=float) for name in "ABCD")
     found, wanted = (len(a), b.shape[1], len(c)), (nx, recording.n_u, recording.n_y)
     if found != wanted:

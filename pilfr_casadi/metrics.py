@@ -7,9 +7,14 @@ The normalised error is that of Krikelis et al. (2024), Eq. 27, for each output 
 averaged over the outputs. A simulation that ran away (infinite or not a number) has an infinite error.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from .recording import InputError
+
+NOTHING = 0.99  # NRMSE from which on a simulation is no better than a constant
+NOTHING_SENTENCE = "The model explains nothing of the training recordings: it is no better than a constant."
 
 
 def rmse_per_output(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> np.ndarray:
@@ -74,6 +79,11 @@ def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
             "not exist; leave it out or use rmse."
         )
     return float(np.mean(errors / sigma))
+
+
+def explains_nothing(errors: Sequence[float]) -> bool:
+    """Whether NRMSEs on several recordings are all those of a constant, `NOTHING` or more."""
+    return bool(errors) and min(errors) >= NOTHING
 
 
 def _scored(y: np.ndarray, y_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,8 @@
 1. `linear_model`: subspace identification refined by output error, states scaled to unit variance (Krikelis et al.,
    Sec. 5.3).
 2. Exploration: from each start a short Gauss-Newton run. Most of what a start will ever reach shows within some forty
-   steps. The first two have the element at the output and at the input, the others anywhere (`start.grid_start`).
+   steps. The first two have the element at the output and at the input, the others anywhere (`start.grid_start`);
+   where the structure says its place, the thresholds are a grid in the first and drawn in the others.
 3. The best few are re-gridded (`start.regrid`) and run again: thresholds that have clustered or fallen asleep are
    spread along the density the fit has found. This is done twice, the second time with thresholds beyond the visited
    range and a weak prior that holds the weights to the smoothed density, which decides what the data leaves open; a
@@ -33,17 +34,17 @@ from .elements import PrandtlIshlinskii, StaticNetwork
 from .envelopes import enveloped, has_networks
 from .gauss_newton import GaussNewton
 from .model import Model
+from .placement import direction_fixed, fixed_whole, places
 from .problem import Problem
 from .recording import InputError
 from .search import Candidate, Search, run_tasks
 from .solution import Solution, Status
-from .start import direction_fixed, fixed_whole, grid_start, network_start, paper_start, regridded, unit_states
+from .start import grid_start, network_start, paper_start, regridded, unit_states
 from .threads import one_blas_thread
 from .tightening import at_bounds
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
-PLACES = ("output", "input")  # of the element in the first starts; in all others it is anywhere
 STARTS = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
 MARGIN = 1.1  # times the smallest error, for the weights of a smooth density
@@ -64,12 +65,12 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     if isinstance(search.structure.element, StaticNetwork):
         values = network_start(search.structure, scaled, inputs, states, rng)
     elif search.start == "grid":
-        place = PLACES[seed] if seed < len(PLACES) else "random"
+        place = dict(enumerate(places(search.structure))).get(seed, "random")
         values = grid_start(search.structure, scaled, inputs, states, rng, place)
         if has_networks(search.structure):
             values = enveloped(search.structure, scaled, values, search.recordings, states, place)
     else:
-        values = paper_start(search.structure, scaled, rng)
+        values = paper_start(search.structure, scaled, inputs, states, rng)
     model = search.model(values)
     problem = search.problem(model)
     candidate = _candidate(seed, model, problem, search.solve(problem, None, solver))
@@ -89,11 +90,10 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
 def drawn(structure: Any, start: str, seed: int) -> bool:
     """Whether a start has anything random in it: with the grid, the direction of z where it is free, or thresholds."""
     element = structure.element
-    network, several = (
-        isinstance(element, StaticNetwork),
-        "r" not in fixed_whole(structure) and getattr(element, "n", 1) > 1,
-    )
-    return start != "grid" or network or (seed >= len(PLACES) and (several or not direction_fixed(structure)))
+    if start != "grid" or isinstance(element, StaticNetwork):
+        return True
+    several = "r" not in fixed_whole(structure) and getattr(element, "n", 1) > 1
+    return seed >= len(places(structure)) and (several or not direction_fixed(structure))
 
 
 def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:

@@ -18,6 +18,8 @@ import numpy as np
 from .elements import Element, PrandtlIshlinskii, StaticNetwork
 from .envelopes import reach
 from .lfr import PILFR
+from .placement import direction_fixed, driven_through, fixed_whole, is_zero, read_through
+from .subspace_problem import or_one
 
 Blocks = dict[str, np.ndarray]
 LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
@@ -53,13 +55,27 @@ def unit_states(
 
 
 def paper_start(
-    structure: PILFR, linear: Mapping[str, np.ndarray], rng: np.random.Generator, spread: float = 0.1
+    structure: PILFR,
+    linear: Mapping[str, np.ndarray],
+    inputs: list[np.ndarray],
+    states: list[np.ndarray],
+    rng: np.random.Generator,
+    spread: float = 0.1,
 ) -> Blocks:
-    """Start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)`, R = `spread`, `B_w = D_yw = 0`."""
+    """Start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)`, R = `spread`, `B_w = D_yw = 0`.
+
+    Where the structure leaves no direction of z to draw, thresholds are in units of z's deviation: z then has the units
+    of an input or output, in which all of them could lie beyond it. Where the output is read through the element alone
+    (Wiener), z is the linear model's output: against any other the weights, which are not negative, fall to zero, where
+    nothing else has a slope.
+    """
     element = _layer(structure)
     shape = (element.channels, element.n)
     blocks = _directions(element, linear, rng)
     blocks["w"], blocks["r"] = rng.uniform(0, 1 / element.n, shape), rng.uniform(0, spread, shape)
+    if direction_fixed(structure):
+        blocks |= _between(structure, linear, blocks)
+        blocks["r"] *= or_one(np.std(_signal(inputs, states, blocks), axis=0))[:, None]
     return blocks
 
 
@@ -85,7 +101,7 @@ def grid_start(
     a linear system, or in what it drives):
 
     - "random": a random direction in states and inputs, each in units of its deviation; `B_w = D_yw = 0`; where the
-      structure fixes the direction, random thresholds in place of the grid;
+      structure leaves no direction to draw, random thresholds in place of the grid;
     - "output": z is the linear model's output, half of which is read through the element;
     - "input": z is the input, half of which reaches the linear model through the element.
 
@@ -102,16 +118,6 @@ def grid_start(
     blocks["r"] = 0.9 * widest[:, None] * grid
     blocks["w"] = np.full((element.channels, element.n), 1.0 / element.n)
     return blocks
-
-
-def direction_fixed(structure: PILFR) -> bool:
-    """Whether z is fixed by the structure, so that no direction is left to draw."""
-    return {"C_z", "D_zu"} <= set(fixed_whole(structure))
-
-
-def fixed_whole(structure: PILFR) -> list[str]:
-    """Blocks that are fixed to the last entry."""
-    return [k for k, v in structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))]
 
 
 def network_start(
@@ -138,8 +144,7 @@ def network_start(
 def neurons_over(structure: PILFR, element: StaticNetwork, z: np.ndarray, rng: np.random.Generator) -> Blocks:
     """Gains, slopes and biases of neurons that bend within 1.5 deviations of the mean of z (M, channels)."""
     shape = (element.channels, element.hidden)
-    size = np.std(z, axis=0)
-    size = np.where(size > 0, size, 1.0)[:, None]
+    size = or_one(np.std(z, axis=0))[:, None]
     slope = rng.uniform(1, 3, shape) / size
     slope = np.broadcast_to(np.asarray(structure.fixed.get("slope", slope), dtype=float), shape)
     middle = np.mean(z, axis=0)[:, None] + rng.uniform(-1.5, 1.5, shape) * size
@@ -157,29 +162,35 @@ def _placed(
 ) -> tuple[Blocks, np.ndarray]:
     """The linear blocks with the element at its place (see `grid_start`), and the signal z (M, channels)."""
     blocks = _directions(element, linear, rng)
-    u, x = np.concatenate(inputs), np.concatenate(states)
-    fixed = {k: v for k, v in structure.fixed.items() if not np.any(np.isnan(v))}
-    spread = np.std(u, axis=0)
-    blocks["D_zu"] = blocks["D_zu"] / np.where(spread > 0, spread, 1.0)
-    at_output, at_input = (np.arange(element.channels) % n for n in (len(linear["C_y"]), u.shape[1]))
+    fixed, n_u = fixed_whole(structure), linear["B_u"].shape[1]
+    blocks["D_zu"] = blocks["D_zu"] / or_one(np.std(np.concatenate(inputs), axis=0))
+    at_output, at_input = (np.arange(element.channels) % n for n in (len(linear["C_y"]), n_u))
     if place == "output":
         blocks["C_z"], blocks["D_zu"] = linear["C_y"][at_output], linear["D_yu"][at_output]
-    elif place == "input":
-        blocks["C_z"], blocks["D_zu"] = np.zeros_like(blocks["C_z"]), np.eye(u.shape[1])[at_input]
-    if "B_u" in fixed and "D_zu" in fixed:
+    elif place == "input" and not is_zero(structure, "D_zu"):
+        blocks["C_z"], blocks["D_zu"] = np.zeros_like(blocks["C_z"]), np.eye(n_u)[at_input]
+    if driven_through(structure):
         blocks["B_w"], blocks["D_yw"] = linear["B_u"], linear["D_yu"]
-    if "C_y" in fixed and "D_yw" in fixed:
-        blocks["C_z"], blocks["D_zu"] = linear["C_y"], linear["D_yu"]
-    held = {k: np.broadcast_to(np.asarray(v, dtype=float), blocks[k].shape) for k, v in fixed.items() if k in blocks}
-    blocks |= held
-    z = x @ blocks["C_z"].T + u @ blocks["D_zu"].T
-    size = np.std(z, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    if not {"C_z", "D_zu", "D_yw"} & set(fixed):
+    blocks |= _between(structure, linear, blocks)
+    z = _signal(inputs, states, blocks)
+    size = or_one(np.std(z, axis=0))
+    if all(is_zero(structure, k) for k in ("C_z", "D_zu", "D_yw") if k in fixed):
         blocks["C_z"], blocks["D_zu"], z = blocks["C_z"] / size[:, None], blocks["D_zu"] / size[:, None], z / size
-    if place != "random" and not {*blocks, "w", "r"} & set(fixed):
+    if place != "random" and not {*blocks, "w", "r"} & set(fixed) and not {"B_w", "D_yw"} & set(structure.fixed):
         blocks |= _halved(linear, size, at_output if place == "output" else at_input, place == "output")
     return blocks, z
+
+
+def _signal(inputs: list[np.ndarray], states: list[np.ndarray], blocks: Blocks) -> np.ndarray:
+    """The signal z (M, channels) of all recordings."""
+    return np.concatenate(states) @ blocks["C_z"].T + np.concatenate(inputs) @ blocks["D_zu"].T
+
+
+def _between(structure: PILFR, linear: Mapping[str, np.ndarray], blocks: Blocks) -> Blocks:
+    """What the structure says of the blocks: z is the linear model's output where that is read through the element."""
+    out = {"C_z": linear["C_y"], "D_zu": linear["D_yu"]} if read_through(structure) else {}
+    held = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_whole(structure) if k in blocks}
+    return out | {k: np.broadcast_to(v, blocks[k].shape) for k, v in held.items()}
 
 
 def _halved(linear: Mapping[str, np.ndarray], size: np.ndarray, at: np.ndarray, output: bool) -> Blocks:

@@ -6,9 +6,10 @@
 
 The same run file is executed one job after the other, by two processes, and on a Dask cluster of four workers of which
 one is killed (SIGKILL) when a third of the jobs are done; when half of them are, the driver is killed, and resumed. All
-three must give the same bytes. The box plot beside the published quartiles is `fig11_starts.png`. A run file begins at
-the linear model of least output error, where of 100 plain starts more than a quarter stay for every N (upper quartile
-0.27 in training); Fig. 11 from the best linear approximation, as in the paper, is `problems.table2 --figures`.
+three must give the same bytes. The box plot beside the published quartiles is `fig11_starts.png`. The
+training record is not periodic, so starts begin at the linear model of least output error, where plain ones stay more
+often (`problems.table2 --linear output-error`); Fig. 11 from the best linear approximation, as in the paper, is
+`problems.table2 --figures`.
 """
 
 from __future__ import annotations

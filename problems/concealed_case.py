@@ -50,7 +50,7 @@ def case(seed: int) -> Case:
     Raises
     ------
     RuntimeError
-        If no draw of this seed can be used (not seen on seeds 0-999).
+        If no draw of this seed can be used.
     """
     kind = str(np.random.default_rng([seed, 1]).choice(list(KINDS), p=list(KINDS.values())))
     for attempt in range(40):

@@ -51,7 +51,7 @@ def recordings(folder: Path) -> dict[str, Recording]:
 def started_as_measured(r: Recording) -> Recording:
     """The recording with position and velocity at its first sample, from a parabola through the first few.
 
-    Left free, the initial state of an integrator takes up drift that comes later: the fit puts it 3 mm off.
+    Left free, the initial state of an integrator takes up drift that comes later.
     """
     velocity = np.polynomial.Polynomial.fit(r.t[:FIRST], r.y[:FIRST, 0], 2).deriv()(0.0)
     return r.with_(initial=np.array([r.y[0, 0], velocity]))

@@ -10,15 +10,7 @@ reported is its relative error, RMSE / std(y), averaged over outputs and periods
 where the mirror rests and creeps is not in them: the models have no offset (`y_0 = 0`), and what mean their own
 hysteresis makes counts as an error.
 
-What the combined model is made of was chosen on realization 4, fitted to 1 and 5: second envelopes together with input
-plays that have ways of their own take 8 % off after as many iterations, stops beside the envelopes and a scale of the
-damping that is halved each step nothing; from 16 to 26 iterations the error falls by another 9 %.
-
-Trials for the lowest level, on realization 4 after 16 iterations (4.2 / 3.7 / 3.7 % with what is here): input plays
-with weights of either sign leave 4.3 / 3.7 / 3.7; the real poles near half the sampling rate kept at the start, 4.0 /
-3.2 / 3.2; counting the lowest level 1.3 times and its noisy realizations nearly in full then takes 1 % off there and
-adds 2 and 4 % at the others. The whole fit with these poles, these weights and 32 iterations at the end leaves 3.6 /
-3.0 / 3.0 on realization 6, where what is here leaves 3.7 / 2.9 / 2.8: it begins better and ends no better.
+What the combined model is made of was chosen on realization 4, fitted to 1 and 5.
 """
 
 from __future__ import annotations

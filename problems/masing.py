@@ -166,8 +166,8 @@ def simulate(u: ArrayLike, fs: float, *, rig: MasingRig | None = None, substeps:
     rig : MasingRig, optional
         Parameters; those of Table 1 by default.
     substeps : int
-        Runge-Kutta steps per sample. At 120 Hz the default leaves an error of x2 below 1e-5 of its standard deviation
-        (3.5e-6 at worst in 36 records), each doubling 16 times less; two reversals inside one substep go unseen.
+        Runge-Kutta steps per sample. At 120 Hz the default leaves an error of x2 below 1e-5 of its standard deviation,
+        each doubling 16 times less; two reversals inside one substep go unseen.
     hold : {"zero", "linear"}
         Whether the force is held or interpolated between the samples.
 

@@ -34,8 +34,8 @@ class Benchmark:
         ``train``, ``multisine`` and ``sweep``: what an identification may see.
     steady : tuple of Recording
         The flat period of each training realization, for the best linear approximation (Sec. 6.3). Half a period of
-        ramp does not settle the rig: the flat period differs from the steady state by 1.3 % of the output's standard
-        deviation in the median, 6 % at worst (36 periods), so ``initial`` is "estimate".
+        ramp does not settle the rig: the flat period differs from the steady state by some per cent of the output's
+        standard deviation, so ``initial`` is "estimate".
     truth : dict of str to Motion
         Noise-free motion under each of the three inputs.
     rig : MasingRig
@@ -63,7 +63,7 @@ def benchmark(
     white Gaussian noise, the rig starts at rest, and the force is held between samples.
 
     The paper leaves open whether the multisine or the shaped record has unit standard deviation. Only the former brings
-    a linear fit to the published 0.48 on the sweep (0.42 to 0.51 over 12 seeds, the latter 0.34 to 0.42).
+    a linear fit to the published 0.48 on the sweep (`python -m problems.table2 --rows LTI`).
 
     Parameters
     ----------

@@ -11,9 +11,10 @@ import numpy as np
 from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.model import Model
 from pilfr_casadi.multisines import multisine
+from pilfr_casadi.placement import direction_fixed
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import Recording
-from pilfr_casadi.start import direction_fixed, grid_start, unit_states
+from pilfr_casadi.start import grid_start, unit_states
 from pilfr_casadi.subspace import subspace_matrices
 
 Blocks = dict[str, np.ndarray]

@@ -270,6 +270,17 @@ def test_cross_validation_recommends_a_structure(folder):
     assert pilfr.run(path, out=folder / "run").selection.errors == chosen.errors
 
 
+def test_models_that_explain_nothing_count_as_failed(folder, capsys):
+    """A constant output is a minimum, which a solver may call converged; of a start it is a failure."""
+    shut = ("nx = 1", "nx = 1\nbounds = { w = [0.0, 0.0] }")
+    assert main(["campaign", str(changed(folder, ("count = 4", "count = 2"), shut, ("[1, 3]", "[3]")))]) == 1
+    out, err = capsys.readouterr()
+    assert out.count("The model explains nothing of the training recordings") == 2 and "explains nothing" in err
+    result = pilfr.campaign(folder / "rig.toml")
+    assert result.done == () and {s.failure_rate for s in result.summary} == {1.0}
+    assert all(s.quartiles[0] == pytest.approx(1.0, rel=1e-3) for s in result.summary if s.role == "train")
+
+
 def test_a_validation_recording_recommends_one_too(folder):
     write_csv(folder / "held.csv", seed=7, m=400)
     result = pilfr.campaign(changed(folder, ('test = "test.csv"', 'validation = "held.csv"'), ("[1, 3]", "[0, 2, 6]")))

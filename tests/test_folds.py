@@ -8,6 +8,7 @@ from test_cli import refused, write_csv
 import pilfr_casadi as pilfr
 from pilfr_casadi.recording import InputError
 from pilfr_casadi.repetition import repeats_itself, same_input
+from pilfr_casadi.runs import jobs
 from pilfr_casadi.runs.folds import fold
 
 
@@ -31,6 +32,29 @@ def test_folds_hold_out_every_sample_once(folder):
     assert [[part.name for part in fold(three, k, 2)[1]] for k in range(2)] == [["0", "2"], ["1"]]
     with pytest.raises(InputError, match="too few for 30 folds"):
         fold([r], 0, 30)
+
+
+def test_other_folds_are_other_jobs(folder, monkeypatch):
+    """How recordings are dealt is no entry of the run file; results of another dealing must not be taken for these."""
+    path = changed(
+        folder, ("count = 4", "count = 1"), ("report = false", "folds = 2\nreport = false"), ("[1, 3]", "[0]")
+    )
+    assert set(pilfr.campaign(path).done) == {
+        "operators-0_fold-0_seed-0",
+        "operators-0_fold-1_seed-0",
+        "operators-0_seed-0",
+    }
+    assert pilfr.campaign(path).done == ()
+
+    def otherwise(recordings, k, folds):
+        return tuple(tuple(r.with_(skip=r.skip + 5) for r in part) for part in fold(recordings, k, folds))
+
+    monkeypatch.setattr(jobs, "fold", otherwise)
+    assert set(pilfr.campaign(path).done) == {"operators-0_fold-0_seed-0", "operators-0_fold-1_seed-0"}
+    monkeypatch.undo()
+    swapped = {k: fold([pilfr.read(folder / "train.csv", "u", "y", initial="zero")], 1 - k, 2) for k in range(2)}
+    monkeypatch.setattr(jobs, "fold", lambda recordings, k, folds: swapped[k])
+    assert len(pilfr.campaign(path).done) == 2
 
 
 def test_folds_of_steady_periods_are_refused(capsys, folder):

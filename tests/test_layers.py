@@ -55,6 +55,7 @@ LAYERS = {
         "residual_noise",
         "gauge",
         "normal_form",
+        "placement",
         "start",
         "envelopes",
         "modal",

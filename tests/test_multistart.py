@@ -47,8 +47,9 @@ def search():
 @pytest.mark.parametrize("seed", range(3))
 def test_the_papers_start_is_polished(search, seed):
     sequence = np.random.SeedSequence(seed)
-    scaled, _ = unit_states(search.linear, [r.u for r in search.recordings])
-    model = search.model(paper_start(search.structure, scaled, np.random.default_rng(sequence)))
+    inputs = [r.u for r in search.recordings]
+    scaled, states = unit_states(search.linear, inputs)
+    model = search.model(paper_start(search.structure, scaled, inputs, states, np.random.default_rng(sequence)))
     problem = search.problem(model)
     alone = POLISH.solve(problem).theta
     e = problem.residual(alone)

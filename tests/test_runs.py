@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 import run_files
 from run_files import PYTHON, RUN, command, contents
@@ -321,6 +322,32 @@ def test_a_python_file_does_the_same_with_objects(folder):
     (folder / "mine.py").write_text("run = 1 / 0")
     with pytest.raises(InputError, match=r"mine.py, line 1: ZeroDivisionError"):
         pilfr.run(folder / "mine.py")
+
+
+def test_starts_at_the_best_linear_approximation(capsys, folder):
+    """As `linear="bla"` in Python, of periodic training recordings; of others one sentence."""
+    wave = np.random.default_rng(3).normal(size=100)
+    write_csv(folder / "train.csv", m=300, u=np.tile(wave, 3))
+    bla = ("starts = 3", 'starts = 1\nlinear = "bla"')
+    refused(capsys, "run", changed(folder, *bla), says=("periodic training recordings", "'period' in [data]"))
+    periodic = RUN.replace("[0, 1, 2]", "[0]").replace('"zero"', '"zero"\nskip = 100\nperiod = 100')
+    (folder / "rig.toml").write_text(periodic.replace(*bla).replace("period = 100", "period = 90"))
+    refused(capsys, "run", folder / "rig.toml", says="not whole periods of 90 samples")
+    grid = periodic.replace("starts = 3", "starts = 1") + '\n[grid]\nlinear = ["bla", "output-error"]'
+    (folder / "rig.toml").write_text(grid)
+    result = pilfr.run(folder / "rig.toml")
+    assert set(result.done) == {"linear-bla_seed-0", "linear-output-error_seed-0"}
+    train = pilfr.read(folder / "train.csv", "u", "y", initial="zero", skip=100, period=100)
+    for linear, options in (("bla", {"linear": "bla"}), ("output-error", {})):
+        own = pilfr.fit(pilfr.hammerstein(1, pilfr.PrandtlIshlinskii(pilfr.Play, 3)), train, starts=1, **options)
+        found = pilfr.load(result.folder / "jobs" / f"linear-{linear}_seed-0" / "model.json")
+        assert np.array_equal(found.model.parameters.start, own.model.parameters.start)
+    (folder / "rig.toml").write_text(grid.replace("nx = 1\noperators = 3", "lags = 1").replace("hammerstein", "narx"))
+    refused(capsys, "run", folder / "rig.toml", says="linear = 'bla' is not for a NARX or NOE")
+    both = grid.replace('structure = "hammerstein"', "lags = 1\nhidden = 2") + '\nstructure = ["lfr", "narx"]'
+    (folder / "rig.toml").write_text(both)
+    cells = [cell.values for cell in read_run(folder / "rig.toml").cells]
+    assert cells == [{"structure": "lfr", "linear": k} for k in ("bla", "output-error")] + [{"structure": "narx"}]
 
 
 def test_regularization_in_a_run(folder):

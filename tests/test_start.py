@@ -1,10 +1,13 @@
 """Start values: where the element is placed, units, and thresholds placed anew."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from random_models import random_input, random_lfr
 
 from pilfr_casadi.baselines import NARX, network_lfr, ssnn
+from pilfr_casadi.bla import robust_bla
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.fit import fit
@@ -15,7 +18,7 @@ from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import InputError, Recording
 from pilfr_casadi.stability import stability
 from pilfr_casadi.start import grid_start, network_start, paper_start, regrid, unit_states
-from pilfr_casadi.subspace import time_subspace
+from pilfr_casadi.subspace import frequency_subspace, time_subspace
 
 NX, N = 2, 5
 LINEAR = {
@@ -153,7 +156,8 @@ def test_the_papers_start_to_the_letter():
     u = np.random.default_rng(3).normal(size=(400, 2))
     blocks, (x,) = unit_states(LINEAR, [u])
     np.testing.assert_allclose(np.sqrt(np.mean(x**2, axis=0)), 1.0)
-    drawn = [paper_start(PILFR(NX, PrandtlIshlinskii(Play, N)), blocks, np.random.default_rng(k)) for k in range(400)]
+    structure = PILFR(NX, PrandtlIshlinskii(Play, N))
+    drawn = [paper_start(structure, blocks, [u], [x], np.random.default_rng(k)) for k in range(400)]
     for name, (low, high) in {"C_z": (-1, 1), "D_zu": (-1, 1), "w": (0, 1 / N), "r": (0, 0.1)}.items():
         values = np.array([d[name] for d in drawn])
         assert low <= values.min() < low + 0.01 * (high - low)
@@ -166,12 +170,89 @@ def test_the_papers_start_to_the_letter():
         np.testing.assert_array_equal(model.parameters[name].value, blocks[name])
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("form", [hammerstein, wiener])
+def test_the_papers_start_where_the_structure_says_what_z_is(form, unit):
+    """z has the units of an input or output there; no threshold of U(0, 0.1) may lie beyond it for want of scale."""
+    u, scales = np.random.default_rng(3).normal(size=(400, 2)) * [1.0, 4.0], dict.fromkeys(("C_y", "D_yu"), unit)
+    if form is hammerstein:
+        u, scales = unit * u, dict.fromkeys(("B_u", "D_yu"), 1 / unit)
+    blocks, (x,) = unit_states({k: scales.get(k, 1.0) * v for k, v in LINEAR.items()}, [u])
+    structure = form(NX, PrandtlIshlinskii(Play, 200, 2))
+    values = paper_start(structure, blocks, [u], [x], np.random.default_rng(0))
+    z = x @ values["C_z"].T + u @ values["D_zu"].T
+    np.testing.assert_allclose(z, u if form is hammerstein else x @ blocks["C_y"].T + u @ blocks["D_yu"].T)
+    np.testing.assert_allclose(np.max(values["r"], axis=1) / np.std(z, axis=0), 0.1, rtol=0.05)
+
+
+@pytest.mark.parametrize("form", [hammerstein, wiener])
+def test_no_start_is_wasted_where_the_structure_says_where_the_element_is(form):
+    record = hysteretic_record()
+    result = fit(form(2, PrandtlIshlinskii(Play, 4)), record, starts=4)
+    assert [c.drawn for c in result.candidates] == [False, True, True, True]
+    starts = [c.model.parameters["r"].value for c in result.candidates]
+    assert len(np.unique(np.round(starts, 12), axis=0)) == 4
+    np.testing.assert_allclose(starts[0][0], np.arange(4) * starts[0][0, 1])
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+@pytest.mark.parametrize(
+    "fixed", [{"C_y": [[1.0, 0.0]], "D_yw": 0.0}, {"B_u": [[0.0], [1.0]], "D_zu": 0.0}, {"D_yw": 0.0}, {"B_w": 0.0}]
+)
+def test_blocks_that_are_known_are_not_taken_for_those_of_a_wiener_or_hammerstein_model(fixed, channels):
+    record = hysteretic_record()
+    result = fit(PILFR(2, PrandtlIshlinskii(Play, 3, channels), fixed), record, starts=2)
+    assert result.train_nrmse[0] < result.linear_nrmse[0]
+    structure, u = result.structure, [record.u]
+    linear = {k: p.value for k, p in result.linear.parameters.items()}
+    scaled, (x,) = unit_states(linear, u)
+    for place in ("output", "input"):
+        values = grid_start(structure, scaled, u, [x], np.random.default_rng(0), place)
+        np.testing.assert_allclose(np.std(x @ values["C_z"].T + u[0] @ values["D_zu"].T, axis=0), 1.0)
+        if "B_w" in fixed or len(fixed) == 1:  # no half of the model is given to a way that is shut
+            np.testing.assert_array_equal(values["B_u"], scaled["B_u"])
+            np.testing.assert_array_equal(values["C_y"], scaled["C_y"])
+
+
+@pytest.mark.parametrize("yunit", [1e-3, 1e3])
+def test_a_wiener_model_does_not_collapse_from_the_papers_start(yunit):
+    """Against a z of the wrong sign or scale the weights fall to zero, where the model is constant and has no slope."""
+    record = hysteretic_record()
+    record = record.with_(y=yunit * record.y)
+    for seed in range(4):
+        result = fit(wiener(2, PrandtlIshlinskii(Play, 4)), record, start="plain", starts=1, seed=seed)
+        assert result.train_nrmse[0] < 1.05 * result.linear_nrmse[0] and np.sum(result.parameters["w"]) > 0.1
+
+
+def test_a_model_that_explains_nothing_says_so():
+    result = fit(
+        hammerstein(
+            1,
+            PrandtlIshlinskii(Play, 2),
+        ),
+        hysteretic_record(),
+        starts=1,
+    )
+    assert "explains nothing" not in str(result)
+    shut = replace(hammerstein(1, PrandtlIshlinskii(Play, 2)), bounds={"w": (0.0, 0.0)})
+    constant = fit(shut, hysteretic_record(), starts=1)
+    assert constant.status.converged and "explains nothing of the training recordings" in str(constant)
+
+
 def hysteretic_record():
     u = random_input(1, 500)
     structure, values = random_lfr(2, nx=2, n=3)
     model = structure.model(1, 1, values)
     y = make_engine(model, "vm").simulate(u, model.parameters.start, np.zeros(model.n_x + model.n_s))[0]
     return Recording(u, y, 0.1, initial="zero")
+
+
+def steady_record(seed):
+    u = np.tile(random_input(seed, 100), (4, 1))
+    structure, values = random_lfr(2, nx=2, n=3)
+    model = structure.model(1, 1, values)
+    y = make_engine(model, "vm").simulate(u, model.parameters.start, np.zeros(model.n_x + model.n_s))[0]
+    return Recording(u, y, 0.1, initial="zero", period=100, skip=200)
 
 
 def test_plain_starts_are_solved_once_from_the_linear_model_that_is_given():
@@ -187,9 +268,9 @@ def test_plain_starts_are_solved_once_from_the_linear_model_that_is_given():
     }
     for name in ("A", "B_u", "C_y", "D_yu"):
         np.testing.assert_array_equal(result.linear.parameters[name].value, blocks[name])
-    scaled, _ = unit_states(blocks, [record.u])
+    scaled, states = unit_states(blocks, [record.u])
     sequence = np.random.SeedSequence(5).spawn(3)[1]
-    model = structure.model(1, 1, paper_start(structure, scaled, np.random.default_rng(sequence)))
+    model = structure.model(1, 1, paper_start(structure, scaled, [record.u], states, np.random.default_rng(sequence)))
     problem = Problem(model, record, constraints=stability(structure))
     alone = GaussNewton(max_iterations=200, tolerance=1e-4).solve(problem)
     np.testing.assert_allclose(result.candidates[1].theta, alone.theta, rtol=1e-5, atol=1e-7)
@@ -212,6 +293,27 @@ def test_a_linear_model_that_does_not_fit_is_refused():
         fit(structure, record, start="letter")
     one, two = (fit(PILFR(2), record, linear=linear).train_nrmse[0] for linear in (good, None))
     assert one == pytest.approx(two, rel=1e-3)  # refined, where there is nothing else to fit
+
+
+def test_the_best_linear_approximation_by_name():
+    records = [steady_record(seed) for seed in range(2)]
+    structure = PILFR(2, PrandtlIshlinskii(Play, 3))
+    named, given = (
+        fit(structure, records, start="plain", starts=1, linear=linear)
+        for linear in ("bla", frequency_subspace(robust_bla(records), 2))
+    )
+    for name in ("A", "B_u", "C_y", "D_yu", "y_0"):
+        np.testing.assert_array_equal(named.linear.parameters[name].value, given.linear.parameters[name].value)
+    np.testing.assert_array_equal(named.solution.theta, given.solution.theta)
+    assert fit(structure, records, start="plain", starts=1).linear_nrmse < named.linear_nrmse  # another linear model
+    static = fit(PILFR(0, PrandtlIshlinskii(Play, 3)), records, start="plain", starts=1, linear="bla")
+    u, y = ([x - x.mean() for x in (getattr(r, name)[r.skip :, 0] for r in records)] for name in "uy")
+    gain = np.ravel(u) @ np.ravel(y) / np.sum(np.square(u))
+    assert static.linear.parameters["D_yu"].value[0, 0] == pytest.approx(gain)
+    with pytest.raises(InputError, match="the period of recording 'b' is not known"):
+        fit(structure, [records[0], records[1].with_(period=None, name="b", initial="zero")], linear="bla")
+    with pytest.raises(InputError, match="not whole periods of 90 samples"):
+        fit(structure, [r.with_(period=90, initial="zero") for r in records], linear="bla")
 
 
 @pytest.mark.parametrize("structure", [ssnn(NX, 3), network_lfr(NX, 4)])

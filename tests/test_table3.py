@@ -121,6 +121,14 @@ def test_plays_beat_a_linear_model_on_the_real_stack():
     assert error["PI-LFR nx=1 N=10"] < 0.75 * error["LTI nx=1"]
 
 
+def test_some_rows_of_another_platform(capsys):
+    with pytest.raises(SystemExit):
+        main(["--rows", "nonsense"])
+    main(["--rows", "LTI nx=8", "--coupling", "0.02", "--workers", "1"])
+    out = capsys.readouterr().out
+    assert out.count("LTI nx=8") == 2 and "LTI nx=15" not in out and "real piezo stack" not in out
+
+
 @pytest.mark.slow
 def test_the_whole_table(capsys, tmp_path):
     main(["--out", str(tmp_path)])

@@ -18,6 +18,7 @@ from ..hand import close_hands
 from ..interrupts import Progress
 from ..lfr import PILFR
 from ..multistart import drawn
+from ..placement import places
 from ..recording import InputError
 from .described import Run, read_run
 from .execute import RunResult, carried_out
@@ -89,12 +90,14 @@ def _check_seeds(run: Run) -> None:
     """Refuse seeds that would all give the same model: the first starts of a grid start are not random."""
     for cell in run.cells:
         search = cell.search
-        layer = isinstance(cell.model, PILFR) and isinstance(cell.model.element, PrandtlIshlinskii)
-        if len(run.seeds) > 1 and layer and search["start"] == "grid" and search["starts"] < 3:
-            more = ", or 3 starts or more" if drawn(cell.model, "grid", 2) else ", or one seed"
+        if not isinstance(cell.model, PILFR) or not isinstance(cell.model.element, PrandtlIshlinskii):
+            continue
+        first = len(places(cell.model))
+        if len(run.seeds) > 1 and search["start"] == "grid" and search["starts"] <= first:
+            more = f", or {first + 1} starts or more" if drawn(cell.model, "grid", first) else ", or one seed"
             raise InputError(
-                f"{run.file}: the first two of the starts 'grid' are not random, so {len(run.seeds)} seeds with starts "
-                f"= {search['starts']} would give one model; give start = 'paper' in [solver]{more}."
+                f"{run.file}: the first {first} of the starts 'grid' are not random, so {len(run.seeds)} seeds with "
+                f"starts = {search['starts']} would give one model; give start = 'paper' in [solver]{more}."
             )
 
 

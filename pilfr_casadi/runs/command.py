@@ -12,7 +12,9 @@ from ..cli import DONE, INTERRUPTED, NO_RESULT, say
 from ..commands import make_folder
 from ..interrupts import insistent, worker_pool
 from ..lfr import PILFR
-from ..multistart import PLACES, drawn
+from ..metrics import NOTHING_SENTENCE, explains_nothing
+from ..multistart import drawn
+from ..placement import places
 from ..progress import progress_bar
 from ..recording import InputError
 from .campaign import campaign
@@ -132,8 +134,7 @@ def _told(given: Run, result: RunResult, *files: str) -> int:
                 print(f"{cell.name or 'the model'}: {alike}")
     for name in (*files, *([PAGE] if given.report else []), "manifest.json"):
         print(result.folder / name)
-    useless = min(result.fit.train_nrmse) >= 1.0
-    return say("The model explains nothing of the training recording.", NO_RESULT) if useless else DONE
+    return say(NOTHING_SENTENCE, NO_RESULT) if explains_nothing(result.fit.train_nrmse) else DONE
 
 
 def _alike(cell: Cell) -> str:
@@ -145,7 +146,8 @@ def _alike(cell: Cell) -> str:
         return "a linear model has no starts, so every seed gives the same one; use one seed"
     if any(drawn(model, start, i) for i in range(starts)):
         return ""
-    more = f", or {len(PLACES) + 1} starts or more" if drawn(model, start, len(PLACES)) else ""
+    first = len(places(model))
+    more = f", or {first + 1} starts or more" if drawn(model, start, first) else ""
     return f"no start is drawn, so every seed gives the same model; use one seed{more}"
 
 

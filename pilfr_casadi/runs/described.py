@@ -20,6 +20,7 @@ from ..gauss_newton import GaussNewton
 from ..ipopt import Ipopt
 from ..known import check_gain, dc_gain, ordered
 from ..lfr import PILFR
+from ..linear_model import BLA
 from ..load_simulator import user_variable
 from ..model import Model
 from ..multistart import POLISH, STARTS
@@ -126,6 +127,8 @@ def _checked(file: Path, content: Any, kind: str) -> Run:
     data.done()
     _check_files(top, files)
     cells, solver = cells_of(top, _model, _solver)
+    if "period" not in reading and any("linear" in cell.search for cell in cells):
+        top.fail("linear = 'bla' is for periodic training recordings; give their 'period' in [data], in samples")
     stable, constraints = _constraints(top.table("constraints"), [cell.model for cell in cells])
     regularization = _regularization(top.table("regularization"), files)
     out = top.take("out", str, f"{file.stem}-{kind}")
@@ -212,6 +215,8 @@ def _solver(table: Table) -> tuple[Any, dict[str, Any]]:
         "starts": table.number("starts", 8, 1, whole=True),
         "start": table.choice("start", STARTS, "grid"),
     }
+    if table.choice("linear", ("output-error", BLA), "output-error") == BLA:
+        search["linear"] = BLA
     name = table.any("name", "gauss-newton")
     if not isinstance(name, str):
         table.done()

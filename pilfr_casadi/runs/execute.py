@@ -203,7 +203,7 @@ class _Execution:
         jobs = jobs_of(given, place.inputs)
         self.total = len(jobs)
         if given.folds:
-            held = jobs_of(given, place.inputs, folds=True)
+            held = jobs_of(given, place.inputs, place.recordings["train"])
             self._all(held)
             selection = select(place, held)
             jobs = tuple(j for j in jobs if j.cell == selection.cell)
@@ -256,7 +256,7 @@ class _Execution:
         job = next(j for j in usable if j.id == best)
         times = read_times(place.path)
         fit = replace(self._model(job), engine=given.engine)
-        summary = summarised(given, jobs, scores, times)
+        summary = summarised(given, jobs, scores, times, entries)
         manifest.content["chosen"] = best
         manifest.content.pop("choice", None)
         note = FITTED if len(given.cells) > 1 and selection is None else ""

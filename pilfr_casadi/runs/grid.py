@@ -19,7 +19,8 @@ from ..structures import ANY, HYSTERETIC, LAGGED, TAKES
 from .tables import Table, as_plain, shown
 
 MODEL_KEYS = ("structure", "nx", "operator", "operators", "channels", "neurons", "hidden", "lags")
-SOLVER_KEYS = ("start", "starts")
+SOLVER_KEYS = ("start", "starts", "linear")
+OF_LFR = ("start", "linear")  # not of a NARX or NOE
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,7 @@ class Cell:
         Key of the grid -> value, of the keys that matter to the cell; empty where there is no grid.
     model : PILFR, NARX, NOE or Model
     search : dict
-        `starts` and `start`.
+        `starts` and `start`, and `linear` where it is said, as for `fit`.
     said : dict
         What the jobs of the cell depend on, as plain numbers and texts: `model` and `solver` with the cell's values.
     """
@@ -91,8 +92,8 @@ def _idle(model: Mapping[str, Any], axes: Mapping[str, list[Any]]) -> set[str]:
     if "structure" in axes and structure in TAKES:
         others = {name for s in axes["structure"] for name in TAKES.get(s, ())}
         out = {k for k in ANY.difference(TAKES[structure]) if k not in axes or k in others}
-        if structure in LAGGED and ("start" not in axes or not LAGGED.keys() >= set(axes["structure"])):
-            out.add("start")
+        if structure in LAGGED:
+            out |= {k for k in OF_LFR if k not in axes or not LAGGED.keys() >= set(axes["structure"])}
     kinds = axes.get("operator", [])
     if kinds and model.get("operator") != "generalized_play" and ("neurons" not in axes or "generalized_play" in kinds):
         out.add("neurons")
@@ -112,6 +113,9 @@ def _check_start(top: Table, model: PILFR | Lagged | Model, search: Mapping[str,
         top.fail(
             f"start = {search['start']!r} is not for a NARX or NOE, whose starts are of their own kind; leave it out"
         )
+    if "linear" in search and not isinstance(model, PILFR):
+        of = "a NARX or NOE" if isinstance(model, Lagged) else "a Model, which has its own values"
+        top.fail(f"linear = {search['linear']!r} is not for {of}; leave it out")
 
 
 def _axes(table: Table) -> dict[str, list[Any]]:

@@ -1,13 +1,14 @@
 """The jobs of a run: independent identifications with ids that stay, and keys that say what each depends on.
 
 The id of a job names what sets it apart from the others (`seed-0`). Its key is the SHA-256 of everything that its model
-depends on: the contents of the recordings it reads, how they are read, model, solver, constraints, seed, versions. A
-job whose key is known and whose model is there has been done.
+depends on: the contents of the recordings it reads, how they are read, model, solver, constraints, seed, versions, and
+in a cross-validation what its fold is fitted to and held out. A job whose key is known and whose model is there has
+been done.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,8 +17,9 @@ import numpy as np
 
 from ..export.saving import model_text
 from ..fit import fit as identify
-from ..fitted import Fit
+from ..fitted import Fit, fingerprint
 from ..interrupts import Progress
+from ..metrics import NOTHING_SENTENCE, explains_nothing
 from ..model import Model
 from ..recording import InputError, Recording
 from ..solution import Solution, Status
@@ -73,7 +75,7 @@ def input_digests(run: Run) -> dict[str, str]:
     return {name: file_digest(run.located(name)) for names in run.files.values() for name in names}
 
 
-def jobs_of(run: Run, inputs: Mapping[str, str], folds: bool = False) -> tuple[RunJob, ...]:
+def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | None = None) -> tuple[RunJob, ...]:
     """One job a cell and seed.
 
     Parameters
@@ -81,8 +83,9 @@ def jobs_of(run: Run, inputs: Mapping[str, str], folds: bool = False) -> tuple[R
     run : Run
     inputs : mapping
         SHA-256 by file name, from `input_digests`.
-    folds : bool
-        Those of the cross-validation: one a cell, seed and fold, whose models hold one fold out.
+    train : sequence of Recording, optional
+        The training recordings; the jobs then are those of the cross-validation: one a cell, seed and fold, whose
+        models hold one fold out.
     """
     read = run.files["train"] + (run.files["validation"] if run.path is not None else ())
     common = {
@@ -92,15 +95,23 @@ def jobs_of(run: Run, inputs: Mapping[str, str], folds: bool = False) -> tuple[R
         "engine": run.engine,
         "versions": versions(),
     }
+    dealt: dict[int | None, Any] = {None: {}}
+    if train is not None:
+        dealt = {k: {"fold": k, "dealt": _contents(fold(train, k, run.folds))} for k in range(run.folds)}
     jobs = []
     for number, cell in enumerate(run.cells):
         said = {"said": {**run.said, "grid": None, **cell.said}}
-        for part in range(run.folds) if folds else (None,):
+        for part, about in dealt.items():
             own = {} if part is None else {"fold": part}
             for seed in run.seeds:
-                key = digest({**common, **said, "seed": seed, **({**own, "folds": run.folds} if own else {})})
+                key = digest({**common, **said, "seed": seed, **about})
                 jobs.append(RunJob({**cell.values, **own, "seed": seed}, key, number))
     return tuple(jobs)
+
+
+def _contents(parts: Sequence[Sequence[Recording]]) -> list[list[tuple[str, int]]]:
+    """What recordings of several roles hold, in short."""
+    return [[(fingerprint(r), r.skip) for r in part] for part in parts]
 
 
 def outcome(
@@ -125,12 +136,15 @@ def outcome(
         raise KeyboardInterrupt
     missed = [str(limit) for limit in fit.limits if not limit.met]
     infeasible = fit.status is Status.INFEASIBLE
+    nothing = explains_nothing(fit.train_nrmse)
     training = f"NRMSE on training {', '.join(f'{e:.4f}' for e in fit.train_nrmse)}."
+    training += f" {NOTHING_SENTENCE}" if nothing else ""
     about = {
         "status": fit.status.name,
         "sentence": f"{fit.status.value} ({'; '.join(missed)})" if infeasible else f"{training} {fit.status.value}",
         "train": float(np.mean(fit.train_nrmse)),
         "operators_used": operators_used(fit),
+        "explains_nothing": nothing,
     }
     if infeasible:
         return Outcome(about, found.seconds)

@@ -33,9 +33,10 @@ class CellSummary:
     role, recording : str
         `held` and `train` on `folds` are those of the cross-validation.
     jobs, failed : int
-        How many there are, and how many of them have no finite error there: without a model, or running away.
+        How many there are, and how many of them failed: without a model, with one that explains nothing of the
+        training (an NRMSE of 0.99 or more, that of a constant), or without a finite error there.
     quartiles : tuple of float
-        Smallest, lower quartile, median, upper quartile and largest NRMSE of those that have not failed.
+        Smallest, lower quartile, median, upper quartile and largest NRMSE of all that have a finite one.
     seconds : float
         Median time of a job.
     """
@@ -71,7 +72,11 @@ def errors_by_cell(
 
 
 def summarised(
-    run: Run, jobs: Sequence[RunJob], scores: Sequence[Score], times: Mapping[str, float]
+    run: Run,
+    jobs: Sequence[RunJob],
+    scores: Sequence[Score],
+    times: Mapping[str, float],
+    entries: Mapping[str, Mapping[str, Any]],
 ) -> tuple[CellSummary, ...]:
     """One summary a recording and cell."""
     out = []
@@ -82,7 +87,7 @@ def summarised(
             quartiles = np.percentile(finite, (0, 25, 50, 75, 100)) if len(finite) else np.full(5, np.nan)
             seconds = float(np.median([times.get(job, 0.0) for job in errors]))
             cell = run.cells[number].values
-            failed = len(given) - len(finite)
+            failed = sum(not np.isfinite(e) or entries[job].get("explains_nothing", False) for job, e in errors.items())
             out.append(CellSummary(cell, role, name, len(given), failed, tuple(map(float, quartiles)), seconds))
     return tuple(out)
 
