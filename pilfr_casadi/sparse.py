@@ -23,12 +23,12 @@ import numpy as np
 from .checks import is_number
 from .elements import LAYER, PrandtlIshlinskii
 from .fit import fit as identify
-from .fitted import Fit, fingerprint
+from .fitted import Fit
 from .interrupts import Progress
-from .job import Job
+from .job import following
 from .multistart import POLISH, polish
-from .recording import InputError, Recording, as_recordings
-from .search import Candidate, Search
+from .recording import InputError, Recording, as_recordings, fingerprint
+from .search import Candidate
 from .solution import Status
 from .thinning import thinned
 
@@ -92,8 +92,8 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     train : Recording or sequence of Recording
         What it was fitted to.
     options
-        As for `fit`: `solver`, `stable`, `constraints`, `noise`, `engine`. What is left out of `stable` and
-        `constraints` is as the fit has it.
+        As for `fit`: `solver`, `engine`, and `stable`, `constraints`, `noise`, `weights`, which are as the fit has them
+        where they are left out.
 
     Returns
     -------
@@ -141,35 +141,21 @@ def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
     return error if np.isfinite(error) else np.inf
 
 
-def polished(
-    fit: Fit,
-    train: Recording | Sequence[Recording],
-    *,
-    solver: Any = None,
-    stable: bool | float | None = None,
-    constraints: Any = None,
-    noise: float | None = None,
-    engine: str = "auto",
-) -> Fit:
+def polished(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = None, **options: Any) -> Fit:
     """A fit with its thresholds placed anew, as the search does with its best starts, where that is no worse.
 
     The weights are then held near a smooth density by a weak prior (`multistart.polish`).
     """
-    structure, recordings, solver = fit.structure, as_recordings(train), solver or POLISH
+    structure, job = fit.structure, following(fit, train, solver=solver or POLISH, **options)
     assert structure is not None
-    asked = fit.asked.but(stable, constraints)
-    limits = asked.limits(structure)
-    search = Search(
-        structure, recordings, {}, solver, limits, engine, noise=noise, level=float(np.mean(fit.train_nrmse))
-    )
+    search = job.search(structure, {}, level=float(np.mean(fit.train_nrmse)))
     problem = search.problem(fit.model)
-    states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
+    states = [fit.initial_state(r) for r in job.recordings if r.begins == "estimate"]
     theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
     error = float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
     best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))
     if best.model is fit.model and best.error >= error:
         return fit
-    job = Job(recordings, solver, limits, {}, noise, engine, None, asked=asked)
     problem = job.problem(best.model, best.error)
     solution = job.solve(problem, "solve", best.theta)
     found = job.result(best.model, structure, problem, solution, note=best.note)
@@ -207,8 +193,8 @@ def regularization_path(
     progress : callable
         Gets ("path", done, total, smallest validation error so far).
     options
-        As for `fit`: `solver`, `stable`, `constraints`, `noise`, `engine`. What is left out of `stable` and
-        `constraints` is as the fit has it.
+        As for `fit`: `solver`, `engine`, and `stable`, `constraints`, `noise`, `weights`, which are as the fit has them
+        where they are left out.
 
     Returns
     -------
