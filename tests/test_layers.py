@@ -78,6 +78,7 @@ LAYERS = {
         "scaling",
         "solution",
         "exactness",
+        "costless",
         "feasible",
         "exact_penalty",
         "told",
