@@ -53,28 +53,7 @@ NAMES = {"bound": "bounds"}  # options that the structures call otherwise
 
 def fit(options: argparse.Namespace) -> int:
     """Identify a model, write it with a report."""
-    given = [f"--{name}" for name in SEARCH if getattr(options, name) is not None]
-    if options.start_from and given:
-        raise InputError(
-            f"{listed(given)} was given together with --from, whose model has its structure and start already; "
-            "leave one of them out."
-        )
-    for name, default in SEARCH.items():
-        if getattr(options, name) is None:
-            setattr(options, name, default)
-    inputs, outputs = name_list(options.inputs, "--inputs"), name_list(options.outputs, "--outputs")
-    seen = [Path(path).resolve() for path in (*options.train, *options.test)]
-    if len(set(seen)) < len(seen):
-        raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
-    for name, least in LEAST.items():
-        if getattr(options, name) is not None and getattr(options, name) < least:
-            raise InputError(f"--{name} {getattr(options, name)} was given; give {least} or more.")
-    check_structure(options.structure, [name for name in SEARCH if f"--{name}" in given])
-    if options.time_limit is not None and not 0 < options.time_limit < math.inf:
-        raise InputError(f"--time-limit {options.time_limit:g} was given; give seconds, above zero.")
-    target = Path(options.out) / "model.json"
-    if target.exists() and not options.overwrite:
-        raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
+    inputs, outputs, target = _checked(options)
     saved = load(options.start_from) if options.start_from else None
     if saved is not None:
         check_names(saved, inputs, outputs)
@@ -85,28 +64,13 @@ def fit(options: argparse.Namespace) -> int:
         for path, r in zip(paths, recordings, strict=True):
             names = f"inputs {listed(r.inputs)}, outputs {listed(r.outputs)}"
             print(f"{kind} data: {path}, {len(r)} samples, step {r.dt:.6g} s, {names}", flush=True)
-    solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
     clock = Clock()
     try:
-        with (
-            time_limit(options.time_limit, clock),
-            worker_pool(options.workers) as pool,
-            progress_bar() as bar,
-            insistent(bar) as progress,
-        ):
-            task = saved if saved is not None else _structure(options, train)
-            if isinstance(task, Lagged):  # too many lags are refused before they are built
-                check_for_identification(train, task.unknowns(train[0].n_u, train[0].n_y) + 2)
-            engine = announced_engine(task, train[0], options.engine)
-            search = {} if saved is not None else {"starts": options.starts, "seed": options.seed, "executor": pool}
-            result = identify(task, train, solver=solver, engine=engine, progress=progress, **search)
+        task, result = _identified(options, saved, train, clock)
     except KeyboardInterrupt:
         if clock.expired:
             return say(f"No model was ready within --time-limit {options.time_limit:g}; give more time.", NO_RESULT)
         raise
-    if result.status is Status.INTERRUPTED and clock.expired:
-        result = replace(result, solution=replace(result.solution, status=Status.TIME_LIMIT))
-    result = replace(result, engine=engine)
     try:
         with deferred_interrupt():
             result.save(target)
@@ -130,6 +94,55 @@ def fit(options: argparse.Namespace) -> int:
         if min(result.train_nrmse) < 1.0
         else say("The model explains nothing of the training recording.", NO_RESULT)
     )
+
+
+def _checked(options: argparse.Namespace) -> tuple[tuple[str, ...], tuple[str, ...], Path]:
+    """Names of inputs and outputs, and the file that is to be written; defaults filled in, what is unfit refused."""
+    given = [f"--{name}" for name in SEARCH if getattr(options, name) is not None]
+    if options.start_from and given:
+        raise InputError(
+            f"{listed(given)} was given together with --from, whose model has its structure and start already; "
+            "leave one of them out."
+        )
+    for name, default in SEARCH.items():
+        if getattr(options, name) is None:
+            setattr(options, name, default)
+    inputs, outputs = name_list(options.inputs, "--inputs"), name_list(options.outputs, "--outputs")
+    seen = [Path(path).resolve() for path in (*options.train, *options.test)]
+    if len(set(seen)) < len(seen):
+        raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
+    for name, least in LEAST.items():
+        if getattr(options, name) is not None and getattr(options, name) < least:
+            raise InputError(f"--{name} {getattr(options, name)} was given; give {least} or more.")
+    check_structure(options.structure, [name for name in SEARCH if f"--{name}" in given])
+    if options.time_limit is not None and not 0 < options.time_limit < math.inf:
+        raise InputError(f"--time-limit {options.time_limit:g} was given; give seconds, above zero.")
+    target = Path(options.out) / "model.json"
+    if target.exists() and not options.overwrite:
+        raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
+    return inputs, outputs, target
+
+
+def _identified(
+    options: argparse.Namespace, saved: Fit | None, train: list[Recording], clock: Clock
+) -> tuple[Fit | PILFR | Lagged, Fit]:
+    """What was to be fitted, and the fit; its status says where the time was up."""
+    solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
+    with (
+        time_limit(options.time_limit, clock),
+        worker_pool(options.workers) as pool,
+        progress_bar() as bar,
+        insistent(bar) as progress,
+    ):
+        task = saved if saved is not None else _structure(options, train)
+        if isinstance(task, Lagged):  # too many lags are refused before they are built
+            check_for_identification(train, task.unknowns(train[0].n_u, train[0].n_y) + 2)
+        engine = announced_engine(task, train[0], options.engine)
+        search = {} if saved is not None else {"starts": options.starts, "seed": options.seed, "executor": pool}
+        result = identify(task, train, solver=solver, engine=engine, progress=progress, **search)
+    if result.status is Status.INTERRUPTED and clock.expired:
+        result = replace(result, solution=replace(result.solution, status=Status.TIME_LIMIT))
+    return task, replace(result, engine=engine)
 
 
 def simulate(options: argparse.Namespace) -> int:

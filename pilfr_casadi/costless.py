@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .constraints import TOLERATED
+from .exactness import missed
 from .gauge import null_space, orbit_tangents
 from .lfr import BLOCKS, PILFR
 from .problem import Problem
@@ -35,32 +35,26 @@ def costless(problem: Problem, theta: Array) -> Array:
         return theta
     structure = PILFR(problem.model.n_x, problem.model.element)
     moved, over = theta, _over(problem, theta)
+    if not over:
+        return theta
     for _ in range(STEPS):
-        c = _direction(problem, moved, structure) if not _met(problem, moved, over) else None
+        c = _direction(problem, moved, structure) if np.any(missed(problem, moved)) else None
         if c is None:
             break
         there = _flow(problem, moved, structure, c)
         left = _over(problem, there)
-        if not left.sum() < over.sum():
+        if not left < over:
             break
         moved, over = there, left
-    if moved is theta or not _met(problem, moved, over):
+    if moved is theta or np.any(missed(problem, moved)):
         return theta
     return moved if problem.cost(moved) <= (1 + SAME) * problem.cost(theta) else theta
 
 
-def _over(problem: Problem, theta: Array) -> Array:
-    """By how much the constraints are violated, (n_g,)."""
+def _over(problem: Problem, theta: Array) -> float:
+    """By how much the constraints are violated in all."""
     g = problem.constraint(theta)
-    return np.asarray(np.maximum(np.maximum(problem.g_lower - g, g - problem.g_upper), 0.0))
-
-
-def _met(problem: Problem, theta: Array, over: Array) -> bool:
-    """Whether violations are none, in units of the constraints at θ."""
-    if not np.any(over):
-        return True
-    unit = problem.constraint_units(theta)
-    return bool(np.all(over <= TOLERATED * np.where(unit > 0, unit, 1.0)))
+    return float(np.sum(np.maximum(np.maximum(problem.g_lower - g, g - problem.g_upper), 0.0)))
 
 
 def _direction(problem: Problem, theta: Array, structure: PILFR) -> Array | None:
