@@ -2,10 +2,6 @@
 
 The weight μ follows the multipliers by Powell's rule (1978): 1.5 times the largest, or half-way down to that from what
 it was. A weight that only grows keeps what far-off multipliers asked for, and crawls.
-
-A step that has to remove all of a violation cannot be made shorter by damping, which then only makes the multipliers,
-and with them the weight, so large that any step inside is taken, whatever it costs. So where a step fails outside, the
-next one has to remove a smaller share.
 """
 
 from __future__ import annotations
@@ -20,8 +16,6 @@ if TYPE_CHECKING:
     from .lifted import Lifted
     from .problem import Problem
 
-FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
-LARGE, LEAST_SHARE = 1e-3, 1e-3  # violation that is removed in shares, and the smallest of these
 SHRUNK = 1e-2  # share of its first unit below which a constraint's unit is taken anew
 
 
@@ -34,14 +28,12 @@ class ExactPenalty:
         Shape (n_g,), see `Problem.constraint_units`.
     weight, least : float
         μ, and what it never falls below.
-    share : float
-        Of the violation that a step has to remove.
     """
 
     def __init__(self, problem: Problem | Lifted) -> None:
         self.problem, n_g = problem, len(problem.g_lower)
         self.unit, self._known = np.ones(n_g), np.zeros(n_g, dtype=bool)
-        self.weight, self.least, self.share = 0.0, 0.0, 1.0
+        self.weight, self.least = 0.0, 0.0
 
     def measure(self, theta: np.ndarray, squares: np.ndarray) -> None:
         """Take the units of what has a slope at θ and had none before."""
@@ -85,20 +77,6 @@ class ExactPenalty:
     def violation(self, theta: np.ndarray) -> float:
         """Their sum."""
         return float(self.violations(theta).sum())
-
-    def promised(self, violation: float) -> float:
-        """What a step gains by removing its share of a violation."""
-        return self.weight * self.share * violation
-
-    def shorten(self, violation: float) -> bool:
-        """Ask a smaller share of the next step, where the violation is large and the share is not small already."""
-        shorter = violation > LARGE and self.share > LEAST_SHARE
-        self.share = 0.25 * self.share if shorter else self.share if violation > LARGE else 1.0
-        return shorter
-
-    def lengthen(self) -> None:
-        """Ask a larger share of the next step, at most all."""
-        self.share = min(1.0, 2.0 * self.share)
 
     def follow(self, multipliers: np.ndarray) -> None:
         """Let the weight follow the constraints' multipliers (n_g,)."""

@@ -27,15 +27,16 @@ import numpy as np
 from .callback import handled_interrupt
 from .constraints import TOLERATED
 from .damping import without_rounding
-from .exact_penalty import FEASIBLE, ExactPenalty
+from .exact_penalty import ExactPenalty
 from .feasible import Feasible
 from .lifted import Lifted
 from .magnitude import Neighbours
 from .problem import Problem
-from .quadratic_program import QuadraticProgram, Step
+from .quadratic_program import QuadraticProgram
 from .recording import InputError
 from .solution import Iteration, Progress, Solution, Status
 
+FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
 RETURNS = 4  # times that a run which has strayed goes on from the best feasible point
 ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # as far as a run gets
 Watch = Callable[[np.ndarray], bool]
@@ -92,6 +93,15 @@ class GaussNewton:
         where the run is, feasible or not, from which another one can go on.
         """
         return _Run(self, problem, problem.start if start is None else start, progress, watch).run(unfinished)
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A quadratic program's step (n,), its multipliers (n + n_g,), and whether it was found."""
+
+    d: np.ndarray
+    multipliers: np.ndarray
+    good: bool
 
 
 class _Run:
@@ -190,7 +200,7 @@ class _Run:
                 self.penalty.follow(step.multipliers[problem.size :])
             predicted = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d)
             trial, cost, improvement = self._judge(step, hessian + self.damping * np.diag(floor), gradient, slope)
-            expected = predicted + self.penalty.promised(violation)
+            expected = predicted + self.penalty.weight * violation
             fresh = bool(step.good and improvement > 1e-4 * expected and improvement > 0)
             length = float(np.max(np.abs(step.d) * np.sqrt(floor))) if step.good else 0.0
             if fresh:
@@ -198,14 +208,12 @@ class _Run:
                 self.theta, self.cost = trial, cost
                 self.damping = max(self.damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 1e-12)
                 self.growth = 2.0
-                self.penalty.lengthen()
                 self._accepted(length)
             else:
                 if step.good and expected < 1e-3 * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
                     return self._stalled(hessian, floor, gradient, slope)
-                shorter = self.penalty.shorten(violation)
-                self.damping *= 2.0 if shorter else self.growth
-                self.growth *= 1.0 if shorter else 2.0
+                self.damping *= self.growth
+                self.growth *= 2.0
                 if self.damping > 1e12:
                     stalled = self._stalled(hessian, floor, gradient, slope)
                     return Status.INFEASIBLE if violation > TOLERATED else stalled
@@ -237,25 +245,25 @@ class _Run:
 
     def _step(
         self, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, correction: np.ndarray | None = None
-    ) -> Step:
+    ) -> _Step:
         problem = self.problem
         low, high = self.penalty.room(self.penalty.values(self.theta) if correction is None else correction)
-        for share in (1.0, 0.5, 0.1, 0.01, 0.0) if self.n_g else (1.0,):  # of what the step has to remove
+        for share in (1.0, 0.5, 0.1, 0.01, 0.0) if self.n_g else (1.0,):  # of the violation that the step has to remove
             d, multipliers, good = self.qp(
                 damped,
                 gradient,
                 problem.lower - self.theta,
                 problem.upper - self.theta,
                 slope,
-                np.minimum(low, share * self.penalty.share * np.maximum(low, 0.0)),
-                np.maximum(high, share * self.penalty.share * np.minimum(high, 0.0)),
+                np.minimum(low, share * np.maximum(low, 0.0)),
+                np.maximum(high, share * np.minimum(high, 0.0)),
             )
             if good:
                 break
-        return Step(d, multipliers, good)
+        return _Step(d, multipliers, good)
 
     def _judge(
-        self, step: Step, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray
+        self, step: _Step, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray
     ) -> tuple[np.ndarray, float, float]:
         """Trial point, its cost and the improvement of the penalised cost it brings."""
         if not step.good:
@@ -272,7 +280,7 @@ class _Run:
         cost = problem.cost(trial)
         return trial, cost, self.cost - cost + self.penalty.weight * (here - there)
 
-    def _inside(self, step: Step) -> np.ndarray:
+    def _inside(self, step: _Step) -> np.ndarray:
         """The end of a step: exactly on the bounds that its quadratic program holds active, and inside the others."""
         problem, force, theta = self.problem, step.multipliers[: self.problem.size], self.theta + step.d
         theta = np.where((force < 0) & np.isfinite(problem.lower), problem.lower, theta)

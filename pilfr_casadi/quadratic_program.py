@@ -2,20 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """A quadratic program's step (n,), its multipliers (n + n_g,), and whether it was found."""
-
-    d: np.ndarray
-    multipliers: np.ndarray
-    good: bool
 
 
 class QuadraticProgram:

@@ -8,14 +8,13 @@ from random_models import random_input, random_lfr, reference
 from pilfr_casadi.constraints import Constraint, stable
 from pilfr_casadi.damping import without_rounding
 from pilfr_casadi.fit import fit
-from pilfr_casadi.gauss_newton import GaussNewton, _Run
+from pilfr_casadi.gauss_newton import GaussNewton, _Run, _Step
 from pilfr_casadi.ipopt import Ipopt
 from pilfr_casadi.lfr import PILFR
 from pilfr_casadi.linear_model import linear_model
 from pilfr_casadi.magnitude import Neighbours
 from pilfr_casadi.operators import Play
 from pilfr_casadi.problem import Problem
-from pilfr_casadi.quadratic_program import Step
 from pilfr_casadi.recording import Recording
 from pilfr_casadi.solution import Status
 from pilfr_casadi.subspace import subspace_matrices
@@ -114,9 +113,9 @@ def test_a_correction_leaves_penalty_and_multipliers_alone(case, monkeypatch):
     run = _Run(GaussNewton(), problem, problem.start, None)
     run.penalty.weight, run.multipliers = 3.0, np.ones(problem.size + 1)
     run.cost, gradient, hessian = problem.normal(run.theta)
-    wild = Step(np.zeros(problem.size), np.full(problem.size + 1, 1e9), True)
+    wild = _Step(np.zeros(problem.size), np.full(problem.size + 1, 1e9), True)
     monkeypatch.setattr(run, "_step", lambda *_: wild)
-    forward = Step(0.1 * np.ones(problem.size), np.zeros(problem.size + 1), True)
+    forward = _Step(0.1 * np.ones(problem.size), np.zeros(problem.size + 1), True)
     run._judge(forward, hessian, gradient, problem.constraint_jacobian(run.theta))
     assert run.penalty.weight == 3.0 and np.all(run.multipliers == 1.0)
 
