@@ -54,6 +54,47 @@ NAMES = {"bound": "bounds"}  # options that the structures call otherwise
 
 def fit(options: argparse.Namespace) -> int:
     """Identify a model, write it with a report."""
+    inputs, outputs, target = _checked(options)
+    saved = load(options.start_from) if options.start_from else None
+    if saved is not None:
+        check_names(saved, inputs, outputs)
+    train = [read_file(options, path, inputs, outputs) for path in options.train]
+    tests = [read_file(options, path, inputs, outputs) for path in options.test]
+    folder = make_folder(options.out)
+    for kind, paths, recordings in (("training", options.train, train), ("test", options.test, tests)):
+        for path, r in zip(paths, recordings, strict=True):
+            names = f"inputs {listed(r.inputs)}, outputs {listed(r.outputs)}"
+            print(f"{kind} data: {path}, {len(r)} samples, step {r.dt:.6g} s, {names}", flush=True)
+    clock = Clock()
+    try:
+        task, result = _identified(options, saved, train, clock)
+    except KeyboardInterrupt:
+        if clock.expired:
+            return say(f"No model was ready within --time-limit {options.time_limit:g}; give more time.", NO_RESULT)
+        raise
+    try:
+        with deferred_interrupt():
+            result.save(target)
+            from .report import fit_report
+        print(result)
+        if isinstance(task, PILFR) and task.element is not None and result.structure != task:
+            print("No start was finished: this is the linear model that the starts begin with.")
+        for recording in tests:
+            print(_tested(result, recording))
+        page = fit_report(result, train, tests, folder)
+        print(f"model: {target}\nreport: {page}")
+    except KeyboardInterrupt:
+        return say(f"Interrupted; the model is in {target}, a report was not written.", INTERRUPTED)
+    if result.status is Status.INTERRUPTED:
+        return INTERRUPTED
+    if result.status is Status.INFEASIBLE:
+        missed = "; ".join(str(limit) for limit in result.limits if not limit.met)
+        return say(f"The model does not meet its constraints: {missed}.", NO_RESULT)
+    return say(NOTHING_SENTENCE, NO_RESULT) if explains_nothing(result.train_nrmse) else DONE
+
+
+def _checked(options: argparse.Namespace) -> tuple[tuple[str, ...], tuple[str, ...], Path]:
+    """Names of inputs and outputs, and the file that is to be written; defaults filled in, what is unfit refused."""
     given = [f"--{name}" for name in SEARCH if getattr(options, name) is not None]
     if options.start_from and given:
         raise InputError(
@@ -76,57 +117,29 @@ def fit(options: argparse.Namespace) -> int:
     target = Path(options.out) / "model.json"
     if target.exists() and not options.overwrite:
         raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
-    saved = load(options.start_from) if options.start_from else None
-    if saved is not None:
-        check_names(saved, inputs, outputs)
-    train = [read_file(options, path, inputs, outputs) for path in options.train]
-    tests = [read_file(options, path, inputs, outputs) for path in options.test]
-    folder = make_folder(options.out)
-    for kind, paths, recordings in (("training", options.train, train), ("test", options.test, tests)):
-        for path, r in zip(paths, recordings, strict=True):
-            names = f"inputs {listed(r.inputs)}, outputs {listed(r.outputs)}"
-            print(f"{kind} data: {path}, {len(r)} samples, step {r.dt:.6g} s, {names}", flush=True)
+    return inputs, outputs, target
+
+
+def _identified(
+    options: argparse.Namespace, saved: Fit | None, train: list[Recording], clock: Clock
+) -> tuple[Fit | PILFR | Lagged, Fit]:
+    """What was to be fitted, and the fit; its status says where the time was up."""
     solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
-    clock = Clock()
-    try:
-        with (
-            time_limit(options.time_limit, clock),
-            worker_pool(options.workers) as pool,
-            progress_bar() as bar,
-            insistent(bar) as progress,
-        ):
-            task = saved if saved is not None else _structure(options, train)
-            if isinstance(task, Lagged):  # too many lags are refused before they are built
-                check_for_identification(train, task.unknowns(train[0].n_u, train[0].n_y) + 2)
-            engine = announced_engine(task, train[0], options.engine)
-            search = {} if saved is not None else {"starts": options.starts, "seed": options.seed, "executor": pool}
-            result = identify(task, train, solver=solver, engine=engine, progress=progress, **search)
-    except KeyboardInterrupt:
-        if clock.expired:
-            return say(f"No model was ready within --time-limit {options.time_limit:g}; give more time.", NO_RESULT)
-        raise
+    with (
+        time_limit(options.time_limit, clock),
+        worker_pool(options.workers) as pool,
+        progress_bar() as bar,
+        insistent(bar) as progress,
+    ):
+        task = saved if saved is not None else _structure(options, train)
+        if isinstance(task, Lagged):  # too many lags are refused before they are built
+            check_for_identification(train, task.unknowns(train[0].n_u, train[0].n_y) + 2)
+        engine = announced_engine(task, train[0], options.engine)
+        search = {} if saved is not None else {"starts": options.starts, "seed": options.seed, "executor": pool}
+        result = identify(task, train, solver=solver, engine=engine, progress=progress, **search)
     if result.status is Status.INTERRUPTED and clock.expired:
         result = replace(result, solution=replace(result.solution, status=Status.TIME_LIMIT))
-    result = replace(result, engine=engine)
-    try:
-        with deferred_interrupt():
-            result.save(target)
-            from .report import fit_report
-        print(result)
-        if isinstance(task, PILFR) and task.element is not None and result.structure != task:
-            print("No start was finished: this is the linear model that the starts begin with.")
-        for recording in tests:
-            print(_tested(result, recording))
-        page = fit_report(result, train, tests, folder)
-        print(f"model: {target}\nreport: {page}")
-    except KeyboardInterrupt:
-        return say(f"Interrupted; the model is in {target}, a report was not written.", INTERRUPTED)
-    if result.status is Status.INTERRUPTED:
-        return INTERRUPTED
-    if result.status is Status.INFEASIBLE:
-        missed = "; ".join(str(limit) for limit in result.limits if not limit.met)
-        return say(f"The model does not meet its constraints: {missed}.", NO_RESULT)
-    return say(NOTHING_SENTENCE, NO_RESULT) if explains_nothing(result.train_nrmse) else DONE
+    return task, replace(result, engine=engine)
 
 
 def simulate(options: argparse.Namespace) -> int:

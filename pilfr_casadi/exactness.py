@@ -46,6 +46,13 @@ def beyond(problem: Problem, theta: np.ndarray) -> list[str]:
     return names
 
 
+def missed(problem: Problem, theta: np.ndarray) -> np.ndarray:
+    """Which constraints are violated by more than is tolerated in their units at θ: (n_g,), bool."""
+    g, unit = problem.constraint(theta), problem.constraint_units(theta)
+    over = np.maximum(problem.g_lower - g, g - problem.g_upper)
+    return ~np.asarray(over <= TOLERATED * np.where(unit > 0, unit, 1.0))
+
+
 def _far(problem: Problem, theta: np.ndarray, unit: np.ndarray) -> bool:
     """Whether a step has led away: a constraint is violated by more than its unit."""
     g = problem.constraint(theta)

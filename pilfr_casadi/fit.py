@@ -22,7 +22,7 @@ from .baselines import Lagged
 from .constraints import Constraint, loosened
 from .elements import PrandtlIshlinskii, StaticNetwork
 from .exactness import beyond
-from .fitted import Fit, fingerprint
+from .fitted import Fit
 from .interrupts import Progress
 from .job import Job
 from .known import check_gain
@@ -41,7 +41,7 @@ from .stability import check_room, stability_limits
 from .threads import one_blas_thread
 from .ways import at_values, from_starts, from_values, linear_only
 
-__all__ = ["Fit", "Progress", "fingerprint", "fit"]
+__all__ = ["Fit", "Progress", "fit"]
 DEAD_WORKER = (
     "A worker process ended before it returned a result (it may have run out of memory); use fewer workers, or "
     "workers=1."
@@ -64,7 +64,7 @@ def fit(
     stable: bool | float | None = None,
     constraints: Sequence[Constraint] | None = None,
     l1: dict[str, float] | None = None,
-    noise: float | None = None,
+    noise: float | str | None = None,
     weights: Sequence[float] | np.ndarray | None = None,
     engine: str = "auto",
     executor: Executor | None = None,
@@ -105,10 +105,10 @@ def fit(
         fit says.
     constraints : sequence of Constraint, optional
         See `Problem`. Left out, an earlier fit keeps its own; `()` is none.
-    noise : float, optional
+    noise : float or "estimate", optional
         Standard deviation of the noise relative to the output's, which priors are weighed against. By default the noise
         is estimated wherever there are priors: the problem is solved, the noise set to the error that was reached, and
-        the problem solved again, until the two agree.
+        the problem solved again, until the two agree. Left out, an earlier fit keeps its own.
     l1 : dict
         Weight of an L1 penalty by name, `{"w": 1e-4}`: unneeded operators get exactly zero. For a PI-LFR the problem
         is first solved without; then the weights of each channel are scaled to a sum of one and the penalty acts on the
@@ -116,7 +116,7 @@ def fit(
         of your own see `Problem`.
     weights : sequence of float, optional
         How much each recording counts, see `Problem` and `noise_weights`; for a fit from values (a `Model`, a `Fit`, or
-        `start` a mapping).
+        `start` a mapping). Left out, an earlier fit keeps those of its recordings.
     engine : {"auto", "c", "vm"}
         Generated C, or CasADi's virtual machine.
     executor, workers
@@ -148,7 +148,7 @@ def fit(
         raise SystemExit(1)  # a spawned worker that runs the script again; the first process says what to do
     if l1 is not None and not isinstance(l1, dict):
         raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
-    asked = (model.asked if isinstance(model, Fit) else Asked()).but(stable, constraints)
+    asked = (model.asked if isinstance(model, Fit) else Asked()).but(stable, constraints, noise, weights, train)
     if progress is True:
         from .progress import progress_bar
 
@@ -158,7 +158,7 @@ def fit(
     pool = ProcessPoolExecutor(workers, initializer=_leave_interrupts) if own and search else None
     with shown as report:
         threads = 1 if search else workers
-        job = Job((), solver, (), dict(l1 or {}), noise, engine, report, weights, threads, asked)
+        job = Job((), solver, (), dict(l1 or {}), engine, report, threads, asked)
         try:
             return _fit(model, train, job, starts, seed, start, executor or pool, linear)
         except BrokenProcessPool:

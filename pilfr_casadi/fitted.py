@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +19,7 @@ from .limits import Limit, unknown_multipliers
 from .metrics import NOTHING_SENTENCE, explains_nothing, nrmse, rmse_per_output
 from .model import Model
 from .problem import Problem
-from .recording import InputError, Recording, as_recordings
+from .recording import InputError, Recording, as_recordings, fingerprint
 from .search import Candidate
 from .sensitivities import Engine
 from .slopes import settled
@@ -57,7 +56,7 @@ class Fit:
     candidates : tuple of Candidate
         Every start that was tried.
     asked : Asked
-        The bound on spectral radii and the constraints, which fits made from this one hold too.
+        Bound on spectral radii, constraints, noise and weights, which hold for fits made from this one too.
     """
 
     model: Model
@@ -242,13 +241,6 @@ class Fit:
         return "\n".join(line for line in lines if line)
 
     __repr__ = __str__
-
-
-def fingerprint(recording: Recording) -> str:
-    """Short digest of a recording's numbers and of what is said about its initial state."""
-    initial = recording.initial
-    kind = f"{initial} {recording.period}".encode() if isinstance(initial, str) else np.asarray(initial).tobytes()
-    return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes() + kind).hexdigest()[:16]
 
 
 def samples_for_state(model: Model) -> int:

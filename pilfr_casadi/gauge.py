@@ -37,6 +37,14 @@ def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, held: Array
     held : bool array, shape (size,)
         Variables that must not move, such as those at an active bound.
     """
+    inside, outside = orbit_tangents(problem, theta, structure)
+    size = np.maximum(np.sqrt(np.sum(inside**2, axis=0) + np.sum(outside**2, axis=0)), 1e-300)
+    inside, outside = inside / size, outside / size
+    return inside @ null_space(np.concatenate([outside, inside[held]])) if inside.size else inside
+
+
+def orbit_tangents(problem: Problem, theta: Array, structure: PILFR) -> tuple[Array, Array]:
+    """The orbit's generators (one a column) as changes of the variables (size, k), and of what is none (m, k)."""
     parameters = problem.model.parameters
     values = parameters.unpack(problem.parameters(theta))
     states = problem.initial_states(theta)
@@ -45,17 +53,13 @@ def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, held: Array
     for change, move in generators(structure, values):
         blocks = [np.ravel(change.get(name, np.zeros(p.value.shape)), order="F") for name, p in parameters.items()]
         columns.append(np.concatenate([*blocks, *(move(s) for s in states)]))
-    if not columns:
-        return np.zeros((problem.size, 0))
     n = len(states[0])
     moving = np.concatenate([parameters.free, np.repeat(estimated, n)]).astype(bool)
-    everything = np.column_stack(columns)
-    everything = everything / np.maximum(np.linalg.norm(everything, axis=0), 1e-300)
-    inside, outside = everything[moving], everything[~moving]
-    return inside @ _null_space(np.concatenate([outside, inside[held]]))
+    everything = np.column_stack(columns) if columns else np.zeros((len(moving), 0))
+    return everything[moving], everything[~moving]
 
 
-def _null_space(rows: Array, tolerance: float = 1e-10) -> Array:
+def null_space(rows: Array, tolerance: float = 1e-10) -> Array:
     """Orthonormal basis of the vectors that every row maps to zero, rows scaled to unit length."""
     length = np.linalg.norm(rows, axis=1)
     rows = rows[length > 0] / length[length > 0, None]
@@ -154,7 +158,7 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     # a gauge direction that an active constraint forbids is no freedom; a constraint on a spectral radius or a gain
     # forbids none, but for rounding
     forbidden, size = slopes @ tangents, np.abs(slopes) @ np.abs(tangents)
-    tangents = tangents @ _null_space(np.where(np.abs(forbidden) > 1e-4 * size, forbidden, 0.0))
+    tangents = tangents @ null_space(np.where(np.abs(forbidden) > 1e-4 * size, forbidden, 0.0))
     used = np.flatnonzero(~held & (sensitivity > 0))
     square, unit = np.ix_(used, used), sensitivity[used]
     removed = np.column_stack([tangents[used] * unit[:, None], slopes[:, used].T / unit[:, None]])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,10 @@ from .model import Model
 from .outcome import outcome, with_solution
 from .penalty import element_alone, merged, restored, sentence, unit_weights, without_idle
 from .problem import Problem
-from .recording import Recording
+from .recording import Recording, as_recordings
+from .search import Search
 from .solution import Solution, Status
+from .start import Blocks
 from .told import solve_inside
 
 Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
@@ -38,24 +41,31 @@ class Job:
     solver: Any
     limits: tuple[Constraint, ...]
     l1: dict[str, float]
-    noise: float | None
     engine: str
     progress: Progress | None
-    weights: Sequence[float] | np.ndarray | None = None
     threads: int = 1
     asked: Asked = Asked()  # noqa: RUF009  (frozen)
     began: float = field(default_factory=time.perf_counter)
 
+    @cached_property
+    def _weights(self) -> np.ndarray | None:
+        return self.asked.weights_of(self.recordings)
+
     def problem(self, model: Model, noise: float = 1.0, **options: Any) -> Problem:
         """The simulation-error problem of a model."""
-        given: dict[str, Any] = {"constraints": self.limits, "noise": self.noise or noise, "engine": self.engine}
-        given |= {"weights": self.weights, "threads": self.threads, **options}
+        given: dict[str, Any] = {"constraints": self.limits, "noise": self.asked.noise or noise, "engine": self.engine}
+        given |= {"weights": self._weights, "threads": self.threads, **options}
         return Problem(model, self.recordings, **given)
+
+    def search(self, structure: PILFR, linear: Blocks, **options: Any) -> Search:
+        """What the tasks of a search for a structure share."""
+        given = {"engine": self.engine, "noise": self.asked.noise, "weights": self._weights, **options}
+        return Search(structure, self.recordings, linear, self.solver, self.limits, **given)
 
     def settled(self, problem: Problem, solution: Solution, stage: str, **options: Any) -> tuple[Problem, Solution]:
         """Problem and solution with the noise at the error that is reached, where priors are weighed against it."""
         priors = any(p.prior is not None and not np.all(p.fixed) for p in problem.model.parameters.values())
-        for _ in range(ROUNDS if priors and self.noise is None else 0):
+        for _ in range(ROUNDS if priors and self.asked.noise is None else 0):
             error = rms_error(problem, solution)
             if abs(error / problem.noise - 1) < AGREE or error == 0 or solution.status is Status.INTERRUPTED:
                 break
@@ -89,6 +99,23 @@ class Job:
                 raise
             return replace(found[0], solution=replace(solution, status=Status.INTERRUPTED))
         return found[0]
+
+
+def following(
+    fit: Fit,
+    train: Recording | Sequence[Recording],
+    *,
+    solver: Any,
+    stable: bool | float | None = None,
+    constraints: Any = None,
+    noise: float | str | None = None,
+    weights: Any = None,
+    engine: str = "auto",
+) -> Job:
+    """The job of what is made from a fit: what that was asked with holds, where nothing else is given."""
+    recordings = as_recordings(train)
+    asked = fit.asked.but(stable, constraints, noise, weights, recordings)
+    return Job(recordings, solver, asked.limits(fit.structure), {}, engine, None, asked=asked)
 
 
 def interrupted(model: Model, problem: Problem, solution: Solution, note: str) -> Stage:

@@ -53,7 +53,8 @@ class PILFR:
         that are nan stay free: `{"A": [[0.9, nan], [0.0, nan]]}` says what is known of the physics. Of `B_w` and `D_yw`
         a row of zeros and nan, one for each channel of the element, says which channels enter.
     bounds : mapping
-        `(lower, upper)` by parameter name, for example `{"w": (0, 2)}`.
+        `(lower, upper)` by parameter name, for example `{"w": (0, 2)}`; those of the element, such as `w ≥ 0` and
+        `r ≥ 0`, hold beside them.
     priors : mapping
         `(mean, std)` by parameter name: a quadratic prior, see `Parameter`.
     offset : bool
@@ -63,7 +64,8 @@ class PILFR:
     ------
     InputError
         If nx is no whole number of 0 or more, the element is none, a fixed, bounded or prior parameter is unknown, a
-        bound or prior is no pair, or what is given is neither a number nor an array of the parameter's shape.
+        bound or prior is no pair, what is given is neither a number nor an array of the parameter's shape, or it is
+        beyond the element's own bounds.
     """
 
     nx: int
@@ -95,7 +97,9 @@ class PILFR:
         elements = self.element.parameters() if self.element else {}
         shapes = {**block_shapes(self.nx, "n_u", "n_y", self.n_w), **{k: p.value.shape for k, p in elements.items()}}
         for name, shape in shapes.items():
-            self._given(name, shape)
+            told = self._given(name, shape)
+            if name in elements:
+                _check_within(name, elements[name], told)
 
     @property
     def n_w(self) -> int:
@@ -152,7 +156,8 @@ class PILFR:
         changes: dict[str, dict[str, Any]] = {}
         for name, p in model.parameters.items():
             told, shape = self._given(name, p.value.shape), p.value.shape
-            low, high = told.get("bounds", p.bounds)
+            lower, upper = told.get("bounds", p.bounds)
+            low, high = np.maximum(lower, p.bounds[0]), np.minimum(upper, p.bounds[1])
             given = values.get(name, p.value) if p.value.size else p.value  # a larger structure has more blocks
             begin = np.clip(filled(given, f"The value of {name!r}", shape), low, high)
             changes[name] = {"value": begin, "bounds": (low, high)}
@@ -187,6 +192,20 @@ def _check_pair(what: str, given: Any, wanted: str) -> None:
         first = second = np.asarray(np.nan)
     if np.any(np.isnan(first)) or np.any(np.isnan(second)):
         raise InputError(f"{given!r} was given as {what}; give a pair of numbers {wanted}.")
+
+
+def _check_within(name: str, own: Parameter, told: dict[str, Any]) -> None:
+    """Refuse bounds and fixed values beyond those of the element, such as thresholds and weights below zero."""
+    low, high = own.bounds
+    bounds = [(f"A bound of {name!r}", value) for value in told.get("bounds", ())]
+    for what, value in (*bounds, (f"What {name!r} is fixed at", told.get("fixed", np.nan))):
+        beyond = np.isfinite(value) & ((value < low) | (value > high))
+        if np.any(beyond):
+            most = f" and at most {np.max(high):g}" if np.all(np.isfinite(high)) else ""
+            raise InputError(
+                f"{what} is {float(np.broadcast_to(value, beyond.shape)[beyond][0]):g}, but the element's {name} is at "
+                f"least {np.min(low):g}{most}; give a number within, or as a bound numpy.inf for none of your own."
+            )
 
 
 def _says_which(value: Any, n: int) -> bool:

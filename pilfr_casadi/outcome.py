@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 from .asked import Asked
-from .fitted import Fit, fingerprint
+from .fitted import Fit
 from .gauge import standard_errors
 from .lfr import PILFR
 from .limits import limits_of
@@ -15,7 +15,7 @@ from .multistart import PRIOR
 from .open_memory import open_memory_sentence
 from .problem import Problem
 from .reached_gain import reached_gain_sentence
-from .recording import Recording
+from .recording import Recording, fingerprint
 from .search import Candidate
 from .solution import Solution
 from .stability import unbounded_sentence
@@ -56,7 +56,8 @@ def outcome(
         fitted = fitted.with_parameters(
             fitted.parameters.change(**{name: {"prior": priors.get(name)} for name in ("w", "r")})
         )
-        options: dict[str, Any] = {"constraints": problem.constraints, "noise": problem.noise, "scale": problem.scale}
+        names = ("constraints", "noise", "scale", "weights")
+        options: dict[str, Any] = {name: getattr(problem, name) for name in names}
         judged = Problem(fitted, recordings, engine=problem.engine, **options)
     theta = solution.theta
     values = problem.model.parameters.unpack(problem.parameters(theta))

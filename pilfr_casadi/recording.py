@@ -5,6 +5,7 @@ simulation of it has to know besides: the state it starts from, what the input d
 periodic, and how many leading samples are not scored. It never changes once made; everything behind the door trusts it.
 """
 
+import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
@@ -14,7 +15,7 @@ import numpy as np
 
 from .checks import InputError, check_options, initial_state, listed, signal
 
-__all__ = ["InputError", "Recording", "as_recordings", "check_for_identification", "listed"]
+__all__ = ["InputError", "Recording", "as_recordings", "check_for_identification", "fingerprint", "listed"]
 SAME_STEP = (
     1e-4  # recordings fitted together may differ by this share in `dt` (a time column is written with few digits)
 )
@@ -196,6 +197,13 @@ def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, .
     if not recordings:
         raise InputError("no recording was given; give at least one.")
     return recordings
+
+
+def fingerprint(recording: Recording) -> str:
+    """Short digest of a recording's numbers and of what is said about its initial state."""
+    initial = recording.initial
+    kind = f"{initial} {recording.period}".encode() if isinstance(initial, str) else np.asarray(initial).tobytes()
+    return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes() + kind).hexdigest()[:16]
 
 
 def check_for_identification(data: Recording | Iterable[Recording], n_min: int = 2) -> tuple[Recording, ...]:

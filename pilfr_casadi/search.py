@@ -36,6 +36,7 @@ class Search:
     start: str = "grid"
     l1: dict[str, float] = field(default_factory=dict)
     noise: float | None = None
+    weights: np.ndarray | None = None
     level: float = 1.0
     coordinates: bool = True  # whether the states' coordinates are free to choose
     progress: Progress | None = None  # gets the steps of every solve; of starts in other processes they are not heard
@@ -53,6 +54,7 @@ class Search:
             constraints=loosened(self.constraints, least=1.0),
             l1=self.l1,
             noise=self.noise or noise or self.level,
+            weights=self.weights,
         )
 
     def solve(self, problem: Problem, start: np.ndarray | None, solver: Any, held: bool = False) -> Solution:

@@ -23,15 +23,17 @@ import numpy as np
 from .checks import is_number
 from .elements import LAYER, PrandtlIshlinskii
 from .fit import fit as identify
-from .fitted import Fit, fingerprint
+from .fitted import Fit
 from .interrupts import Progress
-from .job import Job
+from .job import following
+from .lfr import PILFR
 from .multistart import POLISH, polish
-from .recording import InputError, Recording, as_recordings
-from .search import Candidate, Search
+from .recording import InputError, Recording, as_recordings, fingerprint
+from .search import Candidate
 from .solution import Status
 from .thinning import thinned
 
+FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # of priors
 STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of L1, in units of the objective that is reached without
 
 
@@ -92,8 +94,8 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     train : Recording or sequence of Recording
         What it was fitted to.
     options
-        As for `fit`: `solver`, `stable`, `constraints`, `noise`, `engine`. What is left out of `stable` and
-        `constraints` is as the fit has it.
+        As for `fit`: `solver`, `engine`, and `stable`, `constraints`, `noise`, `weights`, which are as the fit has them
+        where they are left out.
 
     Returns
     -------
@@ -141,35 +143,21 @@ def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
     return error if np.isfinite(error) else np.inf
 
 
-def polished(
-    fit: Fit,
-    train: Recording | Sequence[Recording],
-    *,
-    solver: Any = None,
-    stable: bool | float | None = None,
-    constraints: Any = None,
-    noise: float | None = None,
-    engine: str = "auto",
-) -> Fit:
+def polished(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = None, **options: Any) -> Fit:
     """A fit with its thresholds placed anew, as the search does with its best starts, where that is no worse.
 
     The weights are then held near a smooth density by a weak prior (`multistart.polish`).
     """
-    structure, recordings, solver = fit.structure, as_recordings(train), solver or POLISH
+    structure, job = fit.structure, following(fit, train, solver=solver or POLISH, **options)
     assert structure is not None
-    asked = fit.asked.but(stable, constraints)
-    limits = asked.limits(structure)
-    search = Search(
-        structure, recordings, {}, solver, limits, engine, noise=noise, level=float(np.mean(fit.train_nrmse))
-    )
+    search = job.search(structure, {}, level=float(np.mean(fit.train_nrmse)))
     problem = search.problem(fit.model)
-    states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
+    states = [fit.initial_state(r) for r in job.recordings if r.begins == "estimate"]
     theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
     error = float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
     best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))
     if best.model is fit.model and best.error >= error:
         return fit
-    job = Job(recordings, solver, limits, {}, noise, engine, None, asked=asked)
     problem = job.problem(best.model, best.error)
     solution = job.solve(problem, "solve", best.theta)
     found = job.result(best.model, structure, problem, solution, note=best.note)
@@ -207,8 +195,8 @@ def regularization_path(
     progress : callable
         Gets ("path", done, total, smallest validation error so far).
     options
-        As for `fit`: `solver`, `stable`, `constraints`, `noise`, `engine`. What is left out of `stable` and
-        `constraints` is as the fit has it.
+        As for `fit`: `solver`, `engine`, and `stable`, `constraints`, `noise`, `weights`, which are as the fit has them
+        where they are left out.
 
     Returns
     -------
@@ -219,45 +207,20 @@ def regularization_path(
     InputError
         If the fit is not one of a PI-LFR, a strength or the margin is unfit, or validation is training.
     """
-    if not isinstance(fit, Fit):
-        raise InputError(f"A regularization path was asked for of a {type(fit).__name__}; give a Fit.")
-    structure, seen, judged = fit.structure, as_recordings(train), as_recordings(validation)
-    if structure is None or (priors is None and not isinstance(structure.element, PrandtlIshlinskii)):
-        raise InputError("A regularization path needs a fit of a PI-LFR with an element; give one.")
-    if {fingerprint(r) for r in seen} & {fingerprint(r) for r in judged}:
-        raise InputError("A validation recording is a training recording too; give one that was not fitted.")
-    scale = fit.solution.cost if priors is None else 1.0
-    given = [scale * s for s in STRENGTHS] if priors is None else [0.01, 0.1, 1.0, 10.0, 100.0]
-    asked: Any = given if strengths is None else strengths
-    listed = isinstance(asked, Sequence | np.ndarray) and all(is_number(s) and 0 < s < np.inf for s in asked)
-    if not (listed and len(asked) and is_number(margin) and 0 <= margin < np.inf):
-        raise InputError(
-            f"strengths = {asked!r} and margin = {margin!r} were given; give one strength or more, all above zero, and "
-            "a margin of zero or more."
-        )
-    given = sorted({float(s) for s in asked})
+    structure, seen, judged = _checked(fit, train, validation, priors is None)
+    given = _strengths(fit.solution.cost if priors is None else None, strengths, margin)
     fits, errors = [fit], [fit.nrmse(judged)]
     thin: dict[int, tuple[Fit, ...]] = {}
     for i, strength in enumerate(given):
         if priors is None:
-            penalised = identify(fit, seen, l1={"w": strength}, **options)
-            pruned = prune(penalised, seen, **options)
-            n = max(1, pruned.structure.element.n)  # type: ignore[union-attr]
-            if n not in thin:
-                thin[n] = thinned(fit, seen, n, **options)
-            spread = thin[n]
-            found = min((pruned, *spread), key=lambda f: _error(f, judged))
-            penalised_stopped = Status.INTERRUPTED in (penalised.status, pruned.status, *(f.status for f in spread))
+            found = _sparser(fit, seen, judged, strength, thin, options)
         else:
             scaled = {k: (m, np.asarray(s, dtype=float) / np.sqrt(strength)) for k, (m, s) in priors.items()}
             held = replace(structure, priors={**structure.priors, **scaled})
             model = fit.model.with_parameters(
                 fit.model.parameters.change(**{k: {"prior": held.priors[k]} for k in scaled})
             )
-            found = identify(replace(fit, structure=held, model=model), seen, **options)
-            penalised_stopped = False
-        if penalised_stopped or found.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
+            found = _whole(identify(replace(fit, structure=held, model=model), seen, **options))
         fits.append(found)
         errors.append(found.nrmse(judged))
         if progress:
@@ -273,3 +236,53 @@ def regularization_path(
         recommended=recommended,
         margin=float(margin),
     )
+
+
+def _checked(
+    fit: Any, train: Any, validation: Any, sparse: bool
+) -> tuple[PILFR, tuple[Recording, ...], tuple[Recording, ...]]:
+    """Structure, training and validation recordings of a path, which for a sparse one needs operators."""
+    if not isinstance(fit, Fit):
+        raise InputError(f"A regularization path was asked for of a {type(fit).__name__}; give a Fit.")
+    structure, seen, judged = fit.structure, as_recordings(train), as_recordings(validation)
+    if structure is None or (sparse and not isinstance(structure.element, PrandtlIshlinskii)):
+        raise InputError("A regularization path needs a fit of a PI-LFR with an element; give one.")
+    if {fingerprint(r) for r in seen} & {fingerprint(r) for r in judged}:
+        raise InputError("A validation recording is a training recording too; give one that was not fitted.")
+    return structure, seen, judged
+
+
+def _strengths(unit: float | None, strengths: Any, margin: Any) -> list[float]:
+    """Strengths in ascending order: those given, else those of a penalty in units of an objective, else of priors."""
+    usual = FACTORS if unit is None else [unit * s for s in STRENGTHS]
+    asked: Any = usual if strengths is None else strengths
+    listed = isinstance(asked, Sequence | np.ndarray) and all(is_number(s) and 0 < s < np.inf for s in asked)
+    if not (listed and len(asked) and is_number(margin) and 0 <= margin < np.inf):
+        raise InputError(
+            f"strengths = {asked!r} and margin = {margin!r} were given; give one strength or more, all above zero, and "
+            "a margin of zero or more."
+        )
+    return sorted({float(s) for s in asked})
+
+
+def _sparser(
+    fit: Fit,
+    seen: tuple[Recording, ...],
+    judged: tuple[Recording, ...],
+    strength: float,
+    thin: dict[int, tuple[Fit, ...]],
+    options: Mapping[str, Any],
+) -> Fit:
+    """The better on validation of what a penalty leaves and of as many operators spread anew (kept in `thin`)."""
+    pruned = _whole(prune(_whole(identify(fit, seen, l1={"w": strength}, **options)), seen, **options))
+    n = max(1, pruned.structure.element.n)  # type: ignore[union-attr]
+    if n not in thin:
+        thin[n] = tuple(_whole(f) for f in thinned(fit, seen, n, **options))
+    return min((pruned, *thin[n]), key=lambda f: _error(f, judged))
+
+
+def _whole(fit: Fit) -> Fit:
+    """The fit, which was not interrupted; else the interrupt goes on."""
+    if fit.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    return fit

@@ -16,7 +16,7 @@ import numpy as np
 
 from .elements import LAYER, PrandtlIshlinskii
 from .fitted import Fit
-from .job import Job
+from .job import following
 from .multistart import POLISH, PRIOR, held_near
 from .recording import Recording, as_recordings
 from .solution import Status
@@ -29,34 +29,25 @@ SPREAD = 0.02  # relative deviation of the prior on weights that are spread over
 
 
 def thinned(
-    fit: Fit,
-    train: Recording | Sequence[Recording],
-    n: int,
-    *,
-    solver: Any = None,
-    stable: bool | float | None = None,
-    constraints: Any = None,
-    noise: float | None = None,
-    engine: str = "auto",
+    fit: Fit, train: Recording | Sequence[Recording], n: int, *, solver: Any = None, **options: Any
 ) -> tuple[Fit, ...]:
     """Fits with n operators a channel, spread in several ways over the density of weights that a fit had.
 
-    They hold what the fit was asked to hold, where nothing else is given.
+    What the fit was asked with holds, where nothing else is given (`job.following`).
     None where weights or thresholds are fixed, bounded or have a prior.
     """
-    structure, recordings, solver = fit.structure, as_recordings(train), solver or POLISH
+    structure, recordings = fit.structure, as_recordings(train)
     bound = structure is None or set(LAYER) & {*structure.fixed, *structure.bounds, *structure.priors}
     if structure is None or bound or not isinstance(structure.element, PrandtlIshlinskii):
         return ()
     smaller, old = replace(structure, element=replace(structure.element, n=n)), fit.model
     z = np.concatenate([fit.signals(r)["z"] for r in recordings])
     reach = np.max(np.abs(z), axis=0)
-    asked = fit.asked.but(stable, constraints)
     states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
     states = [np.concatenate([s[: old.n_x], np.zeros(n * structure.element.channels)]) for s in states]
     found: list[Fit] = []
     for beyond, spacing in WAYS:
-        job = Job(recordings, solver, asked.limits(smaller), {}, noise, engine, None, asked=asked)
+        job = following(replace(fit, structure=smaller), recordings, solver=solver or POLISH, **options)
         rows = [
             regrid(r, w, float(top), beyond=beyond, spacing=spacing, count=n)
             if is_density(w) and top > 0

@@ -26,8 +26,8 @@ from typing import Any
 
 import numpy as np
 
-from .constraints import TOLERATED, BeyondRadius, Constraint, loosened
-from .exactness import beyond
+from .constraints import BeyondRadius, Constraint, loosened
+from .exactness import beyond, missed
 from .gauss_newton import GaussNewton
 from .lifted import Lifted, back, radius_limits, rotated
 from .problem import Problem
@@ -99,10 +99,8 @@ def _beats(problem: Problem, theta: Array, found: Solution) -> bool:
 
 def _met(problem: Problem, theta: Array) -> bool:
     """Whether θ is inside every constraint."""
-    g, unit = problem.constraint(theta), problem.constraint_units(theta)
-    over = np.maximum(problem.g_lower - g, g - problem.g_upper) > TOLERATED * np.where(unit > 0, unit, 1.0)
     own = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)  # these have a check of their own
-    return not beyond(problem, theta) and not np.any(over & ~own)
+    return not beyond(problem, theta) and not np.any(missed(problem, theta) & ~own)
 
 
 def _until(ends: float, solver: GaussNewton) -> GaussNewton:

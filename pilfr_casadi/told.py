@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .costless import costless
 from .gauss_newton import GaussNewton
 from .interrupts import Progress
 from .ipopt import Ipopt
@@ -27,6 +28,8 @@ def solve_inside(
 ) -> Solution:
     """The solution of a solver, of the package or a user's, inside exact bounds on spectral radii (`tightening`).
 
+    It begins where the start meets constraints that cost nothing (`costless`).
+
     Parameters
     ----------
     problem, start, last, held
@@ -38,6 +41,7 @@ def solve_inside(
     progress : callable
         Gets (stage, step, largest number of steps, error).
     """
+    start = costless(problem, problem.start if start is None else start)
     if not isinstance(solver, GaussNewton | Ipopt):
         return within_bounds(problem, start, solver.solve, last, held)
     report, last = iterations(progress, stage, solver.max_iterations), replace(last, time_limit=solver.time_limit)

@@ -24,7 +24,7 @@ from .multistart import KEEP, search_starts
 from .penalty import check_penalty
 from .problem import Problem
 from .recording import InputError, Recording
-from .search import Candidate, Search
+from .search import Candidate
 from .solution import Solution, Status
 
 
@@ -96,10 +96,9 @@ def from_starts(
 ) -> Fit:
     """A PI-LFR from many starts; `problem` and `solution` are those of the linear model."""
     blocks = {k: p.value for k, p in linear.parameters.items()}
-    options: dict[str, Any] = {"engine": job.engine, "start": start, "noise": job.noise}
-    options |= {"level": rms_error(problem, solution), "coordinates": not known_entries(structure)}
-    options["progress"] = job.progress if executor is None else None
-    search = Search(structure, job.recordings, blocks, job.solver, job.limits, **options)
+    level, coordinates = rms_error(problem, solution), not known_entries(structure)
+    told = job.progress if executor is None else None
+    search = job.search(structure, blocks, start=start, level=level, coordinates=coordinates, progress=told)
     least: list[float] = [np.inf]
 
     def report(stage: str, found: list[Candidate], total: int) -> None:

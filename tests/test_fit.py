@@ -316,19 +316,3 @@ def test_start_values_are_not_stretched_to_a_shape():
         pilfr_casadi.InputError, match=r"The start of 'A' has the shape \(1, 2\); give a number or an array"
     ):
         pilfr_casadi.fit(structure, recording, start={"A": [[0.9, 0.1]]})
-
-
-@pytest.mark.filterwarnings("error")
-def test_weights_may_be_let_go_below_zero():
-    rng = np.random.default_rng(0)
-    u = np.cumsum(rng.normal(size=800))[:, None] * 0.1
-    q, r = np.zeros(3), np.array([0.2, 0.5, 1.0])
-    y = np.empty(len(u))
-    for k, z in enumerate(u[:, 0]):
-        q = np.clip(q, z - r, z + r)
-        y[k] = z + q @ [0.8, -0.5, 0.4]
-    record = pilfr_casadi.Recording(u, y + 1e-3 * rng.normal(size=len(y)), 0.01, initial="zero")
-    element = pilfr_casadi.PrandtlIshlinskii(pilfr_casadi.Play, 6)
-    fit = pilfr_casadi.fit(pilfr_casadi.PILFR(2, element, bounds={"w": (-1, 2)}), record, starts=3)
-    assert fit.nrmse(record) < 0.05 and np.all(np.isfinite(fit.parameters["w"]))
-    assert np.min(fit.parameters["w"]) >= -1

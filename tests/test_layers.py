@@ -79,6 +79,7 @@ LAYERS = {
         "scaling",
         "solution",
         "exactness",
+        "costless",
         "feasible",
         "exact_penalty",
         "told",

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr, reference
 
+from pilfr_casadi.combined import Combined, Part
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi.envelope import Envelope
 from pilfr_casadi.lfr import PILFR, block_shapes, hammerstein, wiener
 from pilfr_casadi.operators import Play, Stop
 from pilfr_casadi.recording import InputError
@@ -162,6 +164,13 @@ def test_values_move_into_their_bounds_and_fixed_ones_stay():
     assert (p["r"].bounds[0] == 0).all()
 
 
+def test_no_bound_of_ones_own_leaves_that_of_the_element():
+    w = PILFR(1, PrandtlIshlinskii(Play, 2), bounds={"w": (-np.inf, 3.0)}).model(1, 1).parameters["w"]
+    assert (w.bounds[0] == 0).all() and (w.bounds[1] == 3).all()
+    with pytest.raises(InputError, match="'envelope_rate' is 2, but the element's envelope_rate is at least 1e-06 and"):
+        PILFR(1, Combined((Part("envelope", Envelope(1), (0,)),)), bounds={"envelope_rate": (0.1, 2.0)})
+
+
 @pytest.mark.parametrize(
     "make, words",
     [
@@ -201,6 +210,12 @@ NAN = float("nan")
         ({"bounds": {"w": ([[0.0, 0.0]], 1.0)}}, r"The lower bound of 'w' has the shape \(1, 2\)"),
         ({"bounds": {"A": (-1.0, [1.0, 1.0])}}, r"The upper bound of 'A' has the shape \(2,\)"),
         ({"bounds": {"A": ([[0, 1], [2]], 1.0)}}, "bounds of 'A'; give a pair"),
+        (
+            {"bounds": {"r": (-1.0, 2.0)}},
+            "A bound of 'r' is -1, but the element's r is at least 0; give",
+        ),
+        ({"bounds": {"w": (-np.inf, [[-0.5, 1.0, 1.0]])}}, "A bound of 'w' is -0.5, but"),
+        ({"fixed": {"w": [[NAN, 0.3, -0.2]]}}, "What 'w' is fixed at is -0.2, but the element's w is at least 0"),
         ({"priors": {"A": ([[0.9, 0.1]], 1.0)}}, r"The mean of the prior of 'A' has the shape \(1, 2\)"),
         ({"priors": {"A": (np.inf, 1.0)}}, "The mean of the prior of 'A' holds a value that is not finite"),
         ({"priors": {"w": (0.0, [1.0, 1.0])}}, r"The standard deviation of the prior of 'w' has the shape \(2,\)"),

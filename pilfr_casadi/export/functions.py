@@ -67,25 +67,13 @@ def exported(
         raise InputError(
             f"smooth = {smooth!r} was given; give a number, from zero to {LARGEST:g}, in the signals' units."
         )
-    units: dict[str, str] = {}
     rhs = None
     if isinstance(model, Fit | Model):
         if hold is not None or substeps is not None:
             raise InputError("The model has its own steps; `hold` and `substeps` are for simulators, leave them out.")
-        if isinstance(model, Fit) and dt is not None and dt != model.dt:
-            raise InputError(f"dt = {dt!r} was given, but the fit's step is {model.dt:g} s; leave dt out.")
-        closed = model.model if isinstance(model, Fit) else model
-        units = dict(model.units) if isinstance(model, Fit) else {}
-        step = sampled(closed, model.dt if isinstance(model, Fit) else _duration(dt))
+        closed, step = _of_model(model, dt)
     elif isinstance(model, Simulator):
-        dt, hold = _duration(dt), hold or model.hold or "zero"
-        if hold not in ("zero", "linear"):
-            raise InputError(f"hold = {hold!r} was given; use 'zero' or 'linear'.")
-        whole = isinstance(substeps, int | np.integer) and not isinstance(substeps, bool)
-        if substeps is not None and not (whole and substeps >= 1):
-            raise InputError(f"substeps = {substeps!r} was given; give a whole number, 1 or more.")
-        closed = discretise(model, dt, hold, int(substeps or _substeps(model, dt)))
-        units, step = dict(model.units), sampled(closed, dt, model)
+        closed, step = _of_simulator(model, dt, hold, substeps)
         rhs = right_hand_side(model, f"{name}_rhs")
     elif callable(getattr(model, "export", None)):
         given = {"dt": dt, "hold": hold, "substeps": substeps}
@@ -104,12 +92,33 @@ def exported(
         thresholds=step.thresholds,
         inputs=step.inputs,
         outputs=step.outputs,
-        units={k: v for k, v in units.items() if v},
+        units={k: v for k, v in getattr(model, "units", {}).items() if v},
         dt=step.dt,
         smooth=float(smooth),
         rhs=smoothed(rhs, smooth) if rhs is not None and smooth else rhs,
         sampled=step,
     )
+
+
+def _of_model(model: Fit | Model, dt: float | None) -> tuple[Model, Sampled]:
+    """A fit or a model closed, and as a step."""
+    if isinstance(model, Model):
+        return model, sampled(model, _duration(dt))
+    if dt is not None and dt != model.dt:
+        raise InputError(f"dt = {dt!r} was given, but the fit's step is {model.dt:g} s; leave dt out.")
+    return model.model, sampled(model.model, model.dt)
+
+
+def _of_simulator(model: Simulator, dt: float | None, hold: str | None, substeps: int | None) -> tuple[Model, Sampled]:
+    """A simulator integrated over one sample, and as a step."""
+    dt, hold = _duration(dt), hold or model.hold or "zero"
+    if hold not in ("zero", "linear"):
+        raise InputError(f"hold = {hold!r} was given; use 'zero' or 'linear'.")
+    whole = isinstance(substeps, int | np.integer) and not isinstance(substeps, bool)
+    if substeps is not None and not (whole and substeps >= 1):
+        raise InputError(f"substeps = {substeps!r} was given; give a whole number, 1 or more.")
+    closed = discretise(model, dt, hold, int(substeps or _substeps(model, dt)))
+    return closed, sampled(closed, dt, model)
 
 
 def to_casadi(model: Any, name: str = "model", **options: Any) -> ca.Function:

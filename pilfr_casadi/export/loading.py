@@ -70,7 +70,7 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     fitted = _with_values(file, start, structure)
     rest = _training(file, training, fitted)
     return Fit(
-        asked=asked_by(rest["limits"], structure) if "limits" in training else Asked(),
+        asked=_asked(file, training, rest["limits"], structure),
         model=fitted,
         structure=structure,
         dt=dt,
@@ -124,6 +124,20 @@ def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[
         "candidates": tuple(candidates),
         "seconds": file.number(training, "seconds"),
     }
+
+
+def _asked(file: ModelFile, training: dict[str, Any], limits: tuple[Limit, ...], structure: PILFR | None) -> Asked:
+    """What the fit was asked with, as far as the file has it; the first files did not say it."""
+    if "limits" not in training:
+        return Asked()
+    noise = None if training.get("noise") is None else file.number(training, "noise")
+    weights = None
+    if training.get("weights") is not None:
+        rows = file.table(training, "weights")
+        weights = {recording: float(file.array(weight, (), "a weight")) for recording, weight in rows.items()}
+    if any(number <= 0 for number in (*(() if noise is None else (noise,)), *(weights or {}).values())):
+        file.damaged("the noise or a weight of a recording is not above zero")
+    return asked_by(limits, structure, noise=noise, weights=weights)
 
 
 def _limit(file: ModelFile, row: Any) -> Limit:

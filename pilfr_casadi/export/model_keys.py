@@ -26,7 +26,7 @@ KEYS: dict[tuple[str, ...], tuple[str, ...]] = {
     ("parameters", EACH): ("value", "std", "unit"),
     ("training",): (
         *("status", "sentence", "message", "nrmse", "linear_nrmse", "seconds", "active", "limits", "solve"),
-        *("variables", "multipliers", "history", "starts"),
+        *("variables", "multipliers", "history", "starts", "noise", "weights"),
     ),
     ("training", "limits", EACH): ("name", "kind", "value", "lower", "upper", "multiplier", "active", "met"),
     ("training", "solve"): SOLVE,

@@ -86,6 +86,8 @@ def _document(fit: Fit) -> dict[str, Any]:
             "sentence": solution.status.value,
             "message": solution.message,
             "nrmse": _plain(fit.train_nrmse),
+            "noise": fit.asked.noise,
+            "weights": None if fit.asked.weights is None else dict(fit.asked.weights),
             "linear_nrmse": _plain(fit.linear_nrmse),
             "seconds": fit.seconds,
             "active": list(fit.active),
