@@ -36,7 +36,8 @@ class Port:
     across : callable
         Local coordinate z, of any of x, u, p.
     rate : callable, optional
-        dz/dt, of any of x, u, p; left out, `across` is differentiated along the dynamics.
+        dz/dt, of any of x, u, p; left out, `across` is differentiated along the dynamics. Of a drive without an angle
+        both are the speed, which friction opposes.
     unit, across_unit : str
         Units of w and of z.
     """

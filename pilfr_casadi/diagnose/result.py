@@ -66,6 +66,8 @@ class Diagnosis:
         `nrmse` and `source`.
     substeps : int
         Integration steps a sample with which the corrected simulator was fitted.
+    let_go : str
+        Parameter that was fixed or at a bound and is let go in the corrected simulator; see `held`.
     """
 
     verdict: str
@@ -88,6 +90,7 @@ class Diagnosis:
     interrupted: bool = False
     evidence: Mapping[str, Any] = field(default_factory=dict)
     substeps: int = 1
+    let_go: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """The content of diagnosis.json; numbers that are not finite are None."""

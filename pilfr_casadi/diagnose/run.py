@@ -163,6 +163,7 @@ def diagnose(
         interrupted=search.interrupted,
         evidence={"search": search, "without": without, "after": after},
         substeps=after.model.substeps,
+        let_go=held.name if held else "",
     )
 
 

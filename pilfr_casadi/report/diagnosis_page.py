@@ -95,7 +95,7 @@ def _verdict(case: _Case) -> list[Block]:
     out: list[Block] = []
     for k in range(len(d.effects)):
         out += tables.effect_blocks(d, k)
-    if d.verdict == "complete":
+    if d.verdict == "complete" and not d.let_go:
         out.append(Text("Refitted inside its bounds, the simulator follows the recordings down to the noise."))
     elif d.verdict == "unexplained":
         out.append(Text("No law of the catalogue explains what is missing; below is where it acts, and how."))
@@ -213,8 +213,8 @@ def _compared(case: _Case, c: Comparison, i: int) -> list[Block]:
     r, name = c.recording, c.recording.outputs[i]
     unit, floor = case.unit(name), float(case.noise[i])
     simulated: proof.Simulated = [("refitted", c.before)]
-    if case.diagnosis.effects:
-        simulated.append(("with " + " and ".join(words(e.law) for e in case.diagnosis.effects), c.after))
+    if what := tables.mended(case.diagnosis):
+        simulated.append((what.removesuffix(" put back"), c.after))
     gone = [label for label, v in simulated if v is None]
     lost = f" The simulation diverges: {', '.join(gone)}." if gone else ""
     where = f"{name} in {r.name}"

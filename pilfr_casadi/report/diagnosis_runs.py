@@ -34,7 +34,10 @@ def replay(bench: Workbench, simulator: Simulator) -> Fitted | None:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A recording with its outputs simulated before (refitted) and after (effects put back); None where it diverges."""
+    """A recording with its outputs simulated before (refitted) and after (effects put back, or a value let go).
+
+    None where it diverges.
+    """
 
     recording: Recording
     role: str
@@ -48,7 +51,7 @@ def comparisons(bench: Workbench, recordings: Sequence[Recording], diagnosis: Di
         recordings = [change(r) for r in recordings] if change is not None else recordings
     part = bench.on(recordings)
     before = replay(part, diagnosis.refitted)
-    after = replay(part, diagnosis.corrected) if diagnosis.corrected.elements else None
+    after = replay(part, diagnosis.corrected) if diagnosis.corrected.elements or diagnosis.let_go else None
     out = []
     for i, r in enumerate(part.recordings):
         named = r.with_(name=r.name or (role if len(part.recordings) == 1 else f"{role} {i + 1}"))

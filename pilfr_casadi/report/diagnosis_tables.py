@@ -21,7 +21,7 @@ ALIKE = 1.03  # errors within this factor are as good
 RANKED = 12  # rows of the ranked table that are not folded away
 PEOPLE = ("coulomb", "stribeck")
 FORMS = {"bouc_wen": "Bouc-Wen", "prandtl_ishlinskii": "Prandtl-Ishlinskii", "hertz": "Hertz"}
-STEPS = {"nominal": "as given", "before": "refitted", "after": "with the effects put back"}
+STEPS = {"nominal": "as given", "before": "refitted"}
 
 
 def words(law: str) -> str:
@@ -39,6 +39,19 @@ def percent(value: float | None) -> str:
     return f"{number_text(100 * value, 3)}\u00a0%"
 
 
+def mended(diagnosis: Diagnosis) -> str:
+    """What was put right in the corrected simulator, in words; nothing where it was only refitted."""
+    if diagnosis.effects:
+        return f"with {' and '.join(words(e.law) for e in diagnosis.effects)} put back"
+    return f"with {diagnosis.let_go} let go" if diagnosis.let_go else ""
+
+
+def _steps(diagnosis: Diagnosis) -> dict[str, str]:
+    """Keys of the errors that are shown, and their names."""
+    last = "with the effects put back" if diagnosis.effects else mended(diagnosis)
+    return STEPS | ({"after": last} if last else {})
+
+
 def judged(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
     """The recordings that count, and their errors."""
     errors = diagnosis.errors.get("test")
@@ -51,17 +64,15 @@ def headline(diagnosis: Diagnosis) -> str:
     on = "On held-out recordings" if role == "test" else "On the training recordings (no test was given)"
     text = f"{diagnosis.sentence.rstrip('. ')}. {on} the error is {percent(errors.get('nominal'))} as given"
     text += f", {percent(errors.get('before'))} refitted"
-    if diagnosis.effects:
-        what = " and ".join(words(e.law) for e in diagnosis.effects)
-        text += f", {percent(errors.get('after'))} with {what} put back"
+    if what := mended(diagnosis):
+        text += f", {percent(errors.get('after'))} {what}"
     return f"{text}; the noise floor is {percent(diagnosis.floor['nrmse'])}."
 
 
 def facts(diagnosis: Diagnosis) -> dict[str, str]:
     """Figures of merit."""
     role, errors = judged(diagnosis)
-    steps = list(STEPS) if diagnosis.effects else ["nominal", "before"]
-    out = {f"{role} error, {STEPS[k]}": percent(errors.get(k)) for k in steps}
+    out = {f"{role} error, {name}": percent(errors.get(k)) for k, name in _steps(diagnosis).items()}
     kind = {"periods": "from periods", "repeats": "from repeats"}.get(diagnosis.floor["source"], "estimated")
     out[f"noise floor, {kind}"] = percent(diagnosis.floor["nrmse"])
     if diagnosis.effects:
@@ -71,7 +82,7 @@ def facts(diagnosis: Diagnosis) -> dict[str, str]:
 
 def error_table(diagnosis: Diagnosis) -> Table:
     """Errors before and after, training and test."""
-    steps = list(STEPS) if diagnosis.effects else ["nominal", "before"]
+    steps = _steps(diagnosis)
     rows: list[list[Any]] = []
     for kind, name in (("train", "training"), ("test", "test (held out)")):
         errors = diagnosis.errors.get(kind)
@@ -80,7 +91,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
     note = "Rms error of the free-run simulation over the standard deviation of the measured output, mean over outputs."
     if diagnosis.floor["source"] == "estimated":
         note += " The noise floor is estimated from the residual; coloured noise would make it larger."
-    return Table(["recordings", *(STEPS[k] for k in steps), "noise floor"], rows, note=note, emphasis=[len(rows) - 1])
+    return Table(["recordings", *steps.values(), "noise floor"], rows, note=note, emphasis=[len(rows) - 1])
 
 
 def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
@@ -183,7 +194,7 @@ def flexible_table(diagnosis: Diagnosis) -> Table | None:
 
 def parameter_table(diagnosis: Diagnosis) -> Table:
     """The simulator's own parameters: nominal, refitted, and with the effects in place."""
-    rows = []
+    rows, what = [], "with the effects" if diagnosis.effects else mended(diagnosis)
     for name, p in diagnosis.parameters.items():
         columns = ("nominal", "refit_without", "refit_with")
         given, without, after = (np.ravel(np.asarray(p[k], dtype=float)) for k in columns)
@@ -191,13 +202,14 @@ def parameter_table(diagnosis: Diagnosis) -> Table:
         for i in range(len(given)):
             label = name if len(given) == 1 else f"{name}[{i}]"
             row = [label, _cell(given[i], np.nan), _cell(without[i], np.nan)]
-            if diagnosis.effects:
+            if what:
                 change = after[i] / given[i] - 1 if given[i] else np.nan
                 row += [_cell(after[i], std[i] if i < len(std) else np.nan)]
                 row += [f"{100 * change:+.1f}\u00a0%".replace("-", "−") if np.isfinite(change) else "–"]
             rows.append([*row, p["unit"] or "–"])
-    more = ["refitted with the effects", "change from nominal"] if diagnosis.effects else []
-    note = "A refit without the missing physics bends the other parameters to make up for it." if more else ""
+    more = [f"refitted {what}", "change from nominal"] if what else []
+    note = "A refit without the missing physics bends the other parameters to make up for it."
+    note = note if diagnosis.effects else ""
     return Table(["parameter", "nominal", "refitted as it is", *more, "unit"], rows, note=note)
 
 
