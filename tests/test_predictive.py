@@ -59,8 +59,8 @@ def test_no_first_plan_is_stuck_at_a_kink(limits):
 
 def test_a_plan_that_was_cut_short_is_not_called_converged():
     options, worse = {"inputs": (-3, 3), "y_scale": 0.1, "rate": 0.5}, 0
-    for x, wanted, before in drawn(20):
-        short = PredictiveController(sluggish(), N, iterations=1, **options)
+    short = PredictiveController(sluggish(), N, iterations=1, **options)
+    for x, wanted, before in drawn(20):  # each begins with the plan of another
         whole = PredictiveController(sluggish(), N, **options)(x, wanted, before)
         for _ in range(3):
             plan = short(x, wanted, before)

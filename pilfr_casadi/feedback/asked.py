@@ -114,6 +114,17 @@ def path(reference: Any, samples: int, n_y: int) -> Array:
     raise InputError(f"The reference has the shape {found.shape}; give {(samples, n_y)}, a row a sample.")
 
 
+def within(task: Asked, u: Array, before: Array, rate: Array) -> Array:
+    """Inputs moved into the limits and the rates, sample by sample; `before` is the input of the sample before."""
+    n, u = len(before), np.clip(u, task.low, task.high)
+    if np.any(np.abs(u - np.concatenate([before, u[:-n]])) > rate):
+        for k in range(0, len(u), n):
+            here = slice(k, k + n)
+            slow = np.clip(u[here], before - rate[here], before + rate[here])
+            u[here] = before = np.clip(slow, task.low[here], task.high[here])
+    return u
+
+
 def _pair(limits: Any, of: str, shape: tuple[int, int]) -> tuple[Array, Array]:
     """Lower and upper limit over the horizon; infinite is none."""
     if not isinstance(limits, tuple | list) or len(limits) != 2:

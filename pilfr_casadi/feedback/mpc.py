@@ -21,7 +21,7 @@ import numpy as np
 
 from ..checks import numbers
 from ..recording import InputError
-from .asked import SOLVERS, asked, count, path
+from .asked import SOLVERS, asked, count, path, within
 from .mpc_cost import Cost
 from .mpc_ipopt import Shooting
 from .mpc_sqp import GaussNewton
@@ -88,7 +88,7 @@ class PredictiveController:
         self.function, self.horizon, self.solver, self.iterations = task.function, task.horizon, solver, iterations
         self.low, self.high, self.low_y, self.high_y = task.low, task.high, task.low_y, task.high_y
         self.limited, self.rate, self.y_scale, self.u_scale = task.limited, task.rate, task.y_scale, task.u_scale
-        self._cost = Cost(task)
+        self._task, self._cost = task, Cost(task)
         self._plan: Array | None = None
         self._solver = (GaussNewton if solver == "sqp" else Shooting)(task, self._cost)
 
@@ -121,20 +121,10 @@ class PredictiveController:
         rate = self.rate.copy()
         rate[:n_u] = np.maximum(rate[:n_u], np.maximum(self.low[:n_u] - before, before - self.high[:n_u]))
         most = self.iterations * (FIRST if self._plan is None else 1)
-        within = self._within(start, before, rate)
-        u, y, converged = self._solver.solve(state, wanted, before, within, rate, most)
+        first = within(self._task, start, before, rate)
+        u, y, converged = self._solver.solve(state, wanted, before, first, rate, most)
         self._plan = u
         shaped = u.reshape(-1, n_u), y.reshape(-1, n_y)
         cost = self._cost(u, y, wanted, before)
         spent, converged = perf_counter() - begin, converged and bool(np.isfinite(cost))
         return Plan(*shaped, cost, self._cost.over(y), spent, converged, self.limited)
-
-    def _within(self, u: Array, before: Array, rate: Array) -> Array:
-        """Inputs moved into the limits and the rates, sample by sample."""
-        n, u = len(before), np.clip(u, self.low, self.high)
-        if np.any(np.abs(u - np.concatenate([before, u[:-n]])) > rate):
-            for k in range(0, len(u), n):
-                here = slice(k, k + n)
-                slow = np.clip(u[here], before - rate[here], before + rate[here])
-                u[here] = before = np.clip(slow, self.low[here], self.high[here])
-        return u
