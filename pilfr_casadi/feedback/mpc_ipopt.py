@@ -13,10 +13,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..export.smoothing import smoothed
-from ..recording import InputError
 from .asked import ENORMOUS, Asked, within
 from .mpc_cost import Cost
+from .mpc_rounding import rounded
 
 Array = np.ndarray
 OPTIONS = {"print_level": 0, "sb": "yes", "tol": 1e-9, "warm_start_init_point": "yes", "mu_init": 1e-4}
@@ -66,22 +65,8 @@ class Shooting:
     @cached_property
     def _rounded(self) -> ca.Function | None:
         """The solver of the rounded problem; None where the model has nothing that can be rounded."""
-        task = self._task
-        rng = np.random.default_rng(0)
-        low, high = np.maximum(task.low, -task.u_scale), np.minimum(task.high, task.u_scale)
-        low, high = np.minimum(low, task.high), np.maximum(high, task.low)
-        probe = (low + (high - low) * rng.random(len(low))).reshape(task.horizon, -1).T
-        rest = np.zeros(task.function.size1_in(0))
-        own = np.asarray(self._simulate(rest, probe)[1]).ravel(order="F")
-        for eps in 10.0 ** np.arange(3, -16, -1.0):
-            try:
-                function = smoothed(task.function.expand(), eps)
-            except (InputError, RuntimeError, NotImplementedError):
-                return None
-            y = np.asarray(function.mapaccum("rounded", task.horizon)(rest, probe)[1]).ravel(order="F")
-            if np.max(np.abs(y - own) / task.y_scale) < ROUNDED:
-                return self._solver(function, ROUND)
-        return None
+        function = rounded(self._task, ROUNDED)
+        return None if function is None else self._solver(function, ROUND)
 
     def solve(
         self, x: Array, wanted: Array, before: Array, u: Array, rate: Array, iterations: int

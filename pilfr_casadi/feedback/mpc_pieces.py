@@ -11,7 +11,7 @@ that turn at once, are crossed together.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -54,8 +54,8 @@ class Pieces:
             self._gaps = Buffered(ca.Function("gaps", arguments, [ca.densify(free(*arguments)[1])]))
             self._steps = Steps(task, cost, self.count)
 
-    def solve(self, x: Array, at: At, most: int) -> tuple[Array, Array, bool]:
-        """Inputs that are no worse, outputs, whether no adjacent piece promises a lower cost; of `most` steps."""
+    def solve(self, x: Array, at: At, most: int) -> tuple[tuple[Array, Array, bool], int]:
+        """Inputs that are no worse, outputs, whether no adjacent piece promises a lower cost; steps left of `most`."""
         y, sure = at.y, True
         value = self._cost(at.u, y, at.wanted, at.before)
         own = (self._gaps(x, at.u)[0] >= 0).astype(float)
@@ -66,56 +66,66 @@ class Pieces:
             if found is None:
                 sure = sure and sides is not own
                 continue
-            step, expected, behind = found
-            gain = value - expected
+            gain = value - found.expected
             if gain <= GAIN * min(value, len(y)):
-                ahead = ahead if sides is not own else behind
+                ahead = ahead if sides is not own else _behind(sides, found)
                 continue
             for share in SHARES:
-                u = within(self._task, at.u + share * step, at.before, at.rate)
+                u = within(self._task, at.u + share * found.step, at.before, at.rate)
                 there = self._predict(x, u)[0]
                 lower = self._cost(u, there, at.wanted, at.before)
                 if lower < value - ARMIJO * share * gain:
-                    exact = abs(lower - expected) <= GAIN * lower
+                    exact = abs(lower - found.expected) <= GAIN * lower
                     at, y, value, own, sure = replace(at, u=u), there, lower, sides, True
-                    ahead = behind if exact else [own]
+                    ahead = _behind(sides, found) if exact else [own]
                     break
             else:
                 sure = False
-        return at.u, y, sure and not ahead
+        return (at.u, y, sure and not ahead), most
 
-    def _step(self, x: Array, at: At, sides: Array) -> tuple[Array, float, list[Array]] | None:
-        """Step inside a piece, the cost it promises, and the pieces behind the edges that hold it back."""
+    def _step(self, x: Array, at: At, sides: Array) -> Inside | None:
+        """The step inside a piece."""
         n_y, scale = len(at.y), self._task.u_scale
         found, slopes = self._piece(x, at.u, sides)
         y, jac = found[:n_y], slopes[:n_y]
         sign = 2 * sides - 1
         rows, gaps = sign[:, None] * slopes[n_y:] * scale, sign * found[n_y:]
-        size = np.max(np.abs(rows), axis=1)
+        size = np.abs(rows).max(axis=1)
         flat = size < FLAT
-        size = np.where(flat, 1.0, size)
-        rows, least = rows / size[:, None], np.where(flat, -ENORMOUS, -gaps / size)
+        size[flat] = 1.0
+        rows, least = rows / size[:, None], -gaps / size
+        least[flat] = -ENORMOUS
         result = self._steps(replace(at, y=y, jac=jac), (rows, least))
         if result is None:
             return None
         step, multipliers = result
         expected = self._cost(at.u + step, y + jac @ step, at.wanted, at.before)
-        touched = np.flatnonzero(rows @ (step / scale) - least < TOUCHING)
-        return step, expected, _behind(sides, rows[touched], touched, multipliers[touched])
+        return Inside(step, expected, rows, multipliers, rows @ (step / scale) - least < TOUCHING)
 
 
-def _behind(sides: Array, rows: Array, touched: Array, multipliers: Array) -> list[Array]:
+@dataclass(frozen=True)
+class Inside:
+    """A step inside a piece: the cost it promises, the rows of the edges, their multipliers, which of them it touches."""
+
+    step: Array
+    expected: float
+    rows: Array
+    multipliers: Array
+    touched: Array
+
+
+def _behind(sides: Array, found: Inside) -> list[Array]:
     """The pieces behind all edges that hold a step back, and behind each of them, the strongest first."""
-    norms = np.linalg.norm(rows, axis=1)
+    touched = np.flatnonzero(found.touched)
+    rows, multipliers = found.rows[touched], found.multipliers[touched]
+    rows = rows / np.linalg.norm(rows, axis=1)[:, None]
+    strong = multipliers > HELD * max(1.0, float(np.max(multipliers, initial=0.0)))
+    alike = rows @ rows.T > 1 - ALIKE
     groups: list[Array] = []
-    left = np.ones(len(touched), dtype=bool)
     for i in np.argsort(-multipliers):
-        if multipliers[i] <= HELD * max(1.0, float(np.max(multipliers))):
-            break
-        if left[i]:
-            same = rows @ rows[i] > (1 - ALIKE) * norms * norms[i]
-            left &= ~same
-            groups.append(touched[same])
+        if strong[i]:
+            groups.append(touched[alike[i]])
+            strong &= ~alike[i]
     if len(groups) > 1:
         groups.insert(0, np.concatenate(groups))
     pieces = []
