@@ -57,7 +57,8 @@ def test_no_first_plan_is_stuck_at_a_kink(limits):
     assert np.mean(np.array(said)[:, 1]) > 0.8  # IPOPT ends, though most optima lie in kinks
 
 
-def test_a_plan_that_was_cut_short_is_not_called_converged():
+def test_a_plan_that_was_cut_short_is_not_called_converged(monkeypatch):
+    monkeypatch.setattr("pilfr_casadi.feedback.mpc_sqp.ENTERED", 1)
     options, worse = {"inputs": (-3, 3), "y_scale": 0.1, "rate": 0.5}, 0
     short = PredictiveController(sluggish(), N, iterations=1, **options)
     for x, wanted, before in drawn(20):  # each begins with the plan of another

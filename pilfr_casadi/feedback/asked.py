@@ -9,12 +9,14 @@ import casadi as ca
 import numpy as np
 
 from ..checks import numbers
+from ..export.exported_model import Exported
 from ..fitted import Fit
 from ..recording import InputError
 from .mpc_scales import scale_of_inputs, scale_of_outputs
 
 Array = np.ndarray
 ENORMOUS = 1e20  # stands for no limit
+NEXT = "next"  # what a step of interpolated inputs reads
 SOLVERS = ("sqp", "ipopt")
 
 
@@ -82,11 +84,15 @@ def planned_with(given: Any) -> ca.Function:
     InputError
         If it is none.
     """
-    function = given
-    if isinstance(given, Fit):
-        function = given.to_casadi()
-    elif not isinstance(given, ca.Function):  # of an observer, of an export
-        function = getattr(given, "function", getattr(given, "step", given))
+    model = given.export() if isinstance(given, Fit) else given
+    if isinstance(model, Exported) and NEXT in model.sampled.reads:
+        raise InputError(
+            f"The inputs of {model.name} are interpolated, so that a step takes those of the next sample too, and these "
+            'are not free; export it with hold="zero" to plan with it.'
+        )
+    function = model
+    if not isinstance(model, ca.Function):  # of an observer, of an export
+        function = getattr(model, "function", getattr(model, "step", model))
     if not isinstance(function, ca.Function):
         raise InputError(
             f"A {type(given).__name__} cannot be planned with; give a Fit, an observer, an export, or a "

@@ -54,7 +54,7 @@ class Pieces:
             self._gaps = Buffered(ca.Function("gaps", arguments, [ca.densify(free(*arguments)[1])]))
             self._steps = Steps(task, cost, self.count)
 
-    def solve(self, x: Array, at: At, most: int) -> tuple[tuple[Array, Array, bool], int]:
+    def solve(self, x: Array, at: At, most: int, bar: float = np.inf) -> tuple[tuple[Array, Array, bool], int]:
         """Inputs that are no worse, outputs, whether no adjacent piece promises a lower cost; steps left of `most`."""
         y, sure = at.y, True
         value = self._cost(at.u, y, at.wanted, at.before)
@@ -69,6 +69,8 @@ class Pieces:
             gain = value - found.expected
             if gain <= GAIN * min(value, len(y)):
                 ahead = ahead if sides is not own else _behind(sides, found)
+                if value > bar:
+                    break
                 continue
             for share in SHARES:
                 u = within(self._task, at.u + share * found.step, at.before, at.rate)
@@ -105,7 +107,7 @@ class Pieces:
 
 @dataclass(frozen=True)
 class Inside:
-    """A step inside a piece: the cost it promises, the rows of the edges, their multipliers, which of them it touches."""
+    """A step inside a piece, the cost it promises; the edges: their rows and multipliers, and whether it touches them."""
 
     step: Array
     expected: float

@@ -3,8 +3,8 @@
 Between kinks the model is linear in x and u, so a step that crosses none ends in the optimum of its piece. Where no
 share of a step lowers the cost as promised, a kink is in between, and the slopes of this side say nothing of the other:
 the search then goes from piece to piece (`mpc_pieces`). Among kinks there are many optima, so it is made from where the
-steps led, from where they lead with the kinks rounded, and from the previous input held, and the best is taken. A plan
-is called converged where the QP has next to nothing to gain there, or no adjacent piece has.
+steps led, from where they lead with the kinks rounded, and, unless these two agree, from the previous input held; the
+best is taken. A plan is called converged where the QP has next to nothing to gain there, or no adjacent piece has.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from .mpc_steps import At, Steps
 Array = np.ndarray
 CLOSE = 1e-5  # of u_scale: a smaller step ends the search
 ENTERED = 8  # most pieces for each Gauss-Newton step
+ALIKE = 1e-3  # of the cost: two searches that end so close have found the same
 ROUNDED = 0.1  # of y_scale, by which rounding may change the outputs
 
 
@@ -50,17 +51,29 @@ class GaussNewton:
         at, done = self._descend(self._exact, x, begin, iterations)
         if done or self._pieces is None:
             return at.u, at.y, done
-        best, left = self._pieces.solve(x, at, ENTERED * iterations)
-        held = within(self._task, np.tile(before, self._task.horizon), before, rate)
-        for start in (u, held):
-            there = replace(begin, u=start)
-            if start is u and self._rounded:
-                there = self._descend(self._rounded, x, self._rounded.at(x, begin), iterations)[0]
-            if left > 0:
-                found, left = self._pieces.solve(x, replace(there, y=self._exact.outputs(x, there.u)[0]), left)
-                costs = [self._cost(*plan[:2], wanted, before) for plan in (best, found)]
-                best = found if costs[1] < costs[0] else best
+        most = ENTERED * iterations
+        best, most = self._pieces.solve(x, at, most)
+        least = self._cost(*best[:2], wanted, before)
+        for start in (self._smooth, self._held):
+            u = start(x, begin, iterations)
+            there = replace(begin, u=u, y=self._exact.outputs(x, u)[0])
+            found, most = self._pieces.solve(x, there, most, least)
+            cost = self._cost(*found[:2], wanted, before)
+            alike = abs(cost - least) < ALIKE * least
+            best, least = (found, cost) if cost < least else (best, least)
+            if alike or not most:
+                break
         return best
+
+    def _smooth(self, x: Array, at: At, iterations: int) -> Array:
+        """Where the steps lead with the kinks rounded."""
+        if self._rounded is None:
+            return at.u
+        return self._descend(self._rounded, x, self._rounded.at(x, at), iterations)[0].u
+
+    def _held(self, x: Array, at: At, iterations: int) -> Array:
+        """The previous input."""
+        return within(self._task, np.tile(at.before, self._task.horizon), at.before, at.rate)
 
     def _descend(self, prediction: Prediction, x: Array, at: At, iterations: int) -> tuple[At, bool]:
         """Steps until a kink is in the way, and whether there was none."""
