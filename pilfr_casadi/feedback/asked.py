@@ -87,7 +87,7 @@ def planned_with(given: Any) -> ca.Function:
     model = given.export() if isinstance(given, Fit) else given
     if isinstance(model, Exported) and NEXT in model.sampled.reads:
         raise InputError(
-            f"The inputs of {model.name} are interpolated, so that a step takes those of the next sample too, and these "
+            f"The inputs of {model.name} are interpolated, so a step takes those of the next sample too, and these "
             'are not free; export it with hold="zero" to plan with it.'
         )
     function = model

@@ -107,7 +107,7 @@ class Pieces:
 
 @dataclass(frozen=True)
 class Inside:
-    """A step inside a piece, the cost it promises; the edges: their rows and multipliers, and whether it touches them."""
+    """A step inside a piece, the cost it promises; of the edges the rows, multipliers, and which are touched."""
 
     step: Array
     expected: float
