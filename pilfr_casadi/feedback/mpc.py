@@ -10,10 +10,11 @@ sample times of a millisecond; and `"ipopt"`, multiple shooting with a variable 
 that adjoins promises a lower cost (`mpc_pieces`): that is what converged means, an optimum nearby, not of all plans.
 From 150 random states and inputs of a model with eight plays, far from one another, all first plans by either solver
 converged, none by one was more than one percent worse than that by the other, and no random step lowered one by SQP by
-more than 0.1 %. With several inputs and outputs behind plays there are more optima: of 60 plans each for three models
-with two of both those by SQP were better than IPOPT's in the median (0.6 to 0.97 of the cost), and 93 to 98 % of them
-no more than one percent worse. A plan that has NOT converged was cut short by `iterations`, or is of a model that SQP
-knows no pieces of. Like any other it keeps the limits of inputs and rates.
+more than 0.1 %. With several inputs and outputs behind plays there are more optima: of 60 plans for each of three
+models with two of both those by SQP cost 0.60 to 0.97 of IPOPT's in the median, and 97 to 100 % of them were no more
+than one percent worse. A plan that has NOT converged was cut short by `iterations`, by equations that are not finite or
+curved too strongly, or is of a model of which SQP knows no pieces. Like any other it keeps the limits of inputs and
+rates.
 """
 
 from __future__ import annotations

@@ -29,6 +29,7 @@ ARMIJO = 0.1  # of what was promised, to be kept
 TOUCHING = 1e-7  # of the row of an edge
 HELD = 1e-9  # of the largest multiplier
 ALIKE = 1e-9  # cosines less than one: the same slope
+PATIENCE, FAR = 5, 100.0  # steps after which a search so many times above the bar is given up
 FLAT = 1e-12  # of the units of a gap: one that no input changes
 
 
@@ -55,12 +56,16 @@ class Pieces:
             self._steps = Steps(task, cost, self.count)
 
     def solve(self, x: Array, at: At, most: int, bar: float = np.inf) -> tuple[tuple[Array, Array, bool], int]:
-        """Inputs that are no worse, outputs, whether no adjacent piece promises a lower cost; steps left of `most`."""
+        """Inputs that are no worse, outputs, whether no adjacent piece promises a lower cost; steps left of `most`.
+
+        A search that is not to end above the cost `bar` gives up in a piece whose optimum is, or far above it.
+        """
         y, sure = at.y, True
         value = self._cost(at.u, y, at.wanted, at.before)
         own = (self._gaps(x, at.u)[0] >= 0).astype(float)
         ahead = [own]
-        while ahead and most > 0:
+        hopeless = most - PATIENCE
+        while ahead and most > 0 and (most > hopeless or value <= FAR * bar):
             sides, most = ahead.pop(0), most - 1
             found = self._step(x, at, sides)
             if found is None:

@@ -3,8 +3,8 @@
 Between kinks the model is linear in x and u, so a step that crosses none ends in the optimum of its piece. Where no
 share of a step lowers the cost as promised, a kink is in between, and the slopes of this side say nothing of the other:
 the search then goes from piece to piece (`mpc_pieces`). Among kinks there are many optima, so it is made from where the
-steps led, from where they lead with the kinks rounded, and, unless these two agree, from the previous input held; the
-best is taken. A plan is called converged where the QP has next to nothing to gain there, or no adjacent piece has.
+steps led, from where they lead with the kinks rounded, and from the previous input held, and the best is taken. A plan
+is called converged where the QP has next to nothing to gain there, or no adjacent piece has.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from .mpc_steps import At, Steps
 Array = np.ndarray
 CLOSE = 1e-5  # of u_scale: a smaller step ends the search
 ENTERED = 8  # most pieces for each Gauss-Newton step
-ALIKE = 1e-3  # of the cost: two searches that end so close have found the same
 ROUNDED = 0.1  # of y_scale, by which rounding may change the outputs
 
 
@@ -59,9 +58,8 @@ class GaussNewton:
             there = replace(begin, u=u, y=self._exact.outputs(x, u)[0])
             found, most = self._pieces.solve(x, there, most, least)
             cost = self._cost(*found[:2], wanted, before)
-            alike = abs(cost - least) < ALIKE * least
             best, least = (found, cost) if cost < least else (best, least)
-            if alike or not most:
+            if not most:
                 break
         return best
 
