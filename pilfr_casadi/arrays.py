@@ -61,3 +61,31 @@ def _call(function: ca.Function, given: Sequence[np.ndarray], found: Sequence[np
         if out.size:
             buffer.set_res(i, out.data)
     evaluate()
+
+
+class Buffered:
+    """A function of dense arguments and results that is called again and again, on the same memory."""
+
+    def __init__(self, function: ca.Function) -> None:
+        self.function = function
+        self._buffer, self._evaluate = function.buffer()
+        self._given = [np.zeros((function.size2_in(i), function.size1_in(i))) for i in range(function.n_in())]
+        self._found = [np.zeros((function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]
+        for i, a in enumerate(self._given):
+            if a.size:
+                self._buffer.set_arg(i, a.data)
+        for i, out in enumerate(self._found):
+            if out.size:
+                self._buffer.set_res(i, out.data)
+
+    def __call__(self, *arguments: np.ndarray) -> list[np.ndarray]:
+        """Results, a vector where there is one column, else a matrix (rows, columns); what is not given is zero."""
+        for own, a in zip(self._given, arguments, strict=False):
+            own[...] = np.asarray(a).T
+        self._evaluate()
+        return [out[0].copy() if len(out) == 1 else out.T.copy() for out in self._found]
+
+    @property
+    def success(self) -> bool:
+        """Whether a solver found its solution."""
+        return bool(self._buffer.stats()["success"])

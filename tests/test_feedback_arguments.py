@@ -234,3 +234,12 @@ def test_what_is_printed_is_short_and_readable(small):
     ):
         assert words in str(thing) == repr(thing) and len(str(thing)) < 300 and "array(" not in str(thing), str(thing)
     assert "process noise a step: 0.001 of each" in str(observer) and "outputs within their limits" in str(plan)
+
+
+def test_interpolated_inputs_are_refused():
+    dynamics, outputs = (lambda x, u: dict(v=u.f - 4.0 * x.v)), (lambda x: dict(v=x.v))
+    simulator = pilfr.Simulator(dynamics, outputs, states=("v",), inputs=("f",))
+    linear, zero = pilfr.exported(simulator, dt=0.1, hold="linear"), pilfr.exported(simulator, dt=0.1)
+    refused(lambda: PredictiveController(linear, 5, inputs=(-1.0, 1.0)), "interpolated")
+    refused(lambda: pilfr.do_mpc_controller(linear, 5, np.zeros(9), inputs=(-1.0, 1.0)), "interpolated")
+    assert PredictiveController(zero, 5, inputs=(-1.0, 1.0)).function.size1_in(1) == 1

@@ -57,10 +57,26 @@ def test_no_first_plan_is_stuck_at_a_kink(limits):
     assert np.mean(np.array(said)[:, 1]) > 0.8  # IPOPT ends, though most optima lie in kinks
 
 
-def test_a_plan_that_was_cut_short_is_not_called_converged():
+def test_first_plans_are_optima_nearby():
+    function, rng, said, gains = sluggish(), np.random.default_rng(1), [], []
+    run = function.mapaccum(N)
+    for x, wanted, before in drawn(150, seed=11):
+        controller = PredictiveController(function, N, inputs=(-3, 3), y_scale=0.1, rate=0.5)
+        plan = controller(x, wanted, before)
+        said.append(plan.converged)
+        size = 10.0 ** rng.uniform(-4, -1, (60, 1)) * (rng.random((60, N)) < rng.uniform(0.05, 1, (60, 1)))
+        for moved in np.clip(plan.inputs[:, 0] + 3 * size * rng.standard_normal((60, N)), -3, 3):
+            y, changes = np.asarray(run(x, moved[None])[1])[0], np.diff(moved, prepend=before)
+            cost = np.sum(((y - wanted) / 0.1) ** 2) + 1e-3 * np.sum((changes / 3) ** 2)
+            gains.append(1 - cost / plan.cost if np.max(np.abs(changes)) <= 0.5 else 0.0)
+    assert all(said) and np.max(gains) < 1e-3, (np.mean(said), np.max(gains))
+
+
+def test_a_plan_that_was_cut_short_is_not_called_converged(monkeypatch):
+    monkeypatch.setattr("pilfr_casadi.feedback.mpc_sqp.ENTERED", 1)
     options, worse = {"inputs": (-3, 3), "y_scale": 0.1, "rate": 0.5}, 0
-    for x, wanted, before in drawn(20):
-        short = PredictiveController(sluggish(), N, iterations=1, **options)
+    short = PredictiveController(sluggish(), N, iterations=1, **options)
+    for x, wanted, before in drawn(20):  # each begins with the plan of another
         whole = PredictiveController(sluggish(), N, **options)(x, wanted, before)
         for _ in range(3):
             plan = short(x, wanted, before)

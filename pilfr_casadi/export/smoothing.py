@@ -64,7 +64,7 @@ def smoothed(function: ca.Function, eps: float) -> ca.Function:
             return a / ca.sqrt(a**2 + eps**2 / 4)
         return ca.SX.unary(code, a) if b is None else ca.SX.binary(code, a, b)
 
-    found = _walk(function, [ca.vertsplit(a) if a.numel() else [] for a in arguments], apply, ca.SX)
+    found = walk(function, [ca.vertsplit(a) if a.numel() else [] for a in arguments], apply, ca.SX)
     results = [ca.vertcat(ca.SX(0, 1), *row) for row in found]
     return ca.Function(function.name(), arguments, results, function.name_in(), function.name_out())
 
@@ -86,14 +86,14 @@ def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) 
                 return EVERYTHING
         return EVERYTHING if math.isnan(low) or math.isnan(high) else (float(low), float(high))
 
-    return _walk(function, list(arguments), apply, lambda value: (float(value), float(value)))
+    return walk(function, list(arguments), apply, lambda value: (float(value), float(value)))
 
 
 def _sizes(function: ca.Function) -> list[int]:
     return [int(function.numel_in(i)) for i in range(function.n_in())]
 
 
-def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any], constant: Callable[..., Any]) -> Any:
+def walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any], constant: Callable[..., Any]) -> Any:
     """Run a function's instructions on other values; a choice between the two sides of a comparison is a max or a min.
 
     Equal expressions get one number, by which the choice `a > b ? a : b` is known, which CasADi writes as a sum of two.

@@ -9,12 +9,14 @@ import casadi as ca
 import numpy as np
 
 from ..checks import numbers
+from ..export.exported_model import Exported
 from ..fitted import Fit
 from ..recording import InputError
 from .mpc_scales import scale_of_inputs, scale_of_outputs
 
 Array = np.ndarray
 ENORMOUS = 1e20  # stands for no limit
+NEXT = "next"  # what a step of interpolated inputs reads
 SOLVERS = ("sqp", "ipopt")
 
 
@@ -82,11 +84,15 @@ def planned_with(given: Any) -> ca.Function:
     InputError
         If it is none.
     """
-    function = given
-    if isinstance(given, Fit):
-        function = given.to_casadi()
-    elif not isinstance(given, ca.Function):  # of an observer, of an export
-        function = getattr(given, "function", getattr(given, "step", given))
+    model = given.export() if isinstance(given, Fit) else given
+    if isinstance(model, Exported) and NEXT in model.sampled.reads:
+        raise InputError(
+            f"The inputs of {model.name} are interpolated, so a step takes those of the next sample too, and these "
+            'are not free; export it with hold="zero" to plan with it.'
+        )
+    function = model
+    if not isinstance(model, ca.Function):  # of an observer, of an export
+        function = getattr(model, "function", getattr(model, "step", model))
     if not isinstance(function, ca.Function):
         raise InputError(
             f"A {type(given).__name__} cannot be planned with; give a Fit, an observer, an export, or a "
@@ -112,6 +118,17 @@ def path(reference: Any, samples: int, n_y: int) -> Array:
     if found.shape == (samples, n_y) or (n_y == 1 and found.size == samples == max(found.shape, default=0)):
         return found.reshape(-1)
     raise InputError(f"The reference has the shape {found.shape}; give {(samples, n_y)}, a row a sample.")
+
+
+def within(task: Asked, u: Array, before: Array, rate: Array) -> Array:
+    """Inputs moved into the limits and the rates, sample by sample; `before` is the input of the sample before."""
+    n, u = len(before), np.clip(u, task.low, task.high)
+    if np.any(np.abs(u - np.concatenate([before, u[:-n]])) > rate):
+        for k in range(0, len(u), n):
+            here = slice(k, k + n)
+            slow = np.clip(u[here], before - rate[here], before + rate[here])
+            u[here] = before = np.clip(slow, task.low[here], task.high[here])
+    return u
 
 
 def _pair(limits: Any, of: str, shape: tuple[int, int]) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ import numpy as np
 from ..checks import numbers
 from ..recording import InputError
 from .asked import ENORMOUS, asked, planned_with
-from .mpc_cost import PENALTY
+from .mpc_cost import price_of
 
 Array = np.ndarray
 MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
@@ -116,7 +116,8 @@ def do_mpc_controller(
     mpc.set_objective(lterm=ca.sumsqr(error), mterm=ca.SX(0))
     mpc.set_rterm(u=task.move / u_size**2)
     mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = low, high
-    soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": PENALTY}
+    price = price_of(np.maximum(low_y - path, path - high_y) / y_size)
+    soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": price}
     for name, side, limit in (("above", 1, high_y), ("below", -1, low_y)):
         held = np.flatnonzero(np.abs(limit) < ENORMOUS)
         if len(held):

@@ -13,10 +13,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from ..export.smoothing import smoothed
-from ..recording import InputError
-from .asked import ENORMOUS, Asked
+from .asked import ENORMOUS, Asked, within
 from .mpc_cost import Cost
+from .mpc_rounding import rounded
 
 Array = np.ndarray
 OPTIONS = {"print_level": 0, "sb": "yes", "tol": 1e-9, "warm_start_init_point": "yes", "mu_init": 1e-4}
@@ -31,20 +30,23 @@ class Shooting:
     def __init__(self, task: Asked, cost: Cost) -> None:
         self._task, self._cost = task, cost
         self._simulate = task.function.mapaccum("simulate", task.horizon)
+        self._slacks = len(task.low_y) * task.limited
         self._exact = self._solver(task.function, EXACT)
         free, zero = np.full(len(task.low_y), np.inf), np.zeros(task.function.size1_in(0) * task.horizon)
         low_y, high_y = (np.where(np.abs(v) < ENORMOUS, v, np.sign(v) * np.inf) for v in (task.low_y, task.high_y))
         self._bounds = {
-            "lbx": np.concatenate([np.full(len(zero), -np.inf), task.low, [0.0]]),
-            "ubx": np.concatenate([np.full(len(zero), np.inf), task.high, [np.inf]]),
+            "lbx": np.concatenate([np.full(len(zero), -np.inf), task.low, np.zeros(self._slacks)]),
+            "ubx": np.concatenate([np.full(len(zero), np.inf), task.high, np.full(self._slacks, np.inf)]),
         }
-        self._sides = (zero, low_y / task.y_scale, -free), (zero, free, high_y / task.y_scale)
+        sides = (low_y / task.y_scale, -free), (free, high_y / task.y_scale)
+        self._sides = [(zero, *(side if task.limited else ())) for side in sides]
 
     def _solver(self, function: ca.Function, most: int) -> ca.Function:
         task, cost = self._task, self._cost
         n, n_u, n_y, m = (*(function.size1_in(i) for i in (0, 1)), function.size1_out(1), task.horizon)
-        states, u, s = ca.MX.sym("X", n, m), ca.MX.sym("U", n_u, m), ca.MX.sym("s")
+        states, u, s = ca.MX.sym("X", n, m), ca.MX.sym("U", n_u, m), ca.MX.sym("s", self._slacks)
         x, wanted, before = ca.MX.sym("x", n), ca.MX.sym("r", n_y, m), ca.MX.sym("before", n_u)
+        price = ca.MX.sym("price")
         following, y = function.map(m)(ca.horzcat(x, states[:, :-1]), u)
         error = (ca.vec(y) - ca.vec(wanted)) / task.y_scale
         moves = ca.DM(cost.weighted) @ ca.vec(u)
@@ -54,31 +56,17 @@ class Shooting:
         y = ca.vec(y) / task.y_scale
         nlp = {
             "x": ca.vertcat(ca.vec(states), ca.vec(u), s),
-            "p": ca.vertcat(x, ca.vec(wanted), before),
-            "f": ca.sumsqr(error) + ca.sumsqr(moves - first) + cost.penalty * s,
-            "g": ca.vertcat(ca.vec(following - states), changes, y + s, y - s),
+            "p": ca.vertcat(x, ca.vec(wanted), before, price),
+            "f": ca.sumsqr(error) + ca.sumsqr(moves - first) + price * ca.sum1(s),
+            "g": ca.vertcat(ca.vec(following - states), changes, *((y + s, y - s) if task.limited else ())),
         }
         return ca.nlpsol("mpc", "ipopt", nlp, {"ipopt": {**OPTIONS, "max_iter": most}, "print_time": False})
 
     @cached_property
     def _rounded(self) -> ca.Function | None:
         """The solver of the rounded problem; None where the model has nothing that can be rounded."""
-        task = self._task
-        rng = np.random.default_rng(0)
-        low, high = np.maximum(task.low, -task.u_scale), np.minimum(task.high, task.u_scale)
-        low, high = np.minimum(low, task.high), np.maximum(high, task.low)
-        probe = (low + (high - low) * rng.random(len(low))).reshape(task.horizon, -1).T
-        rest = np.zeros(task.function.size1_in(0))
-        own = np.asarray(self._simulate(rest, probe)[1]).ravel(order="F")
-        for eps in 10.0 ** np.arange(3, -16, -1.0):
-            try:
-                function = smoothed(task.function.expand(), eps)
-            except (InputError, RuntimeError, NotImplementedError):
-                return None
-            y = np.asarray(function.mapaccum("rounded", task.horizon)(rest, probe)[1]).ravel(order="F")
-            if np.max(np.abs(y - own) / task.y_scale) < ROUNDED:
-                return self._solver(function, ROUND)
-        return None
+        function = rounded(self._task, ROUNDED)
+        return None if function is None else self._solver(function, ROUND)
 
     def solve(
         self, x: Array, wanted: Array, before: Array, u: Array, rate: Array, iterations: int
@@ -99,11 +87,11 @@ class Shooting:
     ) -> tuple[Array, Array, bool]:
         n_u, m = self._task.function.size1_in(1), self._task.horizon
         states = np.asarray(self._simulate(x, u.reshape(m, n_u).T)[0]).ravel(order="F")
-        p = np.concatenate([x, wanted, before])
-        (zero, low, free), (_, none, high) = self._sides
-        limits = {"lbg": np.concatenate([zero, -rate, low, free]), "ubg": np.concatenate([zero, rate, none, high])}
-        out = solver(x0=np.concatenate([states, u, [0.0]]), p=p, **self._bounds, **limits)
-        found = np.asarray(out["x"]).ravel()
-        u = np.clip(found[len(states) : -1], self._task.low, self._task.high)
+        p = np.concatenate([x, wanted, before, [self._cost.price(wanted)]])
+        (zero, *low), (_, *high) = self._sides
+        limits = {"lbg": np.concatenate([zero, -rate, *low]), "ubg": np.concatenate([zero, rate, *high])}
+        out = solver(x0=np.concatenate([states, u, np.zeros(self._slacks)]), p=p, **self._bounds, **limits)
+        u = np.asarray(out["x"]).ravel()[len(states) : len(states) + len(u)]
+        u = within(self._task, u, before, rate)
         y = np.asarray(self._simulate(x, u.reshape(m, n_u).T)[1]).ravel(order="F")
         return u, y, bool(solver.stats()["success"])

@@ -5,8 +5,8 @@
               driven from rest by the lower and by the upper end of the inputs for the whole horizon, whichever is
               smaller; a tenth of that range where no output limits are given; 1 where nothing is known.
 
-A violated limit costs in proportion to y_scale, a deviation with its square: the smaller y_scale, the sooner a limit
-gives way to a reference beyond it. So with limits it is not made as small as without.
+A violated limit costs in proportion to y_scale, a deviation with its square: the smaller y_scale, the less a limit that
+cannot be kept counts against the reference. So with limits it is not made as small as without.
 Both follow from the arguments of the controller alone, so the cost is the same in each call.
 """
 
