@@ -8,6 +8,7 @@ import pytest
 from test_feedback import A, fitted
 
 import pilfr_casadi as pilfr
+from pilfr_casadi.feedback.along import along
 from pilfr_casadi.feedback.reach import reach
 
 
@@ -38,7 +39,7 @@ def plain(error):
 def test_a_fitted_delay_is_found_whatever_the_noise_of_the_fit(delay, noise, smooth):
     record = recorded(delay, noise, smooth, seed=delay)
     fit = pilfr.fit(pilfr.PILFR(2 + delay, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), record, starts=2)
-    away = reach(fit, fit.to_casadi(), record)
+    away = reach(fit, along(fit, record, "reach"), record)
     assert away.delay == delay + 1
     assert np.max(away.markov[: delay + 1]) > 0  # small, but not zero
     made = pilfr.feedforward(fit, record)
@@ -66,7 +67,7 @@ def test_standard_errors_of_the_response_are_those_of_fits_to_other_noise():
         noise = 1e-2 * np.std(record.y) * np.random.default_rng(100 + seed).standard_normal(record.y.shape)
         again = record.with_(y=record.y + noise)
         fit = pilfr.fit(pilfr.PILFR(3, pilfr.PrandtlIshlinskii(pilfr.Play, 4)), again, starts=1)
-        away = reach(fit, fit.to_casadi(), again)
+        away = reach(fit, along(fit, again, "reach"), again)
         return away.markov[:3] / away.markov[2], away.errors[:3] / away.markov[2]
 
     found, errors = (np.array(v) for v in zip(*map(response, range(12)), strict=True))

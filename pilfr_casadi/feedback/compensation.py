@@ -25,13 +25,13 @@ import casadi as ca
 import numpy as np
 
 from ..checks import numbers
-from ..model import Model
 from ..recording import InputError, Recording
+from .along import Along, along
 from .kalman import KalmanFilter, observed
 from .reach import Reach, reach
 
 if TYPE_CHECKING:
-    from ..fit import Fit
+    from .along import Observable
 
 Array = np.ndarray
 FARTHEST = 12  # samples of look-ahead that are tried, from the delay on
@@ -93,7 +93,7 @@ class Feedforward:
 
 
 def feedforward(
-    fit: Fit,
+    fit: Observable,
     recording: Recording,
     *,
     limits: tuple[float, float] | None = None,
@@ -104,8 +104,8 @@ def feedforward(
 
     Parameters
     ----------
-    fit : Fit
-        A model of one input and one output.
+    fit : Fit, Diagnosis, Simulator or Exported
+        A model of one input, held between samples, and one output; of a diagnosis its corrected simulator.
     recording : Recording
         Where the model works; the inverse has to be stable along it. Usually the training recording.
     limits : (low, high), optional
@@ -126,21 +126,23 @@ def feedforward(
         If the observer is none of this model, or the model cannot be inverted: more outputs than inputs or more than
         one, an input that does not reach the output, or not within the look-ahead asked for, or no stable inverse.
     """
-    if not isinstance(getattr(fit, "model", None), Model):
-        raise InputError(f"A {type(fit).__name__} was given to feedforward; give a Fit.")
-    model = fit.model
-    if model.n_y > model.n_u:
+    run = along(fit, recording, "feedforward")
+    n_u, n_y = recording.n_u, run.y.shape[1]
+    if n_y > n_u:
         raise InputError(
-            f"The model has {model.n_y} outputs and {model.n_u} input(s), which cannot make all of them follow wanted "
+            f"The model has {n_y} outputs and {n_u} input(s), which cannot make all of them follow wanted "
             "paths; fit a model of one output, or use predictive control."
         )
-    if model.n_u != 1 or model.n_y != 1:
+    if n_u != 1 or n_y != 1:
         raise InputError(
-            f"The model has {model.n_u} inputs and {model.n_y} output(s); the compensator inverts models of one input "
+            f"The model has {n_u} inputs and {n_y} output(s); the compensator inverts models of one input "
             "and one output, so fit such a one, or use predictive control."
         )
-    if not isinstance(recording, Recording) or not len(recording):
-        raise InputError(f"A {type(recording).__name__} was given to feedforward; give a Recording of the machine.")
+    if len(run.names) > 1:
+        raise InputError(
+            "The model's input is interpolated between samples, so that a step takes two, and the compensator holds "
+            "its own; give exported(simulator, dt=..., hold='zero', start=...), of a diagnosis with its `corrected`."
+        )
     try:
         low, high = (np.min(recording.u), np.max(recording.u)) if limits is None else map(float, limits)
     except (TypeError, ValueError):
@@ -150,10 +152,9 @@ def feedforward(
         raise InputError(
             f"Limits of the input of {given[:60]} were given; give (low, high), finite, with low below high."
         )
-    function = fit.to_casadi()
-    planned = function if observer is None else observed(function, observer, recording)
-    away = reach(fit, function, recording)
-    found, why = _look_ahead(function, recording, away, ahead)
+    planned = run.function if observer is None else observed(run.function, observer, recording)
+    away = reach(fit, run, recording)
+    found, why = _look_ahead(run, recording, away, ahead)
     delay, ends = away.delay or 0, (float(low), float(high))
     step = inverse_step(planned, found, ends, delay)
     return Feedforward(step, found, ends, delay, _outside(away), _note(found, delay, why))
@@ -192,7 +193,7 @@ def _reached(function: ca.Function, ahead: int, delay: int) -> ca.Function:
     return ca.Function("reached", [x, before, u], [y, *slopes])
 
 
-def _look_ahead(function: ca.Function, recording: Recording, away: Reach, asked: int | None) -> tuple[int, str]:
+def _look_ahead(run: Along, recording: Recording, away: Reach, asked: int | None) -> tuple[int, str]:
     """The look-ahead that was asked for, or the shortest that is stable, and why it is not the exact one."""
     whole = isinstance(asked, int | np.integer) and not isinstance(asked, bool)
     if asked is not None and not (whole and 0 <= asked <= LONGEST):
@@ -210,7 +211,7 @@ def _look_ahead(function: ca.Function, recording: Recording, away: Reach, asked:
             f"know the wanted path {n} samples ahead and give ahead={n} or more, or leave it out."
         )
     tried = range(n, n + FARTHEST + 1) if asked is None else sorted({n, asked})
-    found = {d: _inverse(function, recording, away, d) for d in tried}
+    found = {d: _inverse(run, recording, away, d) for d in tried}
     held, limit = max(h for _, h, _ in found.values()), _stable(away)
     usable = [d for d, (gain, _, radius) in found.items() if gain > FAINT * held and radius < limit]
     if usable and asked in (None, usable[-1]):
@@ -230,17 +231,17 @@ def _look_ahead(function: ca.Function, recording: Recording, away: Reach, asked:
     )
 
 
-def _inverse(function: ca.Function, recording: Recording, away: Reach, d: int) -> tuple[float, float, float]:
+def _inverse(run: Along, recording: Recording, away: Reach, d: int) -> tuple[float, float, float]:
     """Of a look-ahead: usual gain, that of an input which does not go on, spectral radius along the recording."""
     n = len(away.linear[0][0])
-    reached, poles, constant = _reached(function, d, away.delay or 0), [], []
+    reached, poles, constant = _reached(run.function, d, away.delay or 0), [], []
     for k, (a, b, _, _) in zip(away.at, away.linear, strict=True):
         slopes = reached(away.before[:, k], recording.u[max(k - 1, 0)], recording.u[k])
         _, g_x, g_before, g_u = (np.asarray(v) for v in slopes)
         gain = float(g_u.item())
         constant.append(abs(gain + float(g_before.item())))
         if gain:
-            feedback = -np.hstack([g_x[:, :n], g_before]) / gain
+            feedback = -np.hstack([g_x[:, run.linear], g_before]) / gain
             inverse = np.vstack([np.hstack([a, np.zeros((n, 1))]) + b @ feedback, feedback])
             poles.append((abs(gain), float(np.max(np.abs(np.linalg.eigvals(inverse))))))
     # where a play sticks the gain may vanish, as in a dead zone; there the input jumps and stays in its bracket
