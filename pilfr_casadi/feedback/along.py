@@ -7,7 +7,7 @@ simulator, in steps and sub-steps as fitted; an export is what it is.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -18,13 +18,21 @@ from ..fitted import Fit
 from ..recording import InputError, Recording
 from ..simulator import Simulator
 
-if TYPE_CHECKING:
-    from ..diagnose import Diagnosis
-
-    Observable = Fit | Diagnosis | Simulator | Exported
-
 Array = np.ndarray
-WANTED = "give a Fit, a Diagnosis, a Simulator or an export"
+
+
+class Corrected(Protocol):
+    """A diagnosis, as far as it is needed here."""
+
+    @property
+    def corrected(self) -> Simulator:
+        """The corrected simulator."""
+
+    def export(self, **options: Any) -> Any:
+        """Its step."""
+
+
+Observable = Fit | Corrected | Simulator | Exported
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +75,11 @@ def exported_for(given: Any, recording: Recording, verb: str) -> Exported:
     InputError
         If it is none of these, or does not fit the recording; `verb` says what it was given to.
     """
-    if not (isinstance(given, Fit | Simulator | Exported) or _is_diagnosis(given)):
-        raise InputError(f"A {type(given).__name__} was given to {verb}; {WANTED}.")
+    diagnosed = not isinstance(given, type) and isinstance(getattr(given, "corrected", None), Simulator)
+    if not (isinstance(given, Fit | Simulator | Exported) or diagnosed):
+        raise InputError(
+            f"A {type(given).__name__} was given to {verb}; give a Fit, a Diagnosis, a Simulator or an export."
+        )
     if not isinstance(recording, Recording) or not len(recording):
         raise InputError(f"A {type(recording).__name__} was given to {verb}; give a Recording of the machine.")
     if isinstance(given, Exported):
@@ -119,8 +130,3 @@ def along(given: Any, recording: Recording, verb: str) -> Along:
         clock=np.array([clock] if clock >= 0 else [], dtype=int),
         scored=counted,
     )
-
-
-def _is_diagnosis(given: Any) -> bool:
-    """Without importing it, which is from a layer above."""
-    return not isinstance(given, type) and isinstance(getattr(given, "corrected", None), Simulator)

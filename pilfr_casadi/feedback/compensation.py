@@ -19,19 +19,15 @@ is stable wherever the model has been driven. That inverse is an approximate one
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from ..checks import numbers
 from ..recording import InputError, Recording
-from .along import Along, along
+from .along import Along, Observable, along
 from .kalman import KalmanFilter, observed
 from .reach import Reach, reach
-
-if TYPE_CHECKING:
-    from .along import Observable
 
 Array = np.ndarray
 FARTHEST = 12  # samples of look-ahead that are tried, from the delay on

@@ -15,17 +15,14 @@ problems.observer`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ..checks import numbers
 from ..recording import InputError, Recording
-from .along import along
-
-if TYPE_CHECKING:
-    from .along import Observable
+from .along import Observable, along
 
 Array = np.ndarray
 TENTH = 0.1

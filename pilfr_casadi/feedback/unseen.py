@@ -13,7 +13,7 @@ throughout act as one, by their weighted sum alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -23,10 +23,8 @@ from ..elements import PrandtlIshlinskii
 from ..export import Exported, exported
 from ..fitted import Fit
 from ..recording import InputError
+from .along import Corrected
 from .kalman import KalmanFilter
-
-if TYPE_CHECKING:
-    from ..diagnose import Diagnosis
 
 Array = np.ndarray
 UNSEEN = 0.5  # left of the spread, from which on a memory counts as not seen
@@ -59,7 +57,7 @@ class Visibility:
         return "\n".join(self.sentences)
 
 
-def visibility(fit: Fit | Diagnosis | Exported, observer: KalmanFilter, x: Array, u: Array) -> Visibility:
+def visibility(fit: Fit | Corrected | Exported, observer: KalmanFilter, x: Array, u: Array) -> Visibility:
     """Which memory the outputs see when the inputs u are applied from the state x on.
 
     Parameters
@@ -123,9 +121,7 @@ def visibility(fit: Fit | Diagnosis | Exported, observer: KalmanFilter, x: Array
     return Visibility(left, tuple(unseen), tuple(sentences), int(np.sum(information > 1)))
 
 
-def _reasons(
-    kind: str, names: dict[int, str], unseen: list[int], size: Array, slip: Array, samples: int
-) -> list[str]:
+def _reasons(kind: str, names: dict[int, str], unseen: list[int], size: Array, slip: Array, samples: int) -> list[str]:
     """A sentence for each kind of reason."""
 
     def named(entries: list[int]) -> str:
@@ -142,9 +138,7 @@ def _reasons(
     if not unseen:
         out.append(f"The outputs of {samples} samples see all {n_memory} memories.")
     if wiped:
-        out.append(
-            f"{named(wiped)}: wiped out before a trace reaches an output; nothing needs to be known of it."
-        )
+        out.append(f"{named(wiped)}: wiped out before a trace reaches an output; nothing needs to be known of it.")
     if idle:
         out.append(f"{named(idle)}: no output depends on what has the weight zero.")
     if len(joint) > 1:
