@@ -7,7 +7,8 @@ solves
 
 the input going on as it went since the sample before, as long as it still reaches the output: a scalar equation that is
 piecewise linear and increasing for plays (decreasing where the gain is negative). It is solved by Newton steps inside a
-bracket that each step narrows, for a fixed number of steps. Where d = n this is the exact inverse. Sampled machines
+bracket that each step narrows, for a fixed number of steps. Where d = n, nothing comes before n samples and the
+equation has one solution, this is the exact inverse. Sampled machines
 often have zeros outside the unit circle (Åström, Hagander & Sternby 1984, Automatica 20); then the exact inverse is
 unstable, and a longer look-ahead is taken, under which
 
@@ -35,6 +36,8 @@ LONGEST = 1000  # that may be asked for
 STABLE = 0.999  # spectral radius of the inverse that is accepted; more where the model's own is as slow
 FAINT = 0.02  # of the largest gain over the look-aheads and along the recording, below which a gain is not used
 STEPS = 40  # of Newton or bisection
+NOTHING = 1e-9  # of the largest answer, below which an earlier one is none
+INPUTS = 31  # between the limits at which the gain's sign is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +111,8 @@ def feedforward(
         Of the input; by default those of the recording.
     ahead : int, optional
         Look-ahead in samples; by default the shortest under which the inverse is stable. Beyond the delay the inverse
-        is approximate, and its print says so.
+        is approximate, as where the model has a small response before or none but one input for an output; its print
+        says so.
     observer : KalmanFilter, optional
         Where the compensator works on an observer's state, the observer, for its disturbances.
 
@@ -153,6 +157,11 @@ def feedforward(
     found, why = _look_ahead(run, recording, away, ahead)
     delay, ends = away.delay or 0, (float(low), float(high))
     step = inverse_step(planned, found, ends, delay)
+    if found == delay and _both_ways(run, recording, away, ends):
+        why = "within the limits the output rises with the input in places and falls in others, so that it is not the "
+        why += "output of one input alone"
+    elif found == delay and away.early > NOTHING:
+        why = f"it has {100 * away.early:.1g} % of its largest response before, which counts as an error of the model"
     return Feedforward(step, found, ends, delay, _outside(away), _note(found, delay, why))
 
 
@@ -203,7 +212,7 @@ def _look_ahead(run: Along, recording: Recording, away: Reach, asked: int | None
     if asked is not None and asked < n:
         raise InputError(
             f"The look-ahead is {asked} samples, but the input reaches the output only after {n} (a delay; what "
-            f"the model has before is no larger than its errors, {100 * _early(away):.1g} % of its largest response); "
+            f"the model has before is no larger than its errors, {100 * away.early:.1g} % of its largest response); "
             f"know the wanted path {n} samples ahead and give ahead={n} or more, or leave it out."
         )
     tried = range(n, n + FARTHEST + 1) if asked is None else sorted({n, asked})
@@ -211,7 +220,9 @@ def _look_ahead(run: Along, recording: Recording, away: Reach, asked: int | None
     held, limit = max(h for _, h, _ in found.values()), _stable(away)
     usable = [d for d, (gain, _, radius) in found.items() if gain > FAINT * held and radius < limit]
     if usable and asked in (None, usable[-1]):
-        taken = usable[0] if asked is None else asked
+        taken, why = usable[0] if asked is None else asked, ""
+        if taken == n:
+            return int(n), why
         if found[n][2] >= limit:
             why = f"the exact inverse would be unstable ({_reason(away, found[n][2])})"
         elif n in usable:
@@ -246,9 +257,14 @@ def _inverse(run: Along, recording: Recording, away: Reach, d: int) -> tuple[flo
     return usual, float(np.median(constant)), radius
 
 
-def _early(away: Reach) -> float:
-    """Largest answer before the delay has passed, over the largest of all."""
-    return float(np.max(away.markov[: away.delay], initial=0.0) / np.max(away.markov))
+def _both_ways(run: Along, recording: Recording, away: Reach, ends: tuple[float, float]) -> bool:
+    """Whether the output, once the input reaches it, rises with the input in places and falls in others."""
+    n = away.delay or 0
+    reached, grid = _reached(run.function, n, n), np.linspace(*ends, INPUTS)
+    of = [reached(run.states[:, k], recording.u[max(k - 1, 0)], grid[None, :])[3] for k in away.at]
+    gains = np.ravel([np.asarray(gain) for gain in of])
+    counted = FAINT * float(np.median(np.abs(gains[gains != 0]))) if np.any(gains) else 0.0
+    return bool(np.min(gains) < -counted and np.max(gains) > counted)
 
 
 def _outside(away: Reach) -> Array:
@@ -277,8 +293,8 @@ def _listed(zeros: Array) -> str:
 
 
 def _note(ahead: int, delay: int, why: str) -> str:
-    samples = f"{delay} sample" + "s" * (delay != 1)
-    begin = f"An input reaches the output after {samples}"
-    if ahead == delay:
-        return f"{begin}: the exact inverse, for a path that is known {samples} ahead."
-    return f"{begin}, but {why}: an approximate inverse, for a path that is known {ahead} samples ahead."
+    of_delay, of_look = (f"{n} sample" + "s" * (n != 1) for n in (delay, ahead))
+    begin = f"An input reaches the output after {of_delay}"
+    if not why:
+        return f"{begin}: the exact inverse, for a path that is known {of_look} ahead."
+    return f"{begin}, but {why}: an approximate inverse, for a path that is known {of_look} ahead."

@@ -49,6 +49,8 @@ class Reach:
         Median magnitudes of the Markov parameters over the points, and their standard errors (nan where unknown).
     delay : int or None
         Samples after which the input reaches the output; None where it never does.
+    early : float
+        Largest Markov parameter before the delay at any of the points, over the largest median.
     """
 
     at: Array
@@ -57,6 +59,7 @@ class Reach:
     markov: Array
     errors: Array
     delay: int | None
+    early: float = 0.0
 
     def zeros(self) -> Array:
         """Zeros at the point of the usual gain, those of the delay included."""
@@ -86,7 +89,9 @@ def reach(given: Any, run: Along, recording: Recording) -> Reach:
     largest = np.max(markov)
     counts = markov > np.where(np.isnan(errors), UNKNOWN * largest, np.maximum(ERRORS * errors, SMALL * largest))
     reached = largest > 1e-12 * np.ptp(recording.y) / max(float(np.ptp(recording.u)), 1e-300) and np.any(counts)
-    return Reach(at, before, linear, markov, errors, int(np.argmax(counts)) if reached else None)
+    delay = int(np.argmax(counts)) if reached else None
+    early = float(np.max(np.abs(each[:, :delay]), initial=0.0) / largest) if reached else 0.0
+    return Reach(at, before, linear, markov, errors, delay, early)
 
 
 def _slopes(name: str, arguments: list[ca.SX], x: ca.SX, u: ca.SX, following: ca.SX, y: ca.SX) -> ca.Function:
