@@ -19,6 +19,7 @@ import numpy as np
 
 from .asked import Asked
 from .baselines import Lagged
+from .checks import is_number
 from .constraints import Constraint, loosened
 from .elements import PrandtlIshlinskii, StaticNetwork
 from .exactness import beyond
@@ -135,6 +136,8 @@ def fit(
         If recordings and model do not fit each other, hold too little, the start is not usable, or an option is unfit.
     """
     solver = solver or POLISH
+    if noise is not None and not (is_number(noise) and 0 < noise < np.inf):
+        raise InputError(f"noise = {noise!r} was given; give a number above zero, or None to have it estimated.")
     _check_options(model, solver, starts, seed, workers, progress)
     if not isinstance(start, Mapping) and start not in STARTS:
         raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper' or 'plain', or values by name.")
@@ -201,13 +204,13 @@ def _fit(
             "A start is found for PrandtlIshlinskii and StaticNetwork; for others give start={name: value} or a Model."
         )
     first = as_recordings(train)[0]
+    fewest = max(model.count(first.n_u, first.n_y), 10 * model.nx) + 2
+    job = replace(job, recordings=check_for_identification(train, fewest))
     shape = model.model(first.n_u, first.n_y).parameters
     check_room(shape, job.limits)
     if job.l1:
         check_penalty(job.l1, shape, model.element is None)
     assert isinstance(start, str)
-    fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
-    job = replace(job, recordings=check_for_identification(train, fewest))
     radius = loosened(stability_limits(model, asked.stable)[:1])
     linear, problem, solution = linear_model(
         job.recordings, model, engine=job.engine, constraints=radius, progress=job.progress, given=given
