@@ -242,10 +242,6 @@ class Fit:
     __repr__ = __str__
 
 
-def _shown(error: float) -> str:
-    return f"{error:.4f}" if error < 1e4 else f"{error:.3g}"
-
-
 def fingerprint(recording: Recording) -> str:
     """Short digest of a recording's numbers and of what is said about its initial state."""
     initial = recording.initial
@@ -290,3 +286,7 @@ def first_state(model: Model, engine: Engine, recording: Recording, samples: int
         problem = Problem(held, head, engine=engine, scale=spread)
         state = GaussNewton(max_iterations=50).solve(problem).theta
     return state
+
+
+def _shown(error: float) -> str:
+    return f"{error:.4f}" if error < 1e4 else f"{error:.3g}"
