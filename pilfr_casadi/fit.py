@@ -19,7 +19,6 @@ import numpy as np
 
 from .asked import Asked
 from .baselines import Lagged
-from .checks import is_number
 from .constraints import Constraint, loosened
 from .elements import PrandtlIshlinskii, StaticNetwork
 from .exactness import beyond
@@ -136,8 +135,6 @@ def fit(
         If recordings and model do not fit each other, hold too little, the start is not usable, or an option is unfit.
     """
     solver = solver or POLISH
-    if noise is not None and not (is_number(noise) and 0 < noise < np.inf):
-        raise InputError(f"noise = {noise!r} was given; give a number above zero, or None to have it estimated.")
     _check_options(model, solver, starts, seed, workers, progress)
     if not isinstance(start, Mapping) and start not in STARTS:
         raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper' or 'plain', or values by name.")
