@@ -29,6 +29,7 @@ from .parameters import ParameterSet
 from .recording import InputError
 
 TOLERATED = 1e-6  # violation, in units of a constraint, that is no failure
+AT_MOST, AT_LEAST = 100.0, 1e-6  # limits that a unit comes to at most; share of the largest change, at least
 UNIT = 100.0  # unit of log ρ: a violation of 1e-4 is tolerated
 SLACK = 1e-4  # share by which `stable` lets the radius exceed its limit
 INSIDE = 2e-7  # how far inside the logarithm of a radius an exact limit is solved: beyond what solvers tolerate
@@ -48,7 +49,8 @@ class Constraint:
         How the constraint is called in results.
     unit : float, optional
         A change of the expression that counts: violations are judged next to it. By default the largest change that one
-        of its variables brings about when it changes by its own size, so that units do not matter.
+        of its variables brings about when it changes by its own size, so that units do not matter, and a hundred times
+        the limit at most, so that a small one is met to 1e-4 of itself.
     exact : bool
         The limits hold at the numbers of the result, not up to a solver's tolerance; for inequalities.
     check : callable, optional
@@ -176,6 +178,13 @@ class Rows:
         held = np.repeat([c.check is not None and c.check(named) <= 0 for c in constraints], self.sizes).astype(bool)
         logs = np.repeat([isinstance(c.expression, LogRadius) for c in constraints], self.sizes).astype(bool)
         check_free(self.function, self._slope, parameters.free, p, self.lower, self.upper, self.labels, held, logs)
+
+    def units_from(self, change: np.ndarray) -> np.ndarray:
+        """Units as given, or from the largest change of each entry (n_g,), no larger than its limits warrant."""
+        limits = np.abs([np.where(np.isfinite(b), b, 0.0) for b in (self.lower, self.upper)])
+        largest = AT_MOST * np.max(limits, axis=0, initial=0.0)
+        own = np.where(largest > 0, np.clip(largest, AT_LEAST * change, change), change)
+        return np.where(np.isnan(self.units), own, self.units)
 
     def values(self, p: np.ndarray) -> np.ndarray:
         """Shape (n_g,); nan where they cannot be computed, such as a gain where a pole is 1 to the last digit."""

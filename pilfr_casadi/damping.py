@@ -17,6 +17,7 @@ import numpy as np
 from .magnitude import Neighbours
 
 ROUNDING = 1e-20  # squares of columns that are rounding
+NONE = 1e-100  # size of a variable that is none: what is left of one that was driven to zero
 
 
 def without_rounding(squares: np.ndarray, theta: np.ndarray, neighbours: Neighbours) -> np.ndarray:
@@ -28,7 +29,7 @@ def without_rounding(squares: np.ndarray, theta: np.ndarray, neighbours: Neighbo
     """
     size = neighbours.sizes(theta)
     idle = (squares <= ROUNDING * neighbours.largest(squares)) & (squares * size**2 <= ROUNDING)
-    return np.asarray(np.where(idle, 1.0 / np.where(size > 0, size, 1.0) ** 2, squares))
+    return np.asarray(np.where(idle, 1.0 / np.where(size > NONE, size, 1.0) ** 2, squares))
 
 
 @dataclass(frozen=True, eq=False)

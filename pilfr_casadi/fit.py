@@ -203,13 +203,13 @@ def _fit(
             "A start is found for PrandtlIshlinskii and StaticNetwork; for others give start={name: value} or a Model."
         )
     first = as_recordings(train)[0]
+    fewest = max(model.count(first.n_u, first.n_y), 10 * model.nx) + 2
+    job = replace(job, recordings=check_for_identification(train, fewest))
     shape = model.model(first.n_u, first.n_y).parameters
     check_room(shape, job.limits)
     if job.l1:
         check_penalty(job.l1, shape, model.element is None)
     assert isinstance(start, str)
-    fewest = max(int(shape.free.sum()), 10 * model.nx) + 2
-    job = replace(job, recordings=check_for_identification(train, fewest))
     radius = loosened(stability_limits(model, asked.stable)[:1])
     linear, problem, solution = linear_model(
         job.recordings, model, engine=job.engine, constraints=radius, progress=job.progress, given=given

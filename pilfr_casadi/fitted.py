@@ -204,7 +204,7 @@ class Fit:
         return exported(self, **options)
 
     def __str__(self) -> str:
-        errors = ", ".join(f"{e:.4f}" for e in self.train_nrmse)
+        errors = ", ".join(map(_shown, self.train_nrmse))
         spent = f", {self.seconds:.1f} s in all" if self.seconds else ""
         lines = [
             self.status.value,
@@ -217,7 +217,7 @@ class Fit:
         if self.candidates:
             reached = sorted(c.error for c in self.candidates)
             some = f"{len(reached)} starts" if len(reached) > 1 else "1 start"
-            lines.append(f"{some}, explored to NRMSE {reached[0]:.4f} ... {reached[-1]:.4f}")
+            lines.append(f"{some}, explored to NRMSE {_shown(reached[0])} ... {_shown(reached[-1])}")
             if not any(c.drawn for c in self.candidates):
                 lines.append("none of them is drawn, so the seed changes nothing")
         if self.linear_nrmse:
@@ -237,7 +237,7 @@ class Fit:
             rows = [limit.name.partition("[")[0] for limit in idle if "[" in limit.name]
             shown += [f"{len(rows)} not active ({', '.join(dict.fromkeys(rows))})"] if rows else []
             lines.append(f"constraints: {'; '.join(shown)}")
-            lines.append(unknown_multipliers(self.limits) if self.status is Status.SMALL_STEP else "")
+            lines.append(unknown_multipliers(self.limits, self.status))
         return "\n".join(line for line in lines if line)
 
     __repr__ = __str__
@@ -280,3 +280,7 @@ def first_state(model: Model, engine: Engine, recording: Recording, samples: int
         problem = Problem(held, head, engine=engine, scale=spread)
         state = GaussNewton(max_iterations=50).solve(problem).theta
     return state
+
+
+def _shown(error: float) -> str:
+    return f"{error:.4f}" if error < 1e4 else f"{error:.3g}"

@@ -142,12 +142,7 @@ class PILFR:
     ) -> Model:
         """The closed model for n_u inputs and n_y outputs, blocks starting at `values` (zero where not given)."""
         values = dict(values or {})
-        for name, count, what in (("D_zu", n_u, "input"), ("D_yw", n_y, "output")):
-            if _is_identity(self.fixed.get(name), self.n_w) and count != self.n_w:
-                raise InputError(
-                    f"{name} is fixed to the identity (as in a Hammerstein or Wiener model) with {self.n_w} channel(s) "
-                    f"of the element, but there are {count} {what}(s); give channels={count} to the element."
-                )
+        self._check_channels(n_u, n_y)
         shapes = block_shapes(self.nx, n_u, n_y, self.n_w)
         blocks = ParameterSet({name: Parameter(np.zeros(shape)) for name, shape in shapes.items()})
         model = open_model(_step, _port, blocks, n_x=self.nx, n_u=n_u, n_w=self.n_w, inputs=inputs, outputs=outputs)
@@ -169,6 +164,30 @@ class PILFR:
             if "prior" in told:
                 changes[name]["prior"] = told["prior"]
         return model.with_parameters(model.parameters.change(**changes))
+
+    def _check_channels(self, n_u: int, n_y: int) -> None:
+        for name, count, what in (("D_zu", n_u, "input"), ("D_yw", n_y, "output")):
+            if _is_identity(self.fixed.get(name), self.n_w) and count != self.n_w:
+                raise InputError(
+                    f"{name} is fixed to the identity (as in a Hammerstein or Wiener model) with {self.n_w} channel(s) "
+                    f"of the element, but there are {count} {what}(s); give channels={count} to the element."
+                )
+
+    def count(self, n_u: int, n_y: int) -> int:
+        """How many parameters are free, without building the model, which takes long where there are millions."""
+        self._check_channels(n_u, n_y)
+        own = {name: ~p.fixed for name, p in (self.element.parameters() if self.element else {}).items()}
+        total = 0
+        for name, shape in block_shapes(self.nx, n_u, n_y, self.n_w).items():
+            whole = "fixed" not in self._given(name, shape) and (name != "y_0" or self.offset)
+            total += int(np.prod(shape)) if whole else self._free(name, shape)
+        return total + sum(
+            self._free(name, free.shape) if name in self.fixed else int(free.sum()) for name, free in own.items()
+        )
+
+    def _free(self, name: str, shape: tuple[int, ...]) -> int:
+        fixed = self._given(name, shape).get("fixed")
+        return 0 if fixed is None else int(np.isnan(fixed).sum())
 
     def linear(self) -> PILFR:
         """The linear model of the same order, everything free."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from .constraints import TOLERATED, BeyondRadius
 from .problem import Problem
-from .solution import Solution
+from .solution import Solution, Status
 
 AT_RADIUS = 1e-3  # share of a bound by which a radius that it holds may lie inside
 FELT = 1e-3  # multiplier next to the logarithm of a radius, in units of the objective, from which a bound holds it
@@ -59,17 +59,18 @@ class Limit:
         return f"{self.name}: {self.value:.9g}, {f'active{cost}' if self.active else 'not active'}"
 
 
-def unknown_multipliers(limits: Sequence[Limit]) -> str:
+def unknown_multipliers(limits: Sequence[Limit], status: Status) -> str:
     """That multipliers of active constraints are not known, empty where they are."""
     names = [
         limit.name for limit in limits if limit.kind == "constraint" and limit.active and np.isnan(limit.multiplier)
     ]
     if not names:
         return ""
-    return (
-        f"multipliers are not known ({', '.join(names)}): the solver ended in steps too small to matter, as at a kink "
-        "of the error, where no rate holds on both sides"
-    )
+    why = "no step of a solver has led to this point"
+    if status is Status.SMALL_STEP:
+        why = "the solver ended in steps too small to matter, as at a kink of the error, where no rate holds on both "
+        why += "sides"
+    return f"multipliers are not known ({', '.join(names)}): {why}"
 
 
 def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:

@@ -41,7 +41,7 @@ from .search import Candidate, Search, run_tasks
 from .solution import Solution, Status
 from .start import grid_start, network_start, paper_start, regridded, unit_states
 from .threads import one_blas_thread
-from .tightening import at_bounds
+from .tightening import held_at_bounds
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
@@ -147,8 +147,8 @@ def polish(search: Search, candidate: Candidate) -> Candidate:
 
 
 def _held(search: Search, candidate: Candidate) -> bool:
-    """Whether a candidate is at an exact bound on a spectral radius."""
-    return at_bounds(search.problem(candidate.model), candidate.theta)
+    """Whether a candidate is at an exact bound on a spectral radius, which its multiplier says to hold it."""
+    return held_at_bounds(search.problem(candidate.model), candidate.theta, candidate.solution)
 
 
 def _best_so_far(found: list[Candidate]) -> Candidate:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from .asked import Asked
 from .fitted import Fit
@@ -17,8 +20,10 @@ from .problem import Problem
 from .reached_gain import reached_gain_sentence
 from .recording import Recording, fingerprint
 from .search import Candidate
-from .solution import Solution
+from .solution import Solution, Status
 from .stability import unbounded_sentence
+
+FAR = 1e3  # times the error of no output at all, from which a model diverges
 
 
 def with_solution(model: Model, problem: Problem, solution: Solution) -> Model:
@@ -59,7 +64,9 @@ def outcome(
         names = ("constraints", "noise", "scale", "weights")
         options: dict[str, Any] = {name: getattr(problem, name) for name in names}
         judged = Problem(fitted, recordings, engine=problem.engine, **options)
-    theta = solution.theta
+    theta, errors = solution.theta, tuple(problem.nrmse(solution.theta))
+    if solution.status.converged and not max(errors) < FAR * _of_nothing(problem):
+        solution = replace(solution, status=Status.DIVERGES)
     values = problem.model.parameters.unpack(problem.parameters(theta))
     told = (
         note,
@@ -80,7 +87,7 @@ def outcome(
         structure=structure,
         dt=recordings[0].dt,
         solution=solution,
-        train_nrmse=tuple(problem.nrmse(theta)),
+        train_nrmse=errors,
         initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
         labels=problem.labels,
         errors=standard_errors(judged, theta, structure) if minimum else {},
@@ -95,3 +102,8 @@ def outcome(
         limits=limits,
         asked=asked or Asked(),
     )
+
+
+def _of_nothing(problem: Problem) -> float:
+    """The largest NRMSE of any output that a model without outputs has, at least 1."""
+    return max(1.0, *(float(np.max(np.sqrt(np.mean(r.y**2, axis=0)) / problem.scale)) for r in problem.recordings))

@@ -264,7 +264,7 @@ class Problem:
         size = Neighbours(self.labels).sizes(theta)
         still = np.ones(self.size) if squares is None else 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
         change = np.abs(self.constraint_jacobian(theta)) * np.where(size > 0, size, still)
-        return np.where(np.isnan(self.rows.units), np.max(change, axis=1, initial=0.0), self.rows.units)
+        return self.rows.units_from(np.max(change, axis=1, initial=0.0))
 
     def active_constraints(self, theta: np.ndarray, tolerance: float = 1e-7) -> np.ndarray:
         """Which general constraints are at a limit, or beyond, up to a share of their unit: (n_g,), bool."""

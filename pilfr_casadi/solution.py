@@ -19,6 +19,7 @@ class Status(Enum):
     TIME_LIMIT = "Not converged: the time limit was reached; the best point so far is returned."
     INTERRUPTED = "Not converged: interrupted; the best point so far is returned."
     DIVERGED_START = "Failed: the simulation diverges at the start values; start from a stable model."
+    DIVERGES = "Failed: the model diverges along the training recordings; bound its radius, or free what is fixed."
     INFEASIBLE = "Failed: the constraints cannot be met from this start; loosen them or start elsewhere."
     RESTORED = "Not converged: the exact bounds are met by scaling the model alone; loosen them or start elsewhere."
     SOLVER_FAILED = "Not converged: the solver stopped early; the best point so far is returned."

@@ -4,7 +4,7 @@ At a tight bound several eigenvalues lie on the circle at once, some of them equ
 outside ends in poor points. So
 
 1. the problem is solved with every such bound at 1 or above (`constraints.loosened`); where the result is inside, it is
-   the solution;
+   the solution, also of a start next to a bound, which may hold nothing;
 2. else `-log ρ` is led from where it is to the bound, at most doubled at a time; before each step `A` and `B_w`
    are scaled by one factor, which scales every matrix of a PI-LFR whose radius is bounded (Krikelis et al. 2024,
    Eq. 15, and the same with the element's slope): the start is inside. Each step is a Gauss-Newton solve with the
@@ -30,6 +30,7 @@ from .constraints import BeyondRadius, Constraint, loosened
 from .exactness import beyond, missed
 from .gauss_newton import GaussNewton
 from .lifted import Lifted, back, radius_limits, rotated
+from .limits import FELT
 from .problem import Problem
 from .solution import Progress, Solution, Status
 
@@ -71,11 +72,11 @@ def within_bounds(
         return solve(problem, start)
     ends = time.perf_counter() + last.time_limit
     given = begin = problem.start if start is None else start
-    if not held and not at_bounds(problem, begin):
+    if not held:
         found = solve(with_constraints(problem, loosened(problem.constraints)), start)
         if found.status in (Status.INTERRUPTED, Status.DIVERGED_START) or _room(problem, found.theta) >= 0:
             return found
-        begin = found.theta
+        begin = begin if at_bounds(problem, begin) else found.theta
     tightened = tighten(problem, begin, _until(ends, last), progress)
     if begin is not given and _beats(problem, given, tightened):
         tightened = tighten(problem, given, _until(ends, last), progress)
@@ -88,6 +89,14 @@ def within_bounds(
 def at_bounds(problem: Problem, theta: Array) -> bool:
     """Whether a point is inside every exact bound on a radius and next to one; False where there is none."""
     return bool(radius_limits(problem)) and 0 <= _room(problem, theta) <= NEAR
+
+
+def held_at_bounds(problem: Problem, theta: Array, solution: Solution) -> bool:
+    """Whether a point is next to a bound that holds it, by the solution's multipliers where it has any."""
+    limits, force = radius_limits(problem), np.abs(solution.multipliers[problem.size :])
+    rows = np.repeat([c in limits for c in problem.constraints], problem.g_sizes).astype(bool)
+    idle = len(force) == len(rows) and bool(np.max(force[rows], initial=0.0) <= FELT * solution.cost)  # nan is unknown
+    return not idle and at_bounds(problem, theta)
 
 
 def _beats(problem: Problem, theta: Array, found: Solution) -> bool:
@@ -232,6 +241,4 @@ def _at_bound(
 
 
 def _unsolved(problem: Problem, theta: Array, status: Status) -> Solution:
-    return Solution(
-        theta, problem.cost(theta), status, 0, 0.0, multipliers=np.zeros(problem.size + len(problem.g_lower))
-    )
+    return Solution(theta, problem.cost(theta), status, 0, 0.0)  # multipliers are not known

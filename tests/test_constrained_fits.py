@@ -16,7 +16,9 @@ from pilfr_casadi.limits import limits_of
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.recording import InputError
 from pilfr_casadi.solution import Status
+from pilfr_casadi.stability import stability_limits
 from pilfr_casadi.thinning import WAYS, thinned
+from pilfr_casadi.tightening import _unsolved
 from problems.constrained import infeasible_sentences, radius, slowest_pole, sparse_plays, stability_table, three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
@@ -133,6 +135,28 @@ def test_at_a_kink_multipliers_are_not_known(record, tmp_path):
     assert np.isnan(pilfr.load(tmp_path / "m.json").limits[0].multiplier)
     page = pilfr.fit_report(stuck, record, (), tmp_path / "report").read_text()
     assert "Multipliers are not known (DC gain = 1.1)" in page
+
+
+def test_where_no_solver_has_been_multipliers_are_not_known(record):
+    fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, stable=0.7)
+    problem = Problem(fit.model, record, constraints=stability_limits(fit.structure, 0.7))
+    scaled = _unsolved(problem, fit.solution.theta, Status.RESTORED)
+    limits = limits_of(problem, scaled)
+    held = [limit for limit in limits if limit.kind == "constraint" and limit.active]
+    assert held and all(np.isnan(limit.multiplier) for limit in held)
+    shown = str(replace(fit, solution=scaled, limits=limits))
+    assert "multipliers are not known (spectral radius <= 0.7" in shown and "multiplier 0" not in shown
+    assert "kink" not in shown
+
+
+def test_a_model_that_diverges_has_not_converged(record):
+    wild = pilfr.PILFR(2, PLAYS, fixed={"A": [[1.1, 0.0], [0.0, 0.9]]})
+    fit = pilfr.fit(wild, record, starts=1, stable=False)
+    assert fit.status is Status.DIVERGES and not fit.status.converged
+    assert str(fit).startswith("Failed: the model diverges along the training recordings")
+    assert all(len(line) < 300 for line in str(fit).splitlines())
+    offset = record.with_(y=record.y + 1e5 * np.std(record.y))  # an error of 1e5 that is none of its growth
+    assert pilfr.fit(pilfr.PILFR(1), offset).status is not Status.DIVERGES
 
 
 def test_a_second_fit_under_the_same_constraint_is_never_worse():

@@ -95,3 +95,6 @@ def test_snippets_of_the_readme(tmp_path):
     script.write_text("\n".join(snippets))
     done = subprocess.run([sys.executable, script], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+    table = done.stdout.partition("strength  operators")[2].partition("the strongest")[0]
+    operators = [int(row.split()[1]) for row in table.splitlines()[1:]]
+    assert operators[0] == 10 and operators[-1] < 9  # the path shows what it is for

@@ -312,6 +312,13 @@ def test_a_damaged_file_is_one_sentence(case, tmp_path):
     assert str(tmp_path / "model.json") in one_sentence(error)
 
 
+def test_a_byte_order_mark_before_a_model_is_no_damage(tmp_path):
+    save(some_fit(), tmp_path / "model.json")
+    (tmp_path / "marked.json").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "model.json").read_bytes())
+    plain, marked = (load(tmp_path / name).parameters for name in ("model.json", "marked.json"))
+    assert all(np.array_equal(plain[name], marked[name]) for name in plain)
+
+
 def test_what_is_not_a_model_file_is_one_sentence(tmp_path):
     save(some_fit(), tmp_path / "good.json")
     good = (tmp_path / "good.json").read_bytes()

@@ -8,6 +8,7 @@ import pytest
 from test_feedback import A, fitted
 
 import pilfr_casadi as pilfr
+from pilfr_casadi.feedback.along import along
 from pilfr_casadi.feedback.reach import reach
 
 
@@ -38,14 +39,17 @@ def plain(error):
 def test_a_fitted_delay_is_found_whatever_the_noise_of_the_fit(delay, noise, smooth):
     record = recorded(delay, noise, smooth, seed=delay)
     fit = pilfr.fit(pilfr.PILFR(2 + delay, pilfr.PrandtlIshlinskii(pilfr.Play, 6)), record, starts=2)
-    away = reach(fit, fit.to_casadi(), record)
+    away = reach(fit, along(fit, record, "reach"), record)
     assert away.delay == delay + 1
     assert np.max(away.markov[: delay + 1]) > 0  # small, but not zero
     made = pilfr.feedforward(fit, record)
     assert (made.delay, made.ahead) == (delay + 1, delay + 1)
     samples = f"{delay + 1} sample" + "s" * (delay > 0)
-    assert str(made) == f"An input reaches the output after {samples}: the exact inverse, for a path that is known " + (
-        f"{samples} ahead."
+    early = re.escape(f"{100 * away.early:.1g} %")
+    assert re.fullmatch(
+        f"An input reaches the output after {samples}, but it has {early} of its largest response before, which counts "
+        f"as an error of the model: an approximate inverse, for a path that is known {samples} ahead.",
+        str(made),
     )
     if delay:
         with pytest.raises(
@@ -66,7 +70,7 @@ def test_standard_errors_of_the_response_are_those_of_fits_to_other_noise():
         noise = 1e-2 * np.std(record.y) * np.random.default_rng(100 + seed).standard_normal(record.y.shape)
         again = record.with_(y=record.y + noise)
         fit = pilfr.fit(pilfr.PILFR(3, pilfr.PrandtlIshlinskii(pilfr.Play, 4)), again, starts=1)
-        away = reach(fit, fit.to_casadi(), again)
+        away = reach(fit, along(fit, again, "reach"), again)
         return away.markov[:3] / away.markov[2], away.errors[:3] / away.markov[2]
 
     found, errors = (np.array(v) for v in zip(*map(response, range(12)), strict=True))
@@ -121,6 +125,26 @@ def test_a_pair_of_zeros_is_named_once():
     except pilfr.InputError as error:
         text = str(error)
     assert re.search(r"at (1|0\.99\d+|1\.00\d+) ± (1|0\.99\d+|1\.00\d+)i[);]", text), text
+
+
+def test_an_inverse_is_called_exact_where_it_gives_back_the_models_own_output():
+    values = {"A": A, "B_u": [[1.0], [0.5]], "C_y": [[1.0, 0.4]]}
+    for fixed, word in (({"D_yu": 0.0}, "the exact inverse"), ({}, "an approximate inverse")):
+        fit, record = fitted(pilfr.PILFR(2, fixed=fixed), values)
+        made = pilfr.feedforward(fit, record, limits=(-50, 50))
+        assert (made.delay, made.ahead) == (1, 1) and word in str(made)
+        y = fit.simulate(record)[:, 0]
+        again = fit.simulate(record.with_(u=made.inputs(y)))[:, 0]
+        assert (np.max(np.abs(again - y)) < 1e-10 * np.max(np.abs(y))) == (word == "the exact inverse")
+
+
+@pytest.mark.parametrize(("direct", "word"), [(0.5, "the exact inverse"), (-0.5, "an approximate inverse")])
+def test_an_output_that_more_than_one_input_gives_has_no_exact_inverse(direct, word):
+    element = pilfr.PrandtlIshlinskii(pilfr.Play, 2)
+    values = {"D_yu": [[direct]], "D_yw": [[1.0]], "D_zu": [[1.0]], "w": [[0.4, 0.6]], "r": [[0.2, 0.6]]}
+    made = pilfr.feedforward(*fitted(pilfr.PILFR(0, element), values))
+    assert made.delay == made.ahead == 0 and word in str(made)
+    assert ("rises with the input in places and falls in others" in str(made)) == (direct < 0)
 
 
 def test_an_input_that_reaches_nothing_is_said():

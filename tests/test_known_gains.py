@@ -8,9 +8,11 @@ from random_models import coupled_plays
 import pilfr_casadi as pilfr
 from pilfr_casadi.exact_penalty import ExactPenalty
 from pilfr_casadi.known import Gain, dc_gain
+from pilfr_casadi.limits import limits_of
 from pilfr_casadi.problem import Problem
 from pilfr_casadi.reached_gain import reached_gain_sentence
 from pilfr_casadi.recording import InputError
+from pilfr_casadi.solution import Solution, Status
 from problems.constrained import three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
@@ -44,7 +46,7 @@ def test_a_unit_from_beside_a_pole_is_taken_anew(record):
     problem = Problem(model, record, constraints=[dc_gain(1.0)])
     penalty, away = ExactPenalty(problem), np.array([0.9, 1.0, 1.0, 0.0, 0.0])
     penalty.measure(problem.start, np.ones(problem.size))
-    assert penalty.unit[0] > 1e15 and penalty.violation(away) < 1e-12  # off by 9, and it seems nothing
+    assert penalty.unit[0] > 1e11 and penalty.violation(away) < 1e-10  # off by 9, and it seems nothing
     assert penalty.shrink(away) and penalty.unit[0] < 200 and penalty.violation(away) > 0.05
     assert not penalty.shrink(away)
 
@@ -110,6 +112,16 @@ def test_gains_of_several_channels_are_named_and_held_row_by_row():
     assert [limit.name for limit in limits] == [f"DC gain = 2, 0.4; -0.2, 1 ± 0.001[{i}]" for i in range(4)]
     assert np.allclose([limit.value for limit in limits], wanted.ravel(), atol=1.01e-3)
     assert np.allclose([limit.lower for limit in limits], wanted.ravel() - 1e-3)
+
+
+def test_what_is_off_by_a_hundredth_of_a_small_limit_is_not_met():
+    model = pilfr.PILFR(2).model(2, 2, {"A": 0.5 * np.eye(2), "B_u": np.eye(2), "C_y": [[1.0, 0.5], [1.0, 1.0]]})
+    gain = np.array([[2.0, 1.0], [2.0, 2.0]])
+    gain[0, 1] = 1e-6
+    parameters = model.parameters.change(D_yu={"value": [[0.0, -1.0 + 1.01e-6], [0.0, 0.0]]})
+    problem = Problem(model.with_parameters(parameters), two_by_two(), constraints=[dc_gain(gain)])
+    solution = Solution(problem.start, 1.0, Status.SOLVER_FAILED, 0, 0.0)
+    assert [limit.met for limit in limits_of(problem, solution)][:4] == [True, False, True, True]
 
 
 @pytest.mark.parametrize("value", [[1.0, 2.0, 3.0, 4.0], [[1.0, 2.0]], [[1.0], [2.0]], [1.0, 2.0], np.ones((1, 1))])

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr, reference
 
+from pilfr_casadi.baselines import ssnn
 from pilfr_casadi.combined import Combined, Part
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.elements import PrandtlIshlinskii
 from pilfr_casadi.envelope import Envelope
 from pilfr_casadi.lfr import PILFR, block_shapes, hammerstein, wiener
-from pilfr_casadi.operators import Play, Stop
+from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
 from pilfr_casadi.recording import InputError
 
 
@@ -236,3 +237,20 @@ def test_shapes_that_data_tells_are_checked_with_it():
         structure.model(2, 1)
     with pytest.raises(InputError, match=r"The value of 'A' has the shape \(1, 2\)"):
         structure.model(1, 1, {"A": [[0.9, 0.1]]})
+
+
+@pytest.mark.parametrize(
+    "structure",
+    [
+        PILFR(0),
+        PILFR(3, ONE, offset=False),
+        PILFR(2, ONE, fixed={"A": [[0.9, NAN], [0.0, NAN]], "D_yu": 0.0, "r": [[0.1, NAN, 0.3]]}),
+        PILFR(2, PrandtlIshlinskii(Stop, 4, channels=2), fixed={"B_w": np.array([0.0, NAN]), "w": 1.0}),
+        hammerstein(2, PrandtlIshlinskii(Play, 3, channels=2)),
+        wiener(1, PrandtlIshlinskii(GeneralizedPlay(neurons=2), 2, channels=3)),
+        ssnn(3, 4),
+    ],
+    ids=str,
+)
+def test_free_parameters_are_counted_as_the_model_has_them(structure):
+    assert structure.count(2, 3) == int(structure.model(2, 3).parameters.free.sum())

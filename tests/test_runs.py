@@ -137,6 +137,16 @@ def test_a_changed_file_runs_again_just_what_depends_on_it(folder):
     assert len(pilfr.run(folder / "rig.toml").done) == 3
 
 
+def test_a_recording_that_is_changed_and_restored_leaves_the_bytes_of_the_first_run(folder):
+    first = pilfr.run(folder / "rig.toml")
+    before, test = contents(first.folder), (folder / "test.csv").read_bytes()
+    write_csv(folder / "test.csv", seed=9, m=400)
+    other = pilfr.run(folder / "rig.toml")
+    assert len(other.manifest["scores"]) == len(first.manifest["scores"]) and contents(first.folder) != before
+    (folder / "test.csv").write_bytes(test)
+    assert pilfr.run(folder / "rig.toml").done == () and contents(first.folder) == before
+
+
 def test_the_same_content_under_another_key_order_is_the_same_job(folder):
     run = read_run(folder / "rig.toml")
     text = RUN.replace('structure = "hammerstein"\nnx = 1\n', 'nx = 1\nstructure = "hammerstein"\n')
@@ -193,6 +203,8 @@ def test_a_missing_model_is_made_again(folder):
         ("[solver]", "[constraints]\ndc_gain = 'two'\n[solver]", "dc_gain"),
         ("[solver]", "[constraints]\nown = [1]\n[solver]", "'own'"),
         ("[solver]", "[regularization]\nl1 = -1\n[solver]", "'l1'"),
+        ("[solver]", "[regularization]\nprune = true\n[solver]", "'prune' in [regularization] goes with 'l1'"),
+        ("nx = 1", "nx = 5000", "at least"),
         ("[solver]", "[regularization]\npath = 3\n[solver]", "'path'"),
         ("[solver]", "[regularization]\npath = [true]\n[solver]", "'path' in [regularization] is [True]"),
         ("[solver]", "[regularization]\npath = [0.0]\n[solver]", "strengths above zero"),

@@ -248,3 +248,25 @@ def test_a_linear_model_without_the_bound_is_called_so(record):
     tight, free = (pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=1, stable=stable) for stable in (0.7, True))
     assert "the linear model alone, without the constraints, to judge" in str(tight)
     assert "the linear model alone, to judge" in str(free)
+
+
+def resonance(samples=2000):
+    """A lightly damped mass on a spring and stops, driven below and about its resonance."""
+    rng = np.random.default_rng(0)
+    u = pilfr.multisine(samples, f_max=8, fs=100.0, rng=rng) * np.minimum(1, np.arange(samples) / 50)
+    r, q, x, v, y = np.linspace(0.005, 0.06, 6), np.zeros(6), 0.0, 0.0, np.zeros(samples)
+    for k in range(samples):
+        y[k] = x
+        for _ in range(5):
+            q = np.clip(q, x - r, x + r)
+            v += 0.002 * (100 * u[k] - 600 * x - 100 * np.sum(x - q) - v)
+            x += 0.002 * v
+    return pilfr.Recording(u, y + 2e-3 * np.std(y) * rng.standard_normal(samples), 0.01, initial="zero")
+
+
+def test_a_bound_next_to_the_radius_that_holds_nothing_costs_nothing():
+    record, structure = resonance(), pilfr.PILFR(2, pilfr.PrandtlIshlinskii(pilfr.Stop, 5))
+    free = pilfr.fit(structure, record, starts=2)
+    for share in (1.0001, 1.001):
+        bounded = pilfr.fit(structure, record, starts=2, stable=share * radius(free))
+        assert bounded.train_nrmse[0] <= 1.001 * free.train_nrmse[0]

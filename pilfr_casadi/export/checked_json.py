@@ -74,7 +74,7 @@ class ModelFile:
             size = os.stat(self.path).st_size
             if size > LARGEST:
                 self.fail(f"has {size / 1e6:.0f} MB, which no model file has; give a file that `save` wrote")
-            text = Path(self.path).read_text(encoding="utf-8")
+            text = Path(self.path).read_text(encoding="utf-8-sig")
         except FileNotFoundError:
             self.fail("does not exist; check the path")
         except IsADirectoryError:

@@ -38,6 +38,8 @@ class Sampled:
         Names of the entries of x; the time comes last, where it is one.
     thresholds : dict
         Name of a memory -> half-width of the play that it belongs to.
+    held : tuple of str
+        Names of the operators' memory; a shift register is none, it moves at every step.
     """
 
     one: ca.Function
@@ -48,6 +50,7 @@ class Sampled:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     thresholds: dict[str, float]
+    held: tuple[str, ...] = ()
 
     @property
     def timed(self) -> bool:
@@ -102,12 +105,13 @@ def sampled(model: Model, dt: float, simulator: Simulator | None = None) -> Samp
     x, row = ca.SX.sym("x", model.n_state), ca.SX.sym("row", model.n_u)
     stepped = model.closed(x, row, ca.DM(model.parameters.start))
     one = ca.Function("one", [x, row], [ca.densify(e) for e in stepped], ["x", "row"], ["x_next", "y"])
-    states, thresholds = _of_laws(model, dt, simulator) if simulator else _of_element(model)
+    states, thresholds, held = _of_laws(model, dt, simulator) if simulator else _of_element(model)
     inputs = model.inputs + (tuple(f"{name}{NEXT}" for name in model.inputs) if "next" in model.reads else ())
     names = _unique([*states, *([TIME] if "t" in model.reads else [])])
     renamed = dict(zip(states, names, strict=False))
     kept = {renamed[name]: value for name, value in thresholds.items()}
-    return Sampled(one, model.reads, model.substeps, dt, names, _unique(inputs), model.outputs, kept)
+    still = tuple(renamed[name] for name in held)
+    return Sampled(one, model.reads, model.substeps, dt, names, _unique(inputs), model.outputs, kept, still)
 
 
 def right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
@@ -132,21 +136,22 @@ def right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
     )
 
 
-def _of_element(model: Model) -> tuple[list[str], dict[str, float]]:
+def _of_element(model: Model) -> tuple[list[str], dict[str, float], list[str]]:
     """Names of linear states, then of the element's memory, `memory[0,3]` being that of the threshold r[0,3]."""
     more = [f"state{k + 1}" for k in range(len(model.states), model.n_x)]
     if not isinstance(model.element, PrandtlIshlinskii):
-        return [*model.states, *more, *(f"memory[{k}]" for k in range(model.n_s))], {}
+        unnamed = [f"memory[{k}]" for k in range(model.n_s)]
+        return [*model.states, *more, *unnamed], {}, unnamed
     r = np.asarray(model.parameters["r"].value)
     memory = {f"memory[{i},{j}]": float(r[i, j]) for i, j in np.ndindex(r.shape)}
-    return [*model.states, *more, *memory], memory
+    return [*model.states, *more, *memory], memory, list(memory)
 
 
-def _of_laws(model: Model, dt: float, simulator: Simulator) -> tuple[list[str], dict[str, float]]:
+def _of_laws(model: Model, dt: float, simulator: Simulator) -> tuple[list[str], dict[str, float], list[str]]:
     """Names of states, then of the laws' own states and memory behind the port: `ground.q1`, `ground.memory1`."""
     simulator = on_grid(simulator, dt / model.substeps)
     equations = Equations(simulator, ca.SX(ParameterSet(dict(simulator.parameters)).start))
-    placed, flows, memory = simulator.elements, [], []
+    placed, flows, memory, held = simulator.elements, [], [], []
     thresholds: dict[str, float] = {}
     for element, n_q, n_s in zip(placed, equations.n_q, equations.n_s, strict=True):
         flows += [f"{element.prefix}q{k + 1}" for k in range(n_q)]
@@ -155,7 +160,8 @@ def _of_laws(model: Model, dt: float, simulator: Simulator) -> tuple[list[str], 
         r = np.ravel(p.value) if p is not None else np.zeros(0)
         thresholds |= dict(zip(own, map(float, r), strict=True)) if len(r) == n_s else {}
         memory += own
-    return [*simulator.states, *flows, *memory], thresholds
+        held += [] if getattr(element.law, "shifts", False) else own
+    return [*simulator.states, *flows, *memory], thresholds, held
 
 
 def _unique(names: Sequence[str]) -> tuple[str, ...]:

@@ -7,7 +7,8 @@ solves
 
 the input going on as it went since the sample before, as long as it still reaches the output: a scalar equation that is
 piecewise linear and increasing for plays (decreasing where the gain is negative). It is solved by Newton steps inside a
-bracket that each step narrows, for a fixed number of steps. Where d = n this is the exact inverse. Sampled machines
+bracket that each step narrows, for a fixed number of steps. Where d = n, nothing comes before n samples and the
+equation has one solution, this is the exact inverse. Sampled machines
 often have zeros outside the unit circle (Åström, Hagander & Sternby 1984, Automatica 20); then the exact inverse is
 unstable, and a longer look-ahead is taken, under which
 
@@ -19,19 +20,15 @@ is stable wherever the model has been driven. That inverse is an approximate one
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from ..checks import numbers
-from ..model import Model
 from ..recording import InputError, Recording
+from .along import Along, Observable, along
 from .kalman import KalmanFilter, observed
 from .reach import Reach, reach
-
-if TYPE_CHECKING:
-    from ..fit import Fit
 
 Array = np.ndarray
 FARTHEST = 12  # samples of look-ahead that are tried, from the delay on
@@ -39,6 +36,8 @@ LONGEST = 1000  # that may be asked for
 STABLE = 0.999  # spectral radius of the inverse that is accepted; more where the model's own is as slow
 FAINT = 0.02  # of the largest gain over the look-aheads and along the recording, below which a gain is not used
 STEPS = 40  # of Newton or bisection
+NOTHING = 1e-9  # of the largest answer, below which an earlier one is none
+INPUTS = 31  # between the limits at which the gain's sign is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,7 @@ class Feedforward:
 
 
 def feedforward(
-    fit: Fit,
+    fit: Observable,
     recording: Recording,
     *,
     limits: tuple[float, float] | None = None,
@@ -104,15 +103,16 @@ def feedforward(
 
     Parameters
     ----------
-    fit : Fit
-        A model of one input and one output.
+    fit : Fit, Diagnosis, Simulator or Exported
+        A model of one input, held between samples, and one output; of a diagnosis its corrected simulator.
     recording : Recording
         Where the model works; the inverse has to be stable along it. Usually the training recording.
     limits : (low, high), optional
         Of the input; by default those of the recording.
     ahead : int, optional
         Look-ahead in samples; by default the shortest under which the inverse is stable. Beyond the delay the inverse
-        is approximate, and its print says so.
+        is approximate, as where the model has a small response before or none but one input for an output; its print
+        says so.
     observer : KalmanFilter, optional
         Where the compensator works on an observer's state, the observer, for its disturbances.
 
@@ -126,21 +126,23 @@ def feedforward(
         If the observer is none of this model, or the model cannot be inverted: more outputs than inputs or more than
         one, an input that does not reach the output, or not within the look-ahead asked for, or no stable inverse.
     """
-    if not isinstance(getattr(fit, "model", None), Model):
-        raise InputError(f"A {type(fit).__name__} was given to feedforward; give a Fit.")
-    model = fit.model
-    if model.n_y > model.n_u:
+    run = along(fit, recording, "feedforward")
+    n_u, n_y = recording.n_u, run.y.shape[1]
+    if n_y > n_u:
         raise InputError(
-            f"The model has {model.n_y} outputs and {model.n_u} input(s), which cannot make all of them follow wanted "
+            f"The model has {n_y} outputs and {n_u} input(s), which cannot make all of them follow wanted "
             "paths; fit a model of one output, or use predictive control."
         )
-    if model.n_u != 1 or model.n_y != 1:
+    if n_u != 1 or n_y != 1:
         raise InputError(
-            f"The model has {model.n_u} inputs and {model.n_y} output(s); the compensator inverts models of one input "
+            f"The model has {n_u} inputs and {n_y} output(s); the compensator inverts models of one input "
             "and one output, so fit such a one, or use predictive control."
         )
-    if not isinstance(recording, Recording) or not len(recording):
-        raise InputError(f"A {type(recording).__name__} was given to feedforward; give a Recording of the machine.")
+    if len(run.names) > 1:
+        raise InputError(
+            "The model's input is interpolated between samples, so that a step takes two, and the compensator holds "
+            "its own; give exported(simulator, dt=..., hold='zero', start=...), of a diagnosis with its `corrected`."
+        )
     try:
         low, high = (np.min(recording.u), np.max(recording.u)) if limits is None else map(float, limits)
     except (TypeError, ValueError):
@@ -150,12 +152,16 @@ def feedforward(
         raise InputError(
             f"Limits of the input of {given[:60]} were given; give (low, high), finite, with low below high."
         )
-    function = fit.to_casadi()
-    planned = function if observer is None else observed(function, observer, recording)
-    away = reach(fit, function, recording)
-    found, why = _look_ahead(function, recording, away, ahead)
+    planned = run.function if observer is None else observed(run.function, observer, recording)
+    away = reach(fit, run, recording)
+    found, why = _look_ahead(run, recording, away, ahead)
     delay, ends = away.delay or 0, (float(low), float(high))
     step = inverse_step(planned, found, ends, delay)
+    if found == delay and _both_ways(run, recording, away, ends):
+        why = "within the limits the output rises with the input in places and falls in others, so that it is not the "
+        why += "output of one input alone"
+    elif found == delay and away.early > NOTHING:
+        why = f"it has {100 * away.early:.1g} % of its largest response before, which counts as an error of the model"
     return Feedforward(step, found, ends, delay, _outside(away), _note(found, delay, why))
 
 
@@ -192,7 +198,7 @@ def _reached(function: ca.Function, ahead: int, delay: int) -> ca.Function:
     return ca.Function("reached", [x, before, u], [y, *slopes])
 
 
-def _look_ahead(function: ca.Function, recording: Recording, away: Reach, asked: int | None) -> tuple[int, str]:
+def _look_ahead(run: Along, recording: Recording, away: Reach, asked: int | None) -> tuple[int, str]:
     """The look-ahead that was asked for, or the shortest that is stable, and why it is not the exact one."""
     whole = isinstance(asked, int | np.integer) and not isinstance(asked, bool)
     if asked is not None and not (whole and 0 <= asked <= LONGEST):
@@ -206,15 +212,17 @@ def _look_ahead(function: ca.Function, recording: Recording, away: Reach, asked:
     if asked is not None and asked < n:
         raise InputError(
             f"The look-ahead is {asked} samples, but the input reaches the output only after {n} (a delay; what "
-            f"the model has before is no larger than its errors, {100 * _early(away):.1g} % of its largest response); "
+            f"the model has before is no larger than its errors, {100 * away.early:.1g} % of its largest response); "
             f"know the wanted path {n} samples ahead and give ahead={n} or more, or leave it out."
         )
     tried = range(n, n + FARTHEST + 1) if asked is None else sorted({n, asked})
-    found = {d: _inverse(function, recording, away, d) for d in tried}
+    found = {d: _inverse(run, recording, away, d) for d in tried}
     held, limit = max(h for _, h, _ in found.values()), _stable(away)
     usable = [d for d, (gain, _, radius) in found.items() if gain > FAINT * held and radius < limit]
     if usable and asked in (None, usable[-1]):
-        taken = usable[0] if asked is None else asked
+        taken, why = usable[0] if asked is None else asked, ""
+        if taken == n:
+            return int(n), why
         if found[n][2] >= limit:
             why = f"the exact inverse would be unstable ({_reason(away, found[n][2])})"
         elif n in usable:
@@ -230,17 +238,17 @@ def _look_ahead(function: ca.Function, recording: Recording, away: Reach, asked:
     )
 
 
-def _inverse(function: ca.Function, recording: Recording, away: Reach, d: int) -> tuple[float, float, float]:
+def _inverse(run: Along, recording: Recording, away: Reach, d: int) -> tuple[float, float, float]:
     """Of a look-ahead: usual gain, that of an input which does not go on, spectral radius along the recording."""
     n = len(away.linear[0][0])
-    reached, poles, constant = _reached(function, d, away.delay or 0), [], []
+    reached, poles, constant = _reached(run.function, d, away.delay or 0), [], []
     for k, (a, b, _, _) in zip(away.at, away.linear, strict=True):
         slopes = reached(away.before[:, k], recording.u[max(k - 1, 0)], recording.u[k])
         _, g_x, g_before, g_u = (np.asarray(v) for v in slopes)
         gain = float(g_u.item())
         constant.append(abs(gain + float(g_before.item())))
         if gain:
-            feedback = -np.hstack([g_x[:, :n], g_before]) / gain
+            feedback = -np.hstack([g_x[:, run.linear], g_before]) / gain
             inverse = np.vstack([np.hstack([a, np.zeros((n, 1))]) + b @ feedback, feedback])
             poles.append((abs(gain), float(np.max(np.abs(np.linalg.eigvals(inverse))))))
     # where a play sticks the gain may vanish, as in a dead zone; there the input jumps and stays in its bracket
@@ -249,9 +257,14 @@ def _inverse(function: ca.Function, recording: Recording, away: Reach, d: int) -
     return usual, float(np.median(constant)), radius
 
 
-def _early(away: Reach) -> float:
-    """Largest answer before the delay has passed, over the largest of all."""
-    return float(np.max(away.markov[: away.delay], initial=0.0) / np.max(away.markov))
+def _both_ways(run: Along, recording: Recording, away: Reach, ends: tuple[float, float]) -> bool:
+    """Whether the output, once the input reaches it, rises with the input in places and falls in others."""
+    n = away.delay or 0
+    reached, grid = _reached(run.function, n, n), np.linspace(*ends, INPUTS)
+    of = [reached(run.states[:, k], recording.u[max(k - 1, 0)], grid[None, :])[3] for k in away.at]
+    gains = np.ravel([np.asarray(gain) for gain in of])
+    counted = FAINT * float(np.median(np.abs(gains[gains != 0]))) if np.any(gains) else 0.0
+    return bool(np.min(gains) < -counted and np.max(gains) > counted)
 
 
 def _outside(away: Reach) -> Array:
@@ -280,8 +293,8 @@ def _listed(zeros: Array) -> str:
 
 
 def _note(ahead: int, delay: int, why: str) -> str:
-    samples = f"{delay} sample" + "s" * (delay != 1)
-    begin = f"An input reaches the output after {samples}"
-    if ahead == delay:
-        return f"{begin}: the exact inverse, for a path that is known {samples} ahead."
-    return f"{begin}, but {why}: an approximate inverse, for a path that is known {ahead} samples ahead."
+    of_delay, of_look = (f"{n} sample" + "s" * (n != 1) for n in (delay, ahead))
+    begin = f"An input reaches the output after {of_delay}"
+    if not why:
+        return f"{begin}: the exact inverse, for a path that is known {of_look} ahead."
+    return f"{begin}, but {why}: an approximate inverse, for a path that is known {of_look} ahead."

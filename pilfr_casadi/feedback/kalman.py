@@ -15,17 +15,14 @@ problems.observer`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..checks import LARGEST, numbers
-from ..model import Model
+from ..checks import numbers
 from ..recording import InputError, Recording
-
-if TYPE_CHECKING:
-    from ..fit import Fit
+from .along import Observable, along
 
 Array = np.ndarray
 TENTH = 0.1
@@ -40,7 +37,7 @@ class KalmanFilter:
     Attributes
     ----------
     function : casadi.Function
-        The model `(x, u) -> (x_next, y)` that is observed: the fit's, with the disturbances of the outputs behind its
+        The model `(x, u) -> (x_next, y)` that is observed, with the disturbances of the outputs behind its
         state where they were asked for.
     step : casadi.Function
         `(x, P, u, y) -> (x_next, P_next, y_pred)`: x and y_pred are predicted from the samples before the present one,
@@ -115,9 +112,9 @@ def _semidefinite(P: Array) -> bool:
 
 
 def kalman_filter(
-    fit: Fit, recording: Recording, *, disturbance: bool = False, share: float | None = None
+    fit: Observable, recording: Recording, *, disturbance: bool = False, share: float | None = None
 ) -> KalmanFilter:
-    """An extended Kalman filter of a fit, with noise levels from what the fit leaves of a recording.
+    """An extended Kalman filter of a model, with noise levels from what the model leaves of a recording.
 
     The measurement noise has the variance of the residual of the free simulation. The process noise of each state and
     each memory is a share of its root mean square over the recording, by default the one under which the recording's
@@ -125,8 +122,9 @@ def kalman_filter(
 
     Parameters
     ----------
-    fit : Fit
-        The model.
+    fit : Fit, Diagnosis, Simulator or Exported
+        The model: of a diagnosis its corrected simulator; an export with `start=` the recording. Where inputs are
+        interpolated, the filter's u are those of a sample and of the next one, as the export's.
     recording : Recording
         Usually the training recording.
     disturbance : bool
@@ -145,20 +143,17 @@ def kalman_filter(
     InputError
         If the recording does not fit the model, or the share is not positive.
     """
-    if not isinstance(getattr(fit, "model", None), Model):
-        raise InputError(f"A {type(fit).__name__} was given to observe; give a Fit.")
     if share is not None and not (isinstance(share, int | float | np.number) and 0 < share < np.inf):
         raise InputError(f"The share of process noise is {share!r}; give a number above 0, such as 1e-3.")
-    if not fit.model.n_state and not disturbance:
+    run = along(fit, recording, "kalman_filter")
+    function, start = run.function, run.states[:, 0]
+    if not len(start) and not disturbance:
         raise InputError("The model has neither states nor memory to observe; ask for disturbance=True.")
-    function = fit.to_casadi()
-    start = fit.initial_state(recording)
-    residual = (recording.y - fit.simulate(recording))[fit.scored_from(recording) :]
-    states = np.asarray(function.mapaccum("states", len(recording))(start, recording.u.T)[0])
-    if not (np.all(np.abs(states) < LARGEST) and np.all(np.abs(residual) < LARGEST)):
-        raise InputError("The model diverges along the recording, which tells nothing of its noise; fit a stable one.")
-    spread = np.sqrt(np.mean(states**2, axis=1))
+    residual = (recording.y - run.y)[run.scored :]
+    spread = np.sqrt(np.mean(run.states[:, 1:] ** 2, axis=1))
+    spread[run.clock] = 0.0  # the time is known
     spread = np.maximum(spread, 1e-6 * np.max(spread, initial=1e-300))
+    spread[run.clock] = 0.0
     level = np.mean(residual**2, axis=0)
     if disturbance:
         function = disturbed(function)
@@ -166,7 +161,7 @@ def kalman_filter(
         start, spread = np.concatenate([start, np.zeros(len(level))]), np.concatenate([spread, size])
     noise = np.diag(np.maximum(level, 1e-16 * np.mean(recording.y**2, axis=0) + 1e-300))
     made = [_filter(function, spread, noise, s) for s in (SHARES if share is None else [share])]
-    return min(made, key=lambda f: _surprise(f, recording, start)) if len(made) > 1 else made[0]
+    return min(made, key=lambda f: _surprise(f, run.u, recording.y, start)) if len(made) > 1 else made[0]
 
 
 def _filter(function: ca.Function, spread: Array, noise: Array, share: float) -> KalmanFilter:
@@ -236,10 +231,10 @@ def ekf_step(function: ca.Function, Q: Array, R: Array) -> ca.Function:
     return ca.Function("observer", [x, p, u, y], [function(corrected, u)[0], covariance, predicted], *names)
 
 
-def _surprise(observer: KalmanFilter, recording: Recording, start: Array) -> float:
+def _surprise(observer: KalmanFilter, u: Array, y: Array, start: Array) -> float:
     """Minus twice the mean log-likelihood of one-step predictions with errors of their own size, up to a constant."""
     used = slice(None, 2048)
-    u, y = recording.u[used], recording.y[used]
+    u, y = u[used], y[used]
     _, predicted, _ = observer.run(u, y, start, observer.Q + 1e-6 * observer.P0)
     error = (y - predicted)[len(y) // 10 :]
     size = np.mean(error**2, axis=0)

@@ -14,18 +14,17 @@ the poles of the exact inverse; n of them are zero, those of the delay.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..checks import LARGEST, InputError
+from ..checks import InputError
+from ..fitted import Fit
 from ..gauge import covariance, variance
 from ..problem import Problem
 from ..recording import Recording
-
-if TYPE_CHECKING:
-    from ..fit import Fit
+from .along import Along
 
 Array = np.ndarray
 POINTS = 60  # states along the recording
@@ -50,6 +49,8 @@ class Reach:
         Median magnitudes of the Markov parameters over the points, and their standard errors (nan where unknown).
     delay : int or None
         Samples after which the input reaches the output; None where it never does.
+    early : float
+        Largest Markov parameter before the delay at any of the points, over the largest median.
     """
 
     at: Array
@@ -58,6 +59,7 @@ class Reach:
     markov: Array
     errors: Array
     delay: int | None
+    early: float = 0.0
 
     def zeros(self) -> Array:
         """Zeros at the point of the usual gain, those of the delay included."""
@@ -72,25 +74,24 @@ class Reach:
         return np.asarray(np.linalg.eigvals(inverse))
 
 
-def reach(fit: Fit, function: ca.Function, recording: Recording) -> Reach:
-    """Linearise a fit of one input and one output, `function` its step, along a recording."""
-    start = fit.initial_state(recording)
-    states = np.asarray(function.mapaccum("states", len(recording))(start, recording.u.T)[0])
-    if not np.all(np.abs(states) < LARGEST):
-        raise InputError("The model diverges along the recording, so there is nothing to invert; fit a stable one.")
+def reach(given: Any, run: Along, recording: Recording) -> Reach:
+    """Linearise a model of one input and one output, `run` its run, along a recording."""
+    function, before = run.function, run.states
     at = np.unique(np.linspace(min(1, len(recording) - 1), len(recording) - 1, POINTS).astype(int))
     x, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("u")
     slopes = _slopes("slopes", [x, u], x, u, *function(x, u))
-    before = np.column_stack([start, states])
-    linear = tuple(_of_states(slopes(before[:, k], recording.u[k]), fit.model.n_x) for k in at)
+    linear = tuple(_of_states(slopes(before[:, k], recording.u[k]), run.linear) for k in at)
     each = np.array([_markov(point, SAMPLES) for point in linear])
     markov = np.median(np.abs(each), axis=0)
     typical = int(np.argmin(np.sum(np.abs(np.abs(each) - markov), axis=1)))
-    errors = _errors(fit, recording, before[:, at[typical]], recording.u[at[typical]])
+    point = before[:, at[typical]], recording.u[at[typical]]
+    errors = _errors(given, recording, *point) if isinstance(given, Fit) else np.full(SAMPLES, np.nan)
     largest = np.max(markov)
     counts = markov > np.where(np.isnan(errors), UNKNOWN * largest, np.maximum(ERRORS * errors, SMALL * largest))
     reached = largest > 1e-12 * np.ptp(recording.y) / max(float(np.ptp(recording.u)), 1e-300) and np.any(counts)
-    return Reach(at, before, linear, markov, errors, int(np.argmax(counts)) if reached else None)
+    delay = int(np.argmax(counts)) if reached else None
+    early = float(np.max(np.abs(each[:, :delay]), initial=0.0) / largest) if reached else 0.0
+    return Reach(at, before, linear, markov, errors, delay, early)
 
 
 def _slopes(name: str, arguments: list[ca.SX], x: ca.SX, u: ca.SX, following: ca.SX, y: ca.SX) -> ca.Function:
@@ -98,9 +99,9 @@ def _slopes(name: str, arguments: list[ca.SX], x: ca.SX, u: ca.SX, following: ca
     return ca.Function(name, arguments, blocks)
 
 
-def _of_states(blocks: Any, n: int) -> tuple[Array, ...]:
+def _of_states(blocks: Any, linear: Array) -> tuple[Array, ...]:
     a, b, c, d = (np.asarray(v) for v in blocks)
-    return a[:n, :n], b[:n], c[:, :n], d
+    return a[np.ix_(linear, linear)], b[linear], c[:, linear], d
 
 
 def _markov(point: tuple[Array, ...], samples: int) -> Array:
@@ -128,7 +129,7 @@ def _errors(fit: Fit, recording: Recording, state: Array, drive: Array) -> Array
     for i in np.flatnonzero(parameters.free):
         step = 1e-6 * max(abs(parameters.start[i]), 1e-3 * np.max(np.abs(parameters.start)))
         moved = [parameters.start + way * step * (np.arange(parameters.size) == i) for way in (1, -1)]
-        up, down = (_markov(_of_states(slopes(state, drive, value), model.n_x), SAMPLES) for value in moved)
+        up, down = (_markov(_of_states(slopes(state, drive, value), np.arange(model.n_x)), SAMPLES) for value in moved)
         derivatives.append((up - down) / (2 * step))
     spread = np.diag(variance(covariance(problem, problem.start, fit.structure), np.array(derivatives).T))
     return np.sqrt(np.where(np.isfinite(spread), np.maximum(spread, 0.0), np.nan))

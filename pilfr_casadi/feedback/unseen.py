@@ -13,19 +13,18 @@ throughout act as one, by their weighted sum alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ..checks import numbers
 from ..elements import PrandtlIshlinskii
-from ..model import Model
+from ..export import Exported, exported
+from ..fitted import Fit
 from ..recording import InputError
+from .along import Corrected
 from .kalman import KalmanFilter
-
-if TYPE_CHECKING:
-    from ..fit import Fit
 
 Array = np.ndarray
 UNSEEN = 0.5  # left of the spread, from which on a memory counts as not seen
@@ -58,19 +57,19 @@ class Visibility:
         return "\n".join(self.sentences)
 
 
-def visibility(fit: Fit, observer: KalmanFilter, x: Array, u: Array) -> Visibility:
+def visibility(fit: Fit | Corrected | Exported, observer: KalmanFilter, x: Array, u: Array) -> Visibility:
     """Which memory the outputs see when the inputs u are applied from the state x on.
 
     Parameters
     ----------
-    fit : Fit
+    fit : Fit, Diagnosis or Exported
         The model.
     observer : KalmanFilter
         Its filter, of which the noise and the usual spread are taken.
     x : array, shape (n,)
         State of the observer at the window's beginning.
     u : array, shape (samples, n_u)
-        Inputs of the window.
+        Inputs of the window, as the observer takes them.
 
     Returns
     -------
@@ -82,20 +81,24 @@ def visibility(fit: Fit, observer: KalmanFilter, x: Array, u: Array) -> Visibili
     InputError
         If x or u do not fit the model.
     """
-    if not isinstance(getattr(fit, "model", None), Model) or not isinstance(observer, KalmanFilter):
+    usable = isinstance(fit, Exported) or (callable(getattr(fit, "export", None)) and not isinstance(fit, type))
+    if not usable or not isinstance(observer, KalmanFilter):
         raise InputError(
             f"A {type(fit).__name__} and a {type(observer).__name__} were given; give a Fit and its kalman_filter."
         )
-    model, function, n = fit.model, observer.function, len(observer.x0)
-    if n < model.n_state:
-        raise InputError(f"The observer has {n} states and the model {model.n_state}; give the model's own observer.")
+    model, function, n = fit if isinstance(fit, Exported) else exported(fit), observer.function, len(observer.x0)
+    if n < len(model.states):
+        raise InputError(
+            f"The observer has {n} states and the model {len(model.states)}; give the model's own observer."
+        )
     x, u = numbers(x, "The state").ravel(), numbers(u, "u")
     u = u[:, None] if u.ndim == 1 else u
-    if len(x) != n or u.ndim != 2 or u.shape[1] != model.n_u or not len(u):
+    if len(x) != n or u.ndim != 2 or u.shape[1] != len(model.inputs) or not len(u):
         raise InputError(
-            f"A state of {len(x)} numbers and inputs {u.shape} were given; give {n} numbers and (samples, {model.n_u})."
+            f"A state of {len(x)} numbers and inputs {u.shape} were given; give {n} numbers and "
+            f"(samples, {len(model.inputs)})."
         )
-    state, drive = ca.SX.sym("x", n), ca.SX.sym("u", model.n_u)
+    state, drive = ca.SX.sym("x", n), ca.SX.sym("u", len(model.inputs))
     following, output = function(state, drive)
     slopes = ca.Function(
         "slopes", [state, drive], [following, ca.jacobian(following, state), ca.jacobian(output, state)]
@@ -112,15 +115,19 @@ def visibility(fit: Fit, observer: KalmanFilter, x: Array, u: Array) -> Visibili
     traces = np.vstack(rows) * observer.spread
     information = np.linalg.eigvalsh(traces.T @ traces)
     left = np.sqrt(np.clip(np.diag(np.linalg.inv(np.eye(n) + traces.T @ traces)), 0, 1))
-    unseen = [j for j in range(model.n_x, model.n_state) if left[j] > UNSEEN]
-    sentences = _reasons(fit, unseen, np.linalg.norm(traces, axis=0), slip, len(u))
+    kind, names = _names(fit, model)
+    unseen = [j for j in names if left[j] > UNSEEN]
+    sentences = _reasons(kind, names, unseen, np.linalg.norm(traces, axis=0), slip, len(u))
     return Visibility(left, tuple(unseen), tuple(sentences), int(np.sum(information > 1)))
 
 
-def _reasons(fit: Fit, unseen: list[int], size: Array, slip: Array, samples: int) -> list[str]:
+def _reasons(kind: str, names: dict[int, str], unseen: list[int], size: Array, slip: Array, samples: int) -> list[str]:
     """A sentence for each kind of reason."""
-    model = fit.model
-    n_memory, tiny = model.n_s, TRACE * np.max(size, initial=0.0)
+
+    def named(entries: list[int]) -> str:
+        return f"{kind} " + ", ".join(names[j] for j in entries)
+
+    n_memory, tiny = len(names), TRACE * np.max(size, initial=0.0)
     if not n_memory:
         return ["The model has no memory to see."]
     wiped = [j for j in unseen if size[j] <= tiny and slip[j] >= 0]
@@ -131,41 +138,40 @@ def _reasons(fit: Fit, unseen: list[int], size: Array, slip: Array, samples: int
     if not unseen:
         out.append(f"The outputs of {samples} samples see all {n_memory} memories.")
     if wiped:
-        out.append(
-            f"{_named(fit, wiped)}: wiped out before a trace reaches an output; nothing needs to be known of it."
-        )
+        out.append(f"{named(wiped)}: wiped out before a trace reaches an output; nothing needs to be known of it.")
     if idle:
-        out.append(f"{_named(fit, idle)}: no output depends on what has the weight zero.")
+        out.append(f"{named(idle)}: no output depends on what has the weight zero.")
     if len(joint) > 1:
         out.append(
-            f"{_named(fit, joint)}: stick over all {samples} samples, so that the outputs see the weighted sum of what "
+            f"{named(joint)}: stick over all {samples} samples, so that the outputs see the weighted sum of what "
             "sticks and not each one; an excursion that makes them slip one after the other tells them apart."
         )
     elif joint:
         out.append(
-            f"{_named(fit, joint)}: sticks over all {samples} samples, and what it adds to the outputs drowns in noise "
+            f"{named(joint)}: sticks over all {samples} samples, and what it adds to the outputs drowns in noise "
             "or looks like that of others; an excursion that makes it slip settles it."
         )
     if faint:
         verb = "slip" if len(faint) > 1 else "slips"
         out.append(
-            f"{_named(fit, faint)}: {verb} within the window, and the trace left before drowns in noise or looks like "
+            f"{named(faint)}: {verb} within the window, and the trace left before drowns in noise or looks like "
             "that of others; from then on the signal that drives the operator tells its memory."
         )
     return out
 
 
-def _named(fit: Fit, entries: list[int]) -> str:
-    """Memories by their operator and threshold where the element has them."""
-    model = fit.model
-    element = model.element
-    if not isinstance(element, PrandtlIshlinskii):
-        return "Memory " + ", ".join(str(j - model.n_x + 1) for j in entries)
-    r = fit.parameters["r"]
-    names = []
-    for j in entries:
-        channel, i = divmod(j - model.n_x, element.n)
-        where = f" of channel {channel + 1}" if element.channels > 1 else ""
-        names.append(f"{i + 1}{where} (r = {r[channel, i]:.3g})")
-    kind = element.operator.name.replace("_", " ")
-    return f"{kind[0].upper()}{kind[1:]} " + ", ".join(names)
+def _names(fit: Any, model: Exported) -> tuple[str, dict[int, str]]:
+    """What memory is called, and where each is in the state with its own name, and its threshold where it has one."""
+    places = {model.states[name]: name for name in model.sampled.held}
+    element = fit.model.element if isinstance(fit, Fit) else None
+    if isinstance(fit, Fit) and not isinstance(element, PrandtlIshlinskii):
+        return "Memory", {place: str(k + 1) for k, place in enumerate(places)}
+    out = {}
+    for k, (place, name) in enumerate(places.items()):
+        r, shown = model.thresholds.get(name), name
+        if isinstance(element, PrandtlIshlinskii):
+            channel, i = divmod(k, element.n)
+            shown = f"{i + 1}{f' of channel {channel + 1}' if element.channels > 1 else ''}"
+        out[place] = shown if r is None else f"{shown} (r = {r:.3g})"
+    kind = element.operator.name.replace("_", " ") if isinstance(element, PrandtlIshlinskii) else "memory"
+    return f"{kind[0].upper()}{kind[1:]}", out

@@ -279,9 +279,11 @@ def _campaign(table: Table) -> dict[str, Any]:
 
 def _regularization(table: Table, files: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
     path = table.any("path", False)
-    l1, prune = table.number("l1", None, 0.0), table.take("prune", bool, True)
+    l1, prune = table.number("l1", None, 0.0), table.take("prune", bool)
     margin = table.number("margin", 0.05, 0.0)
     table.done()
+    if prune is not None and l1 is None:
+        table.fail("'prune' in [regularization] goes with 'l1', a path prunes by itself; give l1, or leave prune out")
     if path is not False:
         usable = path is True or (
             isinstance(path, list | tuple) and path and all(is_number(s) and 0 < s < float("inf") for s in path)
@@ -293,4 +295,4 @@ def _regularization(table: Table, files: Mapping[str, tuple[str, ...]]) -> dict[
         if not files["validation"]:
             table.fail("'path' in [regularization] is chosen by validation; give [data] a validation recording")
         path = () if path is True else tuple(float(s) for s in path)
-    return {"l1": l1, "prune": prune, "path": None if path is False else path, "margin": margin}
+    return {"l1": l1, "prune": prune is not False, "path": None if path is False else path, "margin": margin}

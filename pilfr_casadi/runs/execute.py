@@ -251,7 +251,7 @@ class _Execution:
                 raise ConstraintsNotMet(f"{given.file}: no job meets its constraints; {about}")
             kind = InputError if all(entries[j.id].get("refused") for j in whole) else NoModel
             raise kind(f"{given.file}: no job gave a model; {about}")
-        scores = place.scores(jobs)
+        scores = place.scores(jobs, last=True)
         best = chosen(scores, [j.id for j in usable])
         job = next(j for j in usable if j.id == best)
         times = read_times(place.path)

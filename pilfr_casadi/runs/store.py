@@ -80,9 +80,9 @@ class Store:
         note_times(self.path, {job.id: found.seconds for job, found in batch})
         self.manifest.put_all(models, entries)
 
-    def scores(self, jobs: Sequence[RunJob]) -> list[Score]:
-        """Errors of the jobs' models, those that the manifest knows from there."""
-        out = []
+    def scores(self, jobs: Sequence[RunJob], last: bool = False) -> list[Score]:
+        """Errors of the jobs' models, those that the manifest knows from there; at `last` it forgets all others."""
+        out, used = [], set()
         for job in (j for j in jobs if self.ended_well(j)):
             if job.fold is not None:
                 entry = self.entries[job.id]
@@ -97,7 +97,11 @@ class Store:
                     fit = fit or load(self.path / job.model_file, model=own if isinstance(own, Model) else None)
                     known[key] = error_of(replace(fit, engine=self.run.engine), recording)
                 value = known[key]
+                used.add(key)
                 out.append(Score(job.id, role, name, np.nan if value is None else float(value)))
+        if last:
+            kept = self.manifest.content["scores"]
+            self.manifest.content["scores"] = {key: error for key, error in kept.items() if key in used}
         return out
 
     def _score_key(self, model: str, name: str) -> str:
