@@ -50,6 +50,13 @@ class Port:
     across_unit: str = ""
     series: bool = False
 
+    @property
+    def kinds(self) -> set[str]:
+        """Places of laws that it is: "parallel", or "series" and at a sensor "sensor"."""
+        if not self.series:
+            return {"parallel"}
+        return {"series", "sensor"} if self.name.startswith("sensor:") else {"series"}
+
 
 @dataclass(frozen=True, eq=False)
 class Placed:
@@ -227,8 +234,8 @@ class Simulator:
         """A simulator with a law put into a port; see `model.close_loop`."""
         place = self.port(port)
         allowed = getattr(law, "places", ("series", "parallel"))
-        kind = "series" if place.series else "parallel"
-        if kind not in allowed:
+        if not place.kinds & set(allowed):
+            kind = "series" if place.series else "parallel"
             raise InputError(f"The law {law.id!r} cannot stand in {kind} at {port!r}; choose another port or law.")
         if getattr(law, "channels", 1) != 1:
             raise InputError(f"The element has {law.channels} channels, the port {port!r} has one; give as many.")

@@ -133,7 +133,7 @@ def test_a_law_speaks_of_itself(kind):
     assert any(letter.isdigit() for letter in law.source), "no citation"
     assert inspect.getdoc(kind)
     assert all("[" not in readable_unit(unit, "N", "m") for unit in law.units.values())
-    assert set(law.places) <= {"parallel", "series"} and law.places
+    assert set(law.places) <= {"parallel", "series", "sensor"} and law.places
     for name, (low, high) in law.bounds(LOCAL).items():
         assert name in own
         assert np.all(np.asarray(low) <= np.asarray(high))

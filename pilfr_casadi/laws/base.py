@@ -89,8 +89,8 @@ class Law:
         Parameter -> unit, in terms of w, z and s: "w/z^3".
     strength : tuple of str
         Parameters in which the force is linear.
-    places : tuple of {"parallel", "series"}
-        Inside the dynamics, or at an actuator or a sensor.
+    places : tuple of {"parallel", "series", "sensor"}
+        Inside the dynamics, at an actuator or a sensor, or at a sensor alone.
     dissipative : bool
         Strengths must oppose motion, but for those in `signed`.
     restoring : bool

@@ -54,7 +54,7 @@ class Ripple(PeriodicForce):
     form = "ripple"
     source = "Heydemann (1981), Applied Optics 20(19)"
     sentence = "an error that repeats with the signal itself, as from an encoder off centre or its interpolation"
-    places: ClassVar[tuple[str, ...]] = ("series",)
+    places: ClassVar[tuple[str, ...]] = ("sensor",)
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield from grid(L=2 * local.half / np.arange(3.0, 60.1, 1.0))
