@@ -35,7 +35,7 @@ PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each
 LOOKED_AT = 60  # pairs of laws whose share is cross-validated
 RIDGE = 1e-4
 WORTH = 0.8  # times the error so far that a pair has to come to
-PROMISING = 0.9  # of the mean square so far: pairs that leave more are not put up against every law
+PROMISING = 0.9  # of the mean square so far that a pair leaves at most after the first round
 ROUNDS = 3  # times that one law is put up against all others
 
 
@@ -167,9 +167,9 @@ def _two(search: Search) -> tuple[Fitted, list[Pass]] | None:
     best = min((c for c in fits if c is not None), key=lambda c: c.error, default=None)
     best = search.polished(best) if best is not None else None
     search.timed("two at once", began)
-    if best is None or best.full > PROMISING * search.base.cost:
+    if best is None or best.full > search.base.cost:
         return None
-    joint, passes = best.fitted, dict[str, Any]()
+    joint, passes, before = best.fitted, dict[str, Any](), search.base.cost
     elements = list(joint.simulator.elements[-2:])
     for k in range(ROUNDS):
         kept, other = elements
@@ -178,6 +178,8 @@ def _two(search: Search) -> tuple[Fitted, list[Pass]] | None:
         if step.choice is None:
             return None
         joint = step.choice.winner.fitted
+        if joint.cost > PROMISING * before:
+            return None
         new = joint.simulator.elements[-1]
         same = (new.port, type(new.law)) == (other.port, type(other.law))
         passes = {kept.port: passes.get(kept.port), new.port: replace(step, accepted=True)}
