@@ -15,6 +15,7 @@ from .recording import Recording
 Array = np.ndarray
 
 ALIKE = 0.02  # rms difference over deviation; a measured input is never quite the same
+UNLIKE = 0.5  # the same beyond which an input has another period than is said, or none: noise alone gives 1.4
 MOST = 2 / 3  # of a recording: the largest lag at which it is compared with itself
 
 
@@ -33,6 +34,15 @@ def repeats_itself(recording: Recording) -> bool:
     away = np.argmax(apart > size)  # a slow input is like itself a moment later: first it has to be unlike
     last = int(MOST * m)
     return bool(away and away < last and np.min(apart[away : last + 1]) <= ALIKE**2 * size)
+
+
+def keeps_its_period(recording: Recording) -> bool:
+    """Whether the input repeats after the period of a recording that is said to be in periodic steady state."""
+    u, n = recording.u[recording.skip :], recording.period or 0
+    if recording.begins != "periodic" or not 0 < n < len(u):
+        return True
+    apart = np.sqrt(np.mean((u[n:] - u[:-n]) ** 2, axis=0))
+    return bool(np.all(apart <= UNLIKE * np.std(u, axis=0)))
 
 
 def same_input(one: Recording, other: Recording) -> bool:

@@ -60,7 +60,8 @@ def test_other_folds_are_other_jobs(folder, monkeypatch):
 def test_folds_of_steady_periods_are_refused(capsys, folder):
     """Whatever block is held out, the others have its input: it would prove nothing."""
     wave = np.random.default_rng(3).normal(size=100)
-    write_csv(folder / "train.csv", m=300, u=np.tile(wave, 3))
+    for name in ("train", "test"):
+        write_csv(folder / f"{name}.csv", m=300, u=np.tile(wave, 3))
     once = ("report = false", "report = false\nfolds = 3")
     for path in (changed(folder, once), changed(folder, once, ('"zero"', '"periodic"\nperiod = 100'))):
         refused(capsys, "campaign", path, says=("folds = 3 was given", "proves nothing; give other realizations"))

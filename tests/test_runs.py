@@ -197,6 +197,7 @@ def test_a_missing_model_is_made_again(folder):
         ('outputs = "y"', 'outputs = "z"', "z"),
         ('outputs = "y"', "outputs = 3", "a name, or a list of names"),
         ('initial = "zero"', 'initial = "nil"', "nil"),
+        ('initial = "zero"', 'initial = "periodic"\nperiod = 40', ("does not repeat after 40 samples", "period")),
         ("[solver]", "[solver]\ntime_limit = 3", "max_iterations"),
         ("[solver]", '[solver]\nname = "newton"', "'gauss-newton' or 'ipopt'"),
         ("[solver]", "[constraints]\nspectral_radius = -1\n[solver]", "'spectral_radius'"),

@@ -161,7 +161,7 @@ def feedforward(
         why = "within the limits the output rises with the input in places and falls in others, so that it is not the "
         why += "output of one input alone"
     elif found == delay and away.early > NOTHING:
-        why = f"it has {100 * away.early:.1g} % of its largest response before, which counts as an error of the model"
+        why = f"it has {_percent(away.early)} of its largest response before, which counts as an error of the model"
     return Feedforward(step, found, ends, delay, _outside(away), _note(found, delay, why))
 
 
@@ -212,7 +212,7 @@ def _look_ahead(run: Along, recording: Recording, away: Reach, asked: int | None
     if asked is not None and asked < n:
         raise InputError(
             f"The look-ahead is {asked} samples, but the input reaches the output only after {n} (a delay; what "
-            f"the model has before is no larger than its errors, {100 * away.early:.1g} % of its largest response); "
+            f"the model has before is no larger than its errors, {_percent(away.early)} of its largest response); "
             f"know the wanted path {n} samples ahead and give ahead={n} or more, or leave it out."
         )
     tried = range(n, n + FARTHEST + 1) if asked is None else sorted({n, asked})
@@ -298,3 +298,7 @@ def _note(ahead: int, delay: int, why: str) -> str:
     if not why:
         return f"{begin}: the exact inverse, for a path that is known {of_look} ahead."
     return f"{begin}, but {why}: an approximate inverse, for a path that is known {of_look} ahead."
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1g} %" if share < 0.1 else f"{100 * share:.0f} %"

@@ -24,6 +24,7 @@ from ..interrupts import Progress, deferred_interrupt
 from ..model import Model
 from ..readers import read
 from ..recording import InputError, Recording
+from ..repetition import keeps_its_period
 from ..solution import Status
 from .described import ROLES, Run, read_run
 from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, check_own, read_times, sweep
@@ -292,6 +293,12 @@ def _read(given: Run, name: str) -> Recording:
     options = dict(given.reading)
     inputs, outputs = options.pop("inputs"), options.pop("outputs")
     try:
-        return read(given.located(name), inputs, outputs, **options)
+        found = read(given.located(name), inputs, outputs, **options)
     except TypeError as error:
         raise InputError(f"{given.file}: {error}.") from None
+    if not keeps_its_period(found):
+        raise InputError(
+            f'{given.file}: the input of {name} does not repeat after {found.period} samples, as initial = "periodic" '
+            'says of every recording of the run; correct `period`, or give initial = "estimate".'
+        )
+    return found
