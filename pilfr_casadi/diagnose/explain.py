@@ -28,6 +28,7 @@ REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them 
 AGAIN = 3  # starts that a pair is fitted from again
 SAME = 1.02  # times the mean square error of fits that came to the same place
 BEHIND = 3.0  # times the best error of a pair that is not worth more starts
+FAINT = 0.1  # of the share that the other way of looking sees, below which one has seen nothing to start at
 
 
 def survivors(scored: Sequence[Scored]) -> list[tuple[str, type[Law], list[Scored]]]:
@@ -45,6 +46,7 @@ def survivors(scored: Sequence[Scored]) -> list[tuple[str, type[Law], list[Score
     for s in scored:
         if (s.port, type(s.law)) in chosen:
             chosen[s.port, type(s.law)].append(s)
+    chosen = {key: [s for s in found if s.share > FAINT * found[0].share] or found for key, found in chosen.items()}
     return [(port, law, entries) for (port, law), entries in chosen.items()]
 
 
