@@ -102,7 +102,9 @@ def diagnose(
     prepared_at = time.perf_counter()
     said = said_hold(simulator, recordings, hold) is not None
     search = Search(ready.bench, ready.without, ready.floor, laws, workers, say, said).run(effects)
-    if not said and (search.misheld > MISHELD or search.unsure()) and not search.interrupted:
+    named = any(p.accepted for p in search.passes)
+    doubted = search.wavers() if named else search.unsure()  # a late sensor looks like the other hold
+    if not said and (search.misheld > MISHELD or doubted) and not search.interrupted:
         ready, search = _otherwise_held(simulator, recordings, engine, ready, search, effects)
     bench, without = ready.bench, ready.without
     search.base = without_idle_offsets(bench, search.base)
@@ -181,7 +183,7 @@ def _otherwise_held(
     except KeyboardInterrupt:
         search.interrupted = True
         return ready, search
-    if not wrong and again.certainty() <= search.certainty():
+    if not wrong and (again.certainty() <= search.certainty() or again.base.cost > search.base.cost):
         search.interrupted = again.interrupted
         return ready, search
     ratio = search.misheld if wrong else float(np.sqrt(search.base.cost / max(again.base.cost, 1e-300)))

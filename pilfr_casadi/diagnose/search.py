@@ -153,9 +153,11 @@ class Search:
 
     def unsure(self) -> bool:
         """Whether something is left that a force explains, and what is named does not explain it or is not sure."""
-        if self.certainty() > UNSURE or not self._much():
-            return False
-        return max(self.open_after.values(), default=0.0) > HINT
+        return self.wavers() and max(self.open_after.values(), default=0.0) > HINT
+
+    def wavers(self) -> bool:
+        """Whether something is left, and what is named does not explain it or is not sure."""
+        return self.certainty() <= UNSURE and self._much()
 
     def certainty(self) -> float:
         """Confidence of the least sure name; nothing where nothing is named, or what is named does not explain."""
