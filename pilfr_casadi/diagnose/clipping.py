@@ -10,7 +10,11 @@ import numpy as np
 from ..laws.limits import AsymmetricSaturation
 from ..recording import Recording
 from .gates import Gate, refit
+from .linearise import linearised
+from .remainder import folds, followed, held_out, moved
 from .workbench import Fitted, Workbench
+
+HALF = 0.5  # of the mismatch, that what lies beyond a limit leaves at most
 
 
 def unclip(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
@@ -36,18 +40,52 @@ def unclip(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gat
     return bench, plain, gates
 
 
-def clipped_input(bench: Workbench, where: str) -> Gate | None:
-    """The clipped input at whose actuator the mismatch is: what went into the machine is not in the recording."""
+def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | None:
+    """The clipped input beyond whose limits most of the mismatch lies, where no law leaves less (`remains`) of it.
+
+    What went into the machine there is not in the recording; a parabola over each time at a limit stands for it.
+    """
     for i, low, high, count in clipped(bench.recordings, "u"):
         name = bench.simulator.inputs[i]
-        if where == f"actuator:{name}":
+        left = 1 - _beyond(bench, without, i, low, high)
+        if left < min(HALF, remains):
             at = " and ".join(f"{v:.6g}" for v in _said(low, high))
             sentence = (
-                f"{name} is clipped at {at} ({count} samples at the limit), and the mismatch looks like a signal added "
-                "to it: what went into the machine there is not in the recording. Record it with a larger range."
+                f"{name} is clipped at {at} ({count} samples at the limit), and what it may have been beyond explains "
+                f"{1 - left:.0%} of the mismatch: what went into the machine there is not in the recording. Record it "
+                "with a larger range."
             )
             return Gate(name, "clipping", _said(low, high), sentence, False, fault=True)
     return None
+
+
+def _beyond(bench: Workbench, without: Fitted, i: int, low: float, high: float) -> float:
+    """Share of the error that input i beyond its limits explains, on blocks that it was not fitted to."""
+    probe, runs = linearised(bench, without)
+    port = probe.ports.index(f"actuator:{bench.simulator.inputs[i]}")
+    skips = [r.skip for r in bench.recordings]
+    limits = [(v, sign) for v, sign in ((low, -1.0), (high, 1.0)) if np.isfinite(v)]
+    phi, error = [], []
+    for run, r in zip(runs, bench.recordings, strict=True):
+        beyond = np.column_stack([sign * _bulges(r.u[:, i] == v) for v, sign in limits])
+        phi.append(moved(bench, run, [(port, beyond)], r.skip)[:, -len(limits) :])
+        error.append((run.error / bench.scale)[r.skip :].ravel())
+    base = followed(bench, runs, skips)
+    left, columns = np.concatenate(error), np.concatenate(phi)
+    left = left - base @ (base.T @ left)
+    columns = columns - base @ (base.T @ columns)
+    if np.any(np.linalg.lstsq(columns, left, rcond=1e-8)[0] > 0):  # it would have been within the limit
+        return 0.0
+    return held_out(columns, left, folds(len(left), len(runs)))
+
+
+def _bulges(at: np.ndarray) -> np.ndarray:
+    """A parabola of curvature one over each stretch of a mask."""
+    out, edges = np.zeros(len(at)), np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]])))
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        t = np.arange(end - begin) + 0.5
+        out[begin:end] = t * (end - begin - t) / 2
+    return out
 
 
 def _said(low: float, high: float) -> list[float]:

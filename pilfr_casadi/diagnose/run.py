@@ -28,7 +28,7 @@ from .result import Diagnosis, Effect
 from .search import MISHELD, Pass, Search
 from .tones import tones
 from .undeclared import beyond_the_ports
-from .verdict import UNSURE, confidence, judge
+from .verdict import UNSURE, confidence, judge, left_open
 from .workbench import Fitted
 
 
@@ -193,11 +193,10 @@ def _otherwise_held(
 def _lost_input(search: Search, verdict: str) -> Gate | None:
     """The clipped input that a mismatch without a sure name comes from."""
     named = [p.choice for p in search.passes if p.accepted and p.choice is not None]
-    if verdict == "missing-physics" and min(confidence(c, search) for c in named) < UNSURE:
-        return clipped_input(search.bench, named[0].winner.port)
-    if verdict == "unexplained":
-        return clipped_input(search.bench, max(search.open_before, key=lambda k: search.open_before[k], default=""))
-    return None
+    sure = verdict == "missing-physics" and min(confidence(c, search) for c in named) >= UNSURE
+    if sure or verdict not in ("missing-physics", "unexplained"):
+        return None
+    return clipped_input(search.bench, search.without, left_open(search)[0] if named else 1.0)
 
 
 def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
