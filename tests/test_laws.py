@@ -191,6 +191,12 @@ def test_friction_that_falls_over_all_speeds_is_hardly_larger_at_rest(kind):
     assert law.doubtful({"v_s": 2.0, "v_0": 0.01}) and not law.doubtful({"v_s": 0.5, "v_0": 0.01})
 
 
+@pytest.mark.parametrize("kind", (laws.CoulombFriction, laws.AsymmetricFriction, laws.DirectionalFriction))
+def test_friction_that_reverses_over_most_speeds_is_hardly_dry(kind):
+    law = kind().at({}, {"v_0": (0.002, 0.5)})
+    assert law.doubtful({"v_0": 0.3}) and not law.doubtful({"v_0": 0.1})
+
+
 def test_a_mode_that_cannot_swing_is_hardly_a_mode():
     law = Mode().at({}, {"D": (1e-3, 1.0)})
     assert law.doubtful({"D": 1.0}) and not law.doubtful({"D": 0.4})

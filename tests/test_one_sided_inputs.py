@@ -5,6 +5,8 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
+from pilfr_casadi.diagnose.clipping import clipped, clipped_input
+from pilfr_casadi.diagnose.prepare import prepare
 
 DT = 0.02
 
@@ -72,6 +74,30 @@ def test_a_clipped_input_is_a_fault_of_the_recording():
     d = pilfr.diagnose(stage(), recorded(np.clip(u, -9, 9), moved(u), 6))
     assert d.verdict == "recording-fault", d.sentence
     assert [(g.channel, g.finding, g.corrected) for g in d.gates] == [("drive", "clipping", False)]
+
+
+def swinging(m=1200):
+    t = np.arange(m) * DT
+    return 12 * np.sin(2 * np.pi * 0.21 * t) * np.cos(2 * np.pi * 0.043 * t)
+
+
+def test_a_command_that_stops_at_its_limits_is_no_fault_beside_a_missing_law():
+    u = np.clip(swinging(), -9, 9)
+    bench, ready = _prepared(u, moved(np.sign(u) * np.abs(u) ** 0.6))
+    assert [found[:3] for found in clipped(bench.recordings, "u")] == [(0, -9.0, 9.0)]
+    assert clipped_input(bench, ready, 1.0) is None
+
+
+def test_what_lies_beyond_a_limit_is_told_from_what_is_felt():
+    bench, ready = _prepared(np.clip(swinging(), -9, 9), moved(swinging()))
+    gate = clipped_input(bench, ready, 1.0)
+    assert gate is not None and gate.channel == "drive" and "explains 9" in gate.sentence
+    assert clipped_input(bench, ready, 0.001) is None  # a law leaves less
+
+
+def _prepared(u, y):
+    ready = prepare(stage(), [recorded(u, y, 9)], None, "auto")
+    return ready.bench, ready.without
 
 
 def test_a_parameter_at_its_bound_is_said():

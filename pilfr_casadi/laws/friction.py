@@ -12,6 +12,7 @@ from ..operators import play
 from .base import Law, Local, grid
 
 KNEE = 0.15  # of the speed at which friction has fallen, that its reversal may take
+WIDE = 0.4  # of the widest reversal that is tried, beyond which it is damping that gives way rather than dry friction
 
 
 class CoulombFriction(Law):
@@ -34,6 +35,10 @@ class CoulombFriction(Law):
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"v_0": (2e-3 * local.speed, 0.5 * local.speed)}
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """A reversal over much of the speeds there are: the force depends on speed nearly everywhere."""
+        return bool(values["v_0"] > WIDE * self.parameters()["v_0"].bounds[1])
 
 
 class AsymmetricFriction(CoulombFriction):
