@@ -39,11 +39,11 @@ def test_behind_a_free_integrator_no_sensor_is_blamed_for_what_is_left(port, rem
     assert search._only_drifts(SimpleNamespace(winner=winner, remains=remains)) is drifts
 
 
-def candidate(port, law, error, size=2, at_bound=False, doubtful=False):
+def candidate(port, law, error, size=2, at_bound=False, doubtful=False, form=""):
     """What the choice reads of a fitted candidate."""
     return SimpleNamespace(
         port=port,
-        law=SimpleNamespace(id=law, form="", units={}),
+        law=SimpleNamespace(id=law, form=form, units={}),
         error=error,
         full=error,
         size=size,
@@ -68,6 +68,17 @@ def test_what_is_hardly_what_its_name_says_gives_way_to_what_is():
     assert choose([candidate(**named), plain], (1.0, 1.0), 1e-8, 500.0).winner is not plain
     far, elsewhere = candidate("sensor:x", "dead_zone", 0.13), candidate("guide", "dead_zone", 0.105)
     assert choose([thin, far, elsewhere], (1.0, 1.0), 1e-8, 500.0).winner is thin
+
+
+def test_a_part_that_is_carried_along_is_named_before_the_pole_and_zero_beside_the_path():
+    beside = [candidate(f"{end}:x", "extra_mode", 0.010, size=4, form="mode") for end in ("sensor", "actuator")]
+    carried = candidate("cart", "extra_mode", 0.012, size=3, form="attached mass")
+    other = candidate("cart", "hysteresis", 0.4)
+    choice = choose([*beside, carried, other], (1.0, 1.0), 6.4e-5, 500.0)
+    assert choice.winner is carried and {c.port for c in choice.alike} == {"sensor:x", "actuator:x"}
+    assert choice.margin > 10
+    far = candidate("cart", "extra_mode", 0.016, size=3, form="attached mass")
+    assert choose([*beside, far, other], (1.0, 1.0), 6.4e-5, 500.0).winner in beside
 
 
 class Loose:

@@ -47,6 +47,7 @@ MOST_OPEN = 0.4  # share of the excess that no named law may leave
 # cannot be told apart: under loud noise the first alone would hold for nearly any
 LIKE, AS_MUCH = 0.03, 0.995
 NEARLY = 1.25  # times the error of a law that is hardly what its name says, of one that is
+CARRIED = 1.5  # times the error of a mode beside the path, of the carried mass that it may stand for
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +76,12 @@ class Choice:
 
 def _near(candidate: Candidate, winner: Candidate, before: float) -> bool:
     """Whether a law does as well; `before` is the mean square error without any."""
-    as_much = before - candidate.error**2 >= AS_MUCH * (before - winner.error**2)
-    return candidate.error < (1 + LIKE) * winner.error and as_much
+    return candidate.error < (1 + LIKE) * winner.error and _as_much(candidate, winner, before)
+
+
+def _as_much(candidate: Candidate, winner: Candidate, before: float) -> bool:
+    """Whether a law takes away as much of the mean square."""
+    return bool(before - candidate.error**2 >= AS_MUCH * (before - winner.error**2))
 
 
 def _fits(candidate: Candidate, winner: Candidate) -> bool:
@@ -115,10 +120,15 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
         if imitates(winner, rival, floor):
             winner = rival
             break
+    carried = [c for c in ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]
+    beside: list[Candidate] = []
+    if winner.law.form == "mode" and carried and _as_much(carried[0], winner, before):
+        winner = carried[0]  # any pair of a pole and a zero is a mode: a part that is carried along is one
+        beside = [c for c in reversed(ranked) if c.law.form == "mode" and c.error < winner.error]
     gain = n * (0.5 * np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
     first = {c.name: c for c in reversed(ranked) if c.name != winner.name}  # the best of each name
     no_larger = [c for c in reversed(ranked) if c.name in first and _near(c, winner, before) and c.size <= winner.size]
-    alike = {c.name: c for c in no_larger}
+    alike = {c.name: c for c in (*beside, *no_larger) if c.name != winner.name}
     ports, margin = {winner.port, *(port for port, _ in alike)}, np.inf
     for c in first.values():
         ratio = c.error / winner.error
