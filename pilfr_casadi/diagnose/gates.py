@@ -26,6 +26,7 @@ FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 # mean square error that a wrong unit of time leaves at least, and where it has driven parameters to their bounds
 HOPELESS, STRAINED = 0.1, 0.01
+MOST_AT_BOUNDS = 0.3  # share of the parameters at their bounds, beyond which a unit of time has bent the simulator
 CURED = 0.12  # share of the mean square that a sign or a unit put right leaves at most
 NEAR = 6.0  # a factor is tried where it brings the simulated and the measured size this near
 
@@ -222,7 +223,8 @@ def slips(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbench, Fit
     for kind, names in (("y", bench.simulator.output_names), ("u", bench.simulator.inputs)):
         for i, j in combinations(range(len(names)), 2) if plain.cost > STRAINED else ():
             trials.append((f"{names[i]}, {names[j]}", "exchange", [names[i], names[j]], exchanged(kind, i, j)))
-    for factor in (1e-3, 1e3, 60.0, 1 / 60) if plain.cost > (STRAINED if plain.at_bounds > 0.3 else HOPELESS) else ():
+    hopeless = plain.cost > (STRAINED if plain.at_bounds > MOST_AT_BOUNDS else HOPELESS)
+    for factor in (1e-3, 1e3, 60.0, 1 / 60) if hopeless else ():
         trials.append(("time", "time-unit", factor, slower_by(factor)))
 
     def tried(trial: tuple[str, str, Any, Change]) -> tuple[Workbench, Fitted | None]:
@@ -237,7 +239,8 @@ def slips(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbench, Fit
         return other, None if near is None else refit(other, near, same=near)
 
     for trial, (other, result) in zip(trials, side_by_side(tried, trials, workers), strict=True):
-        if result is not None and result.cost < best.cost:
+        bent = trial[1] == "time-unit" and result is not None and result.at_bounds > MOST_AT_BOUNDS
+        if result is not None and result.cost < best.cost and not bent:
             best, found = result, (*trial, other)
     if found is None or best.cost > CURED * plain.cost or best.cost > 0.3:
         return bench, plain, []
