@@ -121,7 +121,7 @@ def diagnose(
     if search.interrupted and not accepted:
         sentence = (
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "
-            f"{without.cost**0.5:.3g} of the outputs' deviation."
+            f"{mean_nrmse(bench, without):.3g} of the outputs' deviation."
         )
     explained = verdict == "missing-physics"
     after = search.base if explained else held.fitted if held else without

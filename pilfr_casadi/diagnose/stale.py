@@ -15,6 +15,7 @@ from .gates import Gate
 
 SHARE, DISTINCT, LONGEST = 0.01, 0.5, 5  # of the samples that repeat, values that differ, and samples of one repeat
 SLOW = 4.5  # steps of an encoder in a sample, after which it may still have stood
+CHANCE = 3.0  # times as many repeats as changes by one step up: noise makes about as many of the one as of the other
 
 
 def stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
@@ -25,7 +26,9 @@ def stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
         levels = np.unique(values)
         step = np.min(np.diff(levels), initial=np.inf)
         repeated = float(np.mean(np.concatenate([_repeated(r.y[r.skip :, i], step) for r in recordings])))
-        if repeated > SHARE and len(levels) > DISTINCT * len(values):
+        changes = np.concatenate([np.diff(r.y[r.skip :, i]) for r in recordings])
+        up = float(np.mean(np.abs(changes - step) < 0.5 * step))
+        if repeated > max(SHARE, CHANCE * up) and len(levels) > DISTINCT * len(values):
             sentence = (
                 f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples; the "
                 "error that this makes is taken for noise: record again, or leave them out."

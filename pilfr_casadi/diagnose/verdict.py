@@ -18,6 +18,7 @@ from .candidate import Candidate
 from .floor import swells_with
 from .gates import Gate
 from .kinship import CONTAINS, handicap, imitates
+from .proof import mean_nrmse
 from .ringing import ringing
 
 if TYPE_CHECKING:
@@ -185,6 +186,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         )
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
+    said, noise = mean_nrmse(search.bench, search.without), search.floor.nrmse(search.bench.scale)
     open_now = max(search.open_before.values(), default=0.0)
     hum = [g for g in gates if g.finding == "tone" and not accepted]
     quiet = error * max(1 - sum(1 - g.left for g in hum), 0.0) ** 0.5
@@ -196,7 +198,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     if bare and open_now < HINT:
         beside = f" but a steady tone in {' and '.join(g.channel for g in hum)}" if hum else ""
         return "complete", (
-            f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {error:.3g} of the "
+            f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {said:.3g} of the "
             f"outputs' deviation, and no force at any port explains any of the rest."
         )
     if not accepted:
@@ -209,7 +211,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         at = f"; a force at {where} could explain {open_now:.0%} of the rest" if open_now > HINT else ""
         return "unexplained", (
             f"Something is missing and no law of the catalogue explains it: refitted, the simulator is off by "
-            f"{error:.3g} of the outputs' deviation, the noise is about {floor:.3g}{at}{rings}."
+            f"{said:.3g} of the outputs' deviation, the noise is about {noise:.3g}{at}{rings}."
         )
     near = accepted[0].winner
     port = near.port
