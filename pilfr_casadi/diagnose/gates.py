@@ -216,7 +216,9 @@ def slips(bench: Workbench, plain: Fitted, workers: int, beside: str = "") -> tu
     Only those of one channel `beside` its offset, where that is in place.
     """
     trials: list[Trial] = []
-    sizes, lost = _sizes(bench), plain.cost > 1  # a size says nothing where a simulator has left its working range
+    # beside an offset there is a working point, which a run from rest would first have to come to
+    sizes = _sizes(bench, plain.residual if beside else _from_rest(bench))
+    lost = plain.cost > 1  # a size says nothing where a simulator has left its working range
     factors = (*FACTORS, FAHRENHEIT, 1 / FAHRENHEIT) if beside else FACTORS
     for i, name in enumerate(bench.simulator.output_names):
         trials.append((name, "sign", -1.0, scaled("y", i, -1.0)))
@@ -272,14 +274,20 @@ def _best_slip(
     return other, best, [Gate(name, finding, value, sentence, True, True, change, left=left)]
 
 
-def _sizes(bench: Workbench) -> np.ndarray:
-    """Size of each measured output over that of the output simulated at the user's values; nan where it diverges."""
+def _sizes(bench: Workbench, errors: Sequence[np.ndarray]) -> np.ndarray:
+    """Size of each measured output over that of the simulated one, by their differences; nan where it diverges."""
+    with np.errstate(all="ignore"):
+        y = [e + r.y for e, r in zip(errors, bench.recordings, strict=True)]
+        return np.asarray(bench.scale / np.std(np.concatenate(y), axis=0))
+
+
+def _from_rest(bench: Workbench) -> list[np.ndarray]:
+    """Errors of the simulator at the user's values, run from rest."""
     model = bench.model(bench.simulator)
     engine = make_engine(model, bench.engine)
     start, n = model.parameters.start, model.n_state
     with np.errstate(all="ignore"):
-        y = [engine.simulate(model.drive(r), start, np.zeros(n))[0] for r in bench.recordings]
-        return np.asarray(bench.scale / np.std(np.concatenate(y), axis=0))
+        return [engine.simulate(model.drive(r), start, np.zeros(n))[0] - r.y for r in bench.recordings]
 
 
 def _near(ratio: float) -> bool:
