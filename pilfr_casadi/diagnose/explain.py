@@ -19,7 +19,7 @@ from ..laws import Law
 from ..simulator import Simulator
 from .candidate import Candidate, attempt, heads
 from .screen import Scored
-from .workbench import Fitted, Workbench, at_rest, started
+from .workbench import Fitted, Workbench, started
 
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
 BEST = 10  # pairs of each list that are fitted, besides the best of each port
@@ -100,7 +100,7 @@ def prepare(bench: Workbench, entries: Sequence[Scored], without: Fitted, gain: 
     if set(first.law.parameters()) == set(first.law.strength):  # with nothing of it the simulator is as it was
         _, named = closed(without.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
         starts.append({**without.values, **named})
-    best, *rest = by_cost(bench, model, engine, starts, without)
+    best, *rest = by_cost(bench, placed, model, engine, starts, without)
     ranked = [best, *(s for s in led if s is not best), *(s for s in rest if not any(s is o for o in led))]
     brief = attempt(bench, placed, ranked[:1], states=without.begin, solver=BRIEF, model=model, engine=engine)
     return _Pair(placed, model, engine, ranked, without.begin, brief)
@@ -141,15 +141,20 @@ def refine(bench: Workbench, pairs: Sequence[_Pair], led: bool, pool: ThreadPool
 
 
 def by_cost(
-    bench: Workbench, model: Any, engine: Any, starts: Sequence[Mapping[str, Any]], without: Fitted
+    bench: Workbench,
+    placed: Simulator,
+    model: Any,
+    engine: Any,
+    starts: Sequence[Mapping[str, Any]],
+    without: Fitted,
 ) -> list[Mapping[str, Any]]:
     """Starts in the order of their error as they stand on the first parts, from the initial states of a fit."""
     part = bench.on(heads(bench.recordings))
-    initial = [at_rest(state, model.n_state) for state in without.begin]
+    initial = part.begun(placed, model, started(model, starts[0]), without.begin)
 
     def cost(start: Mapping[str, Any]) -> float:
         values = model.parameters.unpack(started(model, start))
-        found = part.result(without.simulator, values, initial, engine, model).cost
+        found = part.result(placed, values, initial, engine, model).cost
         return found if np.isfinite(found) else np.inf
 
     return sorted(starts, key=cost)

@@ -20,8 +20,10 @@ from ..threads import side_by_side
 from .workbench import QUICK, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]
+Trial = tuple[str, str, Any, Change]  # channel, finding, value, what puts it right
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
+FAHRENHEIT = 1.8  # its zero is another one: it comes with an offset
 FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 # mean square error that a wrong unit of time leaves at least, and where it has driven parameters to their bounds
@@ -209,25 +211,40 @@ def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine:
         raise error
 
 
-def slips(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Sign and unit slips of each channel and of the time, and exchanged channels, `workers` at a time."""
-    best, found = plain, None
-    trials: list[tuple[str, str, Any, Change]] = []
-    sizes, lost = _sizes(bench), plain.cost > 1  # a size says nothing where a simulator has left its working range
+def slips(bench: Workbench, plain: Fitted, workers: int, beside: str = "") -> tuple[Workbench, Fitted, list[Gate]]:
+    """Sign and unit slips of each channel and of the time, and exchanged channels, `workers` at a time.
+
+    Only those of one channel `beside` its offset, where that is in place.
+    """
+    trials: list[Trial] = []
+    # beside an offset there is a working point, which a run from rest would first have to come to
+    sizes = _sizes(bench, plain.residual if beside else _from_rest(bench))
+    lost = plain.cost > 1  # a size says nothing where a simulator has left its working range
+    factors = (*FACTORS, FAHRENHEIT, 1 / FAHRENHEIT) if beside else FACTORS
     for i, name in enumerate(bench.simulator.output_names):
         trials.append((name, "sign", -1.0, scaled("y", i, -1.0)))
-        trials += [(name, "unit", f, scaled("y", i, f)) for f in FACTORS if lost or _near(f * sizes[i])]
+        trials += [(name, "unit", f, scaled("y", i, f)) for f in factors if lost or _near(f * sizes[i])]
     for i, name in enumerate(bench.simulator.inputs):
         trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
-        trials += [(name, "unit", f, scaled("u", i, f)) for f in FACTORS if lost or any(_near(v / f) for v in sizes)]
+        trials += [(name, "unit", f, scaled("u", i, f)) for f in factors if lost or any(_near(v / f) for v in sizes)]
+    if beside:
+        return _best_slip(bench, plain, [t for t in trials if t[0] == beside], workers, " and an offset")
     for kind, names in (("y", bench.simulator.output_names), ("u", bench.simulator.inputs)):
         for i, j in combinations(range(len(names)), 2) if plain.cost > STRAINED else ():
             trials.append((f"{names[i]}, {names[j]}", "exchange", [names[i], names[j]], exchanged(kind, i, j)))
     hopeless = plain.cost > (STRAINED if plain.at_bounds > MOST_AT_BOUNDS else HOPELESS)
     for factor in (1e-3, 1e3, 60.0, 1 / 60) if hopeless else ():
         trials.append(("time", "time-unit", factor, slower_by(factor)))
+    return _best_slip(bench, plain, trials, workers)
 
-    def tried(trial: tuple[str, str, Any, Change]) -> tuple[Workbench, Fitted | None]:
+
+def _best_slip(
+    bench: Workbench, plain: Fitted, trials: Sequence[Trial], workers: int, more: str = ""
+) -> tuple[Workbench, Fitted, list[Gate]]:
+    """The trial after which the simulator follows best, where that is far better than without."""
+    best, found = plain, None
+
+    def tried(trial: Trial) -> tuple[Workbench, Fitted | None]:
         other: Workbench = changed(bench, trial[3])
         same: Fitted | None = plain
         if trial[1] == "time-unit":
@@ -246,12 +263,12 @@ def slips(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbench, Fit
         return bench, plain, []
     name, finding, value, change, other = found
     if finding == "sign":
-        words = f"{name} has the wrong sign"
+        words = f"{name} has the wrong sign{more}"
     elif finding == "exchange":
         words = f"{value[0]} and {value[1]} are exchanged"
     else:
         what = name if finding == "unit" else "the time"
-        words = f"{what} is off by a factor of {1 / value:.4g}, as from a wrong unit"
+        words = f"{what} is off by a factor of {1 / value:.4g}{more}, as from a wrong unit"
     sentence = (
         f"In the recordings {words}: with it corrected the refitted simulator's error falls from "
         f"{np.sqrt(plain.cost):.3g} to {np.sqrt(best.cost):.3g} of the outputs' deviation."
@@ -260,14 +277,20 @@ def slips(bench: Workbench, plain: Fitted, workers: int) -> tuple[Workbench, Fit
     return other, best, [Gate(name, finding, value, sentence, True, True, change, left=left)]
 
 
-def _sizes(bench: Workbench) -> np.ndarray:
-    """Size of each measured output over that of the output simulated at the user's values; nan where it diverges."""
+def _sizes(bench: Workbench, errors: Sequence[np.ndarray]) -> np.ndarray:
+    """Size of each measured output over that of the simulated one, by their differences; nan where it diverges."""
+    with np.errstate(all="ignore"):
+        y = [e + r.y for e, r in zip(errors, bench.recordings, strict=True)]
+        return np.asarray(bench.scale / np.std(np.concatenate(y), axis=0))
+
+
+def _from_rest(bench: Workbench) -> list[np.ndarray]:
+    """Errors of the simulator at the user's values, run from rest."""
     model = bench.model(bench.simulator)
     engine = make_engine(model, bench.engine)
     start, n = model.parameters.start, model.n_state
     with np.errstate(all="ignore"):
-        y = [engine.simulate(model.drive(r), start, np.zeros(n))[0] for r in bench.recordings]
-        return np.asarray(bench.scale / np.std(np.concatenate(y), axis=0))
+        return [engine.simulate(model.drive(r), start, np.zeros(n))[0] - r.y for r in bench.recordings]
 
 
 def _near(ratio: float) -> bool:

@@ -119,6 +119,8 @@ class Run:
         The same for a positive force that pushes the port back.
     lift, push : array, shape (n_ports,)
         Largest effect of a unit force on the local coordinate's first and second derivative.
+    from_zero : bool
+        Whether it begins with everything at zero.
     """
 
     a: np.ndarray
@@ -134,6 +136,7 @@ class Run:
     back: np.ndarray
     lift: np.ndarray
     push: np.ndarray
+    from_zero: bool = False
 
     @property
     def n_free(self) -> int:
@@ -179,7 +182,7 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     moved, sign = np.abs(lift).max(axis=0) > 0, -np.sign(np.median(push, axis=0))
     sense = {"sign": np.where(moved, 0.0, sign), "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign)}
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}
-    return Run(a, b, c, d, mean, error=y - r.y, z=z, dz=dz, u=u, **sense, **felt)
+    return Run(a, b, c, d, mean, error=y - r.y, z=z, dz=dz, u=u, **sense, **felt, from_zero=r.begins == "zero")
 
 
 def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -280,4 +283,5 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     with np.errstate(divide="ignore", over="ignore"):  # a force that does not move the port has no limit
         stiffest = np.where(lift > 0, rate / lift, rate**2 / push)
     inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in runs]).T, strict=True))
-    return [Local(z[:, j], dz[:, j], bench.dt, lengths, float(k), inputs) for j, k in enumerate(stiffest)]
+    rest = tuple(r.from_zero for r in runs)
+    return [Local(z[:, j], dz[:, j], bench.dt, lengths, float(k), inputs, rest) for j, k in enumerate(stiffest)]

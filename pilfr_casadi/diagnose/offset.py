@@ -16,7 +16,7 @@ import numpy as np
 from ..laws.base import Law
 from ..recording import InputError
 from .floor import effective_size
-from .gates import Gate
+from .gates import CURED, STRAINED, Gate, slips
 from .linearise import linearised
 from .remainder import block_diagonal, moved, orthonormal
 from .workbench import THOROUGH, Fitted, Workbench
@@ -94,6 +94,25 @@ def offsets(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Ga
         bench, plain = other, found
         ports.remove(port)
     return bench, plain, gates
+
+
+def another_zero(
+    bench: Workbench, plain: Fitted, found: tuple[Workbench, Fitted, list[Gate]], workers: int
+) -> tuple[Workbench, Fitted, list[Gate]]:
+    """What slips put right, or where that is far better the slip of an output whose zero is another one as well.
+
+    The offset is told, and kept, by `offsets`.
+    """
+    for name in bench.simulator.output_names if found[1].cost > STRAINED else ():
+        placed = bench.simulator.with_element(f"sensor:{name}", Offset())
+        try:
+            level = bench.fit(placed, [{}, plain.values], states=plain.begin)
+        except InputError:
+            continue
+        other, after, gates = slips(replace(bench, simulator=placed), level, workers, name)
+        if gates and after.cost < CURED * found[1].cost:
+            found = replace(other, simulator=bench.simulator), after, gates
+    return found
 
 
 def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:

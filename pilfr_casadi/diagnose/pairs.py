@@ -25,7 +25,7 @@ from .kinship import handicap
 from .linearise import linearised
 from .remainder import Dose, Remainder, held_out, orthonormal
 from .screen import Scored, start_values
-from .workbench import Fitted, at_rest
+from .workbench import Fitted, started
 
 if TYPE_CHECKING:
     from .search import Pass, Search
@@ -135,7 +135,7 @@ def _beside(search: Search, joint: Fitted, kept: Any) -> Fitted:
     simulator = search.bench.simulator.with_element(kept.port, kept.law)
     model = search.bench.model(simulator)
     known = {k: v for k, v in joint.values.items() if k in model.parameters}
-    initial = [at_rest(state, model.n_state) for state in joint.begin]
+    initial = search.bench.begun(simulator, model, started(model, known), joint.begin)
     return search.bench.result(simulator, known, initial, make_engine(model, search.bench.engine), model)
 
 

@@ -14,7 +14,7 @@ from .floor import Floor, measured_floor, white_part
 from .gates import Gate, choose_hold, hold_note, opened, said_hold, slips
 from .glitches import without_glitches
 from .linearise import along, linearised, observer_gain
-from .offset import offsets
+from .offset import another_zero, offsets
 from .proof import errors_of
 from .settling import without_transients
 from .stale import stale_samples
@@ -60,7 +60,7 @@ def prepare(
     without = refitted(bench)
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     if without.cost > SUSPECT * float(np.mean((first.deviation / bench.scale) ** 2)) and without.cost > LEAST:
-        bench, without, more = slips(bench, without, workers)
+        bench, without, more = another_zero(bench, without, slips(bench, without, workers), workers)
         gates = [*gates, *more]
         if more:  # what looked better on wrong data says nothing
             between, notes = choose_hold(simulator, bench.recordings, hold, engine)

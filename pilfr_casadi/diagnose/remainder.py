@@ -76,8 +76,9 @@ class Remainder:
     @classmethod
     def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
         """Along some runs, for the laws that the data can speak to; only `at` one port where it is named."""
+        signals = ("a", "b", "c", "d", "error", "z", "dz", "u")
         short = [
-            replace(r, **{k: getattr(r, k)[w] for k in ("a", "b", "c", "d", "error", "z", "dz", "u")})
+            replace(r, **{k: getattr(r, k)[w] for k in signals}, from_zero=r.from_zero and w.start == 0)
             for r, w in zip(runs, _windows(bench, runs), strict=True)
         ]
         error = np.concatenate([(r.error / bench.scale).ravel() for r in short])

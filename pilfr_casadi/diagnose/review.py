@@ -67,7 +67,7 @@ def put_more_finely(search: Search) -> None:
         placed = bare.with_element(element.port, law)
         model = search.bench.model(placed)
         engine = make_engine(model, search.bench.engine)
-        nearest = by_cost(search.bench, model, engine, starts, search.base)[:1]
+        nearest = by_cost(search.bench, placed, model, engine, starts, search.base)[:1]
         try:
             finer = search.bench.fit(placed, nearest, states=search.base.begin, model=model, engine=engine)
         except InputError:

@@ -21,6 +21,7 @@ from ..simulator import Simulator
 from ..substeps import MOST, REACH, choose_substeps, fastest, growth, wanted_substeps
 from ..threads import one_at_a_time
 from .arranged import arranged
+from .standing import standing, stands
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 HUGE, ENDLESS = 1e6, 1e20  # times the largest measured value, and mean square error, of what grows without end
@@ -172,7 +173,7 @@ class Workbench:
             return self._as_it_is(simulator, model, engine)
         best: tuple[float, np.ndarray, Problem] | None = None
         for start in starts:
-            found = self._run(model, engine, start, states, tuple(anneal), solver)
+            found = self._run(simulator, model, engine, start, states, tuple(anneal), solver)
             if found is not None and (best is None or found[0] < best[0]):
                 best = found
         if best is None:
@@ -220,6 +221,7 @@ class Workbench:
 
     def _run(
         self,
+        simulator: Simulator,
         model: Model,
         engine: Engine,
         start: Mapping[str, Any],
@@ -229,7 +231,10 @@ class Workbench:
     ) -> tuple[float, np.ndarray, Problem] | None:
         parameters = model.parameters
         vector = started(model, start)
-        states = self._unknown(guess, model.n_state) if len(guess) else None
+        states = None
+        if len(guess):
+            unknown = zip(self.recordings, self.begun(simulator, model, vector, guess), strict=True)
+            states = np.concatenate([np.zeros(0), *(state for r, state in unknown if r.begins == "estimate")])
         problem: Problem | None = None
         for gamma in (*path, 0.0):
             at = parameters.at(vector)
@@ -257,13 +262,18 @@ class Workbench:
         cost = problem.cost(theta)
         return (cost, theta, problem) if cost < ENDLESS else None
 
-    def _unknown(self, states: Sequence[np.ndarray], n: int) -> np.ndarray:
-        """Guesses of the initial states that are estimated, one after the other, n each."""
-        out = [np.zeros(0)]
-        for r, state in zip(self.recordings, states, strict=True):
-            if r.begins == "estimate":
-                out.append(at_rest(np.asarray(state, dtype=float)[:n], n))
-        return np.concatenate(out)
+    def begun(
+        self, simulator: Simulator, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """Initial states (n_state,) whose first entries are given; laws begin at rest, where each recording begins."""
+        out, n = [], model.n_state
+        for r, given in zip(self.recordings, states, strict=True):
+            state = np.asarray(given, dtype=float)[:n]
+            full = np.zeros(n)
+            if r.begins == "estimate" and len(state) < n and stands(simulator):
+                full = standing(simulator, self.dt / model.substeps, vector, state, r.u[0])
+            out.append(np.append(state, full[len(state) :]))
+        return out
 
     def result(
         self,
@@ -281,11 +291,6 @@ class Workbench:
             scored = [(e / self.scale)[r.skip :] for e, r in zip(residual, self.recordings, strict=True)]
             cost = float(np.mean(np.concatenate(scored) ** 2))
         return Fitted(simulator, model, engine, values, initial, residual, cost)
-
-
-def at_rest(state: np.ndarray, n: int) -> np.ndarray:
-    """A state (n,) whose first entries are given and whose others, those of laws, are zero."""
-    return np.append(state, np.zeros(n - len(state)))
 
 
 def started(model: Model, start: Mapping[str, Any]) -> np.ndarray:

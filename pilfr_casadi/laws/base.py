@@ -35,6 +35,8 @@ class Local:
         Largest stiffness (w/z) that the simulation's steps can follow at the port: a harder contact is a wall.
     inputs : mapping of str to array, shape (M,)
         The simulator's inputs, for laws that one of them scales.
+    from_zero : tuple of bool
+        Which recordings begin with everything at zero; in the others laws begin as if z had stood still before.
     """
 
     z: np.ndarray
@@ -43,6 +45,7 @@ class Local:
     lengths: tuple[int, ...]
     stiffest: float = np.inf
     inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
+    from_zero: tuple[bool, ...] = ()
 
     @cached_property
     def low(self) -> float:
@@ -97,6 +100,8 @@ class Law:
         Strengths must push back.
     order : int
         States of its own.
+    follows : int
+        How many of these, the first, come to rest at the signal where it stands still; the others at zero.
     shifts : bool
         Its memory is a shift register, which takes in the signal at the begin of a step.
     substeps : int
@@ -117,6 +122,7 @@ class Law:
     restoring: ClassVar[bool] = False
     signed: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[int] = 0
+    follows: ClassVar[int] = 0
     shifts: ClassVar[bool] = False
     substeps: ClassVar[int] = 1
     scaled_by: ClassVar[str] = ""
@@ -157,6 +163,12 @@ class Law:
         if cls.order:
             named |= set(inspect.signature(cls.flow).parameters)  # type: ignore[attr-defined]
         return named & {"z", "dz", "t", "x", "u"}
+
+    def standing(self, z: float) -> np.ndarray:
+        """States of its own, or its memory, where the signal has stood still at z."""
+        out = np.zeros(int(getattr(self, "memory", 0)) if hasattr(self, "step") else self.order)
+        out[: len(out) if self.shifts else self.follows] = z
+        return out
 
     def on_grid(self, h: float) -> Law:
         """The law for steps of length h, s; most do not care."""

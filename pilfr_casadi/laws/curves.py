@@ -11,6 +11,8 @@ import numpy as np
 from .base import Law, Local, grid
 
 STRAIGHT = 0.03  # difference of a power from one that is no curve
+NARROW = 0.05  # half the range over the middle of it, below which any curve is a gain and an offset
+SIDED = 0.05  # share of the reach that a signal goes to either side at least, to tell the one from the other
 
 
 class Polynomial(Law):
@@ -27,6 +29,10 @@ class Polynomial(Law):
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a_2 * z**2 + p.a_3 * z**3
+
+    def applies(self, local: Local) -> str:
+        narrow = local.half < NARROW * abs(local.low + local.high) / 2
+        return "the signal stays where any curve is straight" if narrow else ""
 
 
 class Quadratic(Polynomial):
@@ -64,6 +70,10 @@ class Magnitude(Polynomial):
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a * ca.fabs(z)
+
+    def applies(self, local: Local) -> str:
+        """On one side alone it is a gain."""
+        return "" if min(-local.low, local.high) > SIDED * local.reach else "one side is hardly visited"
 
 
 class Power(Polynomial):

@@ -60,7 +60,7 @@ class Relaxation(Law):
     units: ClassVar[Mapping[str, str]] = {"k_v": "w/z", "T": "s"}
     strength: ClassVar[tuple[str, ...]] = ("k_v",)
     dissipative = True
-    order = 1
+    order = follows = 1
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return p.k_v * (z - q)
@@ -83,7 +83,7 @@ class TwoStageRelaxation(Relaxation):
     equation = "w = k_1 (z - q_1) + k_2 (z - q_2),  dq_i/dt = (z - q_i) / T_i"
     units: ClassVar[Mapping[str, str]] = {"k_1": "w/z", "k_2": "w/z", "T_1": "s", "T_2": "s"}
     strength: ClassVar[tuple[str, ...]] = ("k_1", "k_2")
-    order = 2
+    order = follows = 2
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return p.k_1 * (z - q[0]) + p.k_2 * (z - q[1])
@@ -128,7 +128,7 @@ class TwoStageCreep(Creep):
     equation = "w = c_1 q_1 + c_2 q_2,  dq_i/dt = (u - q_i) / T_i"
     units: ClassVar[Mapping[str, str]] = {"c_1": "", "c_2": "", "T_1": "s", "T_2": "s"}
     strength: ClassVar[tuple[str, ...]] = ("c_1", "c_2")
-    order = 2
+    order = follows = 2
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c_1 * q[0] + p.c_2 * q[1]
@@ -156,7 +156,7 @@ class Lag(Law):
     sentence = "an unmodelled lag: the signal follows with a time constant"
     units: ClassVar[Mapping[str, str]] = {"T": "s"}
     places: ClassVar[tuple[str, ...]] = ("series",)
-    order = 1
+    order = follows = 1
     substeps: ClassVar[int] = 4  # a lag shorter than a sample is still one
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
@@ -183,7 +183,7 @@ class Resonance(Law):
     sentence = "an unmodelled resonance in the path of the signal"
     units: ClassVar[Mapping[str, str]] = {"W": "rad/s", "D": ""}
     places: ClassVar[tuple[str, ...]] = ("series",)
-    order = 2
+    order, follows = 2, 1
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return q[0] - z

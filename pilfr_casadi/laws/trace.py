@@ -34,7 +34,7 @@ def columns(law: Law) -> int:
 def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarray:
     """Force at unit strength for each shape, shape (M, len(shapes), columns).
 
-    Laws with states or memory start each recording from rest.
+    Laws with states or memory start each recording from rest: at zero, or where z stands; see `Local.from_zero`.
     """
     if not shapes:
         return np.zeros((len(local.z), 0, columns(law)))
@@ -48,14 +48,15 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
     table = [np.ravel(shape.get(n, p[n].value)) for shape in shapes for n in names]
     vector = np.concatenate([*table, [local.dt]])
     found, at = [], 0
-    for m in local.lengths:
+    for i, m in enumerate(local.lengths):
         zs, dzs = local.z[at : at + m], local.dz[at : at + m]
         following = (np.append(values[1:], values[-1]) for values in (zs, dzs))
         rows = np.column_stack([zs, dzs, local.dt * np.arange(m), *following])
         at += m
         if step.size1_in(0):
             same = np.broadcast_to(vector, (m, len(vector)))
-            found.append(accumulated(step, np.zeros(step.size1_in(0)), rows, same)[1])
+            first = kind().standing(0.0 if any(local.from_zero[i : i + 1]) else zs[0])
+            found.append(accumulated(step, np.tile(first, len(shapes)), rows, same)[1])
         else:
             found.append(mapped(step, np.zeros((m, 0)), rows, vector)[1][:, :, 0])
     forces = np.concatenate(found) if len(found) > 1 else found[0]
