@@ -185,6 +185,26 @@ def test_plays_beside_a_bend_that_does_it_all_are_hardly_a_hysteresis():
     assert law.doubtful({**plays, "w": np.full(6, 0.1), "r": np.full(6, 0.97)})  # plays that never move
 
 
+def test_plays_of_one_threshold_in_place_of_the_signal_are_hardly_more_than_a_backlash():
+    law = laws.PlayHysteresis()
+    narrow = {"w": np.array([-1.0, 0.45, 0.0, 0.55, 0.0, 0.0]), "r": np.array([0.02, 17.2, 222.0, 15.4, 90.0, 240.0])}
+    assert law.doubtful(narrow)
+    assert not law.doubtful({**narrow, "w": np.array([-0.6, 0.45, 0.0, 0.55, 0.0, 0.0])})  # beside the signal
+    assert not law.doubtful({**narrow, "w": np.array([-1.0, 0.45, 0.1, 0.45, 0.0, 0.0])})  # of all sizes
+
+
+@pytest.mark.parametrize("plain", [kind for kind in FINER if kind is not StopHysteresis])
+def test_more_plays_begin_near_those_that_they_refine(plain):
+    (finer,) = FINER[plain]
+    few = plain().at({"w": np.array([-0.4, 0.3, 0.2, 0.1, 0.1, 0.05]), "r": np.linspace(0.0, 0.5, 6)})
+    few = few.at({k: p.value for k, p in few.parameters().items()})
+    (start,) = finer.finer_starts(few.values, LOCAL)
+    more = finer().at(start, finer().bounds(LOCAL))
+    one, other = (trace(law, LOCAL, [{}])[:, 0, : law.n] @ law.parameters()["w"].value for law in (few, more))
+    assert all(np.shape(more.parameters()[k].value) == (11,) for k in ("w", "r"))
+    assert np.std(one - other) < 0.1 * np.std(one)
+
+
 @pytest.mark.parametrize("kind", (StribeckFriction, PreslidingStribeckFriction))
 def test_friction_that_falls_over_all_speeds_is_hardly_larger_at_rest(kind):
     law = kind().at({}, {"v_s": (0.01, 2.0)})

@@ -10,8 +10,6 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ..compiled import make_engine
 from ..laws import FINER
 from ..recording import InputError
@@ -59,8 +57,8 @@ def put_more_finely(search: Search) -> None:
         if local is None:
             return
         began = time.perf_counter()
-        total = float(np.sum(search.base.values[f"{element.prefix}w"]))
-        shapes = [{**shape, **dict.fromkeys(kind.strength, total)} for shape in kind().shapes(local)]
+        given = {k: search.base.values[f"{element.prefix}{k}"] for k in winner.law.parameters()}
+        shapes = list(kind.finer_starts(given, local))
         law = kind().at(shapes[0], kind().bounds(local))
         own = [{f"{element.prefix}{k}": v for k, v in shape.items()} for shape in shapes]
         starts = [{**search.base.values, **values} for values in own]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from .base import Law, Local, readable_unit
 from .composed import behind_gap, scaled
 from .curves import Cubic, Magnitude, Orifice, Polynomial, Power, PowerWithGain, Quadratic, Root
@@ -33,7 +35,16 @@ from .friction import (
     StribeckFriction,
     ViscousDamping,
 )
-from .hysteresis import Backlash, BoucWen, BoucWenActuator, GeneralizedHysteresis, PlayHysteresis, StopHysteresis
+from .hysteresis import (
+    Backlash,
+    BoucWen,
+    BoucWenActuator,
+    FineGeneralized,
+    FinePlays,
+    GeneralizedHysteresis,
+    PlayHysteresis,
+    StopHysteresis,
+)
 from .limits import (
     AsymmetricDeadZone,
     AsymmetricSaturation,
@@ -125,7 +136,11 @@ CATALOGUE: tuple[type[Law], ...] = (
 )
 
 # what a named law is put more finely by, once it is named: it costs more to fit
-FINER: dict[type[Law], tuple[type[Law], ...]] = {StopHysteresis: (SmoothHysteresis,)}
+FINER: dict[type[Law], tuple[Any, ...]] = {
+    StopHysteresis: (SmoothHysteresis,),
+    PlayHysteresis: (FinePlays,),
+    GeneralizedHysteresis: (FineGeneralized,),
+}
 
 # what an input that the simulator's equations do not read may scale
 SCALABLE: tuple[type[Law], ...] = (

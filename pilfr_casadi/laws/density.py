@@ -54,3 +54,9 @@ class SmoothHysteresis(Law):
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"R": (2e-3 * local.half, 2 * local.half), "a": (0.3, 12.0)}
+
+    @classmethod
+    def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
+        """As stiff at first as the stops of given weights, spread in several ways."""
+        for shape in cls().shapes(local):
+            yield {**shape, "k_h": float(np.sum(values["w"]))}

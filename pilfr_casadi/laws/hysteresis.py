@@ -14,6 +14,7 @@ from .base import Law, Local, grid
 
 PARTS = 4  # of a step of a held signal
 THIN = 0.1  # widest loop over the bend beside it that leaves a curve without memory
+DIRECT, ALIKE = 0.05, 0.15  # gain past the plays, and spread of their thresholds over the mean, of a mere backlash
 
 
 class StopHysteresis(Law):
@@ -82,6 +83,29 @@ class PlayHysteresis(StopHysteresis):
         # plays lag behind the signal where their weights are positive (Kuhnen 2003); the first is the gain
         return {**super().bounds(local), "w": (np.append(-1.0, np.zeros(self.n - 1)), np.inf)}
 
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Whether plays of about one threshold stand in place of the whole signal: a backlash."""
+        w, r = np.asarray(values["w"])[1:], np.asarray(values["r"])[1:]
+        total = float(np.sum(w))
+        if abs(1 + float(values["w"][0])) > DIRECT * total:
+            return False
+        mean = float(w @ r) / max(total, 1e-300)
+        return bool(w @ (r - mean) ** 2 < (ALIKE * mean) ** 2 * total)
+
+    @classmethod
+    def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
+        """Each play but the first in two, a little apart."""
+        w, r = np.asarray(values["w"]), np.asarray(values["r"])
+        apart = np.concatenate([r[:1], 0.8 * r[1:], 1.2 * r[1:]])
+        yield {**values, "w": np.concatenate([w[:1], w[1:] / 2, w[1:] / 2]), "r": apart}
+
+
+class FinePlays(PlayHysteresis):
+    """The same with more plays."""
+
+    n = 11
+    memory = 11
+
 
 class GeneralizedHysteresis(PlayHysteresis):
     """Asymmetric hysteresis: plays of a bent signal (Al Janaideh, Rakheja & Su 2011)."""
@@ -120,6 +144,13 @@ class GeneralizedHysteresis(PlayHysteresis):
         reach = self.parameters()["r"].bounds[1]
         wide = np.abs(values["w"]) * np.clip(np.minimum(values["r"], reach - values["r"]), 0.0, None)
         return bool(np.sum(wide) < THIN * np.max(reach) ** 2 * abs(values["b_2"]))
+
+
+class FineGeneralized(GeneralizedHysteresis):
+    """The same with more plays."""
+
+    n = 11
+    memory = 11
 
 
 class BoucWen(Law):
