@@ -1,0 +1,221 @@
+"""Gate of gaps: samples that were lost within a recording, time renumbered, so that every channel jumps at once.
+
+Along the refitted run, a jump δ of the state at sample k changes what comes after by `Φ_k δ`. With e what parameters
+and initial states leave of the error, and base what they can follow, the best jump takes away
+
+    s' (S - G G')⁻¹ s,    S = Φ_k'Φ_k,  G = Φ_k' base,  s = Φ_k' e
+
+of e'e; S, G and s follow from those of the next sample, so that every sample is tried at once. A shock or a stop moves
+no state that is the integral of another, and a step of a force or of a sensor moves none: where one of these does about
+as well, or where no state is such an integral, nothing is said. A jump is confirmed by a refit to the two pieces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..integration import states_along
+from ..recording import InputError, Recording
+from .gates import Gate
+from .linearise import Run, linearised
+from .timing import ALONE, DROP, nominal_directions
+from .workbench import THOROUGH, Fitted, Workbench
+
+MOST = 3  # gaps
+ABOVE = 4.0  # times the noise, in mean square, beyond which gaps are looked for
+SHARE = 0.2  # of the mean square that a jump takes away at least
+RIVAL, WORSE = 0.97, 2.0  # of that, a shock or a step takes away at most, and times what a jump leaves it leaves
+SHORTEST = 40  # samples of a piece
+NEAR = 3  # samples around a jump at which a shock is tried
+BETWEEN = (-0.5, 0.0, 0.5)  # samples, by which it may come later
+BESIDE, SHARP = 5, 1.5  # samples beside a gap, where a jump leaves so many times the mean square
+CHUNK = 256  # samples solved for at a time
+RIDGE = 1e-6  # of a jump that initial states can follow nothing is known
+
+Origin = tuple[str, int]  # label of the recording as given, and its sample that a piece begins with
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A jump of the state at a sample of a recording; the shares are of the mean square that it takes away.
+
+    Attributes
+    ----------
+    rival : float
+        What a shock nearby, or a step of one force or sensor there, takes away.
+    beside : float
+        What a jump some samples away does.
+    size : array, shape (n_x,)
+        The jump.
+    """
+
+    recording: int
+    sample: int
+    share: float
+    rival: float
+    beside: float
+    size: np.ndarray
+
+    @property
+    def told(self) -> bool:
+        """Whether it takes much away and no rival nearly as much."""
+        return (
+            self.share > SHARE and self.rival < RIVAL * self.share and 1 - self.rival > WORSE * max(1 - self.share, 0.0)
+        )
+
+    @property
+    def sharp(self) -> bool:
+        """Whether it does so at this very sample, as what drifts does not."""
+        return 1 - self.beside > SHARP * (1 - self.share)
+
+
+def gaps(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, Fitted, list[Gate]]:
+    """Look for lost samples; returns a bench with recordings cut there, where that cures most of the mismatch.
+
+    The state at the first sample of a later piece is estimated. Recordings in periodic steady state are left alone.
+    """
+    noise2 = min(noise2, _quiet(bench, plain) or noise2)
+    now, found, sharp, jumps = bench, plain, True, 0
+    origins: list[Origin] = [(r.label, 0) for r in bench.recordings]
+    while jumps < MOST and found.cost > ABOVE * noise2:
+        jump = find_jump(now, found)
+        if jump is None or not jump.told:
+            break
+        i, k = jump.recording, jump.sample
+        r = now.recordings[i]
+        label, begin = origins[i]
+        name = f"{r.name} from {(begin + k) * r.dt:.6g} s".strip()
+        pieces = (r.slice(0, k), r.slice(k).with_(name=name, initial="estimate", period=None))
+        other = replace(now, recordings=(*now.recordings[:i], *pieces, *now.recordings[i + 1 :]))
+        states = [*found.begin[: i + 1], _begin(found, r, jump, found.initial[i]), *found.begin[i + 1 :]]
+        try:
+            again = other.fit(other.simulator, [found.values, {}], states=states, solver=THOROUGH)
+        except InputError:
+            break
+        if again.cost > (1 - SHARE / 2) * found.cost:
+            break
+        origins.insert(i + 1, (label, begin + k))
+        now, found, sharp, jumps = other, again, sharp and jump.sharp, jumps + 1
+    if not jumps or found.cost > DROP * plain.cost or not (sharp or found.cost < ALONE**2 * noise2):
+        return bench, plain, []
+    return now, found, [_gate(bench, [o for o in origins if o[1]], plain.cost, found.cost)]
+
+
+def _quiet(bench: Workbench, fitted: Fitted) -> float:
+    """Mean square of white noise, from the median of third differences, which a few jumps do not move."""
+    thirds = np.abs(np.concatenate([np.diff(e, 3, axis=0) for e in fitted.residual]))
+    return float(np.mean((1.4826 * np.median(thirds, axis=0) / bench.scale) ** 2) / 20)
+
+
+def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
+    """The jump of the simulator's states that takes most away, to first order; None where gaps cannot be told."""
+    simulator = bench.simulator
+    if not simulator.kinematic:
+        return None
+    runs = linearised(bench, fitted)[1]
+    base = nominal_directions(bench, fitted)
+    error = np.concatenate(
+        [(one.error / bench.scale)[r.skip :].ravel() for one, r in zip(runs, bench.recordings, strict=True)]
+    )
+    error = error - base @ (base.T @ error)
+    n_x = len(simulator.states)
+    moved = [i for i, name in enumerate(simulator.states) if name not in simulator.kinematic]
+    best: Jump | None = None
+    at = 0
+    for i, (r, one) in enumerate(zip(bench.recordings, runs, strict=True)):
+        rows = slice(at, at + (len(r) - r.skip) * r.n_y)
+        at = rows.stop
+        if r.begins == "periodic" or len(r) - r.skip < 2 * SHORTEST:
+            continue
+        shares, rivals, sizes = _taken(one, bench.scale, base[rows], error[rows], r.skip, n_x, moved)
+        shares[: r.skip + SHORTEST] = shares[len(r) - SHORTEST :] = 0.0
+        k = int(np.argmax(shares))
+        if best is None or shares[k] > best.share:
+            rival = float(np.max(rivals[max(k - NEAR, 0) : k + NEAR + 1]))
+            beside = float(max(shares[k - BESIDE], shares[k + BESIDE]))
+            best = Jump(i, k, float(shares[k]), rival, beside, sizes[k])
+    total = max(float(error @ error), 1e-300)
+    if best is None:
+        return None
+    return replace(best, share=best.share / total, rival=best.rival / total, beside=best.beside / total)
+
+
+def _taken(
+    run: Run, scale: np.ndarray, base: np.ndarray, error: np.ndarray, skip: int, n_x: int, moved: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """At each sample, what the best jump of the state takes away, what its best rival does, and that jump.
+
+    Shapes (M,), (M,) and (M, n_x); `moved` are the states that a shock moves.
+    """
+    m, n, _ = run.a.shape
+    full = n + run.b.shape[2] - run.n_free
+    taken, rival, size = np.zeros(m), np.zeros(m), np.zeros((m, n_x))
+    unit, shock = np.eye(full), np.eye(full)[:, list(moved)]
+    steps = [unit[:, [j]] for j in range(n, full)]
+    for now, s, g, e in _backwards(run, scale, base, error, skip):
+        left = s - g @ np.swapaxes(g, 1, 2)
+        turn = np.zeros_like(s)
+        turn[:, :n, :n] = run.a[now] - np.eye(n)
+        shocks = [shock + part * turn @ shock for part in BETWEEN]
+        taken[now], size[now] = _solved(left, s, e, unit[:, :n_x])
+        rival[now] = np.max([_solved(left, s, e, way)[0] for way in (*shocks, *steps)], axis=0)
+    return taken, rival, size
+
+
+def _solved(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What jumps along some ways, (n, k) or (K, n, k), take away, and how far along them."""
+    across = np.swapaxes(ways, -1, -2)
+    size = np.sqrt(np.maximum(np.einsum("...ii->...i", across @ s @ ways), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    matrix = across @ left @ ways / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(ways.shape[-1])
+    wanted = (across @ e[:, :, None])[:, :, 0] / size
+    found = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0]
+    return np.sum(found * wanted, axis=1), found / size
+
+
+def _backwards(
+    run: Run, scale: np.ndarray, base: np.ndarray, error: np.ndarray, skip: int
+) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
+    """S, G and s of states and of forces that stay from a sample on, for some samples at a time, the last first."""
+    m, n_y, n = run.c.shape
+    forces = run.b.shape[2] - run.n_free
+    full, n_b = n + forces, base.shape[1]
+    read = np.zeros((m - skip, n_y, n_b + 1))
+    read[:, :, :n_b] = base.reshape(m - skip, n_y, n_b)
+    read[:, :, n_b] = error.reshape(m - skip, n_y)
+    c = np.concatenate([run.c, run.d[:, :, run.n_free :]], axis=2) / scale[:, None]
+    s, g = np.zeros((full, full)), np.zeros((full, n_b + 1))
+    a = np.eye(full)
+    for stop in range(m, skip, -CHUNK):
+        now = slice(max(stop - CHUNK, skip), stop)
+        every_s, every_g = np.zeros((stop - now.start, full, full)), np.zeros((stop - now.start, full, n_b + 1))
+        for k in range(stop - 1, now.start - 1, -1):
+            a[:n, :n], a[:n, n:] = run.a[k], run.b[k, :, run.n_free :]
+            s = c[k].T @ c[k] + a.T @ s @ a
+            g = c[k].T @ read[k - skip] + a.T @ g
+            every_s[k - now.start], every_g[k - now.start] = s, g
+        yield now, every_s, every_g[:, :, :n_b], every_g[:, :, n_b]
+
+
+def _begin(fitted: Fitted, r: Recording, jump: Jump, state: np.ndarray) -> np.ndarray:
+    """The simulator's own states after a jump, to first order."""
+    model = fitted.model
+    before = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps]
+    return np.asarray(before[jump.sample, : len(jump.size)] - jump.size)
+
+
+def _gate(bench: Workbench, places: Sequence[Origin], before: float, after: float) -> Gate:
+    """What is told about gaps before some samples."""
+    ordered = sorted(places)
+    dt, several = bench.dt, len({label for label, _ in ordered}) > 1 or len(bench.recordings) > 1
+    at = " and ".join(f"t = {k * dt:.6g} s (sample {k}{f' of {label}' if several else ''})" for label, k in ordered)
+    names = ", ".join([*bench.simulator.inputs, *bench.simulator.output_names])
+    sentence = (
+        f"Samples are missing just before {at}: the state jumps there as no force and no shock could make it, as where "
+        "a logger lost some and counted on. With the recording cut there the refitted error falls from "
+        f"{before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation."
+    )
+    return Gate(names, "gap", [k * dt for _, k in ordered], sentence, True, True, left=after / before)
