@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -28,10 +29,11 @@ MOST = 3  # gaps
 ABOVE = 4.0  # times the noise, in mean square, beyond which gaps are looked for
 SHARE = 0.2  # of the mean square that a jump takes away at least
 RIVAL, WORSE = 0.97, 2.0  # of that, a shock or a step takes away at most, and times what a jump leaves it leaves
+TURNS = 5  # of a fit and a jump
 SHORTEST = 40  # samples of a piece
 NEAR = 3  # samples around a jump at which a shock is tried
 BETWEEN = (-0.5, 0.0, 0.5)  # samples, by which it may come later
-BESIDE, SHARP = 5, 1.5  # samples beside a gap, where a jump leaves so many times the mean square
+BESIDE, SHARP = 5, 1.1  # samples beside a gap, where a jump leaves so many times the mean square
 CHUNK = 256  # samples solved for at a time
 RIDGE = 1e-6  # of a jump that initial states can follow nothing is known
 
@@ -60,11 +62,14 @@ class Jump:
     size: np.ndarray
 
     @property
+    def distinct(self) -> bool:
+        """Whether it takes much away, and no rival as much."""
+        return self.share > SHARE and self.rival < RIVAL * self.share
+
+    @property
     def told(self) -> bool:
-        """Whether it takes much away and no rival nearly as much."""
-        return (
-            self.share > SHARE and self.rival < RIVAL * self.share and 1 - self.rival > WORSE * max(1 - self.share, 0.0)
-        )
+        """Whether every rival also leaves far more."""
+        return self.distinct and 1 - self.rival > WORSE * max(1 - self.share, 0.0)
 
     @property
     def sharp(self) -> bool:
@@ -78,30 +83,79 @@ def gaps(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, Fit
     The state at the first sample of a later piece is estimated. Recordings in periodic steady state are left alone.
     """
     noise2 = min(noise2, _quiet(bench, plain) or noise2)
-    now, found, sharp, jumps = bench, plain, True, 0
+    now, found = bench, plain
     origins: list[Origin] = [(r.label, 0) for r in bench.recordings]
-    while jumps < MOST and found.cost > ABOVE * noise2:
-        jump = find_jump(now, found)
-        if jump is None or not jump.told:
+    while len(origins) < len(bench.recordings) + MOST and found.cost > ABOVE * noise2:
+        settled = _settled(now, found)
+        if settled is None or not settled[0].distinct or settled[2].cost > (1 - SHARE / 2) * found.cost:
             break
-        i, k = jump.recording, jump.sample
-        r = now.recordings[i]
-        label, begin = origins[i]
-        name = f"{r.name} from {(begin + k) * r.dt:.6g} s".strip()
-        pieces = (r.slice(0, k), r.slice(k).with_(name=name, initial="estimate", period=None))
-        other = replace(now, recordings=(*now.recordings[:i], *pieces, *now.recordings[i + 1 :]))
-        states = [*found.begin[: i + 1], _begin(found, r, jump, found.initial[i]), *found.begin[i + 1 :]]
+        jump, now, found = settled
+        label, begin = origins[jump.recording]
+        origins.insert(jump.recording + 1, (label, begin + jump.sample))
+    if found.cost > DROP * plain.cost:
+        return bench, plain, []
+    sharp = True
+    for i, (label, begin) in enumerate(origins):  # each once more, now that the others are cut
+        if not begin:
+            continue
+        settled = _settled(*_joined(now, found, i))
+        if settled is None or settled[0].recording != i - 1 or not settled[0].told:
+            return bench, plain, []
+        jump, now, found = settled
+        origins[i] = label, origins[i - 1][1] + jump.sample
+        sharp = sharp and jump.sharp
+    if not (sharp or found.cost < ALONE**2 * noise2):
+        return bench, plain, []
+    pieces = [
+        r.with_(name=f"{r.name} from {begin * r.dt:.6g} s".strip()) if begin else r
+        for r, (_, begin) in zip(now.recordings, origins, strict=True)
+    ]
+    now = replace(now, recordings=tuple(pieces))
+    return now, found, [_gate(bench, [o for o in origins if o[1]], plain.cost, found.cost)]
+
+
+def _joined(bench: Workbench, fitted: Fitted, i: int) -> tuple[Workbench, Fitted]:
+    """The bench with a piece put back behind the one before, and the run there at the same values."""
+    one, other = bench.recordings[i - 1 : i + 1]
+    whole = one.with_(u=np.concatenate([one.u, other.u]), y=np.concatenate([one.y, other.y]))
+    before = replace(bench, recordings=(*bench.recordings[: i - 1], whole, *bench.recordings[i + 1 :]))
+    return before, _same(before, fitted, [*fitted.initial[:i], *fitted.initial[i + 1 :]])
+
+
+def _same(bench: Workbench, fitted: Fitted, initial: list[np.ndarray]) -> Fitted:
+    """Another bench's fit on this one's recordings, as it stands."""
+    return bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
+
+
+def _settled(bench: Workbench, fitted: Fitted) -> tuple[Jump, Workbench, Fitted] | None:
+    """The jump, and the fit to the pieces, in turn until the jump stays: a fit across a gap may have gone astray."""
+    best: tuple[Jump, Workbench, Fitted] | None = None
+    along = fitted
+    for _ in range(TURNS):
+        jump = find_jump(bench, along)
+        if jump is None or jump.share < SHARE:
+            break
+        i = jump.recording
+        if best is not None and (i, jump.sample) == (best[0].recording, best[0].sample):
+            return jump, *best[1:]
+        pieces = _cut(bench.recordings[i], jump.sample)
+        other = replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
+        states = [*along.begin[: i + 1], _begin(along, bench.recordings[i], jump), *along.begin[i + 1 :]]
+        starts: list[dict[str, Any]] = [along.values, {}]
         try:
-            again = other.fit(other.simulator, [found.values, {}], states=states, solver=THOROUGH)
+            found = other.fit(
+                other.simulator, starts, states=states, solver=THOROUGH, model=fitted.model, engine=fitted.engine
+            )
         except InputError:
             break
-        if again.cost > (1 - SHARE / 2) * found.cost:
-            break
-        origins.insert(i + 1, (label, begin + k))
-        now, found, sharp, jumps = other, again, sharp and jump.sharp, jumps + 1
-    if not jumps or found.cost > DROP * plain.cost or not (sharp or found.cost < ALONE**2 * noise2):
-        return bench, plain, []
-    return now, found, [_gate(bench, [o for o in origins if o[1]], plain.cost, found.cost)]
+        best = jump, other, found
+        along = _same(bench, found, [*found.initial[: i + 1], *found.initial[i + 2 :]])
+    return best
+
+
+def _cut(r: Recording, sample: int) -> tuple[Recording, Recording]:
+    """A recording in two, of which the second begins in a state that is to be estimated."""
+    return r.slice(0, sample), r.slice(sample).with_(initial="estimate", period=None)
 
 
 def _quiet(bench: Workbench, fitted: Fitted) -> float:
@@ -200,11 +254,11 @@ def _backwards(
         yield now, every_s, every_g[:, :, :n_b], every_g[:, :, n_b]
 
 
-def _begin(fitted: Fitted, r: Recording, jump: Jump, state: np.ndarray) -> np.ndarray:
+def _begin(fitted: Fitted, r: Recording, jump: Jump) -> np.ndarray:
     """The simulator's own states after a jump, to first order."""
     model = fitted.model
-    before = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps]
-    return np.asarray(before[jump.sample, : len(jump.size)] - jump.size)
+    states = states_along(model, model.drive(r), fitted.vector, fitted.initial[jump.recording])
+    return np.asarray(states[jump.sample * model.substeps, : len(jump.size)] - jump.size)
 
 
 def _gate(bench: Workbench, places: Sequence[Origin], before: float, after: float) -> Gate:
