@@ -38,6 +38,7 @@ CHUNK = 256  # samples solved for at a time
 RIDGE = 1e-6  # of a jump that initial states can follow nothing is known
 
 Origin = tuple[str, int]  # label of the recording as given, and its sample that a piece begins with
+Stage = tuple[Workbench, Fitted, list[Origin]]
 
 
 @dataclass(frozen=True)
@@ -83,35 +84,45 @@ def gaps(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, Fit
     The state at the first sample of a later piece is estimated. Recordings in periodic steady state are left alone.
     """
     noise2 = min(noise2, _quiet(bench, plain) or noise2)
-    now, found = bench, plain
-    origins: list[Origin] = [(r.label, 0) for r in bench.recordings]
-    while len(origins) < len(bench.recordings) + MOST and found.cost > ABOVE * noise2:
+    least = ALONE**2 * noise2
+    stages: list[Stage] = [(bench, plain, [(r.label, 0) for r in bench.recordings])]
+    while len(stages) <= MOST and stages[-1][1].cost > ABOVE * noise2:
+        now, found, origins = stages[-1]
         settled = _settled(now, found)
         if settled is None or not settled[0].distinct or settled[2].cost > (1 - SHARE / 2) * found.cost:
             break
         jump, now, found = settled
         label, begin = origins[jump.recording]
-        origins.insert(jump.recording + 1, (label, begin + jump.sample))
-    if found.cost > DROP * plain.cost:
-        return bench, plain, []
-    sharp = True
-    for i, (label, begin) in enumerate(origins):  # each once more, now that the others are cut
+        at = jump.recording + 1
+        stages.append((now, found, [*origins[:at], (label, begin + jump.sample), *origins[at:]]))
+    for now, found, origins in reversed(stages[1:]):  # what looked like one more may be another cause's
+        confirmed = _confirmed(now, found, origins, least) if found.cost < DROP * plain.cost else None
+        if confirmed is not None:
+            now, found, origins = confirmed
+            pieces = [_named(r, begin) for r, (_, begin) in zip(now.recordings, origins, strict=True)]
+            gate = _gate(bench, [o for o in origins if o[1]], plain.cost, found.cost)
+            return replace(now, recordings=tuple(pieces)), found, [gate]
+    return bench, plain, []
+
+
+def _confirmed(now: Workbench, found: Fitted, origins: list[Origin], least: float) -> Stage | None:
+    """Each gap once more, now that the others are cut; None where one of them is none."""
+    sharp, origins = True, list(origins)
+    for i, (label, begin) in enumerate(origins):
         if not begin:
             continue
         settled = _settled(*_joined(now, found, i))
         if settled is None or settled[0].recording != i - 1 or not settled[0].told:
-            return bench, plain, []
+            return None
         jump, now, found = settled
         origins[i] = label, origins[i - 1][1] + jump.sample
         sharp = sharp and jump.sharp
-    if not (sharp or found.cost < ALONE**2 * noise2):
-        return bench, plain, []
-    pieces = [
-        r.with_(name=f"{r.name} from {begin * r.dt:.6g} s".strip()) if begin else r
-        for r, (_, begin) in zip(now.recordings, origins, strict=True)
-    ]
-    now = replace(now, recordings=tuple(pieces))
-    return now, found, [_gate(bench, [o for o in origins if o[1]], plain.cost, found.cost)]
+    return (now, found, origins) if sharp or found.cost < least else None
+
+
+def _named(r: Recording, begin: int) -> Recording:
+    """A piece, by the time that it begins at."""
+    return r.with_(name=f"{r.name} from {begin * r.dt:.6g} s".strip()) if begin else r
 
 
 def _joined(bench: Workbench, fitted: Fitted, i: int) -> tuple[Workbench, Fitted]:
@@ -164,6 +175,7 @@ def _quiet(bench: Workbench, fitted: Fitted) -> float:
     return float(np.mean((1.4826 * np.median(thirds, axis=0) / bench.scale) ** 2) / 20)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
     """The jump of the simulator's states that takes most away, to first order; None where gaps cannot be told."""
     simulator = bench.simulator
@@ -226,6 +238,8 @@ def _solved(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) ->
     size = np.where(size > 0, size, 1.0)
     matrix = across @ left @ ways / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(ways.shape[-1])
     wanted = (across @ e[:, :, None])[:, :, 0] / size
+    lost = ~(np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(wanted).all(axis=1))  # where a run grows without end
+    matrix[lost], wanted[lost] = np.eye(ways.shape[-1]), 0.0
     found = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0]
     return np.sum(found * wanted, axis=1), found / size
 
