@@ -164,15 +164,19 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     else:
         seen = led(model, gain)
         states = states_along(seen, seen.drive(r), np.append(p, 1.0), x)
-    parts, means = [], []
+    kept: list[np.ndarray] = []
+    means = []
     for begin in range(0, len(states), CHUNK * n):  # matrices of all sub-steps would be large
         now = slice(begin, begin + CHUNK * n)
         y, a, b, c, d = mapped(probe.step, states[now], drive[now])
         means.append([len(y) * v.mean(axis=0) for v in (a, b, c)])
         if gain is not None:
             a, b = a - gain @ c, b - gain @ d
-        parts.append((*over_samples(a, b, n), c[::n], d[::n], y[::n, :, 0]))
-    a, b, c, d, y = (np.concatenate(v) for v in zip(*parts, strict=True))
+        part = (*over_samples(a, b, n), c[::n], d[::n], y[::n, :, 0])
+        kept = kept or [np.empty((len(r), *v.shape[1:])) for v in part]  # with many states too large to hold twice
+        for whole, v in zip(kept, part, strict=True):
+            whole[begin // n : begin // n + len(v)] = v
+    a, b, c, d, y = kept
     mean = tuple(sum(v) / len(states) for v in zip(*means, strict=True))
     u = r.u
     slope = np.gradient(u, r.dt, axis=0) if bench.hold == "linear" and len(u) > 2 else np.zeros_like(u)

@@ -11,6 +11,7 @@ from ..recording import InputError, Recording
 from ..simulator import Simulator
 from .clipping import unclip
 from .floor import Floor, measured_floor, white_part
+from .gaps import gaps
 from .gates import Gate, choose_hold, hold_note, opened, said_hold, slips
 from .glitches import without_glitches
 from .linearise import along, linearised, observer_gain
@@ -71,8 +72,16 @@ def prepare(
     gates += more
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
-    given, before = bench, without
     unsaid = said_hold(simulator, recordings, hold) is None
+    bench, without, more = gaps(bench, without, noise2)
+    if more:  # what looked better across a gap, and the noise that it makes, say nothing
+        gates += more
+        if unsaid:
+            bench, without, held = _better_held(bench, without)
+            gates, notes = [g for g in gates if g not in notes] + held, held
+        floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+        noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
+    given, before = bench, without
     # where inputs are taken as held but are interpolated, a late channel is late by half a sample more or less
     bench, without, more = timing(given, before, noise2, 0.5 if unsaid else 1.0)
     if more and unsaid:  # out of step, what looked better says nothing
@@ -112,6 +121,19 @@ def refitted(bench: Workbench) -> Fitted:
     except (InputError, np.linalg.LinAlgError):
         return plain
     return found if found.cost < plain.cost else plain
+
+
+def _better_held(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
+    """The bench with what fits better of inputs held and interpolated between samples; and what is to be told."""
+    other = bench.otherwise_held()
+    try:
+        found = other.fit(other.simulator, [fitted.values], states=fitted.begin, solver=THOROUGH)
+    except InputError:
+        return bench, fitted, []
+    ratio = (max(found.cost, fitted.cost) / max(min(found.cost, fitted.cost), 1e-300)) ** 0.5
+    if found.cost < fitted.cost and ratio > 1.02:
+        bench, fitted = other, found
+    return bench, fitted, [hold_note(bench.simulator, bench.hold, ratio)] if ratio > 1.02 else []
 
 
 def _honest(fitted: Fitted, gates: Sequence[Gate], dt: float) -> float:

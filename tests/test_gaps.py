@@ -1,0 +1,135 @@
+"""Samples lost within a recording, its time renumbered."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_rig import OFF, recordings, rig
+from test_diagnosis_report import SCHEMA, problems
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import laws
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose.gaps import _settled, find_jump, gaps
+from pilfr_casadi.diagnose.prepare import prepare, refitted
+from pilfr_casadi.diagnose.workbench import Workbench
+from pilfr_casadi.integration import discretise
+
+
+def lost(r, *places, count=25):
+    """The recording without `count` samples from some places on, as they are numbered afterwards."""
+    keep = np.ones(len(r), dtype=bool)
+    for i, k in enumerate(sorted(places)):
+        keep[k + i * count : k + (i + 1) * count] = False
+    return r.with_(u=r.u[keep], y=r.y[keep])
+
+
+def bench(*train):
+    made = Workbench.of(rig(OFF), train, "zero")
+    return made, refitted(made)
+
+
+def looked(*train):
+    """Samples of the gaps found, by recording."""
+    made, plain = bench(*train)
+    other, found, told = gaps(made, plain, 1e-6)
+    assert (other is made and found is plain) or (found.cost < 0.3 * plain.cost and told)
+    return [len(r) for r in other.recordings], told
+
+
+def test_a_gap_is_a_fault_of_the_recording(tmp_path):
+    (r,) = recordings(count=1)
+    found = pilfr.diagnose(rig(OFF), lost(r, 1100).with_(name="run"), test=recordings(seed=5, count=1))
+    (gate,) = [g for g in found.gates if g.finding == "gap"]
+    assert found.verdict == "recording-fault"
+    assert (gate.corrected, gate.fault, gate.value) == (True, True, [pytest.approx(2.2)])
+    assert "just before t = 2.2 s (sample 1100)" in found.sentence
+    assert [len(piece) for piece in found.train] == [1100, 1375]
+    assert found.errors["train"]["after"] < 0.003 and found.errors["test"]["after"] < 0.003
+    found.report(tmp_path)
+    written = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
+    assert problems(written, SCHEMA) == []
+    assert [g["finding"] for g in written["gates"]] == ["gap"]
+    assert [r.name for r in found.train] == ["run", "run from 2.2 s"]
+    assert "sample 1100" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_several_gaps_are_found_and_the_recordings_told_apart():
+    a, b = recordings(count=2)
+    lengths, (gate,) = looked(lost(a, 700, 1700).with_(name="a"), b.with_(name="b"))
+    assert lengths == [700, 1000, 750, 2500]
+    assert "sample 700 of recording 'a'" in gate.sentence and "sample 1700 of recording 'a'" in gate.sentence
+
+
+def test_friction_is_named_beside_a_gap():
+    train = recordings(laws.CoulombFriction(values={"F_c": 3.0, "v_0": 0.01}))
+    some = (laws.CoulombFriction, laws.CubicStiffness, laws.QuadraticDrag)
+    found = pilfr.diagnose(rig(OFF), [lost(train[0], 1200), train[1]], laws=some, effects=1)
+    assert "gap" in [g.finding for g in found.gates]
+    assert [(e.port, e.law) for e in found.effects] == [("ground-m1", "coulomb_friction")]
+
+
+def pushed(push, count=1):
+    """Recordings of the rig with a force that is not recorded."""
+    true = rig()
+    model = discretise(true, 2e-3, "zero", 4)
+    engine, out = make_engine(model), []
+    for r in recordings(count=count):
+        whole = r.with_(u=r.u + push)
+        y = engine.simulate(model.drive(whole), model.parameters.start, np.zeros(model.n_state))[0]
+        out.append(r.with_(y=y + 1e-3 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape)))
+    return out
+
+
+@pytest.mark.parametrize("samples", [1, 6])
+def test_a_shock_is_no_gap(samples):
+    push = np.zeros((2500, 1))
+    push[1200 : 1200 + samples] = 5000 / samples
+    made, plain = bench(*pushed(push))
+    jump, _, pieces = _settled(made, plain)
+    assert pieces.cost < 0.1 * plain.cost and not jump.told  # cutting would cure it, and yet
+    assert gaps(made, plain, 1e-6)[2] == []
+
+
+@pytest.mark.parametrize("kind", ["step", "ramp", "sensor"])
+def test_a_step_and_a_drift_are_no_gaps(kind):
+    push = np.zeros((2500, 1))
+    if kind == "step":
+        push[1200:] = 60.0
+    if kind == "ramp":
+        push[:, 0] = np.linspace(0, 100, 2500)
+    (r,) = pushed(push)
+    if kind == "sensor":
+        y = np.array(r.y)
+        y[1200:] += np.std(y)
+        r = r.with_(y=y)
+    lengths, told = looked(r)
+    assert lengths == [2500] and not told
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        laws.PiecewiseStiffness(values={"k_c": 8000.0, "g": 0.04}),
+        laws.CoulombFriction(values={"F_c": 15.0, "v_0": 0.01}),
+    ],
+    ids=lambda law: law.id,
+)
+def test_a_stop_and_friction_are_no_gaps(law):
+    lengths, told = looked(*recordings(law, count=1))
+    assert lengths == [2500] and not told
+
+
+def test_where_states_cannot_tell_and_in_periodic_recordings_nothing_is_looked_for():
+    (r,) = recordings(count=1)
+    made, plain = bench(lost(r, 1100))
+    plain_states = replace(made.simulator, dynamics=_hidden(made.simulator.dynamics))
+    assert find_jump(replace(made, simulator=plain_states), plain) is None
+    tail = lost(r, 1100).slice(0, 2400).with_(initial="periodic", period=1200)
+    assert not [g for g in prepare(rig(OFF), [tail], "zero", "auto").gates if g.finding == "gap"]
+
+
+def _hidden(dynamics):
+    """The same equations, no state of which is plainly the integral of another."""
+    return lambda x, u, p: {name: 1.0000001 * d for name, d in dynamics(x, u, p).items()}
