@@ -28,7 +28,7 @@ REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them 
 AGAIN = 3  # starts that a pair is fitted from again
 SAME = 1.02  # times the mean square error of fits that came to the same place
 BEHIND = 3.0  # times the best error of a pair that is not worth more starts
-FAINT = 0.1  # of the share that the other way of looking sees, below which one has seen nothing to start at
+FAINT = 0.01  # of the share that the other way of looking sees, below which one has seen nothing to start at
 
 
 def survivors(scored: Sequence[Scored]) -> list[tuple[str, type[Law], list[Scored]]]:
