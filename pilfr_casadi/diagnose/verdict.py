@@ -33,7 +33,8 @@ HINT = 0.1  # share of a residual that a flexible force has to explain to count
 PARTLY, STILL = 0.09, 0.3  # of the excess left, and of it explainable: a name that only comes near
 LITTLE = 0.02  # of the excess left, with rivals near and a force that explains most of it
 MAINLY = 0.6  # of it explainable: whatever the rivals, the name is wrong or incomplete
-CLEAR = 1.5  # times the winner's error that every rival's is, for a name that only comes near to be given all the same
+# times the winner's error (twice the mean square) that every rival's is, for a name that only comes near to be given
+CLEAR = 1.4
 DRIVEN = 0.5  # share of a name's confidence where it takes a parameter at its bound
 # times the noise, and times the fitted part's error on the rest, that halve it; more does not, for a good sensor knows
 # of no model error and an integrator drifts
