@@ -102,8 +102,8 @@ def diagnose(
     prepared_at = time.perf_counter()
     said = said_hold(simulator, recordings, hold) is not None
     search = Search(ready.bench, ready.without, ready.floor, laws, workers, say, said).run(effects)
-    named = any(p.accepted for p in search.passes)
-    doubted = search.wavers() if named else search.unsure()  # a late sensor looks like the other hold
+    # a late sensor looks like the other hold
+    doubted = search.much() if any(p.accepted for p in search.passes) else search.unsure()
     if not said and (search.misheld > MISHELD or doubted) and not search.interrupted:
         ready, search = _otherwise_held(simulator, recordings, engine, ready, search, effects)
     bench, without = ready.bench, ready.without

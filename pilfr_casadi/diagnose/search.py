@@ -125,7 +125,7 @@ class Search:
             seen = looked.result()
         for number in range(effects):
             if number:
-                if not self._much():
+                if not self.much():
                     break
                 seen = self.screened()
                 if max([*self.open_after.values(), *(s.share for s in seen[0])], default=0.0) < HINT:
@@ -153,11 +153,9 @@ class Search:
 
     def unsure(self) -> bool:
         """Whether something is left that a force explains, and what is named does not explain it or is not sure."""
-        return self.wavers() and max(self.open_after.values(), default=0.0) > HINT
-
-    def wavers(self) -> bool:
-        """Whether something is left, and what is named does not explain it or is not sure."""
-        return self.certainty() <= UNSURE and self._much()
+        if self.certainty() > UNSURE or not self.much():
+            return False
+        return max(self.open_after.values(), default=0.0) > HINT
 
     def certainty(self) -> float:
         """Confidence of the least sure name; nothing where nothing is named, or what is named does not explain."""
@@ -179,8 +177,8 @@ class Search:
         self.misheld = float(np.sqrt(self.base.cost / max(other.cost, 1e-300)))
         return self.misheld > MISHELD
 
-    def _much(self) -> bool:
-        """Whether enough is left to look for a second effect."""
+    def much(self) -> bool:
+        """Whether enough is left to look further."""
         excess, still = left_open(self)
         much = excess > MORE or self.base.cost > max(LOUD**2 * self.floor2, SEEN)
         return much or (excess > LITTLE and still > MAINLY)
