@@ -81,6 +81,14 @@ def test_a_part_that_is_carried_along_is_named_before_the_pole_and_zero_beside_t
     assert choose([*beside, far, other], (1.0, 1.0), 6.4e-5, 500.0).winner in beside
 
 
+def test_a_slow_trend_that_may_be_anywhere_is_the_sensors():
+    everywhere = [candidate(port, "drift", 0.1, size=4) for port in ("actuator:u", "guide", "sensor:x")]
+    choice = choose(everywhere, (1.0, 1.0), 1e-4, 500.0)
+    assert choice.winner is everywhere[2] and {c.port for c in choice.alike} == {"actuator:u", "guide"}
+    worse = candidate("sensor:x", "drift", 0.2, size=4)
+    assert choose([*everywhere[:2], worse], (1.0, 1.0), 1e-4, 500.0).winner is everywhere[0]
+
+
 class Loose:
     """A law by its id; each has a type of its own."""
 

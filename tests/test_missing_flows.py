@@ -178,6 +178,28 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
     assert judge(search, [])[0] == "unexplained"
 
 
+@pytest.mark.parametrize(("sure", "verdict"), [((0.07, 0.05), "unexplained"), ((0.3, 0.05), "missing-physics")])
+def test_two_names_that_are_hardly_sure_are_no_answer(sure, verdict, monkeypatch):
+    law = SimpleNamespace(id="delay")
+    choices = [
+        SimpleNamespace(winner=SimpleNamespace(port=p, law=law), margin=2.0, common=None, sure=c)
+        for p, c in zip(("a", "b"), sure, strict=True)
+    ]
+    monkeypatch.setitem(judge.__globals__, "confidence", lambda choice, search: choice.sure)
+    search = SimpleNamespace(
+        passes=[SimpleNamespace(accepted=True, choice=c) for c in choices],
+        floor2=1e-6,
+        floor=SimpleNamespace(source="repeats"),
+        base=SimpleNamespace(cost=0.01),
+        without=SimpleNamespace(cost=1.0),
+        open_before={"a": 0.9},
+        open_after={"a": 0.0},
+    )
+    found, sentence = judge(search, [])
+    assert found == verdict
+    assert ("delay at a and delay at b" in sentence) is (verdict == "missing-physics")
+
+
 def test_a_refinement_that_comes_out_as_zero_is_the_law_that_it_refines():
     """Stribeck's curve without its rise is plain dry friction."""
     bench = Workbench.of(axis(), [moved(0)], "zero")

@@ -29,7 +29,7 @@ IMITATES = {
     ("hysteresis", "stribeck_friction"): 1.4,
     ("hysteresis", "backlash"): 1.4,
     ("clearance", "piecewise_stiffness"): 1.4,
-    ("extra_mode", "delay"): 1.4,
+    ("extra_mode", "delay"): 1.25,
 }
 FORMS = {
     "mode": 1.15,

@@ -177,13 +177,19 @@ def _otherwise_held(
     try:
         hold = search.bench.otherwise_held().hold
         other = prepare(simulator, recordings, hold, engine, search.workers)
-        again = Search(other.bench, other.without, other.floor, search.laws, search.workers, search.say).run(effects)
+        for most in (effects,) if wrong else (1, effects):  # one effect shows whether it is worth the search for two
+            again = Search(other.bench, other.without, other.floor, search.laws, search.workers, search.say).run(most)
+            if not wrong and again.base.cost > search.base.cost:
+                search.interrupted = again.interrupted
+                return ready, search
+            if not again.much():
+                break
     except InputError:  # it cannot be run so
         return ready, search
     except KeyboardInterrupt:
         search.interrupted = True
         return ready, search
-    if not wrong and (again.certainty() <= search.certainty() or again.base.cost > search.base.cost):
+    if not wrong and again.certainty() <= search.certainty():
         search.interrupted = again.interrupted
         return ready, search
     ratio = search.misheld if wrong else float(np.sqrt(search.base.cost / max(again.base.cost, 1e-300)))

@@ -231,10 +231,15 @@ class Search:
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
     def _mends(self, before: Fitted) -> bool:
-        """Whether a law beside another at its port does no more than mend it: it leaves too much of what was left."""
+        """Whether a law does no more than mend another at its port, or one that imitates others as it does itself.
+
+        It leaves too much of what was left.
+        """
         left = (self.base.cost - self.floor2) / max(before.cost - self.floor2, 1e-300)
-        ports = [e.port for e in self._found()]
-        return len(set(ports)) < len(ports) and left > NEARLY_ALL
+        found = self._found()
+        ports, ids = {e.port for e in found}, [e.law.id for e in found]
+        alike = len(set(ids)) < len(ids) and set(ids) <= set(FLEXIBLE)
+        return (len(ports) < len(found) or alike) and left > NEARLY_ALL
 
     def _found(self) -> Sequence[Placed]:
         """What stands in the ports so far."""

@@ -41,6 +41,7 @@ DRIVEN = 0.5  # share of a name's confidence where it takes a parameter at its b
 FAR_OFF, FAR_AHEAD = 16.0, 4.0
 SLIGHT = 3e-3  # share of the whole excess that halves the confidence of an effect which explains no more
 UNSURE = 0.5  # confidence below which a name is called likely
+HARDLY = 0.1  # confidence below which two names together are no answer
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
 PURE = 0.05  # share of model error in a residual that is taken for noise
@@ -127,6 +128,9 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     if winner.law.form == "mode" and carried and _as_much(carried[0], winner, before):
         winner = carried[0]  # any pair of a pole and a zero is a mode: a part that is carried along is one
         beside = [c for c in reversed(ranked) if c.law.form == "mode" and c.error < winner.error]
+    if winner.law.id == "drift":  # what an actuator's would have to be tuned for, a sensor's is by itself
+        slow = [c for c in ranked if c.law.id == "drift" and c.port.startswith("sensor:") and c.size <= winner.size]
+        winner = next((c for c in slow if _near(c, winner, before)), winner)
     gain = n * (0.5 * np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
     first = {c.name: c for c in reversed(ranked) if c.name != winner.name}  # the best of each name
     no_larger = [c for c in reversed(ranked) if c.name in first and _near(c, winner, before) and c.size <= winner.size]
@@ -179,15 +183,15 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
         common = next((c.common for c in accepted if c.common), None)
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
-        sure = min(confidence(c, search) for c in accepted) > UNSURE
-        return "missing-physics", (
-            f"The simulator leaves out {words}."
-            if sure
-            else f"The simulator most likely leaves out {words}; the name is not certain."
-        )
+        sure = [confidence(c, search) for c in accepted]
+        if len(sure) < 2 or max(sure) > HARDLY:
+            return "missing-physics", (
+                f"The simulator leaves out {words}."
+                if min(sure) > UNSURE
+                else f"The simulator most likely leaves out {words}; the name is not certain."
+            )
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
-    said, noise = mean_nrmse(search.bench, search.without), search.floor.nrmse(search.bench.scale)
     open_now = max(search.open_before.values(), default=0.0)
     hum = [g for g in gates if g.finding == "tone" and not accepted]
     quiet = error * max(1 - sum(1 - g.left for g in hum), 0.0) ** 0.5
@@ -199,7 +203,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     if bare and open_now < HINT:
         beside = f" but a steady tone in {' and '.join(g.channel for g in hum)}" if hum else ""
         return "complete", (
-            f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {said:.3g} of the "
+            f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {_said(search):.3g} of the "
             f"outputs' deviation, and no force at any port explains any of the rest."
         )
     if not accepted:
@@ -210,9 +214,10 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
             else ""
         )
         at = f"; a force at {where} could explain {open_now:.0%} of the rest" if open_now > HINT else ""
+        noise = search.floor.nrmse(search.bench.scale)
         return "unexplained", (
             f"Something is missing and no law of the catalogue explains it: refitted, the simulator is off by "
-            f"{said:.3g} of the outputs' deviation, the noise is about {noise:.3g}{at}{rings}."
+            f"{_said(search):.3g} of the outputs' deviation, the noise is about {noise:.3g}{at}{rings}."
         )
     near = accepted[0].winner
     port = near.port
@@ -223,6 +228,11 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         f"{near.law.id.replace('_', ' ')} at {near.port}, leaves {remains:.0%} of the excess, and a flexible force "
         f"explains {still:.0%} of what it leaves."
     )
+
+
+def _said(search: Search) -> float:
+    """Error of the refitted simulator, as the tables give it."""
+    return mean_nrmse(search.bench, search.without)
 
 
 def explains(accepted: Sequence[Choice], remains: float, still: float) -> bool:
