@@ -69,7 +69,7 @@ def test_piezo_stack_has_hysteresis_at_its_actuator(piezo_found):
     assert errors["before"] > 5 > 2 * errors["after"]
 
 
-@pytest.mark.xfail(reason="six plays of a bent signal follow the nested loops to 2.3 % of the range")
+@pytest.mark.xfail(reason="eleven plays of a bent signal follow the nested loops to 2.21 % of the range")
 def test_piezo_stack_is_followed(piezo_found):
     assert piezo_found[1]["after"] <= 2.2
 
