@@ -182,7 +182,7 @@ def _otherwise_held(
             if not wrong and again.base.cost > search.base.cost:
                 search.interrupted = again.interrupted
                 return ready, search
-            if not again.much():
+            if again.interrupted or not again.much():
                 break
     except InputError:  # it cannot be run so
         return ready, search
