@@ -12,9 +12,9 @@ import os
 import signal
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 
 Progress = Callable[[str, int, int, float], None]
 
@@ -90,15 +90,29 @@ def worker_pool(count: int) -> Iterator[Executor | None]:
     finally:
         if masks:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    done = False
     try:
         yield pool
-        done = True
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        time.sleep(0.0 if done else 0.2)  # the pool forgets what it has not begun, before its processes go
-        for worker in set(multiprocessing.active_children()) - others:
-            worker.terminate()
+        try:
+            _forget(pool)
+        finally:
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.terminate()
+
+
+def _forget(pool: ProcessPoolExecutor) -> None:
+    """Shut a pool when it has dropped what it has not begun.
+
+    A pool that loses its processes while it holds a cancelled task does not end (before Python 3.12). It drops tasks in
+    the order in which they came: when one that comes last is cancelled, the others are.
+    """
+    try:
+        last = pool.submit(os.getpid)
+    except BrokenProcessPool:
+        return
+    pool.shutdown(wait=False, cancel_futures=True)
+    with contextlib.suppress(CancelledError, TimeoutError, BrokenProcessPool):
+        last.result(10)
 
 
 class Clock:
