@@ -25,9 +25,10 @@ DEGREE = 4
 TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
 
 
-def _chebyshev(x: Any) -> list[Any]:
+def chebyshev(x: Any, degree: int = DEGREE) -> list[Any]:
+    """Chebyshev polynomials of the first kind, from degree 0 on."""
     out = [1.0, x]
-    for _ in range(DEGREE - 1):
+    for _ in range(degree - 1):
         out.append(2 * x * out[-1] - out[-2])
     return out
 
@@ -43,7 +44,7 @@ class Surface(Law):
 
     def force(self, z: Any, dz: Any, p: Any) -> Any:
         """Chebyshev terms."""
-        a, b = _chebyshev((z - p.z_m) / p.z_s), _chebyshev(dz / p.v_s)
+        a, b = chebyshev((z - p.z_m) / p.z_s), chebyshev(dz / p.v_s)
         return sum(p.c[k] * a[i] * b[j] for k, (i, j) in enumerate(TERMS))
 
     def parameters(self) -> dict[str, Parameter]:

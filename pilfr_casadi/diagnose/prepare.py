@@ -12,7 +12,7 @@ from ..simulator import Simulator
 from .clipping import unclip
 from .floor import Floor, measured_floor, white_part
 from .gaps import gaps
-from .gates import Gate, choose_hold, hold_note, opened, said_hold, slips
+from .gates import CURED, STRAINED, Gate, choose_hold, hold_note, opened, said_hold, slips
 from .glitches import without_glitches
 from .linearise import along, linearised, observer_gain
 from .offset import another_zero, offsets
@@ -59,9 +59,15 @@ def prepare(
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, bench.model(simulator))
     without = refitted(bench)
+    unsaid = said_hold(simulator, recordings, hold) is None
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
-    if without.cost > SUSPECT * float(np.mean((first.deviation / bench.scale) ** 2)) and without.cost > LEAST:
-        bench, without, more = another_zero(bench, without, slips(bench, without, workers), workers)
+    noise2 = float(np.mean((first.deviation / bench.scale) ** 2))
+    if without.cost > SUSPECT * noise2 and without.cost > LEAST:
+        found = another_zero(bench, without, slips(bench, without, workers), workers)
+        if found[2] and found[1].cost > STRAINED:  # late by half a swing looks like another sign
+            late = timing(bench, without, noise2, 0.5 if unsaid else 1.0)
+            found = late if late[2] and late[1].cost < CURED * found[1].cost else found
+        bench, without, more = found
         gates = [*gates, *more]
         if more:  # what looked better on wrong data says nothing
             between, notes = choose_hold(simulator, bench.recordings, hold, engine)
@@ -72,7 +78,6 @@ def prepare(
     gates += more
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
-    unsaid = said_hold(simulator, recordings, hold) is None
     bench, without, more = gaps(bench, without, noise2)
     if more:  # what looked better across a gap, and the noise that it makes, say nothing
         gates += more

@@ -26,6 +26,7 @@ from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .kinship import FLEXIBLE, complements
 from .linearise import linearised
+from .own_shape import own_shape
 from .pairs import two_at_once
 from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
@@ -227,6 +228,7 @@ class Search:
         if accepted and number:  # what is not fitted has to improve as well
             assert choice is not None
             accepted = self._stands(choice, before[1]) and not self._only_drifts(choice)
+            accepted = accepted and not (number == 1 and own_shape(self, choice.winner))
         self.timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
