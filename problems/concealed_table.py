@@ -1,7 +1,8 @@
 """Near-equivalent answers of the concealed cases, fixed before any result was seen, each with its physical argument.
 
 - commute: In a linear plant of one input and one output, linear time-invariant laws (delay, creep, extra_mode)
-  commute with it: at the actuator or at the sensor they give the same output.
+  commute with it: at the actuator or at the sensor they give the same output. A delay commutes with any plant whose
+  equations do not hold the time, linear or not, for it shifts the time itself.
 - static: In a device without states any law at the actuator is the same law at the sensor, scaled by the gain.
 - quasi-static: A stage driven well below its resonance is a gain: a law of rate-independent kind at the actuator and
   at the sensor differ by a scale; in its equation it stands as a force of the displacement.
@@ -38,7 +39,7 @@ def equivalents(
     siso = len(rig.inputs) == len(rig.outputs) == 1
     series = ":" in effect.port
     ends = {f"actuator:{n}" for n in rig.inputs} | {f"sensor:{n}" for n in rig.outputs}
-    if siso and series and rig.linear_plant and effect.law in LINEAR_LAWS:  # commute
+    if siso and series and ((rig.linear_plant and effect.law in LINEAR_LAWS) or effect.law == "delay"):  # commute
         pairs |= {(end, effect.law) for end in ends}
     if siso and series and not rig.states:  # static
         pairs |= {(end, effect.law) for end in ends}

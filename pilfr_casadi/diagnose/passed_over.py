@@ -3,7 +3,8 @@
 A flexible law may have taken the place of a simpler one at its port. And a resonance whose frequency is found at the
 wrong port is found at the right one from there: a small mass that is carried along is felt in a narrow band, between
 whose neighbours on the grid the screen may miss it. A damped resonance, too, slips between the lightly damped ones of
-the grid; the delay or the lag that comes near in its place says at which frequency it would be as late.
+the grid; the delay or the lag that comes near in its place says at which frequency it would be as late. What takes
+time, such as a delay, looks alike before and behind a simulator that is nearly linear: it is put up at the other end.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ def passed_over(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> li
     if best.law.id in FLEXIBLE:
         plain = [type(s.law) for s in other if s.law.id not in FLEXIBLE]
         chosen += list(dict.fromkeys(plain))[:IMITATED]
-    return [*(s for s in other if type(s.law) in chosen), *_carried(candidates, scored), *_late(candidates, scored)]
+    more = (*_carried(candidates, scored), *_late(candidates, scored), *_other_end(candidates, scored))
+    return [*(s for s in other if type(s.law) in chosen), *more]
 
 
 def _carried(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
@@ -68,3 +70,23 @@ def _late(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Sco
             found = [{"W": 2 * damping / late[s.port], "D": damping} for damping in DAMPED]
             out[key] = replace(s, starts=(*({**start, **w} for start in s.starts[:1] for w in found), *s.starts[:1]))
     return list(out.values())
+
+
+def _other_end(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
+    """The best law of a signal that takes time, at every actuator and sensor where it did not come near."""
+    best = candidates[0]
+    element = best.fitted.simulator.elements[-1]
+    times = [k for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")]
+    if not (best.law.order or best.law.shifts) or not _in_series(best.port):
+        return []
+    found = {k: float(np.ravel(best.fitted.values[f"{element.prefix}{k}"])[0]) for k in times}
+    near = {c.port for c in candidates if type(c.law) is type(best.law) and c.error < AHEAD * best.error}
+    out: dict[str, Scored] = {}
+    for s in scored:
+        if type(s.law) is type(best.law) and _in_series(s.port) and s.port not in near and s.port not in out:
+            out[s.port] = replace(s, starts=(*({**start, **found} for start in s.starts), *s.starts))
+    return list(out.values())
+
+
+def _in_series(port: str) -> bool:
+    return port.startswith(("actuator:", "sensor:"))
