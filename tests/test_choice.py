@@ -131,6 +131,21 @@ def test_where_a_delay_comes_near_damped_resonances_as_late_are_tried():
     assert passed_over([best, late], scored) == []
 
 
+def test_a_delay_is_tried_at_the_other_end_as_well():
+    law = Delay(values={"T": 0.02})
+    late = candidate("sensor:y", "delay", 0.1)
+    late.law = law
+    late.fitted = SimpleNamespace(
+        values={"d.T": 0.02}, simulator=SimpleNamespace(elements=[Placed("sensor:y", law, "d.")])
+    )
+    ports = ("sensor:y", "actuator:u", "spring")
+    scored = [Scored(port, Delay(), 0.1, ({"T": 0.05},), None) for port in ports]
+    (more,) = passed_over([late], scored)
+    assert more.port == "actuator:u" and [start["T"] for start in more.starts] == [0.02, 0.05]
+    there = SimpleNamespace(port="actuator:u", law=Delay(), error=0.11, fitted=late.fitted)
+    assert passed_over([late, there], scored) == []
+
+
 def spring():
     """A mass on a spring, measured at position and velocity."""
     return Simulator(

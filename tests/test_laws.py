@@ -191,6 +191,9 @@ def test_plays_of_one_threshold_in_place_of_the_signal_are_hardly_more_than_a_ba
     assert law.doubtful(narrow)
     assert not law.doubtful({**narrow, "w": np.array([-0.6, 0.45, 0.0, 0.55, 0.0, 0.0])})  # beside the signal
     assert not law.doubtful({**narrow, "w": np.array([-1.0, 0.45, 0.1, 0.45, 0.0, 0.0])})  # of all sizes
+    wide = {**narrow, "w": np.array([-1.0, 0.45, 1e-4, 0.55, 0.0, 0.0])}
+    bent = GeneralizedHysteresis().at({}, {"r": (1e-3, 240.0)})
+    assert law.doubtful(wide) and bent.doubtful({**wide, "a_2": 0.0, "a_3": 0.0, "b_2": 0.0})
 
 
 @pytest.mark.parametrize("plain", [kind for kind in FINER if kind is not StopHysteresis])

@@ -1,4 +1,4 @@
-"""Channels that were exchanged."""
+"""Channels that were exchanged, moved, or late by half a swing."""
 
 import numpy as np
 import pytest
@@ -44,3 +44,39 @@ def test_exchanged_channels_are_told(exchanged):
     assert found.verdict == "recording-fault"
     assert [(g.channel, g.finding, g.value) for g in found.gates] == [(", ".join(channels), "exchange", channels)]
     assert found.errors["train"]["after"] < 0.01 and "are exchanged" in found.sentence
+
+
+@pytest.mark.parametrize(("moved", "verdict"), [(0.3, "recording-fault"), (1e-3, "complete")])
+def test_an_offset_that_was_the_mismatch_is_a_fault(moved, verdict):
+    u, y = recorded()
+    r = Recording(u, y + np.array([0.0, moved]), DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
+    found = pilfr.diagnose(tanks(1.15), r)
+    assert found.verdict == verdict
+    if verdict == "recording-fault":
+        (gate,) = found.gates
+        assert (gate.channel, gate.finding) == ("lower", "offset") and gate.value == pytest.approx(moved, rel=0.02)
+        assert "lower has a constant offset" in found.sentence
+
+
+def beam(off=1.0):
+    """One lightly damped mode."""
+    return Simulator(
+        lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
+        lambda x: {"pos": x.pos},
+        states=("pos", "vel"),
+        inputs=("force",),
+        parameters={"k": Parameter(40.0 * off, bounds=(10, 200)), "d": Parameter(0.08 * off, bounds=(0, 5))},
+    )
+
+
+@pytest.mark.parametrize("fault", ["late", "sign"])
+def test_late_by_half_a_swing_is_no_wrong_sign(fault):
+    rng, model, late = np.random.default_rng(1), discretise(beam(), DT), 10
+    u = pilfr.multisine(M + late, f_max=3.0, fs=1 / DT, rng=rng)
+    r = Recording(u, np.zeros(M + late), DT, ("force",), ("pos",), initial="zero", hold="zero")
+    y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(2))[0]
+    y += 5e-3 * np.std(y) * rng.standard_normal(y.shape)
+    u, y = (u[late:], y[:M]) if fault == "late" else (u[:M], -y[:M])
+    found = pilfr.diagnose(beam(1.1), Recording(u, y, DT, ("force",), ("pos",), initial="estimate", hold="zero"))
+    assert found.verdict == "recording-fault"
+    assert [g.finding for g in found.gates] == [{"late": "alignment", "sign": "sign"}[fault]]

@@ -75,11 +75,11 @@ def _late(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Sco
 def _other_end(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
     """The best law of a signal that takes time, at every actuator and sensor where it did not come near."""
     best = candidates[0]
-    element = best.fitted.simulator.elements[-1]
-    times = [k for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")]
-    if not (best.law.order or best.law.shifts) or not _in_series(best.port):
+    if not _in_series(best.port) or not (best.law.order or best.law.shifts):
         return []
-    found = {k: float(np.ravel(best.fitted.values[f"{element.prefix}{k}"])[0]) for k in times}
+    prefix = best.fitted.simulator.elements[-1].prefix
+    times = [k for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")]
+    found = {k: float(np.ravel(best.fitted.values[f"{prefix}{k}"])[0]) for k in times}
     near = {c.port for c in candidates if type(c.law) is type(best.law) and c.error < AHEAD * best.error}
     out: dict[str, Scored] = {}
     for s in scored:

@@ -90,7 +90,7 @@ class PlayHysteresis(StopHysteresis):
         if abs(1 + float(values["w"][0])) > DIRECT * total:
             return False
         mean = float(w @ r) / max(total, 1e-300)
-        return bool(w @ (r - mean) ** 2 < (ALIKE * mean) ** 2 * total)
+        return bool(w @ np.abs(r - mean) < ALIKE * mean * total)
 
     @classmethod
     def finer_starts(cls, values: Mapping[str, Any], local: Local) -> Iterator[dict[str, Any]]:
@@ -140,10 +140,10 @@ class GeneralizedHysteresis(PlayHysteresis):
         return {**super().bounds(local), **bend}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Whether the loops are thin beside the memoryless part: it is hardly a hysteresis then."""
+        """Whether it is a backlash, or the loops are thin beside the memoryless part: hardly a hysteresis then."""
         reach = self.parameters()["r"].bounds[1]
         wide = np.abs(values["w"]) * np.clip(np.minimum(values["r"], reach - values["r"]), 0.0, None)
-        return bool(np.sum(wide) < THIN * np.max(reach) ** 2 * abs(values["b_2"]))
+        return super().doubtful(values) or bool(np.sum(wide) < THIN * np.max(reach) ** 2 * abs(values["b_2"]))
 
 
 class FineGeneralized(GeneralizedHysteresis):
