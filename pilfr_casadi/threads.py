@@ -22,8 +22,10 @@ SYMBOLIC = threading.RLock()
 
 @functools.cache
 def _controller() -> Any:
+    import scipy.linalg  # brings a BLAS of its own, and only those that are there by now are limited
     from threadpoolctl import ThreadpoolController
 
+    assert scipy.linalg
     return ThreadpoolController()
 
 

@@ -1,0 +1,24 @@
+"""One BLAS thread where fits run side by side."""
+
+import json
+import subprocess
+import sys
+
+SCRIPT = """
+import json
+from pilfr_casadi.threads import one_blas_thread
+
+@one_blas_thread
+def limited():
+    import scipy.linalg  # late: with a BLAS of its own
+    from threadpoolctl import threadpool_info
+    return [found["num_threads"] for found in threadpool_info() if found["user_api"] == "blas"]
+
+print(json.dumps(limited()))
+"""
+
+
+def test_every_blas_is_limited_to_one_thread_whenever_it_is_loaded():
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+    counts = json.loads(done.stdout)
+    assert counts and set(counts) == {1}
