@@ -184,7 +184,8 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         common = next((c.common for c in accepted if c.common), None)
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
         sure = [confidence(c, search) for c in accepted]
-        if max(sure) > HARDLY:
+        ahead = len(accepted) == 1 and accepted[0].margin > CLEAR  # of all rivals, though it leaves much
+        if ahead or max(sure) > HARDLY:
             return "missing-physics", (
                 f"The simulator leaves out {words}."
                 if min(sure) > UNSURE
