@@ -68,6 +68,7 @@ from .stiffness import (
     ProgressiveStiffness,
     QuadraticStiffness,
     QuinticStiffness,
+    SlackSpring,
     SoftClearance,
 )
 
@@ -83,6 +84,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     PiecewiseStiffnessBelow,
     HertzContact,
     Clearance,
+    SlackSpring,
     SoftClearance,
     OffCentreClearance,
     CoulombFriction,

@@ -11,6 +11,8 @@ import numpy as np
 
 from .base import Law, Local, grid
 
+DEAF = 0.707  # damping ratio from which on a second-order response has no peak
+
 
 @dataclass(frozen=True)
 class Delay(Law):
@@ -214,8 +216,8 @@ class Mode(Resonance):
         return p.c_1 * q[0] + p.c_2 * q[1]
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """As much damping as there can be: two lags that follow anything linear, no mode."""
-        return bool(values["D"] >= self.parameters()["D"].bounds[1])
+        """So much damping that no frequency stands out: two lags that follow anything linear, no mode."""
+        return bool(values["D"] > DEAF)
 
 
 class Attached(Resonance):

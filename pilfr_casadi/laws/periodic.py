@@ -10,6 +10,7 @@ import numpy as np
 
 from .base import Law, Local, grid
 
+FEWEST, SEEN = 1.5, 2.0  # periods within the motion that are tried, and that make a force a periodic one
 
 class PeriodicForce(Law):
     """A force that repeats with position: cogging, ripple of a screw or gear (Hanselman 2006)."""
@@ -26,10 +27,14 @@ class PeriodicForce(Law):
         return p.a * ca.sin(angle) + p.b * ca.cos(angle)
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(L=2 * local.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 60.1, 1.0)]))
+        yield from grid(L=2 * local.half / np.concatenate([np.arange(FEWEST, 8, 0.5), np.arange(8, 60.1, 1.0)]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"L": (2 * local.half / 60, 2 * local.half / 1.5)}
+        return {"L": (2 * local.half / 60, 2 * local.half / FEWEST)}
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Fewer than two periods within the motion: any other curve."""
+        return bool(values["L"] > FEWEST / SEEN * self.parameters()["L"].bounds[1])
 
 
 class HarmonicForce(PeriodicForce):
@@ -55,6 +60,10 @@ class Ripple(PeriodicForce):
     source = "Heydemann (1981), Applied Optics 20(19)"
     sentence = "an error that repeats with the signal itself, as from an encoder off centre or its interpolation"
     places: ClassVar[tuple[str, ...]] = ("sensor",)
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Three periods are enough."""
+        return False
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield from grid(L=2 * local.half / np.arange(3.0, 60.1, 1.0))

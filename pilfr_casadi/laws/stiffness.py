@@ -215,6 +215,18 @@ class Clearance(Law):
         return one_sided(local)
 
 
+class SlackSpring(Clearance):
+    """A gap in line with a spring that the simulator has: within it, that spring carries nothing."""
+
+    form = "in its own spring"
+    equation = "w = -k_g clip(z, -g, g)"
+    sentence = "a clearance in line with a spring that is modelled: it carries load only beyond a gap on either side"
+    restoring = True  # it takes of a spring away
+
+    def force(self, z: Any, p: Any) -> Any:
+        return -p.k_g * ca.fmax(ca.fmin(z, p.g), -p.g)
+
+
 class SoftClearance(Clearance):
     """A gap between curved bodies: Hertz's contact on either side."""
 
