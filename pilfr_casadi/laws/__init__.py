@@ -68,6 +68,7 @@ from .stiffness import (
     ProgressiveStiffness,
     QuadraticStiffness,
     QuinticStiffness,
+    SlackCoupling,
     SlackSpring,
     SoftClearance,
 )
@@ -85,6 +86,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     HertzContact,
     Clearance,
     SlackSpring,
+    SlackCoupling,
     SoftClearance,
     OffCentreClearance,
     CoulombFriction,

@@ -14,9 +14,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
+import casadi as ca
 import numpy as np
 
 from ..parameters import Parameter
+
+EDGE = 0.05  # share of a gap over which contact sets in
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +201,11 @@ def readable_unit(unit: str, w: str, z: str) -> str:
         known = {"w": w or "[w]", "z": z or "[z]"}.get(base, base)
         parts.append(f"({known})^{power}" if power and " " in known else known + (f"^{power}" if power else ""))
     return "".join(f" {p} " if p == "*" else p for p in parts).strip()
+
+
+def beyond(z: Any, g: Any) -> Any:
+    """From 0 to 1 where z passes a gap of g on either side: over a part of it, for a jump would have no slope in g."""
+    return (1 + ca.tanh((ca.fabs(z) - g) / (EDGE * g))) / 2
 
 
 def grid(**axes: Any) -> Iterator[dict[str, Any]]:

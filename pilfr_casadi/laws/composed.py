@@ -13,10 +13,9 @@ from typing import Any
 import casadi as ca
 
 from ..recording import InputError
-from .base import Law, Local
+from .base import Law, Local, beyond
 
 GAPS = (0.1, 0.3, 0.6)  # of the largest |z|
-EDGE = 0.05  # share of the gap over which contact sets in
 
 
 def _kind(law: Any) -> type[Law]:
@@ -98,9 +97,7 @@ def behind_gap(law: type[Law]) -> type[Law]:
 @functools.cache
 def _behind(base: Any) -> Any:
     def reached(z: Any, dz: Any, p: Any) -> tuple[Any, Any]:
-        beyond = z - ca.fmin(ca.fmax(z, -p["g"]), p["g"])
-        touching = (1 + ca.tanh((ca.fabs(z) - p["g"]) / (EDGE * p["g"]))) / 2  # a jump would have no slope in g
-        return beyond, touching * dz
+        return z - ca.fmin(ca.fmax(z, -p["g"]), p["g"]), beyond(z, p["g"]) * dz
 
     class Behind(base):
         form = _form(base, "behind a gap")
@@ -123,16 +120,16 @@ def _behind(base: Any) -> Any:
 
             def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0) -> Any:
                 """The law's own, beyond the gap."""
-                beyond, rate = reached(z, dz, p)
+                past, rate = reached(z, dz, p)
                 more = {"dz": rate} if "dz" in inspect.signature(base.step).parameters else {}
-                return base.step(self, beyond, s, p, **more)
+                return base.step(self, past, s, p, **more)
 
         else:
 
             def force(self, **have: Any) -> Any:
                 """The law's own, beyond the gap."""
-                beyond, rate = reached(have["z"], have["dz"], have["p"])
-                have |= {"z": beyond, "dz": rate}
+                past, rate = reached(have["z"], have["dz"], have["p"])
+                have |= {"z": past, "dz": rate}
                 return base.force(
                     self, **{k: v for k, v in have.items() if k in inspect.signature(base.force).parameters}
                 )

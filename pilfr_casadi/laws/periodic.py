@@ -12,6 +12,7 @@ from .base import Law, Local, grid
 
 FEWEST, SEEN = 1.5, 2.0  # periods within the motion that are tried, and that make a force a periodic one
 
+
 class PeriodicForce(Law):
     """A force that repeats with position: cogging, ripple of a screw or gear (Hanselman 2006)."""
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from .base import Law, Local, grid
+from .base import Law, Local, beyond, grid
 
 
 def one_sided(local: Local) -> str:
@@ -225,6 +225,19 @@ class SlackSpring(Clearance):
 
     def force(self, z: Any, p: Any) -> Any:
         return -p.k_g * ca.fmax(ca.fmin(z, p.g), -p.g)
+
+
+class SlackCoupling(SlackSpring):
+    """The same where a damper beside that spring loses contact with it, as between the teeth of gears."""
+
+    form = "in its own coupling"
+    equation = "w = -k_g clip(z, -g, g) - c_g dz/dt (|z| < g)"
+    sentence = "a clearance in line with a coupling that is modelled: its spring and damper act only beyond a gap"
+    units: ClassVar[Mapping[str, str]] = {"k_g": "w/z", "c_g": "w*s/z", "g": "z"}
+    strength: ClassVar[tuple[str, ...]] = ("k_g", "c_g")
+
+    def force(self, z: Any, dz: Any, p: Any) -> Any:  # type: ignore[override]
+        return super().force(z, p) - p.c_g * dz * (1 - beyond(z, p.g))
 
 
 class SoftClearance(Clearance):
