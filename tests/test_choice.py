@@ -89,27 +89,6 @@ def test_a_slow_trend_that_may_be_anywhere_is_the_sensors():
     assert choose([*everywhere[:2], worse], (1.0, 1.0), 1e-4, 500.0).winner is everywhere[0]
 
 
-class Loose:
-    """A law by its id; each has a type of its own."""
-
-    id = "delay"
-
-
-class Looser(Loose):
-    """Another."""
-
-    id = "backlash"
-
-
-def test_a_law_that_can_imitate_others_is_put_up_against_them():
-    scored = [SimpleNamespace(port=port, law=law) for port in ("a", "b") for law in (Loose(), Looser())]
-    flexible = candidate("a", "extra_mode", 0.1)
-    assert [(s.port, s.law.id) for s in passed_over([flexible], scored)] == [("a", "delay"), ("a", "backlash")]
-    tried = SimpleNamespace(port="a", law=Looser(), error=0.1)
-    assert [s.law.id for s in passed_over([flexible, tried], scored)] == ["delay"]
-    assert passed_over([candidate("a", "cubic_stiffness", 0.1)], scored) == []
-
-
 def test_a_special_case_that_was_left_after_a_few_steps_is_fitted_again():
     scored = [Scored("a", law, 0.1, ({},), None) for law in (LinearStiffness(), CubicStiffness())]
     flexible, left = candidate("a", "extra_mode", 0.1), candidate("a", "linear_stiffness", 0.5)

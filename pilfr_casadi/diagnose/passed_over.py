@@ -1,6 +1,6 @@
 """Laws that the screen did not let through and that what came out best asks for.
 
-A flexible law may have taken the place of a simpler one at its port. And a resonance whose frequency is found at the
+A resonance whose frequency is found at the
 wrong port is found at the right one from there: a small mass that is carried along is felt in a narrow band, between
 whose neighbours on the grid the screen may miss it. A damped resonance, too, slips between the lightly damped ones of
 the grid; the delay or the lag that comes near in its place says at which frequency it would be as late. What takes
@@ -16,10 +16,9 @@ import numpy as np
 
 from ..laws.dynamic import Attached, Delay, Lag, Resonance
 from .candidate import Candidate
-from .kinship import CONTAINS, FLEXIBLE
+from .kinship import CONTAINS
 from .screen import Scored
 
-IMITATED = 3  # simpler laws put up against one that can imitate others
 AHEAD = 1.5  # times the best error beyond which a carried mass, or a special case, is worth another start
 BEHIND = 3.0  # times the best error of a delay or a lag that may stand for a resonance
 DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in its place
@@ -35,9 +34,6 @@ def passed_over(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> li
     # a special case of what came out best may have been left where a few steps led
     chosen = [type(s.law) for s in other if s.law.id in CONTAINS.get(best.law.id, ())]
     other = [s for s in other if (s.port, type(s.law)) not in tried or type(s.law) in chosen]
-    if best.law.id in FLEXIBLE:
-        plain = [type(s.law) for s in other if s.law.id not in FLEXIBLE]
-        chosen += list(dict.fromkeys(plain))[:IMITATED]
     more = (*_carried(candidates, scored), *_late(candidates, scored), *_other_end(candidates, scored))
     return [*(s for s in other if type(s.law) in chosen), *more]
 

@@ -24,6 +24,7 @@ from .exchange import exchange
 from .explain import explain
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
+from .imitated import imitated
 from .kinship import FLEXIBLE, complements
 from .linearise import linearised
 from .own_shape import own_shape
@@ -203,7 +204,7 @@ class Search:
             return Pass(None, (), tuple(scored), before, False)
         began = time.perf_counter()
         candidates = self._explained(number, scored, gain)
-        missed = passed_over(candidates, scored)
+        missed = [*passed_over(candidates, scored), *imitated(self.bench, candidates, scored)]
         if missed:
             more = self._explained(number, missed, gain)
             candidates = sorted([*candidates, *more], key=lambda c: c.error)
