@@ -12,6 +12,7 @@ from pilfr_casadi.diagnose.gates import Gate
 from pilfr_casadi.diagnose.passed_over import passed_over
 from pilfr_casadi.diagnose.screen import Scored
 from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.second_effect import only_drifts
 from pilfr_casadi.diagnose.timing import timing
 from pilfr_casadi.diagnose.verdict import choose, strained
 from pilfr_casadi.diagnose.workbench import Workbench
@@ -36,7 +37,7 @@ def test_behind_a_free_integrator_no_sensor_is_blamed_for_what_is_left(port, rem
     """Unless next to nothing is left then: no drift that is followed does that."""
     search = searching(Workbench.of(axis(), [moved(0)], "zero"))
     winner = SimpleNamespace(port=port, law=SimpleNamespace(id="hysteresis"))
-    assert search._only_drifts(SimpleNamespace(winner=winner, remains=remains)) is drifts
+    assert only_drifts(search, SimpleNamespace(winner=winner, remains=remains)) is drifts
 
 
 def candidate(port, law, error, size=2, at_bound=False, doubtful=False, form=""):

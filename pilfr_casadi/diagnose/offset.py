@@ -88,10 +88,10 @@ def offsets(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Ga
             break
         kind, name = port.split(":", 1)
         value = float(found.values[with_law.elements[-1].prefix + "w_0"])
-        where = "input" if kind == "actuator" else "output"
+        where, load = ("input", ", or a constant load acts like one") if kind == "actuator" else ("output", "")
         sentence = (
-            f"The {where} {name} has a constant offset of about {value:.3g}; with it as a parameter the refitted error "
-            f"falls from {plain.cost**0.5:.3g} to {found.cost**0.5:.3g} of the outputs' deviation."
+            f"The {where} {name} has a constant offset of about {value:.3g}{load}; with it as a parameter the refitted "
+            f"error falls from {plain.cost**0.5:.3g} to {found.cost**0.5:.3g} of the outputs' deviation."
         )
         gates.append(Gate(name, "offset", value, sentence, True, parameter=with_law.elements[-1].prefix + "w_0"))
         bench, plain = other, found

@@ -126,10 +126,14 @@ class Diagnosis:
         diagnosis_report(self, folder)
 
     def warnings(self) -> list[str]:
-        """What makes the answer less certain than it looks: parameters at bounds, a test error far above training's."""
+        """What makes the answer less certain than it looks: parameters at bounds, a test error far above training's.
+
+        At zero is what a named effect has replaced, such as a damper that was there for friction.
+        """
         out, own = [], self.corrected.parameters
         ends = {k: (np.asarray(own[k].value), *own[k].bounds) for k in self.parameters if not own[k].fixed}
         held = {k: np.ravel(v)[0] for k, (v, low, high) in ends.items() if np.any((v <= low) | (v >= high))}
+        held = {k: v for k, v in held.items() if v or not self.effects}
         if held:
             names = ", ".join(f"{k} ({v:.4g})" for k, v in held.items())
             one = len(held) == 1

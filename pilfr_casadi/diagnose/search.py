@@ -25,13 +25,13 @@ from .explain import explain
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .imitated import imitated
-from .kinship import FLEXIBLE, complements
+from .kinship import complements
 from .linearise import linearised
-from .own_shape import own_shape
 from .pairs import two_at_once
 from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
 from .screen import Scored, screen
+from .second_effect import believed, mends
 from .verdict import HINT, LITTLE, MAINLY, UNSURE, Choice, choose, confidence, explains, left_open
 from .workbench import THOROUGH, Fitted, Workbench
 
@@ -41,9 +41,6 @@ MORE, LOUD = 0.03, 3.0  # share of the excess, or times the noise, that has to b
 SEEN = 2.5e-5  # mean square error below which what is more than noise is not worth a second effect
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 POLISHED = 4  # candidates fitted to everything before one is chosen
-MOSTLY = 0.5  # share of the rest that a second effect may leave
-NEARLY_ALL = 0.1  # the same beside another law at its port
-UNSEEN, NO_WORSE = 0.7, 1.1  # shares of the mean square on the unseen part that a second effect may leave
 NOTHING = 0.01  # below this share nothing is explained
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
@@ -144,7 +141,7 @@ class Search:
             if number:
                 look_back(self)
                 exchange(self)
-                if self._mends(before):
+                if mends(self, before):
                     self.base, self.passes = before, [*passes, replace(found, accepted=False)]
                     break
             if self._wrongly_held():
@@ -196,7 +193,7 @@ class Search:
     def pass_(self, number: int, seen: Seen) -> Pass:
         """Fit what the screen lets through, and choose; `number` effects were accepted before."""
         scored, gain = seen
-        scored = [s for s in scored if all(e.port != s.port or complements(e.law, s.law) for e in self._found())]
+        scored = [s for s in scored if all(e.port != s.port or complements(e.law, s.law) for e in self.found())]
         most = max((s.share for s in scored), default=0.0)
         nothing = max(most, max(self.open_after.values(), default=0.0)) < NOTHING and self.base.cost < 0.0025
         before = (self.base.cost, self.base.cost)
@@ -228,23 +225,11 @@ class Search:
         accepted = choice is not None and choice.gain > ROOM
         if accepted and number:  # what is not fitted has to improve as well
             assert choice is not None
-            accepted = self._stands(choice, before[1]) and not self._only_drifts(choice)
-            accepted = accepted and not (number == 1 and own_shape(self, choice.winner))
+            accepted = believed(self, choice, before[1], number)
         self.timed("choice", began)
         return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
 
-    def _mends(self, before: Fitted) -> bool:
-        """Whether a law does no more than mend another at its port, or one that imitates others as it does itself.
-
-        It leaves too much of what was left.
-        """
-        left = (self.base.cost - self.floor2) / max(before.cost - self.floor2, 1e-300)
-        found = self._found()
-        ports, ids = {e.port for e in found}, [e.law.id for e in found]
-        alike = len(set(ids)) < len(ids) and set(ids) <= set(FLEXIBLE)
-        return (len(ports) < len(found) or alike) and left > NEARLY_ALL
-
-    def _found(self) -> Sequence[Placed]:
+    def found(self) -> Sequence[Placed]:
         """What stands in the ports so far."""
         return self.base.simulator.elements[len(self.bench.simulator.elements) :]
 
@@ -255,28 +240,6 @@ class Search:
         return explain(
             self.bench, scored, self.base, gain, self.workers, enough, lambda i, n, e: self.say(stage, i, n, e)
         )
-
-    def _only_drifts(self, choice: Choice) -> bool:
-        """Whether a law that imitates others stands at a sensor behind a free integrator, whose drift it can follow.
-
-        What leaves next to nothing does more than that.
-        """
-        at_sensor = choice.winner.port.startswith("sensor:")
-        if choice.winner.law.id not in FLEXIBLE or not at_sensor or choice.remains < LITTLE:
-            return False
-        a = linearised(self.bench, self.without)[1][0].mean[0]
-        return bool(np.any(np.abs(np.linalg.eigvals(a) - 1) < 1e-6))
-
-    def _stands(self, choice: Choice, unseen: float) -> bool:
-        """Whether a second effect is believed: most of what is left goes, and what is not fitted improves.
-
-        A law that imitates none and takes most away overall need only not do worse there, which may see little of it.
-        `unseen` is the mean square error before on what is not fitted.
-        """
-        left = (choice.winner.full - self.floor2) / max(self.base.cost - self.floor2, 1e-300)
-        sure = choice.winner.law.id not in FLEXIBLE and left < MOSTLY
-        clear = choice.remains < MOSTLY and choice.winner.tail < UNSEEN * unseen
-        return clear or (sure and choice.winner.tail < NO_WORSE * unseen)
 
     def effective_samples(self, candidates: Sequence[Candidate]) -> float:
         """Effective samples of the best candidate's residual."""
