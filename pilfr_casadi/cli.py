@@ -41,12 +41,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from .interrupts import deferred_interrupt
+    from .interrupts import deferred_interrupt, terminable
 
     with deferred_interrupt():  # an import is not to be torn apart
         from . import commands
         from .checks import InputError
-    with warnings.catch_warnings():
+    with terminable(), warnings.catch_warnings():
         warnings.showwarning = _warn
         try:
             return int(getattr(commands, options.command)(options))

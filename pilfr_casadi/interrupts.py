@@ -1,7 +1,8 @@
 """Ctrl-C, time limits and worker processes: what the command line does so that a run ends soon, and ends clean.
 
 Ctrl-C reaches every process of the terminal's foreground group. The workers are deaf to it; the first process stops
-waiting for them, keeps the best so far and ends them. A time limit is a Ctrl-C that a clock gives.
+waiting for them, keeps the best so far and ends them. A time limit is a Ctrl-C that a clock gives, and so is SIGTERM,
+which `timeout` and job schedulers send.
 """
 
 from __future__ import annotations
@@ -69,9 +70,29 @@ def insistent(progress: Progress) -> Iterator[Progress]:
         mouth.close()
 
 
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """SIGTERM does what Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ended(*_: object) -> None:
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a script
+            raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGTERM, ended)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def _deaf() -> None:
-    """In a worker: Ctrl-C is for the process that waits for the results."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """In a worker: what ends a run is for the process that waits for the results."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextlib.contextmanager
@@ -97,7 +118,7 @@ def worker_pool(count: int) -> Iterator[Executor | None]:
             _forget(pool)
         finally:
             for worker in set(multiprocessing.active_children()) - others:
-                worker.terminate()
+                worker.kill()
 
 
 def _forget(pool: ProcessPoolExecutor) -> None:

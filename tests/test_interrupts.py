@@ -89,8 +89,8 @@ def session(leader):
     return found
 
 
-def struck(arguments, until):
-    """Run a command, strike its whole process group once `until(process)`; status, stdout, stderr, processes."""
+def struck(arguments, until, number=signal.SIGINT):
+    """Run a command, signal its whole process group once `until(process)`; status, stdout, stderr, processes."""
     process = subprocess.Popen(
         [*PILFR, *map(str, arguments)],
         start_new_session=True,
@@ -104,7 +104,7 @@ def struck(arguments, until):
         while not until(process):
             assert process.poll() is None and time.monotonic() < end
             time.sleep(0.02)
-        os.killpg(process.pid, signal.SIGINT)
+        os.killpg(process.pid, number)
         out, err = process.communicate(timeout=60)
         end = time.monotonic() + 10
         while (left := session(process.pid)) and time.monotonic() < end:
@@ -120,8 +120,11 @@ def struck(arguments, until):
 
 
 @linux
-@pytest.mark.parametrize("pause", [0.0, 0.3, 1.0, 2.5])
-def test_the_first_ctrl_c_ends_a_run_with_workers(tmp_path, pause):
+@pytest.mark.parametrize(
+    ("pause", "number"),
+    [(0.0, signal.SIGINT), (0.3, signal.SIGINT), (1.0, signal.SIGINT), (2.5, signal.SIGINT), (2.5, signal.SIGTERM)],
+)
+def test_the_first_signal_ends_a_run_with_workers(tmp_path, pause, number):
     """Struck `pause` seconds after its workers have begun."""
     out_dir, since = tmp_path / "out", []
 
@@ -131,7 +134,7 @@ def test_the_first_ctrl_c_ends_a_run_with_workers(tmp_path, pause):
         return since and time.monotonic() - since[0] >= pause
 
     names = ("--inputs", "u", "--outputs", "x2", "--initial", "zero", "--nx", 5, "--starts", 500, "--workers", 2)
-    status, out, err, left = struck(("fit", TRAIN, *names, "--out", out_dir), until)
+    status, out, err, left = struck(("fit", TRAIN, *names, "--out", out_dir), until, number)
     assert status == 130 and left == []
     assert "Traceback" not in err and "Exception" not in err
     written = (out_dir / "model.json").exists()
