@@ -28,6 +28,7 @@ from .result import Diagnosis, Effect
 from .search import MISHELD, Pass, Search
 from .tones import tones
 from .undeclared import beyond_the_ports
+from .varying import varying
 from .verdict import UNSURE, confidence, judge, left_open
 from .workbench import Fitted
 
@@ -117,7 +118,7 @@ def diagnose(
     if (lost := _lost_input(search, verdict)) is not None:
         verdict, sentence, gates = "recording-fault", lost.sentence, (*gates, lost)
     elif verdict == "unexplained":
-        gates = (*gates, *beyond_the_ports(search))
+        gates = (*gates, *beyond_the_ports(search), *varying(search))
     if search.interrupted and not accepted:
         sentence = (
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "
