@@ -106,7 +106,9 @@ def diagnose(
     # a late sensor looks like the other hold
     doubted = search.much() if any(p.accepted for p in search.passes) else search.unsure()
     if not said and (search.misheld > MISHELD or doubted) and not search.interrupted:
+        first, ended = search, time.perf_counter()
         ready, search = _otherwise_held(simulator, recordings, engine, ready, search, effects)
+        search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - prepared_at
     bench, without = ready.bench, ready.without
     search.base = without_idle_offsets(bench, search.base)
     gates = (*ready.gates, *tones(bench, search.base))
