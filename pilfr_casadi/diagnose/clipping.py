@@ -12,6 +12,7 @@ from ..recording import Recording
 from .gates import Gate, refit
 from .linearise import linearised
 from .remainder import folds, followed, held_out, moved
+from .stale import stretches
 from .workbench import Fitted, Workbench
 
 HALF = 0.5  # of the mismatch, that what lies beyond a limit leaves at most
@@ -81,8 +82,8 @@ def _beyond(bench: Workbench, without: Fitted, i: int, low: float, high: float) 
 
 def _bulges(at: np.ndarray) -> np.ndarray:
     """A parabola of curvature one over each stretch of a mask."""
-    out, edges = np.zeros(len(at)), np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]])))
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+    out = np.zeros(len(at))
+    for begin, end in stretches(at):
         t = np.arange(end - begin) + 0.5
         out[begin:end] = t * (end - begin - t) / 2
     return out
@@ -104,7 +105,7 @@ def clipped(recordings: Sequence[Recording], kind: str) -> list[tuple[int, float
         limits, count = [-np.inf, np.inf], 0
         for j, extreme in enumerate((y.min(), y.max())):
             at = y == extreme
-            runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]]))))[::2]
+            runs = np.diff(stretches(at)).ravel()
             neighbours = np.mean(np.abs(np.diff(y)) == 0)
             if (
                 at.sum() >= 6

@@ -37,11 +37,15 @@ def stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
     return found
 
 
+def stretches(mask: np.ndarray) -> np.ndarray:
+    """Begin and end of each stretch of a mask (M,) that is true, shape (n, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]]))).reshape(-1, 2)
+
+
 def _repeated(y: np.ndarray, step: float) -> np.ndarray:
     """Which samples repeat the one before away from the limits, in runs that are not long and followed by a jump."""
     same = np.append(False, y[1:] == y[:-1]) & (y > np.min(y)) & (y < np.max(y))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
-    for begin, end in edges.reshape(-1, 2):
+    for begin, end in stretches(same):
         if end - begin > LONGEST or abs(y[min(end, len(y) - 1)] - y[begin]) <= SLOW * step:
             same[begin:end] = False
     return same
