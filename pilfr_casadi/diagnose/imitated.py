@@ -26,6 +26,7 @@ from .workbench import Fitted, Workbench
 MOST = 3  # simple laws put up against one that can imitate others
 NEAR = 1.5  # times the best error, of what has been fitted well enough
 SEEN = 4000  # samples that forces are compared on, about
+HUGE = 1e60  # signals that a simulation which diverges comes to
 
 
 def imitated(bench: Workbench, candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
@@ -39,11 +40,12 @@ def imitated(bench: Workbench, candidates: Sequence[Candidate], scored: Sequence
         if s.port == best.port and s.law.id not in FLEXIBLE and type(s.law) not in near:
             entries.setdefault(type(s.law), s)
     local = felt(bench, best.fitted, best.port)
-    if not entries or not np.all(np.isfinite(local.z)):
+    if not entries or not max(np.max(np.abs(local.z)), np.max(np.abs(local.dz))) < HUGE:
         return []
     values, law = _own(best), best.law
     force = trace(law.at(values), local, [_shape(law, values)])[:, 0] @ _strengths(law, values)
-    found = [(*_likest(s.law, local, force), s) for s in entries.values()]
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = [(*_likest(s.law, local, force), s) for s in entries.values()]
     ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:MOST]
     return [replace(s, starts=(start, *s.starts)) for _, start, s in ranked]
 
