@@ -150,6 +150,10 @@ def time_limit(seconds: float | None, clock: Clock) -> Iterator[None]:
         yield
         return
     ended = False
+    # in the background of a script Ctrl-C is ignored, and a clock would be too
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if ours:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def strike() -> None:
         with lock:
@@ -172,3 +176,5 @@ def time_limit(seconds: float | None, clock: Clock) -> Iterator[None]:
         with deferred_interrupt(), lock:
             ended = True
         timer.cancel()
+        if ours:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -42,6 +42,16 @@ def test_a_time_limit_interrupts_only_what_it_limits():
     assert not clock.expired and threading.active_count() < 20
 
 
+def test_a_time_limit_holds_where_ctrl_c_is_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(KeyboardInterrupt), time_limit(0.05, Clock()):
+            time.sleep(20)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_a_swallowed_interrupt_is_not_forgotten():
     seen = []
     with insistent(lambda *news: seen.append(news)) as progress:
