@@ -97,10 +97,11 @@ def test_degrees_fahrenheit_are_a_fault_of_the_recording():
     assert "factor of 1.8 and an offset" in found.sentence
 
 
-def test_an_offset_alone_is_no_wrong_unit():
+def test_an_offset_alone_is_a_fault_but_no_wrong_unit():
     found = pilfr.diagnose(tank(1.15), recorded(30.0, change=lambda y: y + np.array([0.0, 12.0])))
     assert [(g.channel, g.finding) for g in found.gates] == [("lower", "offset")]
-    assert found.verdict != "recording-fault"
+    assert found.verdict == "recording-fault"
+    assert "constant offset" in found.sentence and not found.effects
 
 
 def test_a_curve_that_the_signal_sees_only_a_straight_part_of_is_not_tried():
