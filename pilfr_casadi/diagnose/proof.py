@@ -77,10 +77,10 @@ def _by_name(fitted: Fitted, where: np.ndarray, matrix: np.ndarray) -> dict[str,
     return fitted.model.parameters.unpack(full)
 
 
-def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+def covariance(bench: Workbench, fitted: Fitted, held: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
     """Free parameters inside their bounds, as places in the vector (k,), and the covariance of their estimates (k, k).
 
-    Initial states are estimated with them.
+    Initial states are estimated with them; `held` are places in the vector whose values are given.
     """
     free = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
     problem = bench.problem(free, fitted.engine)
@@ -90,6 +90,7 @@ def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray
     theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
     _, _, hessian = problem.normal(theta)
     inside = (theta > problem.lower) & (theta < problem.upper)
+    inside[:n_free] &= ~np.isin(np.flatnonzero(problem.free), held)
     keep = np.flatnonzero(inside & (np.diag(hessian) > 0))
     size = np.sqrt(np.maximum(np.diag(hessian)[keep], 1e-300))
     scaled = hessian[np.ix_(keep, keep)] / np.outer(size, size)
@@ -100,11 +101,17 @@ def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray
 
 
 def shown(bench: Workbench, fitted: Fitted) -> float:
-    """How many standard errors the strengths of the last element are from zero, together; infinite without any."""
+    """How many standard errors the strengths of the last element are from zero, together; infinite without any.
+
+    Its other parameters are held: at no strength they mean nothing, and beside one that they can be traded for (a
+    relaxation of double the stiffness and double the time) a strength looks uncertain that is plain to see.
+    """
     element, parameters = fitted.simulator.elements[-1], fitted.model.parameters
-    spans = [parameters.position(f"{element.prefix}{name}") for name in element.law.strength]
-    strengths = [i for span in spans for i in range(span.start, span.stop)]
-    where, matrix = covariance(bench, fitted)
+    strengths, shapes = list[int](), list[int]()
+    for name in element.law.parameters():
+        span = parameters.position(f"{element.prefix}{name}")
+        (strengths if name in element.law.strength else shapes).extend(range(span.start, span.stop))
+    where, matrix = covariance(bench, fitted, shapes)
     own = np.isin(where, strengths)
     if not np.any(own):
         return np.inf

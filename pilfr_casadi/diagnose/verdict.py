@@ -121,7 +121,7 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     if winner.doubtful and plain:  # what does nearly as well and is what its name says
         winner = plain[0]
     for rival in ranked[1:]:
-        if imitates(winner, rival, floor):
+        if not rival.doubtful and imitates(winner, rival, floor):
             winner = rival
             break
     carried = [c for c in ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]

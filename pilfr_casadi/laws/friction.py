@@ -12,6 +12,8 @@ from ..operators import play
 from .base import Law, Local, grid
 
 KNEE = 0.15  # of the speed at which friction has fallen, that its reversal may take
+SPRINGY = 0.08  # of half the travel, beyond which a contact that springs back is an elasto-plastic part
+MOST = 0.6  # of half the travel, the widest that is tried
 WIDE = 0.4  # of the widest reversal that is tried, beyond which it is damping that gives way rather than dry friction
 
 
@@ -90,7 +92,11 @@ class PreslidingFriction(Law):
         yield from grid(r=local.half * np.array([0.003, 0.01, 0.03, 0.1, 0.25]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"r": (5e-4 * local.half, 0.6 * local.half)}
+        return {"r": (5e-4 * local.half, MOST * local.half)}
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """A contact that springs back over much of the travel: hysteresis, of which this is one stop."""
+        return bool(values["r"] > SPRINGY / MOST * self.parameters()["r"].bounds[1])
 
 
 class StribeckFriction(CoulombFriction):
@@ -146,8 +152,8 @@ class PreslidingStribeckFriction(PreslidingFriction):
         return {**super().bounds(local), "v_s": (4e-3 * local.speed, 0.8 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """A fall that goes on over all speeds: at rest there is no friction that is larger."""
-        return _falls_everywhere(self, values)
+        """As without the fall, or one that goes on over all speeds: at rest there is no friction that is larger."""
+        return super().doubtful(values) or _falls_everywhere(self, values)
 
 
 def _falls_everywhere(law: Law, values: Mapping[str, Any]) -> bool:
