@@ -7,17 +7,17 @@ well alone.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ..compiled import make_engine
 from ..laws import FINER
 from ..recording import InputError
-from ..simulator import Simulator
+from ..simulator import Placed, Simulator
 from ..threads import side_by_side
 from .candidate import Candidate, attempt, judged
-from .explain import by_cost
-from .kinship import complements, imitates
+from .explain import by_cost, closed
+from .kinship import CONTAINS, complements, imitates
 from .verdict import HINT, choose
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 RIVALS = 6  # of the first law, put up against it again
+WIDER = 2  # laws that have it as a special case, put up against it for the first time
 
 
 def prefer_what_leaves_nothing(search: Search) -> None:
@@ -97,21 +98,13 @@ def look_back(search: Search) -> None:
         search.passes[-2:] = [replace(second, choice=replace(second.choice, winner=alone))]
         search.timed("look back", began)
         return
-    winner, others = first.choice.winner, list[tuple[Candidate, Simulator, dict[str, Any]]]()
-    for c in first.candidates:
-        if c.port != winner.port or type(c.law) is type(winner.law) or len(others) >= RIVALS:
-            continue
-        own = c.fitted.simulator.elements[-1]
-        if own.port == kept.port and not complements(own.law, kept.law):
-            continue
-        placed = bare.with_element(own.port, own.law).with_element(kept.port, kept.law)
-        values = {k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}
-        others.append((c, placed, {**search.base.values, **values}))
-    tasks = [(placed, values, search.base.begin) for _, placed, values in others]
+    winner = first.choice.winner
+    others = [o for o in (*_fitted_before(search), *_never_fitted(search)) if o.beside(kept)]
+    tasks = [(o.placed(kept), {**search.base.values, **o.values}, search.base.begin) for o in others]
     tasks.append((search.base.simulator, search.base.values, search.base.initial))
     *found, own_now = side_by_side(lambda t: attempt(search.bench, t[0], [t[1]], states=t[2]), tasks, search.workers)
-    pairs = [(c, again) for (c, *_), again in zip(others, found, strict=True) if again is not None]
-    rivals = [replace(again, port=c.port, law=c.fitted.simulator.elements[-1].law, size=c.size) for c, again in pairs]
+    pairs = [(o.element, again) for o, again in zip(others, found, strict=True) if again is not None]
+    rivals = [replace(again, port=e.port, law=e.law, size=_size(again, e)) for e, again in pairs]
     if own_now is not None and rivals:
         stay = replace(own_now, port=winner.port, law=winner.law, size=winner.size)
         again = choose([stay, *rivals], first.before, search.floor2, search.effective_samples([stay, *rivals]))
@@ -122,3 +115,55 @@ def look_back(search: Search) -> None:
             better = replace(first.choice, winner=again.winner, alike=alike, margin=again.margin)
             search.passes[-2] = replace(first, choice=better)
     search.timed("look back", began)
+
+
+@dataclass(frozen=True)
+class _Rival:
+    """A law that may stand in the first's place, with its values by full name."""
+
+    simulator: Simulator
+    values: dict[str, Any]
+
+    @property
+    def element(self) -> Placed:
+        """Where it stands."""
+        return self.simulator.elements[-1]
+
+    def beside(self, kept: Placed) -> bool:
+        """Whether the second effect may stand beside it."""
+        return self.element.port != kept.port or complements(self.element.law, kept.law)
+
+    def placed(self, kept: Placed) -> Simulator:
+        """With the second effect."""
+        return self.simulator.with_element(kept.port, kept.law)
+
+
+def _fitted_before(search: Search) -> list[_Rival]:
+    """The best of the first effect's port that were fitted in its place."""
+    first = search.passes[-2]
+    assert first.choice is not None
+    winner, out = first.choice.winner, list[_Rival]()
+    for c in first.candidates:
+        if c.port == winner.port and type(c.law) is not type(winner.law) and len(out) < RIVALS:
+            own = c.fitted.simulator.elements[-1]
+            values = {k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}
+            out.append(_Rival(search.bench.simulator.with_element(own.port, own.law), values))
+    return out
+
+
+def _never_fitted(search: Search) -> list[_Rival]:
+    """What has the first law as a special case, where the screen did not let it through: the second effect hid it."""
+    first = search.passes[-2]
+    assert first.choice is not None
+    winner, seen = first.choice.winner, {(c.port, type(c.law)) for c in first.candidates}
+    out = dict[type, _Rival]()
+    for s in first.scored:
+        wider = s.port == winner.port and winner.law.id in CONTAINS.get(s.law.id, ())
+        if wider and (s.port, type(s.law)) not in seen and type(s.law) not in out and len(out) < WIDER:
+            out[type(s.law)] = _Rival(*closed(search.bench.simulator, s, s.starts[0]))
+    return list(out.values())
+
+
+def _size(candidate: Candidate, element: Placed) -> int:
+    values = candidate.fitted.values
+    return element.law.size({k: values[f"{element.prefix}{k}"] for k in element.law.parameters()})
