@@ -34,6 +34,7 @@ SHAPES = 5  # of each law at each port, the best alone
 PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each
 LOOKED_AT = 60  # pairs of laws whose share is cross-validated
 RIDGE = 1e-4
+AS_FAR = 1.25  # times the error so far of a pair that is worth putting its laws up against all others
 WORTH = 0.8  # times the error so far that a pair has to come to
 PROMISING = 0.9  # of the mean square so far that a pair leaves at most after the first round
 ROUNDS = 3  # times that one law is put up against all others
@@ -167,7 +168,7 @@ def _two(search: Search) -> tuple[Fitted, list[Pass]] | None:
     best = min((c for c in fits if c is not None), key=lambda c: c.error, default=None)
     best = search.polished(best) if best is not None else None
     search.timed("two at once", began)
-    if best is None or best.full > search.base.cost:
+    if best is None or best.full > AS_FAR**2 * search.base.cost:
         return None
     joint, passes, before = best.fitted, dict[str, Any](), search.base.cost
     elements = list(joint.simulator.elements[-2:])
