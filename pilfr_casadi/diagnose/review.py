@@ -7,6 +7,7 @@ well alone.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 RIVALS = 6  # of the first law, put up against it again
+LED = 2.0  # times the error of the nearest rival, of those that are fitted again from where it is
 WIDER = 2  # laws that have it as a special case, put up against it for the first time
 
 
@@ -103,10 +105,12 @@ def look_back(search: Search) -> None:
     tasks = [(o.placed(kept), {**search.base.values, **o.values}, search.base.begin) for o in others]
     tasks.append((search.base.simulator, search.base.values, search.base.initial))
     *found, own_now = side_by_side(lambda t: attempt(search.bench, t[0], [t[1]], states=t[2]), tasks, search.workers)
-    pairs = [(o.element, again) for o, again in zip(others, found, strict=True) if again is not None]
-    rivals = [replace(again, port=e.port, law=e.law, size=_size(again, e)) for e, again in pairs]
-    if own_now is not None and rivals:
-        stay = replace(own_now, port=winner.port, law=winner.law, size=winner.size)
+    if own_now is not None and any(found):
+        every = _led(search, [own_now, *(c for c in found if c is not None)])
+        elements = [e for e, c in zip((o.element for o in others), found, strict=True) if c is not None]
+        stay = replace(every[0], port=winner.port, law=winner.law, size=winner.size)
+        pairs = zip(elements, every[1:], strict=True)
+        rivals = [replace(c, port=e.port, law=e.law, size=_size(c, e)) for e, c in pairs]
         again = choose([stay, *rivals], first.before, search.floor2, search.effective_samples([stay, *rivals]))
         other = None if again is None or again.winner is stay else search.polished(again.winner)
         if again is not None and (again.winner is stay or other is not None):
@@ -115,6 +119,25 @@ def look_back(search: Search) -> None:
             better = replace(first.choice, winner=again.winner, alike=alike, margin=again.margin)
             search.passes[-2] = replace(first, choice=better)
     search.timed("look back", began)
+
+
+def _led(search: Search, tried: Sequence[Candidate]) -> list[Candidate]:
+    """Laws in the first's place, the near ones fitted again beside what the second is with the nearest of them.
+
+    The second was fitted beside another's error, and may have stayed at values that only this asked for.
+    """
+    best = min(tried, key=lambda c: c.error)
+
+    def led(c: Candidate) -> Candidate:
+        first, second = c.fitted.simulator.elements[-2:]
+        if c is best or c.error > LED * best.error or first.port == second.port:
+            return c
+        own = {k: v for k, v in c.fitted.values.items() if k.startswith(first.prefix)}
+        shared = {k: v for k, v in best.fitted.values.items() if k in c.fitted.values}
+        again = attempt(search.bench, c.fitted.simulator, [{**shared, **own}], states=c.fitted.begin)
+        return again if again is not None and again.error < c.error else c
+
+    return side_by_side(led, tried, search.workers)
 
 
 @dataclass(frozen=True)
