@@ -18,6 +18,7 @@ from pilfr_casadi.diagnose.verdict import choose, strained
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.laws import CubicStiffness, LinearStiffness
 from pilfr_casadi.laws.dynamic import Delay, Resonance
+from pilfr_casadi.laws.periodic import HarmonicForce, PeriodicForce
 from pilfr_casadi.parameters import Parameter
 from pilfr_casadi.recording import Recording
 from pilfr_casadi.simulator import Placed, Port, Simulator
@@ -124,6 +125,24 @@ def test_a_delay_is_tried_at_the_other_end_as_well():
     assert more.port == "actuator:u" and [start["T"] for start in more.starts] == [0.02, 0.05]
     there = SimpleNamespace(port="actuator:u", law=Delay(), error=0.11, fitted=late.fitted)
     assert passed_over([late, there], scored) == []
+
+
+def test_a_law_with_one_more_term_than_the_best_is_no_worse_and_so_is_fitted_again_from_there():
+    plain, wider = PeriodicForce(), HarmonicForce()
+    best, lost = candidate("a", "periodic_force", 0.1), candidate("a", "periodic_force", 0.5)
+    best.law, lost.law = plain, wider
+    best.fitted = SimpleNamespace(
+        values={"p.a": 3.0, "p.b": -2.0, "p.L": 0.7}, simulator=SimpleNamespace(elements=[Placed("a", plain, "p.")])
+    )
+    start = {"a": 1.0, "b": 1.0, "a_2": 1.0, "b_2": 1.0, "L": 0.1}
+    scored = [Scored(port, law, 0.1, (start,), None) for port in ("a", "b") for law in (plain, wider)]
+    (more,) = [s for s in passed_over([best, lost], scored) if s.port == "a" and isinstance(s.law, HarmonicForce)]
+    assert more.starts == ({"a": 3.0, "b": -2.0, "a_2": 0.0, "b_2": 0.0, "L": 0.7},)
+    lost.fitted = SimpleNamespace(
+        values={f"p.{k}": v for k, v in start.items()},
+        simulator=SimpleNamespace(elements=[Placed("a", wider, "p.")]),
+    )
+    assert passed_over([lost, best], scored) == []
 
 
 def spring():

@@ -34,7 +34,8 @@ def passed_over(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> li
     # a special case of what came out best may have been left where a few steps led
     chosen = [type(s.law) for s in other if s.law.id in CONTAINS.get(best.law.id, ())]
     other = [s for s in other if (s.port, type(s.law)) not in tried or type(s.law) in chosen]
-    more = (*_carried(candidates, scored), *_late(candidates, scored), *_other_end(candidates, scored))
+    other_ways = (_carried, _late, _other_end, _refined)
+    more = [entry for way in other_ways for entry in way(candidates, scored)]
     return [*(s for s in other if type(s.law) in chosen), *more]
 
 
@@ -81,6 +82,21 @@ def _other_end(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> lis
     for s in scored:
         if type(s.law) is type(best.law) and _in_series(s.port) and s.port not in near and s.port not in out:
             out[s.port] = replace(s, starts=(*({**start, **found} for start in s.starts), *s.starts))
+    return list(out.values())
+
+
+def _refined(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
+    """What refines the best law and came out worse, which it cannot: from the best's values, with nothing more."""
+    best = candidates[0]
+    worse = {type(c.law) for c in candidates[1:] if c.port == best.port and isinstance(c.law, type(best.law))}
+    out: dict[type, Scored] = {}
+    for s in scored:
+        kind = type(s.law)
+        more = kind in worse and set(best.law.units) < set(s.law.units)
+        if s.port == best.port and more and kind not in out:
+            prefix = best.fitted.simulator.elements[-1].prefix
+            found = {k: best.fitted.values[f"{prefix}{k}"] for k in best.law.units}
+            out[kind] = replace(s, starts=({**s.starts[0], **dict.fromkeys(s.law.strength, 0.0), **found},))
     return list(out.values())
 
 
