@@ -72,7 +72,7 @@ def _late(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Sco
 def _other_end(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
     """The best law of a signal that takes time, at every actuator and sensor where it did not come near."""
     best = candidates[0]
-    if not _in_series(best.port) or not (best.law.order or best.law.shifts):
+    if not in_series(best.port) or not (best.law.order or best.law.shifts):
         return []
     prefix = best.fitted.simulator.elements[-1].prefix
     times = [k for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")]
@@ -80,7 +80,7 @@ def _other_end(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> lis
     near = {c.port for c in candidates if type(c.law) is type(best.law) and c.error < AHEAD * best.error}
     out: dict[str, Scored] = {}
     for s in scored:
-        if type(s.law) is type(best.law) and _in_series(s.port) and s.port not in near and s.port not in out:
+        if type(s.law) is type(best.law) and in_series(s.port) and s.port not in near and s.port not in out:
             out[s.port] = replace(s, starts=(*({**start, **found} for start in s.starts), *s.starts))
     return list(out.values())
 
@@ -100,5 +100,6 @@ def _refined(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[
     return list(out.values())
 
 
-def _in_series(port: str) -> bool:
+def in_series(port: str) -> bool:
+    """Whether a port is a signal's own: an actuator or a sensor."""
     return port.startswith(("actuator:", "sensor:"))

@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from ..compiled import make_engine
 from ..laws import FINER
+from ..laws.dynamic import Attached
 from ..recording import InputError
 from ..simulator import Placed, Simulator
 from ..threads import side_by_side
 from .candidate import Candidate, attempt, judged
 from .explain import by_cost, closed
 from .kinship import CONTAINS, complements, imitates
+from .passed_over import in_series
 from .verdict import HINT, choose
 
 if TYPE_CHECKING:
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 RIVALS = 6  # of the first law, put up against it again
 LED = 2.0  # times the error of the nearest rival, of those that are fitted again from where it is
-WIDER = 2  # laws that have it as a special case, put up against it for the first time
+WIDER = 2  # laws that have it as a special case, or ports of a carried part, put up against it for the first time
 
 
 def prefer_what_leaves_nothing(search: Search) -> None:
@@ -101,7 +103,8 @@ def look_back(search: Search) -> None:
         search.timed("look back", began)
         return
     winner = first.choice.winner
-    others = [o for o in (*_fitted_before(search), *_never_fitted(search)) if o.beside(kept)]
+    asked = (*_fitted_before(search), *_never_fitted(search), *_carried_along(search))
+    others = [o for o in asked if o.beside(kept)]
     tasks = [(o.placed(kept), {**search.base.values, **o.values}, search.base.begin) for o in others]
     tasks.append((search.base.simulator, search.base.values, search.base.initial))
     *found, own_now = side_by_side(lambda t: attempt(search.bench, t[0], [t[1]], states=t[2]), tasks, search.workers)
@@ -184,6 +187,22 @@ def _never_fitted(search: Search) -> list[_Rival]:
         wider = s.port == winner.port and winner.law.id in CONTAINS.get(s.law.id, ())
         if wider and (s.port, type(s.law)) not in seen and type(s.law) not in out and len(out) < WIDER:
             out[type(s.law)] = _Rival(*closed(search.bench.simulator, s, s.starts[0]))
+    return list(out.values())
+
+
+def _carried_along(search: Search) -> list[_Rival]:
+    """A part that is carried along, at every port, where a mode beside a signal's path stands at an actuator or sensor.
+
+    A pole and a zero more are all of these; beside the second effect the first is now seen by itself.
+    """
+    first, (element, _) = search.passes[-2], search.base.simulator.elements[-2:]
+    if element.law.form != "mode" or not in_series(element.port):
+        return []
+    found = {k: search.base.values[f"{element.prefix}{k}"] for k in ("W", "D")}
+    out = dict[str, _Rival]()
+    for s in first.scored:
+        if isinstance(s.law, Attached) and s.port not in out and len(out) < WIDER:
+            out[s.port] = _Rival(*closed(search.bench.simulator, s, {**s.starts[0], **found}))
     return list(out.values())
 
 

@@ -125,10 +125,10 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
             winner = rival
             break
     carried = [c for c in ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]
-    beside: list[Candidate] = []
     if winner.law.form == "mode" and carried and _as_much(carried[0], winner, before):
         winner = carried[0]  # any pair of a pole and a zero is a mode: a part that is carried along is one
-        beside = [c for c in reversed(ranked) if c.law.form == "mode" and c.error < winner.error]
+    beside = [c for c in reversed(ranked) if c.law.form == "mode" and winner.law.form == "attached mass"]
+    beside = [c for c in beside if c.error < (1 + LIKE) * winner.error]
     if winner.law.id == "drift":  # what an actuator's would have to be tuned for, a sensor's is by itself
         slow = [c for c in ranked if c.law.id == "drift" and c.port.startswith("sensor:") and c.size <= winner.size]
         winner = next((c for c in slow if _near(c, winner, before)), winner)
