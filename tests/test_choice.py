@@ -7,6 +7,7 @@ import pytest
 from test_missing_flows import axis, moved
 
 from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose.choice import choose
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.gates import Gate
 from pilfr_casadi.diagnose.passed_over import passed_over
@@ -14,7 +15,7 @@ from pilfr_casadi.diagnose.screen import Scored
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.second_effect import only_drifts
 from pilfr_casadi.diagnose.timing import timing
-from pilfr_casadi.diagnose.verdict import choose, strained
+from pilfr_casadi.diagnose.verdict import strained
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.laws import CubicStiffness, LinearStiffness
 from pilfr_casadi.laws.dynamic import Delay, Resonance
@@ -81,6 +82,18 @@ def test_a_part_that_is_carried_along_is_named_before_the_pole_and_zero_beside_t
     assert choice.margin > 10
     far = candidate("cart", "extra_mode", 0.016, size=3, form="attached mass")
     assert choose([*beside, far, other], (1.0, 1.0), 6.4e-5, 500.0).winner in beside
+
+
+def test_what_hysteresis_follows_better_does_not_fall_with_speed():
+    falls, dry = candidate("axis", "stribeck_friction", 0.0240, size=4), candidate("axis", "coulomb_friction", 0.0264)
+    bent, elsewhere = candidate("axis", "hysteresis", 0.0210, size=4), candidate("other", "hysteresis", 0.5)
+    choice = choose([bent, falls, dry, elsewhere], (1.0, 1.0), 1.4e-4, 500.0)
+    assert choice.winner is dry and choice.margin > 10
+    worse = candidate("axis", "hysteresis", 0.03, size=4)
+    assert choose([falls, dry, worse, elsewhere], (1.0, 1.0), 1.4e-4, 500.0).winner is falls
+    far = candidate("axis", "coulomb_friction", 0.05)
+    near = candidate("axis", "hysteresis", 0.0235, size=4)
+    assert choose([near, falls, far, elsewhere], (1.0, 1.0), 1.4e-4, 500.0).winner is falls
 
 
 def test_a_slow_trend_that_may_be_anywhere_is_the_sensors():

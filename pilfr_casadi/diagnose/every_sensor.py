@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from ..simulator import Simulator
 from .candidate import Candidate, attempt
-from .verdict import LIKE
+from .choice import LIKE
 
 if TYPE_CHECKING:
     from .search import Search

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 from ..simulator import Simulator
 from ..threads import side_by_side
 from .candidate import Candidate, attempt
+from .choice import LIKE
 from .explain import BRIEF, closed
 from .kinship import complements
 from .review import look_back
-from .verdict import LIKE
 
 if TYPE_CHECKING:
     from .search import Pass, Search

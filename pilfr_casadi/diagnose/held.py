@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..recording import InputError
-from .verdict import LIKE
+from .choice import LIKE
 from .workbench import THOROUGH, Fitted
 
 if TYPE_CHECKING:

@@ -18,10 +18,11 @@ from ..recording import InputError
 from ..simulator import Placed, Simulator
 from ..threads import side_by_side
 from .candidate import Candidate, attempt, judged
+from .choice import choose
 from .explain import by_cost, closed
 from .kinship import CONTAINS, complements, imitates
 from .passed_over import in_series
-from .verdict import HINT, choose
+from .verdict import HINT
 
 if TYPE_CHECKING:
     from .search import Search

@@ -19,6 +19,7 @@ from ..laws import Law
 from ..recording import InputError
 from ..simulator import Placed
 from .candidate import Candidate, heads, judged, polish
+from .choice import Choice, choose
 from .every_sensor import every_sensor
 from .exchange import exchange
 from .explain import explain
@@ -32,7 +33,7 @@ from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
 from .screen import Scored, screen
 from .second_effect import believed, mends
-from .verdict import HINT, LITTLE, MAINLY, UNSURE, Choice, choose, confidence, explains, left_open
+from .verdict import HINT, LITTLE, MAINLY, UNSURE, confidence, explains, left_open
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats by which a law has to improve on the refit to be believed

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .choice import Choice
 from .kinship import FLEXIBLE
 from .linearise import linearised
 from .own_shape import own_shape
-from .verdict import CLEAR, LITTLE, Choice
+from .verdict import CLEAR, LITTLE
 from .workbench import Fitted
 
 if TYPE_CHECKING:

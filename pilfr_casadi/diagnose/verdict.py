@@ -1,23 +1,15 @@
-"""Choosing among fitted candidates, and how sure the choice is.
-
-The criterion of a candidate is `½ n ln(mse) + ½ k ln n` with mse the geometric mean of the errors on the fitted part
-and on the rest, k its parameters and n an effective number of samples, which shrinks with the residual's correlation
-time: where model error dominates, neighbouring samples say the same thing. Laws that can imitate others have to beat
-them by a clear factor first.
-"""
+"""What a search comes to: the verdict with its sentence, and how sure a name is."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .candidate import Candidate
+from .choice import Choice
 from .floor import swells_with
 from .gates import Gate
-from .kinship import CONTAINS, handicap, imitates
 from .proof import mean_nrmse
 from .ringing import ringing
 
@@ -47,105 +39,6 @@ CURES = 1e-3  # share of the mean square that a fault leaves which was the misma
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
 PURE = 0.05  # share of model error in a residual that is taken for noise
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
-# rivals whose error is within this share, and which take away this share of the mean square that the winner does,
-# cannot be told apart: under loud noise the first alone would hold for nearly any
-LIKE, AS_MUCH = 0.03, 0.995
-NEARLY = 1.25  # times the error of a law that is hardly what its name says, of one that is
-CARRIED = 1.5  # times the error of a mode beside the path, of the carried mass that it may stand for
-
-
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """The winner with its rivals.
-
-    Attributes
-    ----------
-    gain : float
-        Criterion gained over the simulator without any law, in nats.
-    remains : float
-        Share of the excess over the floor that the winner leaves.
-    margin : float
-        Smallest ratio of a true rival's error to the winner's.
-    common : tuple of str, optional
-        All sensors and the law, where the same in each of them does as well as the winner.
-    """
-
-    winner: Candidate
-    alike: tuple[Candidate, ...]
-    gain: float
-    remains: float
-    margin: float
-    common: tuple[str, str] | None = None
-
-
-def _near(candidate: Candidate, winner: Candidate, before: float) -> bool:
-    """Whether a law does as well; `before` is the mean square error without any."""
-    return candidate.error < (1 + LIKE) * winner.error and _as_much(candidate, winner, before)
-
-
-def _as_much(candidate: Candidate, winner: Candidate, before: float) -> bool:
-    """Whether a law takes away as much of the mean square."""
-    return bool(before - candidate.error**2 >= AS_MUCH * (before - winner.error**2))
-
-
-def _fits(candidate: Candidate, winner: Candidate) -> bool:
-    """Whether a law at the same port follows everything as well, fitted to everything."""
-    return candidate.port == winner.port and candidate.full < (1 + LIKE) * winner.full
-
-
-def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor: float, n: float) -> Choice | None:
-    """The winner among candidates; `without` are the errors of the simulator alone, `floor` the noise, all squared."""
-    usable = [c for c in candidates if np.isfinite(c.error)]
-    if not usable:
-        return None
-
-    def excess(c: Candidate) -> float:
-        # a handicap counts for what lies above the floor: at the floor nothing is left to imitate
-        noise = min(floor, c.error**2)
-        return float(np.sqrt(noise + (c.error**2 - noise) * handicap(c.law) ** 2))
-
-    def key(c: Candidate) -> float:
-        return float(np.log(excess(c)) + 0.5 * c.size * np.log(n) / n)
-
-    ranked = sorted(usable, key=key)
-    winner = ranked[0]
-    before = float(np.sqrt(without[0] * without[1]))
-    close = [c for c in ranked if _near(c, winner, before) and c.size < winner.size]
-    if close:  # what does as well with fewer parameters
-        winner = min(close, key=lambda c: (c.size, key(c)))
-    as_small = [c for c in ranked if c.size <= winner.size and not c.at_bound]
-    free = [c for c in as_small if _near(c, winner, before) or _fits(c, winner)]
-    if winner.at_bound and free:  # what does as well without being held back
-        winner = min(free, key=lambda c: (c.size, key(c)))
-    plain = [c for c in ranked if c.port == winner.port and not c.doubtful and c.error < NEARLY * winner.error]
-    if winner.doubtful and plain:  # what does nearly as well and is what its name says
-        winner = plain[0]
-    for rival in ranked[1:]:
-        if not rival.doubtful and imitates(winner, rival, floor):
-            winner = rival
-            break
-    carried = [c for c in ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]
-    if winner.law.form == "mode" and carried and _as_much(carried[0], winner, before):
-        winner = carried[0]  # any pair of a pole and a zero is a mode: a part that is carried along is one
-    beside = [c for c in reversed(ranked) if c.law.form == "mode" and winner.law.form == "attached mass"]
-    beside = [c for c in beside if c.error < (1 + LIKE) * winner.error]
-    if winner.law.id == "drift":  # what an actuator's would have to be tuned for, a sensor's is by itself
-        slow = [c for c in ranked if c.law.id == "drift" and c.port.startswith("sensor:") and c.size <= winner.size]
-        winner = next((c for c in slow if _near(c, winner, before)), winner)
-    gain = n * (0.5 * np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
-    first = {c.name: c for c in reversed(ranked) if c.name != winner.name}  # the best of each name
-    no_larger = [c for c in reversed(ranked) if c.name in first and _near(c, winner, before) and c.size <= winner.size]
-    alike = {c.name: c for c in (*beside, *no_larger) if c.name != winner.name}
-    ports, margin = {winner.port, *(port for port, _ in alike)}, np.inf
-    for c in first.values():
-        ratio = c.error / winner.error
-        contains = winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > 1 - LIKE
-        if c.name in alike or (c.port in ports and (_near(c, winner, before) or contains)):
-            continue  # a refinement of the winner, or of what cannot be told from it, is no rival
-        else:
-            margin = min(margin, max(ratio, float(np.exp(key(c) - key(winner)))))
-    remains = (winner.error**2 - floor) / max(before - floor, 1e-300)
-    return Choice(winner, tuple(alike.values())[::-1], float(gain), float(np.clip(remains, 0, 1)), float(margin))
 
 
 def left_open(search: Search) -> tuple[float, float]:
