@@ -62,7 +62,7 @@ def _fits(candidate: Candidate, winner: Candidate) -> bool:
     return candidate.port == winner.port and candidate.full < (1 + LIKE) * winner.full
 
 
-def _bends_as_it_breaks_away(winner: Candidate, ranked: Sequence[Candidate]) -> Candidate | None:
+def bends_as_it_breaks_away(winner: Candidate, ranked: Sequence[Candidate]) -> Candidate | None:
     """Dry friction, where what falls with speed is chosen and hysteresis, which knows of no speed, comes nearer.
 
     Then it is the contact's bend before it slides (Dahl 1968) that the fall imitates.
@@ -106,7 +106,7 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
         if not rival.doubtful and imitates(winner, rival, floor):
             winner = rival
             break
-    bent = _bends_as_it_breaks_away(winner, ranked)
+    bent = bends_as_it_breaks_away(winner, ranked)
     winner, bow = (bent, (winner.name,)) if bent is not None else (winner, ())
     carried = [c for c in ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]
     if winner.law.form == "mode" and carried and _as_much(carried[0], winner, before):

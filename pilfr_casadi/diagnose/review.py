@@ -18,7 +18,7 @@ from ..recording import InputError
 from ..simulator import Placed, Simulator
 from ..threads import side_by_side
 from .candidate import Candidate, attempt, judged
-from .choice import choose
+from .choice import bends_as_it_breaks_away, choose
 from .explain import by_cost, closed
 from .kinship import CONTAINS, complements, imitates
 from .passed_over import in_series
@@ -39,7 +39,8 @@ def prefer_what_leaves_nothing(search: Search) -> None:
     assert found.choice is not None
     winner = found.choice.winner
     nearer = [c for c in found.candidates if c.port == winner.port and c.error < 0.95 * winner.error]
-    closer = [c for c in nearer if not imitates(c, winner, search.floor2)]
+    own = [c for c in nearer if not imitates(c, winner, search.floor2)]
+    closer = [c for c in own if bends_as_it_breaks_away(c, found.candidates) is None]
     still = search.flexible(search.base).get(winner.port, 0.0) if closer else 0.0
     if still < HINT:
         return
