@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.recording import InputError, Recording
 
 from . import concealed_noise as dull
 from .concealed_draw import LEAST, MOST, Draw, Unsuited
@@ -56,7 +56,7 @@ def case(seed: int) -> Case:
     for attempt in range(40):
         try:
             return _Draw(np.random.default_rng([seed, 2, attempt]), seed, kind).case()
-        except (Unsuited, FloatingPointError, np.linalg.LinAlgError, RuntimeError):
+        except (Unsuited, FloatingPointError, np.linalg.LinAlgError, RuntimeError, InputError):  # or what runs away
             continue
     raise RuntimeError(f"no case could be drawn from seed {seed}")
 

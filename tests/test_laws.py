@@ -229,5 +229,6 @@ def test_friction_that_reverses_over_most_speeds_is_hardly_dry(kind):
 
 
 def test_a_mode_that_cannot_swing_is_hardly_a_mode():
-    law = Mode().at({}, {"D": (1e-3, 1.0)})
-    assert law.doubtful({"D": 1.0}) and not law.doubtful({"D": 0.4})
+    law = Mode().at({}, {"D": (1e-3, 1.0), "W": (1.0, 800.0)})
+    assert law.doubtful({"D": 1.0, "W": 50.0}) and not law.doubtful({"D": 0.4, "W": 50.0})
+    assert law.doubtful({"D": 0.2, "W": 800.0})

@@ -72,6 +72,12 @@ class Candidate:
         """Whether the law at its fitted values is hardly what its name says."""
         return self.law.doubtful({k.removeprefix(self._prefix): self.fitted.values[k] for k in self._own})
 
+    def within(self, dt: float) -> bool:
+        """Whether it is a delay, a lag or a mode of a signal that acts within a step dt."""
+        own = {k.removeprefix(self._prefix): float(np.max(self.fitted.values[k])) for k in self._own}
+        timed = in_series(self.port) and (self.law.order > 0 or self.law.shifts)
+        return timed and (own.get("T", np.inf) < dt or own.get("W", 0.0) * dt > 1)
+
     @property
     def _own(self) -> list[str]:
         return [k for k in self.fitted.model.parameters if k.startswith(self._prefix)]
@@ -81,6 +87,11 @@ class Candidate:
         """Of the law's parameters; another effect may stand behind it."""
         elements = self.fitted.simulator.elements[::-1]
         return next((e for e in elements if e.port == self.port and type(e.law) is type(self.law)), elements[0]).prefix
+
+
+def in_series(port: str) -> bool:
+    """Whether a port is a signal's own: an actuator or a sensor."""
+    return port.startswith(("actuator:", "sensor:"))
 
 
 def heads(recordings: Sequence[Recording]) -> tuple[Recording, ...]:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..laws.dynamic import Attached, Delay, Lag, Resonance
-from .candidate import Candidate
+from .candidate import Candidate, in_series
 from .kinship import CONTAINS
 from .screen import Scored
 
@@ -98,8 +98,3 @@ def _refined(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[
             found = {k: best.fitted.values[f"{prefix}{k}"] for k in best.law.units}
             out[kind] = replace(s, starts=({**s.starts[0], **dict.fromkeys(s.law.strength, 0.0), **found},))
     return list(out.values())
-
-
-def in_series(port: str) -> bool:
-    """Whether a port is a signal's own: an actuator or a sensor."""
-    return port.startswith(("actuator:", "sensor:"))

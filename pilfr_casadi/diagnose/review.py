@@ -17,11 +17,10 @@ from ..laws.dynamic import Attached
 from ..recording import InputError
 from ..simulator import Placed, Simulator
 from ..threads import side_by_side
-from .candidate import Candidate, attempt, judged
+from .candidate import Candidate, attempt, in_series, judged
 from .choice import bends_as_it_breaks_away, choose
 from .explain import by_cost, closed
 from .kinship import CONTAINS, complements, imitates
-from .passed_over import in_series
 from .verdict import HINT
 
 if TYPE_CHECKING:

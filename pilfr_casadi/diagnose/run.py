@@ -103,9 +103,7 @@ def diagnose(
     prepared_at = time.perf_counter()
     said = said_hold(simulator, recordings, hold) is not None
     search = Search(ready.bench, ready.without, ready.floor, laws, workers, say, said).run(effects)
-    # a late sensor looks like the other hold
-    doubted = search.much() if any(p.accepted for p in search.passes) else search.unsure()
-    if not said and (search.misheld > MISHELD or doubted) and not search.interrupted:
+    if not said and (search.misheld > MISHELD or _hold_doubted(search)) and not search.interrupted:
         first, ended = search, time.perf_counter()
         ready, search = _otherwise_held(simulator, recordings, engine, ready, search, effects)
         search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - prepared_at
@@ -170,6 +168,16 @@ def diagnose(
         substeps=after.model.substeps,
         let_go=held.name if held else "",
     )
+
+
+def _hold_doubted(search: Search) -> bool:
+    """Whether inputs may do the other thing between samples.
+
+    A late sensor looks like the other hold: what is named explains too little then, or is a lag or a mode within a
+    sample.
+    """
+    named = [p.choice.winner for p in search.passes if p.accepted and p.choice is not None]
+    return (search.much() or any(c.within(search.bench.dt) for c in named)) if named else search.unsure()
 
 
 def _otherwise_held(

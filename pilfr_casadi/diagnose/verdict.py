@@ -33,8 +33,8 @@ DRIVEN = 0.5  # share of a name's confidence where it takes a parameter at its b
 FAR_OFF, FAR_AHEAD = 16.0, 4.0
 SLIGHT = 3e-3  # share of the whole excess that halves the confidence of an effect which explains no more
 UNSURE = 0.5  # confidence below which a name is called likely
-# confidence below which two names, or one that leaves much and has rivals near, are no answer
-HARDLY = 0.1
+# confidence below which a name is no answer, and below which two are none, or one that leaves much with rivals near
+NOT_AT_ALL, HARDLY = 0.02, 0.1
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
 PURE = 0.05  # share of model error in a residual that is taken for noise
@@ -79,7 +79,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
         sure = [confidence(c, search) for c in accepted]
         alone = len(accepted) == 1 and (accepted[0].margin > CLEAR or remains < PARTLY)
-        if alone or max(sure) > HARDLY:
+        if max(sure) > (NOT_AT_ALL if alone else HARDLY):
             return "missing-physics", (
                 f"The simulator leaves out {words}."
                 if min(sure) > UNSURE

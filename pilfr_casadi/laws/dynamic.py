@@ -216,8 +216,11 @@ class Mode(Resonance):
         return p.c_1 * q[0] + p.c_2 * q[1]
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """So much damping that no frequency stands out: two lags that follow anything linear, no mode."""
-        return bool(values["D"] > DEAF)
+        """So much damping that no frequency stands out: two lags that follow anything linear, no mode.
+
+        Or faster than samples can show.
+        """
+        return bool(values["D"] > DEAF or values["W"] >= self.parameters()["W"].bounds[1])
 
 
 class Attached(Resonance):
