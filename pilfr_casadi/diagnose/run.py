@@ -18,14 +18,15 @@ from .arranged import arranged
 from .candidate import Candidate
 from .clipping import clipped_input
 from .experiment import next_experiment, placebo
-from .gates import Gate, hold_note, said_hold
+from .gates import Gate, said_hold
 from .held import held_value
 from .mismatch import mismatch
 from .offset import without_idle_offsets
-from .prepare import Prepared, prepare
+from .other_hold import doubted, otherwise_held
+from .prepare import prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
-from .search import MISHELD, Pass, Search
+from .search import Pass, Search
 from .tones import tones
 from .undeclared import beyond_the_ports
 from .varying import varying
@@ -103,9 +104,9 @@ def diagnose(
     prepared_at = time.perf_counter()
     said = said_hold(simulator, recordings, hold) is not None
     search = Search(ready.bench, ready.without, ready.floor, laws, workers, say, said).run(effects)
-    if not said and (search.misheld > MISHELD or _hold_doubted(search)) and not search.interrupted:
+    if not said and doubted(search):
         first, ended = search, time.perf_counter()
-        ready, search = _otherwise_held(simulator, recordings, engine, ready, search, effects)
+        ready, search = otherwise_held(simulator, recordings, engine, ready, search, effects)
         search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - prepared_at
     bench, without = ready.bench, ready.without
     search.base = without_idle_offsets(bench, search.base)
@@ -168,43 +169,6 @@ def diagnose(
         substeps=after.model.substeps,
         let_go=held.name if held else "",
     )
-
-
-def _hold_doubted(search: Search) -> bool:
-    """Whether inputs may do the other thing between samples.
-
-    A late sensor looks like the other hold: what is named explains too little then, or is a lag or a mode within a
-    sample.
-    """
-    named = [p.choice.winner for p in search.passes if p.accepted and p.choice is not None]
-    return (search.much() or any(c.within(search.bench.dt) for c in named)) if named else search.unsure()
-
-
-def _otherwise_held(
-    simulator: Any, recordings: Sequence[Recording], engine: str, ready: Prepared, search: Search, effects: int
-) -> tuple[Prepared, Search]:
-    """The same with inputs that do the other thing between samples, where they seem to or names are surer then."""
-    wrong = search.misheld > MISHELD
-    try:
-        hold = search.bench.otherwise_held().hold
-        other = prepare(simulator, recordings, hold, engine, search.workers)
-        for most in (effects,) if wrong else (1, effects):  # one effect shows whether it is worth the search for two
-            again = Search(other.bench, other.without, other.floor, search.laws, search.workers, search.say).run(most)
-            if not wrong and again.base.cost > search.base.cost:
-                search.interrupted = again.interrupted
-                return ready, search
-            if again.interrupted or not again.much():
-                break
-    except InputError:  # it cannot be run so
-        return ready, search
-    except KeyboardInterrupt:
-        search.interrupted = True
-        return ready, search
-    if not wrong and again.certainty() <= search.certainty():
-        search.interrupted = again.interrupted
-        return ready, search
-    ratio = search.misheld if wrong else float(np.sqrt(search.base.cost / max(again.base.cost, 1e-300)))
-    return replace(other, gates=(*other.gates, hold_note(simulator, hold, ratio))), again
 
 
 def _lost_input(search: Search, verdict: str) -> Gate | None:

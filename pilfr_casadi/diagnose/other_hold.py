@@ -1,0 +1,53 @@
+"""The same search with inputs that do the other thing between samples, where nobody has said what they do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..recording import InputError, Recording
+from .gates import hold_note
+from .prepare import Prepared, prepare
+from .search import MISHELD, Search
+
+
+def doubted(search: Search) -> bool:
+    """Whether inputs may do the other thing between samples.
+
+    A late sensor looks like the other hold: what is named explains too little then, or is a lag or a mode within a
+    sample.
+    """
+    if search.interrupted or search.misheld > MISHELD:
+        return not search.interrupted
+    named = [p.choice.winner for p in search.passes if p.accepted and p.choice is not None]
+    return (search.much() or any(c.within(search.bench.dt) for c in named)) if named else search.unsure()
+
+
+def otherwise_held(
+    simulator: Any, recordings: Sequence[Recording], engine: str, ready: Prepared, search: Search, effects: int
+) -> tuple[Prepared, Search]:
+    """A search with the other hold where inputs seem to be held so or names are surer then; else the one there is."""
+    wrong = search.misheld > MISHELD
+    try:
+        hold = search.bench.otherwise_held().hold
+        other = prepare(simulator, recordings, hold, engine, search.workers)
+        for most in (effects,) if wrong else (1, effects):  # one effect shows whether it is worth the search for two
+            again = Search(other.bench, other.without, other.floor, search.laws, search.workers, search.say).run(most)
+            if not wrong and again.base.cost > search.base.cost:
+                search.interrupted = again.interrupted
+                return ready, search
+            if again.interrupted or not again.much():
+                break
+    except InputError:  # it cannot be run so
+        return ready, search
+    except KeyboardInterrupt:
+        search.interrupted = True
+        return ready, search
+    if not wrong and again.certainty() <= search.certainty():
+        search.interrupted = again.interrupted
+        return ready, search
+    ratio = search.misheld if wrong else float(np.sqrt(search.base.cost / max(again.base.cost, 1e-300)))
+    return replace(other, gates=(*other.gates, hold_note(simulator, hold, ratio))), again

@@ -1,0 +1,56 @@
+"""When the other hold is tried, and when its search is taken."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from pilfr_casadi.diagnose import other_hold
+from pilfr_casadi.diagnose.candidate import Candidate
+from pilfr_casadi.laws.dynamic import Delay, Mode, Relaxation
+from pilfr_casadi.simulator import Placed
+
+DT = 2e-3
+
+
+def named(port, law, **values):
+    """A fitted candidate, as far as `within` reads it."""
+    own = {f"l.{k}": v for k, v in values.items()}
+    fitted = SimpleNamespace(
+        values=own,
+        simulator=SimpleNamespace(elements=[Placed(port, law, "l.")]),
+        model=SimpleNamespace(parameters=dict.fromkeys(own)),
+    )
+    return Candidate(port, law, fitted, 1.0, 1.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("found", "within"),
+    [
+        (named("sensor:y", Delay(), T=0.4 * DT), True),
+        (named("sensor:y", Delay(), T=3 * DT), False),
+        (named("actuator:u", Mode(), c_1=0.1, W=1.5 / DT, D=0.2), True),
+        (named("actuator:u", Mode(), c_1=0.1, W=0.2 / DT, D=0.2), False),
+        (named("spring", Relaxation(), k_v=3.0, T=0.4 * DT), False),
+    ],
+)
+def test_what_acts_within_a_sample_may_be_the_other_hold(found, within):
+    assert found.within(DT) is within
+    step = SimpleNamespace(accepted=True, choice=SimpleNamespace(winner=found))
+    search = SimpleNamespace(
+        interrupted=False, misheld=1.0, passes=[step], much=lambda: False, bench=SimpleNamespace(dt=DT)
+    )
+    assert other_hold.doubted(search) is within
+    search.interrupted = True
+    assert not other_hold.doubted(search)
+
+
+@pytest.mark.parametrize("stops", [KeyboardInterrupt, other_hold.InputError])
+def test_what_ends_the_other_search_leaves_the_one_there_is(stops, monkeypatch):
+    def prepare(*_):
+        raise stops("ended")
+
+    monkeypatch.setattr(other_hold, "prepare", prepare)
+    bench = SimpleNamespace(otherwise_held=lambda: SimpleNamespace(hold="linear"))
+    search, ready = SimpleNamespace(bench=bench, misheld=1.0, workers=1, interrupted=False), object()
+    assert other_hold.otherwise_held(None, (), "auto", ready, search, 2) == (ready, search)
+    assert search.interrupted is (stops is KeyboardInterrupt)
