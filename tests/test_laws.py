@@ -232,3 +232,10 @@ def test_a_mode_that_cannot_swing_is_hardly_a_mode():
     law = Mode().at({}, {"D": (1e-3, 1.0), "W": (1.0, 800.0)})
     assert law.doubtful({"D": 1.0, "W": 50.0}) and not law.doubtful({"D": 0.4, "W": 50.0})
     assert law.doubtful({"D": 0.2, "W": 800.0})
+
+
+@pytest.mark.parametrize("kind", (laws.Creep, laws.TwoStageCreep))
+def test_creep_of_a_signal_goes_on_in_its_direction(kind):
+    bounds = kind().bounds(LOCAL)
+    assert all(bounds[name] == (0.0, np.inf) for name in kind.strength)
+    assert all(bounds[name][1] == 2 * LOCAL.duration for name in kind.units if name.startswith("T"))

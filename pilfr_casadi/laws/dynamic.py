@@ -122,6 +122,10 @@ class Creep(Relaxation):
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c * q
 
+    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+        # what comes back, or parts of opposite signs, would be a filter, nothing that goes on in the same direction
+        return super().bounds(local) | {name: (0.0, np.inf) for name in self.strength}
+
 
 class TwoStageCreep(Creep):
     """Creep with a fast and a slow part."""
@@ -143,9 +147,8 @@ class TwoStageCreep(Creep):
         yield from _two_times(local)
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        # parts of opposite signs would be a filter, not something that goes on in the same direction
-        times = {name: (5 * local.dt, 2 * local.duration) for name in ("T_1", "T_2")}
-        return times | {name: (0.0, np.inf) for name in self.strength}
+        most = super().bounds(local)
+        return {name: most["T"] for name in ("T_1", "T_2")} | {name: most[name] for name in self.strength}
 
 
 class Lag(Law):
