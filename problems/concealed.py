@@ -1,10 +1,10 @@
 """Concealed cases on which `diagnose` has to find the physics that was left out of a simulator.
 
 `case(seed)` draws a rig, what it hides, and its recordings; `score` judges a diagnosis. Truths are simulated apart from
-the package and, mostly, by formulas that are not the catalogue's. Seeds 0 to 3539 are for development; results are
-reported on seeds from 3540 on.
+the package and, mostly, by formulas that are not the catalogue's. Seeds 0 to 3659 are for development; results are
+reported on seeds from 3660 on.
 
-    python -m problems.concealed --cases 200 --first-seed 3540 --workers 2
+    python -m problems.concealed --cases 200 --first-seed 3660 --workers 2
     python -m problems.concealed --export DIR --cases 5 --first-seed 0      (files for the command line)
 """
 
@@ -15,7 +15,8 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -42,6 +43,15 @@ def run_one(seed: int) -> Score:
         text = " ".join(str(error).split())
         answer, crash = {}, f"{type(error).__name__}: {text[:160]}"
     return score(hidden, answer, time.perf_counter() - began, crash)
+
+
+def scored(path: Path) -> dict[int, Score]:
+    """What a file of `--out` has, by seed; a last line that was cut off in the middle is taken out of it."""
+    whole = path.read_text(encoding="utf-8").rpartition("\n") if path.exists() else ("", "", "")
+    if whole[2]:
+        path.write_text("".join(whole[:2]), encoding="utf-8")
+    lines = whole[0].split("\n") if whole[0] else []
+    return {s.seed: s for s in (Score(**json.loads(text)) for text in lines)}
 
 
 def _write(path: Path, r: Recording) -> None:
@@ -75,8 +85,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark, or write its files."""
     parser = argparse.ArgumentParser(prog="python -m problems.concealed", description="Concealed cases.")
     parser.add_argument("--cases", type=int, default=200)
-    parser.add_argument("--first-seed", type=int, default=3540)
+    parser.add_argument("--first-seed", type=int, default=3660)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="results go here as they come; what is there is not run again")
     parser.add_argument("--only", default="", help="cases with this tag: a rig, a law, a kind, a noise")
     parser.add_argument("--export", type=Path, help="write the cases here instead of running them")
     parser.add_argument("--list", action="store_true", help="print the cases instead of running them")
@@ -99,14 +110,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seeds = kept
     if a.export or a.list:
         return
-    scores = []
-    with ProcessPoolExecutor(a.workers, mp_context=get_context("spawn")) as pool:
-        for k, s in enumerate(pool.map(run_one, seeds), 1):
-            scores.append(s)
-            print(f"[{k:3d}/{len(seeds)}] {line(s)}", flush=True)
-    if not scores:
+    if not seeds:
         sys.exit("No case has that tag; see --list.")
-    print("\n" + summary(scores))
+    done = scored(a.out) if a.out else {}
+    scores = [done[seed] for seed in seeds if seed in done]
+    with ProcessPoolExecutor(a.workers, mp_context=get_context("spawn")) as pool:
+        tasks = [pool.submit(run_one, seed) for seed in seeds if seed not in done]
+        for task in as_completed(tasks):
+            scores.append(task.result())
+            if a.out:
+                with a.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(asdict(scores[-1]), default=float) + "\n")
+            print(f"[{len(scores):3d}/{len(seeds)}] {line(scores[-1])}", flush=True)
+    print("\n" + summary(sorted(scores, key=lambda s: s.seed)))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """The concealed benchmark: reproducible, simulated right, effects visible behind a refit, answers scored right."""
 
 import json
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from pilfr_casadi.problem import Problem
 from pilfr_casadi.readers import read_csv
 from pilfr_casadi.recording import Recording
 from pilfr_casadi.substeps import choose_substeps
-from problems.concealed import KINDS, case, export, run_one, score
+from problems import concealed
+from problems.concealed import KINDS, Score, case, export, run_one, score
 from problems.concealed_case import _Draw
 from problems.concealed_noise import FAULTS, LOUDEST, QUIETEST, draw_fault
 from problems.concealed_rigs_more import RIGS, places
@@ -123,6 +125,36 @@ def test_scores(cases):
     assert score(fault, answer("recording-fault", gates=[gate])).channel
     assert not score(fault, answer("recording-fault")).channel
     assert "MISSED" in summary([crash, wrong]) and "Brier" in summary([good])
+
+
+def test_a_draw_goes_on_where_it_was_ended(tmp_path, monkeypatch, capsys):
+    judged = []
+
+    def run_one(seed):
+        judged.append(seed)
+        unknown = dict.fromkeys(("port", "law", "both", "sure_outside", "channel", "confidence", "ratio"))
+        said = {"expected": "complete", "verdict": "complete", "truth": "", "named": ""}
+        rest = {"verdict_right": True, "spurious": False, "false_alarm": False, "right": True}
+        return Score(seed=seed, name=f"{seed}-rig", kind="none", **said, **unknown, **rest)
+
+    class Here:
+        def __init__(self, *_, **__): ...
+
+        __enter__, __exit__ = lambda self: self, lambda self, *_: None
+
+        def submit(self, run, seed):
+            (task := Future()).set_result(run(seed))
+            return task
+
+    monkeypatch.setattr(concealed, "run_one", run_one)
+    monkeypatch.setattr(concealed, "ProcessPoolExecutor", Here)
+    draw = ["--first-seed", "5", "--out", str(tmp_path / "draw.jsonl")]
+    concealed.main([*draw, "--cases", "2"])
+    with (tmp_path / "draw.jsonl").open("a") as file:
+        file.write('{"seed": 7, "na')
+    concealed.main([*draw, "--cases", "3"])
+    assert judged == [5, 6, 7] and set(concealed.scored(tmp_path / "draw.jsonl")) == {5, 6, 7}
+    assert "verdict right" in capsys.readouterr().out
 
 
 def test_kinds_are_shares():
