@@ -6,7 +6,9 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose.prepare import prepare
 from pilfr_casadi.integration import discretise
+from problems.concealed import case
 
 DT, M = 0.05, 1200
 
@@ -80,3 +82,12 @@ def test_late_by_half_a_swing_is_no_wrong_sign(fault):
     found = pilfr.diagnose(beam(1.1), Recording(u, y, DT, ("force",), ("pos",), initial="estimate", hold="zero"))
     assert found.verdict == "recording-fault"
     assert [g.finding for g in found.gates] == [{"late": "alignment", "sign": "sign"}[fault]]
+
+
+def test_of_two_near_units_the_wrong_hold_does_not_choose():
+    """Degrees for radians: with inputs held instead of interpolated, a sixtieth fits better."""
+    hidden = case(3660)
+    found = prepare(hidden.simulator, hidden.train, None, "auto", 2)
+    units = [g for g in found.gates if g.finding == "unit"]
+    assert [g.channel for g in units] == ["t_case"] and units[0].value == pytest.approx(180 / np.pi)
+    assert found.bench.hold == "linear"
