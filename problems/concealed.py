@@ -1,27 +1,30 @@
 """Concealed cases on which `diagnose` has to find the physics that was left out of a simulator.
 
 `case(seed)` draws a rig, what it hides, and its recordings; `score` judges a diagnosis. Truths are simulated apart from
-the package and, mostly, by formulas that are not the catalogue's. Seeds 0 to 3659 are for development; results are
-reported on seeds from 3660 on.
+the package and, mostly, by formulas that are not the catalogue's. Seeds 0 to 3719 are for development; results are
+reported on seeds from 3720 on.
 
-    python -m problems.concealed --cases 200 --first-seed 3660 --workers 2
+    python -m problems.concealed --cases 200 --first-seed 3720 --workers 2
     python -m problems.concealed --export DIR --cases 5 --first-seed 0      (files for the command line)
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
+import pilfr_casadi
 from pilfr_casadi.recording import Recording
 
 from .concealed_case import KINDS, Case, case
@@ -35,8 +38,6 @@ def run_one(seed: int) -> Score:
     hidden = case(seed)
     began = time.perf_counter()
     try:
-        import pilfr_casadi
-
         diagnosis = pilfr_casadi.diagnose(hidden.simulator, hidden.train, test=hidden.test, workers=1)
         answer, crash = diagnosis.to_dict(), ""
     except Exception as error:
@@ -50,8 +51,17 @@ def scored(path: Path) -> dict[int, Score]:
     whole = path.read_text(encoding="utf-8").rpartition("\n") if path.exists() else ("", "", "")
     if whole[2]:
         path.write_text("".join(whole[:2]), encoding="utf-8")
-    lines = whole[0].split("\n") if whole[0] else []
-    return {s.seed: s for s in (Score(**json.loads(text)) for text in lines)}
+    found = [json.loads(text) for text in whole[0].split("\n")] if whole[0] else []
+    if any(s.pop("code") != code() for s in found):
+        sys.exit(f"{path} has results of other code than this; give another file, or go back to that commit.")
+    return {s["seed"]: Score(**s) for s in found}
+
+
+@cache
+def code() -> str:
+    """A digest of the package's files: results of different code do not make one score."""
+    files = sorted(Path(pilfr_casadi.__file__).parent.rglob("*.py"))
+    return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()[:16]
 
 
 def _write(path: Path, r: Recording) -> None:
@@ -85,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark, or write its files."""
     parser = argparse.ArgumentParser(prog="python -m problems.concealed", description="Concealed cases.")
     parser.add_argument("--cases", type=int, default=200)
-    parser.add_argument("--first-seed", type=int, default=3660)
+    parser.add_argument("--first-seed", type=int, default=3720)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, help="results go here as they come; what is there is not run again")
     parser.add_argument("--only", default="", help="cases with this tag: a rig, a law, a kind, a noise")
@@ -114,14 +124,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit("No case has that tag; see --list.")
     done = scored(a.out) if a.out else {}
     scores = [done[seed] for seed in seeds if seed in done]
-    with ProcessPoolExecutor(a.workers, mp_context=get_context("spawn")) as pool:
-        tasks = [pool.submit(run_one, seed) for seed in seeds if seed not in done]
-        for task in as_completed(tasks):
+    pool = ProcessPoolExecutor(a.workers, mp_context=get_context("spawn"))
+    try:
+        for task in as_completed([pool.submit(run_one, seed) for seed in seeds if seed not in done]):
             scores.append(task.result())
             if a.out:
                 with a.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(asdict(scores[-1]), default=float) + "\n")
+                    file.write(json.dumps({"code": code(), **asdict(scores[-1])}, default=lambda v: v.item()) + "\n")
             print(f"[{len(scores):3d}/{len(seeds)}] {line(scores[-1])}", flush=True)
+    finally:  # an end in the middle begins no further case
+        pool.shutdown(cancel_futures=True)
     print("\n" + summary(sorted(scores, key=lambda s: s.seed)))
 
 

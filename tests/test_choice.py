@@ -18,7 +18,7 @@ from pilfr_casadi.diagnose.timing import timing
 from pilfr_casadi.diagnose.verdict import strained
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.laws import CubicStiffness, LinearStiffness
-from pilfr_casadi.laws.dynamic import Delay, Resonance
+from pilfr_casadi.laws.dynamic import Delay, Drift, Resonance, Settling
 from pilfr_casadi.laws.periodic import HarmonicForce, PeriodicForce
 from pilfr_casadi.parameters import Parameter
 from pilfr_casadi.recording import Recording
@@ -89,6 +89,8 @@ def test_what_hysteresis_follows_better_does_not_fall_with_speed():
     bent, elsewhere = candidate("axis", "hysteresis", 0.0210, size=4), candidate("other", "hysteresis", 0.5)
     choice = choose([bent, falls, dry, elsewhere], (1.0, 1.0), 1.4e-4, 500.0)
     assert choice.winner is dry and choice.margin > 10
+    trifle = candidate("axis", "hysteresis", 0.0239, size=7)
+    assert choose([falls, dry, trifle, elsewhere], (1.0, 1.0), 1.4e-4, 500.0).winner is falls
     worse = candidate("axis", "hysteresis", 0.03, size=4)
     assert choose([falls, dry, worse, elsewhere], (1.0, 1.0), 1.4e-4, 500.0).winner is falls
     far = candidate("axis", "coulomb_friction", 0.05)
@@ -151,6 +153,10 @@ def test_a_law_with_one_more_term_than_the_best_is_no_worse_and_so_is_fitted_aga
     scored = [Scored(port, law, 0.1, (start,), None) for port in ("a", "b") for law in (plain, wider)]
     (more,) = [s for s in passed_over([best, lost], scored) if s.port == "a" and isinstance(s.law, HarmonicForce)]
     assert more.starts == ({"a": 3.0, "b": -2.0, "a_2": 0.0, "b_2": 0.0, "L": 0.7},)
+    other = SimpleNamespace(**{**vars(lost), "law": Settling()})  # of the same names, but no line is an exponential
+    best.law = Drift()
+    assert passed_over([best, other], [Scored("a", Settling(), 0.1, ({"a": 1.0, "b": 0.0, "T": 2.0},), None)]) == []
+    best.law = plain
     lost.fitted = SimpleNamespace(
         values={f"p.{k}": v for k, v in start.items()},
         simulator=SimpleNamespace(elements=[Placed("a", wider, "p.")]),

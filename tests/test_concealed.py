@@ -140,7 +140,8 @@ def test_a_draw_goes_on_where_it_was_ended(tmp_path, monkeypatch, capsys):
     class Here:
         def __init__(self, *_, **__): ...
 
-        __enter__, __exit__ = lambda self: self, lambda self, *_: None
+        def shutdown(self, cancel_futures):
+            assert cancel_futures
 
         def submit(self, run, seed):
             (task := Future()).set_result(run(seed))
@@ -155,6 +156,9 @@ def test_a_draw_goes_on_where_it_was_ended(tmp_path, monkeypatch, capsys):
     concealed.main([*draw, "--cases", "3"])
     assert judged == [5, 6, 7] and set(concealed.scored(tmp_path / "draw.jsonl")) == {5, 6, 7}
     assert "verdict right" in capsys.readouterr().out
+    monkeypatch.setattr(concealed, "code", lambda: "another")
+    with pytest.raises(SystemExit, match="other code"):
+        concealed.main([*draw, "--cases", "3"])
 
 
 def test_kinds_are_shares():

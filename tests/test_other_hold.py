@@ -54,3 +54,34 @@ def test_what_ends_the_other_search_leaves_the_one_there_is(stops, monkeypatch):
     search, ready = SimpleNamespace(bench=bench, misheld=1.0, workers=1, interrupted=False), object()
     assert other_hold.otherwise_held(None, (), "auto", ready, search, 2) == (ready, search)
     assert search.interrupted is (stops is KeyboardInterrupt)
+
+
+@pytest.mark.parametrize(("unsure", "taken"), [(False, True), (True, False)])
+def test_where_nothing_is_missing_with_the_other_hold_that_is_taken(unsure, taken, monkeypatch):
+    other = SimpleNamespace(bench=None, without=None, floor=None, gates=())
+    again = SimpleNamespace(
+        base=SimpleNamespace(cost=1.0),
+        interrupted=False,
+        passes=[],
+        much=lambda: False,
+        unsure=lambda: unsure,
+        certainty=lambda: 0.0,
+    )
+    again.run = lambda most: again
+    monkeypatch.setattr(other_hold, "prepare", lambda *_: other)
+    monkeypatch.setattr(other_hold, "Search", lambda *_: again)
+    monkeypatch.setattr(other_hold, "hold_note", lambda *_: "held")
+    monkeypatch.setattr(other_hold, "replace", lambda of, gates: of)
+    bench = SimpleNamespace(otherwise_held=lambda: SimpleNamespace(hold="linear"))
+    search = SimpleNamespace(
+        bench=bench,
+        misheld=1.0,
+        workers=1,
+        interrupted=False,
+        laws=(),
+        say=None,
+        base=SimpleNamespace(cost=1.0),
+        certainty=lambda: 0.6,
+    )
+    found = other_hold.otherwise_held(None, (), "auto", "ready", search, 2)
+    assert found == ((other, again) if taken else ("ready", search))

@@ -7,11 +7,18 @@ import pytest
 from diagnosis_rig import DT, recordings, rig
 
 from pilfr_casadi.diagnose.proof import deviations, shown
-from pilfr_casadi.diagnose.review import WIDER, _never_fitted
+from pilfr_casadi.diagnose.rivals import WIDER, rivals_beside
 from pilfr_casadi.diagnose.screen import Scored
 from pilfr_casadi.diagnose.workbench import Workbench
-from pilfr_casadi.laws import CATALOGUE, CoulombFriction, Local, PreslidingStribeckFriction, StribeckFriction
-from pilfr_casadi.laws.dynamic import Relaxation
+from pilfr_casadi.laws import (
+    CATALOGUE,
+    CoulombFriction,
+    CubicStiffness,
+    Local,
+    PreslidingStribeckFriction,
+    StribeckFriction,
+)
+from pilfr_casadi.laws.dynamic import Attached, Mode, Relaxation
 
 
 @pytest.fixture(scope="module")
@@ -43,18 +50,47 @@ def _scored(port, kind):
     return Scored(port, kind(), 0.5, (start,), local, 1.0)
 
 
-def test_a_wider_law_that_the_screen_did_not_let_through_is_put_up_beside_a_second_effect():
+@pytest.fixture
+def searched():
+    """Dry friction at one port, a second effect at the other; and what the screen scored of the first."""
     winner = SimpleNamespace(port="ground-m1", law=CoulombFriction())
-    fitted = SimpleNamespace(port="ground-m1", law=PreslidingStribeckFriction())
+    fitted = SimpleNamespace(port="ground-m1", law=PreslidingStribeckFriction(), fitted=None)
     scored = [_scored(port, kind) for port in ("m1-m2", "ground-m1") for kind in CATALOGUE if "parallel" in kind.places]
+    fitted.fitted = SimpleNamespace(simulator=rig().with_element("ground-m1", fitted.law), values={})
+    both = rig().with_element("ground-m1", CoulombFriction()).with_element("m1-m2", CubicStiffness())
     first = SimpleNamespace(choice=SimpleNamespace(winner=winner), candidates=(winner, fitted), scored=tuple(scored))
-    search = SimpleNamespace(passes=[first, None], bench=SimpleNamespace(simulator=rig()))
-    found = _never_fitted(search)
-    assert 1 <= len(found) <= WIDER
-    assert all(r.element.port == "ground-m1" for r in found)
-    ids = {r.element.law.id for r in found}
-    assert ids <= {"stribeck_friction", "hysteresis"}
-    assert not any(isinstance(r.element.law, PreslidingStribeckFriction) for r in found)
-    only = [s for s in scored if isinstance(s.law, StribeckFriction)]
-    search.passes[0].scored = tuple(only)
-    assert [type(r.element.law) for r in _never_fitted(search)] == [StribeckFriction]
+    base = SimpleNamespace(simulator=both, values={})
+    return SimpleNamespace(passes=[first, None], bench=SimpleNamespace(simulator=rig()), base=base)
+
+
+def test_a_wider_law_that_the_screen_did_not_let_through_is_put_up_beside_a_second_effect(searched):
+    kept = searched.base.simulator.elements[-1]
+    before, *wider = rivals_beside(searched, rig(), kept)
+    assert isinstance(before.element.law, PreslidingStribeckFriction)
+    assert 1 <= len(wider) <= WIDER and {r.element.port for r in wider} == {"ground-m1"}
+    assert {r.element.law.id for r in wider} <= {"stribeck_friction", "hysteresis"}
+    assert not any(r.element.law.scaled_by or isinstance(r.element.law, PreslidingStribeckFriction) for r in wider)
+    searched.passes[0].scored = tuple(s for s in searched.passes[0].scored if isinstance(s.law, StribeckFriction))
+    assert [type(r.element.law) for r in rivals_beside(searched, rig(), kept)[1:]] == [StribeckFriction]
+    at_its_port = rig().with_element("ground-m1", CoulombFriction()).elements[-1]
+    assert rivals_beside(searched, rig(), at_its_port) == []  # two that rub at one port are one
+
+
+def test_a_mode_of_a_signal_is_put_up_against_parts_that_are_carried_along(searched):
+    mode = Mode().at({"c_1": 0.1, "c_2": 0.0, "W": 30.0, "D": 0.1})
+    both = rig().with_element("sensor:x2", mode).with_element("m1-m2", CubicStiffness())
+    first, prefix = searched.passes[0], both.elements[0].prefix
+    first.choice.winner = SimpleNamespace(port="sensor:x2", law=mode)
+    searched.base = SimpleNamespace(simulator=both, values={f"{prefix}W": 30.0, f"{prefix}D": 0.1})
+    (carried,) = rivals_beside(searched, rig(), both.elements[-1])
+    assert carried.element.port == "ground-m1" and isinstance(carried.element.law, Attached)
+    assert carried.values[f"{carried.element.prefix}W"] == 30.0
+
+
+def test_what_a_bound_holds_at_nothing_is_not_shown():
+    law = Relaxation().at({"k_v": -200.0, "T": 1.0})
+    bench = Workbench.of(rig(), recordings(law, port="m1-m2", count=1), "zero")
+    bounded = law.at({"k_v": 1.0, "T": 1.0}, {"T": (5 * DT, 10.0), "k_v": (0.0, np.inf)})
+    fitted = bench.fit(rig().with_element("m1-m2", bounded), [{}])
+    assert fitted.values[f"{fitted.simulator.elements[-1].prefix}k_v"] == 0.0
+    assert shown(bench, fitted) == 0.0

@@ -19,6 +19,7 @@ from .kinship import CONTAINS, handicap, imitates
 # rivals whose error is within this share, and which take away this share of the mean square that the winner does,
 # cannot be told apart: under loud noise the first alone would hold for nearly any
 LIKE, AS_MUCH = 0.03, 0.995
+CLEARLY = 1.1  # times the error above the floor of a friction that falls with speed, of a hysteresis that does better
 NEARLY = 1.25  # times the error of a law that is hardly what its name says, of one that is
 CARRIED = 1.5  # times the error of a mode beside the path, of the carried mass that it may stand for
 
@@ -62,15 +63,16 @@ def _fits(candidate: Candidate, winner: Candidate) -> bool:
     return candidate.port == winner.port and candidate.full < (1 + LIKE) * winner.full
 
 
-def bends_as_it_breaks_away(winner: Candidate, ranked: Sequence[Candidate]) -> Candidate | None:
-    """Dry friction, where what falls with speed is chosen and hysteresis, which knows of no speed, comes nearer.
+def dry_instead(winner: Candidate, ranked: Sequence[Candidate], floor: float) -> Candidate | None:
+    """Dry friction, where what falls with speed is chosen and hysteresis, which knows of no speed, is clearly nearer.
 
     Then it is the contact's bend before it slides (Dahl 1968) that the fall imitates.
     """
     if winner.law.id != "stribeck_friction":
         return None
     there = [c for c in ranked if c.port == winner.port]
-    nearer = any(c.law.id == "hysteresis" and c.error < winner.error for c in there)
+    most = (winner.error**2 - floor) / CLEARLY**2
+    nearer = any(c.law.id == "hysteresis" and max(c.error**2 - floor, 0.05 * floor) < most for c in there)
     dry = [c for c in there if c.law.id == "coulomb_friction" and not c.doubtful and c.error < NEARLY * winner.error]
     return dry[0] if nearer and dry else None
 
@@ -106,13 +108,13 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
         if not rival.doubtful and imitates(winner, rival, floor):
             winner = rival
             break
-    bent = bends_as_it_breaks_away(winner, ranked)
-    winner, bow = (bent, (winner.name,)) if bent is not None else (winner, ())
+    dry = dry_instead(winner, ranked, floor)
+    winner, given_up = (winner, None) if dry is None else (dry, winner.name)
     carried = [c for c in ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]
     if winner.law.form == "mode" and carried and _as_much(carried[0], winner, before):
         winner = carried[0]  # any pair of a pole and a zero is a mode: a part that is carried along is one
-    beside = [c for c in reversed(ranked) if c.law.form == "mode" and winner.law.form == "attached mass"]
-    beside = [c for c in beside if c.error < (1 + LIKE) * winner.error]
+    modes = [c for c in reversed(ranked) if c.law.form == "mode" and c.error < (1 + LIKE) * winner.error]
+    beside = modes if winner.law.form == "attached mass" else []
     if winner.law.id == "drift":  # what an actuator's would have to be tuned for, a sensor's is by itself
         slow = [c for c in ranked if c.law.id == "drift" and c.port.startswith("sensor:") and c.size <= winner.size]
         winner = next((c for c in slow if _near(c, winner, before)), winner)
@@ -124,9 +126,8 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     for c in first.values():
         ratio = c.error / winner.error
         contains = winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > 1 - LIKE
-        if c.name in alike or c.name in bow or (c.port in ports and (_near(c, winner, before) or contains)):
-            continue  # a refinement of the winner, or of what cannot be told from it, is no rival
-        else:
+        refines = c.name == given_up or (c.port in ports and (_near(c, winner, before) or contains))
+        if c.name not in alike and not refines:  # nor a refinement of what cannot be told from the winner
             margin = min(margin, max(ratio, float(np.exp(key(c) - key(winner)))))
     remains = (winner.error**2 - floor) / max(before - floor, 1e-300)
     return Choice(winner, tuple(alike.values())[::-1], float(gain), float(np.clip(remains, 0, 1)), float(margin))

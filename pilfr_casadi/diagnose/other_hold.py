@@ -46,7 +46,8 @@ def otherwise_held(
     except KeyboardInterrupt:
         search.interrupted = True
         return ready, search
-    if not wrong and again.certainty() <= search.certainty():
+    nothing = not any(p.accepted for p in again.passes) and not again.unsure()  # is missing, where inputs do the other
+    if not wrong and not nothing and again.certainty() <= search.certainty():
         search.interrupted = again.interrupted
         return ready, search
     ratio = search.misheld if wrong else float(np.sqrt(search.base.cost / max(again.base.cost, 1e-300)))

@@ -1,10 +1,11 @@
 """Laws that the screen did not let through and that what came out best asks for.
 
-A resonance whose frequency is found at the
-wrong port is found at the right one from there: a small mass that is carried along is felt in a narrow band, between
-whose neighbours on the grid the screen may miss it. A damped resonance, too, slips between the lightly damped ones of
-the grid; the delay or the lag that comes near in its place says at which frequency it would be as late. What takes
-time, such as a delay, looks alike before and behind a simulator that is nearly linear: it is put up at the other end.
+A resonance whose frequency is found at the wrong port is found at the right one from there: a small mass that is
+carried along is felt in a narrow band, between whose neighbours on the grid the screen may miss it. A damped resonance,
+too, slips between the lightly damped ones of the grid; the delay or the lag that comes near in its place says at which
+frequency it would be as late. What takes time, such as a delay, looks alike before and behind a simulator that is
+nearly linear: it is put up at the other end. And a law with one more term than the best one is no worse: where it came
+out so, it was started elsewhere.
 """
 
 from __future__ import annotations
@@ -86,15 +87,19 @@ def _other_end(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> lis
 
 
 def _refined(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
-    """What refines the best law and came out worse, which it cannot: from the best's values, with nothing more."""
+    """The best law with one more term, where that came out worse: from the best's values, with none of it.
+
+    A term is a strength: at zero the wider law is the best one.
+    """
     best = candidates[0]
     worse = {type(c.law) for c in candidates[1:] if c.port == best.port and isinstance(c.law, type(best.law))}
     out: dict[type, Scored] = {}
     for s in scored:
         kind = type(s.law)
-        more = kind in worse and set(best.law.units) < set(s.law.units)
-        if s.port == best.port and more and kind not in out:
+        more = set(s.law.units) - set(best.law.units)
+        refines = best.law.units.items() <= s.law.units.items() and more and more <= set(s.law.strength)
+        if s.port == best.port and kind in worse and refines and best.law.strength and kind not in out:
             prefix = best.fitted.simulator.elements[-1].prefix
             found = {k: best.fitted.values[f"{prefix}{k}"] for k in best.law.units}
-            out[kind] = replace(s, starts=({**s.starts[0], **dict.fromkeys(s.law.strength, 0.0), **found},))
+            out[kind] = replace(s, starts=({**dict.fromkeys(more, 0.0), **found},))
     return list(out.values())

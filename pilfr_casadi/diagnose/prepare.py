@@ -62,24 +62,15 @@ def prepare(
     unsaid = said_hold(simulator, recordings, hold) is None
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     noise2 = float(np.mean((first.deviation / bench.scale) ** 2))
-    for last in (
-        False,
-        True,
-    ):  # once again where the hold was wrong: of two near units it may have fitted the wrong one
-        if without.cost <= SUSPECT * noise2 or without.cost <= LEAST:
-            break
-        asked = between
-        found = _slips(bench, without, noise2, unsaid, workers)
-        if not found[2]:
-            break
-        between, notes = choose_hold(simulator, found[0].recordings, hold, engine)  # on wrong data it says nothing
-        if between == asked or last:
+    if without.cost > SUSPECT * noise2 and without.cost > LEAST:
+        raw, found = bench, _slips(bench, without, noise2, unsaid, workers)
+        if found[2]:  # what looked better on wrong data says nothing
+            asked, (between, notes) = between, choose_hold(simulator, found[0].recordings, hold, engine)
+            if between != asked:  # of two units that are near, the wrong hold may have fitted the wrong one
+                found = _slips_again(raw, between, noise2, unsaid, workers) or found
             bench = Workbench.of(simulator, found[0].recordings, between, engine)
             without = bench.fit(simulator, [found[1].values, {}], solver=THOROUGH)
             gates = [*gates, *found[2]]
-            break
-        bench = Workbench.of(simulator, bench.recordings, between, engine)
-        without = refitted(bench)
     gates = [*gates, *notes]
     bench, without, more = unclip(bench, without)
     gates += more
@@ -127,6 +118,18 @@ def _slips(
         return found
     late = timing(bench, without, noise2, 0.5 if unsaid else 1.0)
     return late if late[2] and late[1].cost < CURED * found[1].cost else found
+
+
+def _slips_again(
+    raw: Workbench, hold: str, noise2: float, unsaid: bool, workers: int
+) -> tuple[Workbench, Fitted, list[Gate]] | None:
+    """The same on the recordings as given, with the other hold; None where that shows no slip or cannot be run."""
+    try:
+        bench = Workbench.of(raw.simulator, raw.recordings, hold, raw.engine)
+        found = _slips(bench, refitted(bench), noise2, unsaid, workers)
+    except InputError:
+        return None
+    return found if found[2] else None
 
 
 def refitted(bench: Workbench) -> Fitted:

@@ -113,8 +113,8 @@ def shown(bench: Workbench, fitted: Fitted) -> float:
         (strengths if name in element.law.strength else shapes).extend(range(span.start, span.stop))
     where, matrix = covariance(bench, fitted, shapes)
     own = np.isin(where, strengths)
-    if not np.any(own):
-        return np.inf
+    if not np.any(own):  # at a bound, which is zero where there is nothing of it
+        return np.inf if not strengths or np.any(fitted.vector[strengths]) else 0.0
     deviation = np.sqrt(np.maximum(np.diag(matrix)[own], 1e-300))
     value = fitted.vector[where[own]] / deviation
     together = np.linalg.pinv(matrix[np.ix_(own, own)] / np.outer(deviation, deviation), rcond=1e-9, hermitian=True)

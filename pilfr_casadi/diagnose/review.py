@@ -8,28 +8,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ..compiled import make_engine
 from ..laws import FINER
-from ..laws.dynamic import Attached
 from ..recording import InputError
-from ..simulator import Placed, Simulator
+from ..simulator import Placed
 from ..threads import side_by_side
-from .candidate import Candidate, attempt, in_series, judged
-from .choice import bends_as_it_breaks_away, choose
-from .explain import by_cost, closed
-from .kinship import CONTAINS, complements, imitates
+from .candidate import Candidate, attempt, judged
+from .choice import choose, dry_instead
+from .explain import by_cost
+from .kinship import imitates
+from .rivals import rivals_beside
 from .verdict import HINT
 
 if TYPE_CHECKING:
     from .search import Search
 
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
-RIVALS = 6  # of the first law, put up against it again
 LED = 2.0  # times the error of the nearest rival, of those that are fitted again from where it is
-WIDER = 2  # laws that have it as a special case, or ports of a carried part, put up against it for the first time
 
 
 def prefer_what_leaves_nothing(search: Search) -> None:
@@ -38,8 +36,8 @@ def prefer_what_leaves_nothing(search: Search) -> None:
     assert found.choice is not None
     winner = found.choice.winner
     nearer = [c for c in found.candidates if c.port == winner.port and c.error < 0.95 * winner.error]
-    own = [c for c in nearer if not imitates(c, winner, search.floor2)]
-    closer = [c for c in own if bends_as_it_breaks_away(c, found.candidates) is None]
+    own = [c for c in nearer if not c.doubtful and not imitates(c, winner, search.floor2)]
+    closer = [c for c in own if dry_instead(c, found.candidates, search.floor2) is None]
     still = search.flexible(search.base).get(winner.port, 0.0) if closer else 0.0
     if still < HINT:
         return
@@ -92,10 +90,11 @@ def look_back(search: Search) -> None:
     assert first.choice is not None
     assert second.choice is not None
     kept = search.base.simulator.elements[-1]
-    bare = search.bench.simulator
-    alone = attempt(
-        search.bench, bare.with_element(kept.port, kept.law), [search.base.values], states=search.base.begin
-    )
+    bare = search.base.simulator.without_last_element().without_last_element()
+    by_itself = bare.with_element(kept.port, kept.law)
+    prefix = by_itself.elements[-1].prefix
+    own = {f"{prefix}{k}": search.base.values[f"{kept.prefix}{k}"] for k in kept.law.parameters()}
+    alone = attempt(search.bench, by_itself, [{**search.base.values, **own}], states=search.base.begin)
     near = alone is not None and alone.error < 1.1 * second.choice.winner.error
     alone = search.polished(alone) if alone is not None and near else None
     if alone is not None:
@@ -104,8 +103,7 @@ def look_back(search: Search) -> None:
         search.timed("look back", began)
         return
     winner = first.choice.winner
-    asked = (*_fitted_before(search), *_never_fitted(search), *_carried_along(search))
-    others = [o for o in asked if o.beside(kept)]
+    others = rivals_beside(search, bare, kept)
     tasks = [(o.placed(kept), {**search.base.values, **o.values}, search.base.begin) for o in others]
     tasks.append((search.base.simulator, search.base.values, search.base.initial))
     *found, own_now = side_by_side(lambda t: attempt(search.bench, t[0], [t[1]], states=t[2]), tasks, search.workers)
@@ -119,8 +117,7 @@ def look_back(search: Search) -> None:
         other = None if again is None or again.winner is stay else search.polished(again.winner)
         if again is not None and (again.winner is stay or other is not None):
             search.base = search.base if other is None else other.fitted
-            alike = tuple(c for c in again.alike if c.port == winner.port)
-            better = replace(first.choice, winner=again.winner, alike=alike, margin=again.margin)
+            better = replace(first.choice, winner=other or again.winner, alike=again.alike, margin=again.margin)
             search.passes[-2] = replace(first, choice=better)
     search.timed("look back", began)
 
@@ -142,69 +139,6 @@ def _led(search: Search, tried: Sequence[Candidate]) -> list[Candidate]:
         return again if again is not None and again.error < c.error else c
 
     return side_by_side(led, tried, search.workers)
-
-
-@dataclass(frozen=True)
-class _Rival:
-    """A law that may stand in the first's place, with its values by full name."""
-
-    simulator: Simulator
-    values: dict[str, Any]
-
-    @property
-    def element(self) -> Placed:
-        """Where it stands."""
-        return self.simulator.elements[-1]
-
-    def beside(self, kept: Placed) -> bool:
-        """Whether the second effect may stand beside it."""
-        return self.element.port != kept.port or complements(self.element.law, kept.law)
-
-    def placed(self, kept: Placed) -> Simulator:
-        """With the second effect."""
-        return self.simulator.with_element(kept.port, kept.law)
-
-
-def _fitted_before(search: Search) -> list[_Rival]:
-    """The best of the first effect's port that were fitted in its place."""
-    first = search.passes[-2]
-    assert first.choice is not None
-    winner, out = first.choice.winner, list[_Rival]()
-    for c in first.candidates:
-        if c.port == winner.port and type(c.law) is not type(winner.law) and len(out) < RIVALS:
-            own = c.fitted.simulator.elements[-1]
-            values = {k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}
-            out.append(_Rival(search.bench.simulator.with_element(own.port, own.law), values))
-    return out
-
-
-def _never_fitted(search: Search) -> list[_Rival]:
-    """What has the first law as a special case, where the screen did not let it through: the second effect hid it."""
-    first = search.passes[-2]
-    assert first.choice is not None
-    winner, seen = first.choice.winner, {(c.port, type(c.law)) for c in first.candidates}
-    out = dict[type, _Rival]()
-    for s in first.scored:
-        wider = s.port == winner.port and winner.law.id in CONTAINS.get(s.law.id, ())
-        if wider and (s.port, type(s.law)) not in seen and type(s.law) not in out and len(out) < WIDER:
-            out[type(s.law)] = _Rival(*closed(search.bench.simulator, s, s.starts[0]))
-    return list(out.values())
-
-
-def _carried_along(search: Search) -> list[_Rival]:
-    """A part that is carried along, at every port, where a mode beside a signal's path stands at an actuator or sensor.
-
-    A pole and a zero more are all of these; beside the second effect the first is now seen by itself.
-    """
-    first, (element, _) = search.passes[-2], search.base.simulator.elements[-2:]
-    if element.law.form != "mode" or not in_series(element.port):
-        return []
-    found = {k: search.base.values[f"{element.prefix}{k}"] for k in ("W", "D")}
-    out = dict[str, _Rival]()
-    for s in first.scored:
-        if isinstance(s.law, Attached) and s.port not in out and len(out) < WIDER:
-            out[s.port] = _Rival(*closed(search.bench.simulator, s, {**s.starts[0], **found}))
-    return list(out.values())
 
 
 def _size(candidate: Candidate, element: Placed) -> int:

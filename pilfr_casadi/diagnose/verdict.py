@@ -79,7 +79,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
         sure = [confidence(c, search) for c in accepted]
         alone = len(accepted) == 1 and (accepted[0].margin > CLEAR or remains < PARTLY)
-        if max(sure) > (NOT_AT_ALL if alone else HARDLY):
+        if max(sure) > (NOT_AT_ALL if alone else HARDLY) or (alone and remains < LITTLE):
             return "missing-physics", (
                 f"The simulator leaves out {words}."
                 if min(sure) > UNSURE
