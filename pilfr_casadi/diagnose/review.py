@@ -36,7 +36,7 @@ def prefer_what_leaves_nothing(search: Search) -> None:
     assert found.choice is not None
     winner = found.choice.winner
     nearer = [c for c in found.candidates if c.port == winner.port and c.error < 0.95 * winner.error]
-    own = [c for c in nearer if not c.doubtful and not imitates(c, winner, search.floor2)]
+    own = [c for c in nearer if not imitates(c, winner, search.floor2)]
     closer = [c for c in own if dry_instead(c, found.candidates, search.floor2) is None]
     still = search.flexible(search.base).get(winner.port, 0.0) if closer else 0.0
     if still < HINT:
