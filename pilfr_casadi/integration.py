@@ -24,7 +24,7 @@ from .arrays import accumulated
 from .expressions import Named, call
 from .model import Model, from_expressions
 from .parameters import ParameterSet
-from .simulator import Placed, Simulator
+from .simulator import Placed, Simulator, in_series
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ class Equations:
         y = simulator.measured(x, inputs, p, t)
         rates = self.local(x_only, ca.vertcat(*u.values()), v.slope, t, self.vector)[1]
         for i, e in placed:
-            if e.port.startswith(("actuator:", "sensor:")):
+            if in_series(e.port):
                 continue
             port = simulator.port(e.port)
             z = simulator.across(port, x, inputs, p, t)

@@ -66,6 +66,14 @@ class Placed:
     law: Any
     prefix: str
 
+    def own(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The law's values by its own names, of values by full name."""
+        return {name: values[f"{self.prefix}{name}"] for name in self.law.parameters()}
+
+    def named(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of the law by full name."""
+        return {f"{self.prefix}{name}": value for name, value in own.items()}
+
 
 @dataclass(frozen=True, eq=False)
 class Simulator:
@@ -241,11 +249,11 @@ class Simulator:
             raise InputError(f"The element has {law.channels} channels, the port {port!r} has one; give as many.")
         count = sum(e.port == port for e in self.elements)
         prefix = f"{port}." if not count else f"{port}#{count + 1}."
-        own = {f"{prefix}{name}": p for name, p in law.parameters().items()}
+        placed = Placed(port, law, prefix)
         return replace(
             self,
-            parameters=ParameterSet(dict(self.parameters)) | own,
-            elements=(*self.elements, Placed(port, law, prefix)),
+            parameters=ParameterSet(dict(self.parameters)) | placed.named(law.parameters()),
+            elements=(*self.elements, placed),
         )
 
     def without_last_element(self) -> Simulator:
@@ -253,6 +261,11 @@ class Simulator:
         *kept, last = self.elements
         own = {k: p for k, p in self.parameters.items() if not k.startswith(last.prefix)}
         return replace(self, parameters=ParameterSet(own), elements=tuple(kept))
+
+
+def in_series(port: str) -> bool:
+    """Whether a port, by its name, is a signal's own: an actuator or a sensor."""
+    return port.startswith(("actuator:", "sensor:"))
 
 
 def _series(kind: str, name: str, across: Expression, units: Mapping[str, str]) -> Port:

@@ -59,9 +59,9 @@ def scored(path: Path) -> dict[int, Score]:
 
 @cache
 def code() -> str:
-    """A digest of the package's files: results of different code do not make one score."""
-    files = sorted(Path(pilfr_casadi.__file__).parent.rglob("*.py"))
-    return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()[:16]
+    """A digest of the package's files and of the cases': results of different code do not make one score."""
+    files = [*Path(pilfr_casadi.__file__).parent.rglob("*.py"), *Path(__file__).parent.glob("*.py")]
+    return hashlib.sha256(b"".join(f.read_bytes() for f in sorted(files))).hexdigest()[:16]
 
 
 def _write(path: Path, r: Recording) -> None:
@@ -102,6 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--export", type=Path, help="write the cases here instead of running them")
     parser.add_argument("--list", action="store_true", help="print the cases instead of running them")
     a = parser.parse_args(arguments)
+    code()  # as it is now: it may be edited while cases run
     seeds = list(range(a.first_seed, a.first_seed + a.cases))
     if a.only or a.export or a.list:
         kept = []

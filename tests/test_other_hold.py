@@ -14,10 +14,11 @@ DT = 2e-3
 
 def named(port, law, **values):
     """A fitted candidate, as far as `within` reads it."""
-    own = {f"l.{k}": v for k, v in values.items()}
+    element = Placed(port, law, "l.")
+    own = element.named({k: p.value for k, p in law.parameters().items()} | values)
     fitted = SimpleNamespace(
         values=own,
-        simulator=SimpleNamespace(elements=[Placed(port, law, "l.")]),
+        simulator=SimpleNamespace(elements=[element]),
         model=SimpleNamespace(parameters=dict.fromkeys(own)),
     )
     return Candidate(port, law, fitted, 1.0, 1.0, 1)

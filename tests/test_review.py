@@ -50,17 +50,20 @@ def _scored(port, kind):
     return Scored(port, kind(), 0.5, (start,), local, 1.0)
 
 
+def _at_its_values(simulator):
+    return SimpleNamespace(simulator=simulator, values={k: p.value for k, p in simulator.parameters.items()})
+
+
 @pytest.fixture
 def searched():
     """Dry friction at one port, a second effect at the other; and what the screen scored of the first."""
     winner = SimpleNamespace(port="ground-m1", law=CoulombFriction())
     fitted = SimpleNamespace(port="ground-m1", law=PreslidingStribeckFriction(), fitted=None)
     scored = [_scored(port, kind) for port in ("m1-m2", "ground-m1") for kind in CATALOGUE if "parallel" in kind.places]
-    fitted.fitted = SimpleNamespace(simulator=rig().with_element("ground-m1", fitted.law), values={})
+    fitted.fitted = _at_its_values(rig().with_element("ground-m1", fitted.law))
     both = rig().with_element("ground-m1", CoulombFriction()).with_element("m1-m2", CubicStiffness())
     first = SimpleNamespace(choice=SimpleNamespace(winner=winner), candidates=(winner, fitted), scored=tuple(scored))
-    base = SimpleNamespace(simulator=both, values={})
-    return SimpleNamespace(passes=[first, None], bench=SimpleNamespace(simulator=rig()), base=base)
+    return SimpleNamespace(passes=[first, None], bench=SimpleNamespace(simulator=rig()), base=_at_its_values(both))
 
 
 def test_a_wider_law_that_the_screen_did_not_let_through_is_put_up_beside_a_second_effect(searched):
@@ -79,9 +82,9 @@ def test_a_wider_law_that_the_screen_did_not_let_through_is_put_up_beside_a_seco
 def test_a_mode_of_a_signal_is_put_up_against_parts_that_are_carried_along(searched):
     mode = Mode().at({"c_1": 0.1, "c_2": 0.0, "W": 30.0, "D": 0.1})
     both = rig().with_element("sensor:x2", mode).with_element("m1-m2", CubicStiffness())
-    first, prefix = searched.passes[0], both.elements[0].prefix
+    first = searched.passes[0]
     first.choice.winner = SimpleNamespace(port="sensor:x2", law=mode)
-    searched.base = SimpleNamespace(simulator=both, values={f"{prefix}W": 30.0, f"{prefix}D": 0.1})
+    searched.base = _at_its_values(both)
     (carried,) = rivals_beside(searched, rig(), both.elements[-1])
     assert carried.element.port == "ground-m1" and isinstance(carried.element.law, Attached)
     assert carried.values[f"{carried.element.prefix}W"] == 30.0

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..laws import Law
 from ..recording import InputError, Recording
-from ..simulator import Simulator
+from ..simulator import Placed, Simulator, in_series
 from .arranged import opened_at_the_start
 from .proof import deviations, shown
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
@@ -59,39 +59,34 @@ class Candidate:
     @property
     def at_bound(self) -> bool:
         """Whether a parameter of the law is held back by one of its bounds."""
-        return any(np.any(self.fitted.at_bound(k)) for k in self._own)
+        return any(np.any(self.fitted.at_bound(k)) for k in self.element.named(self.own))
 
     @property
     def held_back(self) -> bool:
         """Whether an upper bound holds one back: at a lower one it is as sharp or as small as the data can tell."""
         p, values = self.fitted.model.parameters, self.fitted.values
-        return any(np.any(values[k] >= p[k].bounds[1]) for k in self._own)
+        return any(np.any(values[k] >= p[k].bounds[1]) for k in self.element.named(self.own))
 
     @property
     def doubtful(self) -> bool:
         """Whether the law at its fitted values is hardly what its name says."""
-        return self.law.doubtful({k.removeprefix(self._prefix): self.fitted.values[k] for k in self._own})
+        return self.law.doubtful(self.own)
 
     def within(self, dt: float) -> bool:
         """Whether it is a delay, a lag or a mode of a signal that acts within a step dt."""
-        own = {k.removeprefix(self._prefix): float(np.max(self.fitted.values[k])) for k in self._own}
         timed = in_series(self.port) and (self.law.order > 0 or self.law.shifts)
-        return timed and (own.get("T", np.inf) < dt or own.get("W", 0.0) * dt > 1)
+        return timed and bool(np.max(self.own.get("T", np.inf)) < dt or np.max(self.own.get("W", 0.0)) * dt > 1)
 
     @property
-    def _own(self) -> list[str]:
-        return [k for k in self.fitted.model.parameters if k.startswith(self._prefix)]
-
-    @property
-    def _prefix(self) -> str:
-        """Of the law's parameters; another effect may stand behind it."""
+    def element(self) -> Placed:
+        """Where the law stands; another effect may stand behind it."""
         elements = self.fitted.simulator.elements[::-1]
-        return next((e for e in elements if e.port == self.port and type(e.law) is type(self.law)), elements[0]).prefix
+        return next((e for e in elements if e.port == self.port and type(e.law) is type(self.law)), elements[0])
 
-
-def in_series(port: str) -> bool:
-    """Whether a port is a signal's own: an actuator or a sensor."""
-    return port.startswith(("actuator:", "sensor:"))
+    @property
+    def own(self) -> dict[str, Any]:
+        """The law's fitted values by its own names."""
+        return self.element.own(self.fitted.values)
 
 
 def heads(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
@@ -140,10 +135,8 @@ def attempt(
         return None
     head, tail = judged(bench, fitted)
     element = simulator.elements[-1]
-    values = {k: fitted.values[f"{element.prefix}{k}"] for k in element.law.parameters()}
-    return Candidate(
-        element.port, element.law, fitted, head, tail if np.isfinite(tail) else 1e12, element.law.size(values)
-    )
+    size = element.law.size(element.own(fitted.values))
+    return Candidate(element.port, element.law, fitted, head, tail if np.isfinite(tail) else 1e12, size)
 
 
 def polish(bench: Workbench, candidate: Candidate) -> Candidate:
@@ -181,9 +174,7 @@ def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray
     if element.port != candidate.port or type(element.law) is not type(candidate.law):  # another was put in after it
         return candidate
     plain: Any = type(candidate.law).__base__
-    own = {
-        k.removeprefix(element.prefix): v for k, v in candidate.fitted.values.items() if k.startswith(element.prefix)
-    }
+    own = element.own(candidate.fitted.values)
     # at a bound there is no standard error: there only nothing is nothing
     doubt = {
         name: np.nan_to_num(WEAK * std[f"{element.prefix}{name}"]) if std else 0.0 for name in candidate.law.strength

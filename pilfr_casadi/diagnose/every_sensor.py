@@ -61,7 +61,7 @@ def _rival(search: Search, ports: list[str], winner: Candidate) -> Candidate | N
     bench, base = search.bench, search.base
     found = base.simulator.elements[len(bench.simulator.elements) :]
     source = next(e for e in found if e.port == winner.port and e.law.id == winner.law.id)
-    own = {name: base.values[f"{source.prefix}{name}"] for name in source.law.parameters()}
+    own = source.own(base.values)
     simulator: Simulator = bench.simulator
     for e in found:
         if e.law.id not in FILTERS:
@@ -69,7 +69,7 @@ def _rival(search: Search, ports: list[str], winner: Candidate) -> Candidate | N
     named = dict[str, object]()
     for port in ports:
         simulator = simulator.with_element(port, source.law)
-        named |= {f"{simulator.elements[-1].prefix}{name}": v for name, v in own.items()}
+        named |= simulator.elements[-1].named(own)
     nominal = {k: p.value for k, p in search.without.simulator.parameters.items()}
     starts = [{**base.values, **named}, {**base.values, **nominal, **named}]
     return attempt(bench, simulator, starts, states=base.begin)

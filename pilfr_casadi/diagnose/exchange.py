@@ -110,7 +110,7 @@ def _closed(search: Search, way: Sequence[Place], screened: bool) -> tuple[Simul
         if entry is None:
             return None
         element = next(e for e in search.base.simulator.elements[::-1] if e.port == c.port and e.law.id == c.law.id)
-        own = {name: search.base.values[f"{element.prefix}{name}"] for name in c.law.units}
+        own = element.own(search.base.values)
         simulator, values = closed(simulator, entry, {**own, **entry.starts[0]} if screened else own)
         named |= values
     return simulator, named

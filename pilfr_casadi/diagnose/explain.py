@@ -65,8 +65,7 @@ def closed(simulator: Simulator, entry: Scored, start: Mapping[str, Any]) -> tup
         limits |= {name: side for name in law.strength if name not in law.signed}
     inside = {k: np.clip(v, *limits[k]) if k in limits else v for k, v in start.items()}
     placed = simulator.with_element(entry.port, law.at(inside, limits))
-    prefix = placed.elements[-1].prefix
-    return placed, {f"{prefix}{k}": v for k, v in inside.items()}
+    return placed, placed.elements[-1].named(inside)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ def imitated(bench: Workbench, candidates: Sequence[Candidate], scored: Sequence
     local = felt(bench, best.fitted, best.port)
     if not entries or not max(np.max(np.abs(local.z)), np.max(np.abs(local.dz))) < HUGE:
         return []
-    values, law = _own(best), best.law
+    values, law = best.own, best.law
     force = trace(law.at(values), local, [_shape(law, values)])[:, 0] @ _strengths(law, values)
     with np.errstate(over="ignore", invalid="ignore"):
         found = [(*_likest(s.law, local, force), s) for s in entries.values()]
@@ -64,11 +64,6 @@ def felt(bench: Workbench, fitted: Fitted, port: str) -> Local:
     lengths = tuple(len(z) for z, _ in parts)
     z, dz = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     return Local(z, dz, bench.dt, lengths, from_zero=tuple(r.begins == "zero" for r in bench.recordings))
-
-
-def _own(candidate: Candidate) -> dict[str, Any]:
-    element = candidate.fitted.simulator.elements[-1]
-    return {k: candidate.fitted.values[f"{element.prefix}{k}"] for k in candidate.law.parameters()}
 
 
 def _shape(law: Law, values: dict[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..laws.dynamic import Attached, Delay, Lag, Resonance
-from .candidate import Candidate, in_series
+from ..simulator import in_series
+from .candidate import Candidate
 from .kinship import CONTAINS
 from .screen import Scored
 
@@ -45,8 +46,7 @@ def _carried(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[
     best = candidates[0]
     if not {"W", "D"} <= set(best.law.units) or isinstance(best.law, Attached):
         return []
-    prefix = best.fitted.simulator.elements[-1].prefix
-    found = {k: float(np.ravel(best.fitted.values[f"{prefix}{k}"])[0]) for k in ("W", "D")}
+    found = {k: float(np.ravel(best.own[k])[0]) for k in ("W", "D")}
     near = {c.port for c in candidates if isinstance(c.law, Attached) and c.error < AHEAD * best.error}
     out: dict[str, Scored] = {}
     for s in scored:
@@ -60,7 +60,7 @@ def _late(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Sco
     late: dict[str, float] = {}
     for c in candidates:
         if isinstance(c.law, Delay | Lag) and c.error < BEHIND * candidates[0].error and c.port not in late:
-            late[c.port] = float(np.ravel(c.fitted.values[f"{c.fitted.simulator.elements[-1].prefix}T"])[0])
+            late[c.port] = float(np.ravel(c.own["T"])[0])
     out: dict[tuple[str, type], Scored] = {}
     for s in scored:
         key = s.port, type(s.law)
@@ -75,9 +75,8 @@ def _other_end(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> lis
     best = candidates[0]
     if not in_series(best.port) or not (best.law.order or best.law.shifts):
         return []
-    prefix = best.fitted.simulator.elements[-1].prefix
     times = [k for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")]
-    found = {k: float(np.ravel(best.fitted.values[f"{prefix}{k}"])[0]) for k in times}
+    found = {k: float(np.ravel(best.own[k])[0]) for k in times}
     near = {c.port for c in candidates if type(c.law) is type(best.law) and c.error < AHEAD * best.error}
     out: dict[str, Scored] = {}
     for s in scored:
@@ -99,7 +98,5 @@ def _refined(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[
         more = set(s.law.units) - set(best.law.units)
         refines = best.law.units.items() <= s.law.units.items() and more and more <= set(s.law.strength)
         if s.port == best.port and kind in worse and refines and best.law.strength and kind not in out:
-            prefix = best.fitted.simulator.elements[-1].prefix
-            found = {k: best.fitted.values[f"{prefix}{k}"] for k in best.law.units}
-            out[kind] = replace(s, starts=({**dict.fromkeys(more, 0.0), **found},))
+            out[kind] = replace(s, starts=({**dict.fromkeys(more, 0.0), **best.own},))
     return list(out.values())

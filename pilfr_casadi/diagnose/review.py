@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 from ..compiled import make_engine
 from ..laws import FINER
 from ..recording import InputError
-from ..simulator import Placed
 from ..threads import side_by_side
 from .candidate import Candidate, attempt, judged
 from .choice import choose, dry_instead
@@ -61,11 +60,10 @@ def put_more_finely(search: Search) -> None:
         if local is None:
             return
         began = time.perf_counter()
-        given = {k: search.base.values[f"{element.prefix}{k}"] for k in winner.law.parameters()}
+        given = element.own(search.base.values)
         shapes = list(kind.finer_starts(given, local))
         law = kind().at(shapes[0], kind().bounds(local))
-        own = [{f"{element.prefix}{k}": v for k, v in shape.items()} for shape in shapes]
-        starts = [{**search.base.values, **values} for values in own]
+        starts = [{**search.base.values, **element.named(shape)} for shape in shapes]
         placed = bare.with_element(element.port, law)
         model = search.bench.model(placed)
         engine = make_engine(model, search.bench.engine)
@@ -76,7 +74,7 @@ def put_more_finely(search: Search) -> None:
             continue
         if finer.cost < FINER_BY * search.base.cost:
             search.base = finer
-            size = law.size({k: finer.values[f"{element.prefix}{k}"] for k in law.parameters()})
+            size = law.size(finer.simulator.elements[-1].own(finer.values))
             head, tail = judged(search.bench, finer)
             better = replace(winner, law=law, fitted=finer, head=head, tail=tail, full=finer.cost, size=size)
             search.passes[-1] = replace(found, choice=replace(found.choice, winner=better))
@@ -92,8 +90,7 @@ def look_back(search: Search) -> None:
     kept = search.base.simulator.elements[-1]
     bare = search.base.simulator.without_last_element().without_last_element()
     by_itself = bare.with_element(kept.port, kept.law)
-    prefix = by_itself.elements[-1].prefix
-    own = {f"{prefix}{k}": search.base.values[f"{kept.prefix}{k}"] for k in kept.law.parameters()}
+    own = by_itself.elements[-1].named(kept.own(search.base.values))
     alone = attempt(search.bench, by_itself, [{**search.base.values, **own}], states=search.base.begin)
     near = alone is not None and alone.error < 1.1 * second.choice.winner.error
     alone = search.polished(alone) if alone is not None and near else None
@@ -112,7 +109,7 @@ def look_back(search: Search) -> None:
         elements = [e for e, c in zip((o.element for o in others), found, strict=True) if c is not None]
         stay = replace(every[0], port=winner.port, law=winner.law, size=winner.size)
         pairs = zip(elements, every[1:], strict=True)
-        rivals = [replace(c, port=e.port, law=e.law, size=_size(c, e)) for e, c in pairs]
+        rivals = [replace(c, port=e.port, law=e.law, size=e.law.size(e.own(c.fitted.values))) for e, c in pairs]
         again = choose([stay, *rivals], first.before, search.floor2, search.effective_samples([stay, *rivals]))
         other = None if again is None or again.winner is stay else search.polished(again.winner)
         if again is not None and (again.winner is stay or other is not None):
@@ -133,14 +130,9 @@ def _led(search: Search, tried: Sequence[Candidate]) -> list[Candidate]:
         first, second = c.fitted.simulator.elements[-2:]
         if c is best or c.error > LED * best.error or first.port == second.port:
             return c
-        own = {k: v for k, v in c.fitted.values.items() if k.startswith(first.prefix)}
+        own = first.named(first.own(c.fitted.values))
         shared = {k: v for k, v in best.fitted.values.items() if k in c.fitted.values}
         again = attempt(search.bench, c.fitted.simulator, [{**shared, **own}], states=c.fitted.begin)
         return again if again is not None and again.error < c.error else c
 
     return side_by_side(led, tried, search.workers)
-
-
-def _size(candidate: Candidate, element: Placed) -> int:
-    values = candidate.fitted.values
-    return element.law.size({k: values[f"{element.prefix}{k}"] for k in element.law.parameters()})

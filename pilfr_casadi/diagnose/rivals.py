@@ -8,8 +8,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from ..laws.dynamic import Attached
-from ..simulator import Placed, Simulator
-from .candidate import in_series
+from ..simulator import Placed, Simulator, in_series
 from .explain import closed
 from .kinship import CONTAINS, complements
 
@@ -62,8 +61,7 @@ def _fitted_before(search: Search, bare: Simulator) -> Iterator[Rival]:
     for c in first.candidates:
         if c.port == winner.port and type(c.law) is not type(winner.law):
             own = c.fitted.simulator.elements[-1]
-            values = {k: v for k, v in c.fitted.values.items() if k.startswith(own.prefix)}
-            yield Rival(bare.with_element(own.port, own.law), values)
+            yield Rival(bare.with_element(own.port, own.law), own.named(own.own(c.fitted.values)))
 
 
 def _never_fitted(search: Search, bare: Simulator) -> Iterator[Rival]:
@@ -86,7 +84,8 @@ def _carried_along(search: Search, bare: Simulator) -> Iterator[Rival]:
     element = search.base.simulator.elements[-2]
     if element.law.form != "mode" or not in_series(element.port):
         return
-    found = {k: search.base.values[f"{element.prefix}{k}"] for k in ("W", "D")}
+    own = element.own(search.base.values)
+    found = {k: own[k] for k in ("W", "D")}
     seen = set[str]()
     for s in search.passes[-2].scored:
         if isinstance(s.law, Attached) and s.port not in seen:

@@ -233,7 +233,7 @@ def usage(diagnosis: Diagnosis) -> str:
     lines += [f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(laws.items())]
     lines += ["from your_file import simulator  # the one that was diagnosed", ""]
     for e in simulator.elements:
-        own = {k.removeprefix(e.prefix): v for k, v in fitted.items() if k.startswith(e.prefix)}
+        own = e.own(fitted)
         limits = {k: tuple(map(_literal, v)) for k, v in e.law.limits.items()}
         lines.append(f"law = {type(e.law).__name__}(")
         for key, value in (("values", own), ("limits", limits)):
