@@ -18,11 +18,20 @@ from pilfr_casadi.diagnose.timing import timing
 from pilfr_casadi.diagnose.verdict import strained
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.laws import CubicStiffness, LinearStiffness
-from pilfr_casadi.laws.dynamic import Delay, Drift, Resonance, Settling
+from pilfr_casadi.laws.dynamic import (
+    Creep,
+    Delay,
+    Drift,
+    Relaxation,
+    Resonance,
+    Settling,
+    TwoStageCreep,
+    TwoStageRelaxation,
+)
 from pilfr_casadi.laws.periodic import HarmonicForce, PeriodicForce
 from pilfr_casadi.parameters import Parameter
 from pilfr_casadi.recording import Recording
-from pilfr_casadi.simulator import Placed, Port, Simulator
+from pilfr_casadi.simulator import Port, Simulator
 
 
 def searching(bench, said=True):
@@ -54,6 +63,11 @@ def candidate(port, law, error, size=2, at_bound=False, doubtful=False, form="")
         doubtful=doubtful,
         name=(port, law),
     )
+
+
+def fitted(port, law, error, **own):
+    """The same of a law of the catalogue, with its fitted values."""
+    return SimpleNamespace(port=port, law=law, error=error, size=len(own), own=own)
 
 
 def test_of_two_that_do_as_well_the_one_that_no_bound_holds_back_is_taken():
@@ -116,10 +130,7 @@ def test_a_special_case_that_was_left_after_a_few_steps_is_fitted_again():
 
 
 def test_where_a_delay_comes_near_damped_resonances_as_late_are_tried():
-    law = Delay(values={"T": 0.02})
-    late = candidate("a", "delay", 0.1)
-    late.law, late.size = law, 1
-    late.fitted = SimpleNamespace(values={"a.T": 0.02}, simulator=SimpleNamespace(elements=[Placed("a", law, "a.")]))
+    late = fitted("a", Delay(), 0.1, T=0.02)
     scored = [Scored(port, Resonance(), 0.1, ({"W": 3.0, "D": 0.05},), None) for port in ("a", "b")]
     (more,) = [s for s in passed_over([late], scored) if s.port == "a"]
     assert [2 * v["D"] / v["W"] == pytest.approx(0.02) for v in more.starts] == [True, True, False]
@@ -128,40 +139,43 @@ def test_where_a_delay_comes_near_damped_resonances_as_late_are_tried():
 
 
 def test_a_delay_is_tried_at_the_other_end_as_well():
-    law = Delay(values={"T": 0.02})
-    late = candidate("sensor:y", "delay", 0.1)
-    late.law = law
-    late.fitted = SimpleNamespace(
-        values={"d.T": 0.02}, simulator=SimpleNamespace(elements=[Placed("sensor:y", law, "d.")])
-    )
+    late = fitted("sensor:y", Delay(), 0.1, T=0.02)
     ports = ("sensor:y", "actuator:u", "spring")
     scored = [Scored(port, Delay(), 0.1, ({"T": 0.05},), None) for port in ports]
     (more,) = passed_over([late], scored)
     assert more.port == "actuator:u" and [start["T"] for start in more.starts] == [0.02, 0.05]
-    there = SimpleNamespace(port="actuator:u", law=Delay(), error=0.11, fitted=late.fitted)
+    there = fitted("actuator:u", Delay(), 0.11, T=0.02)
     assert passed_over([late, there], scored) == []
 
 
-def test_a_law_with_one_more_term_than_the_best_is_no_worse_and_so_is_fitted_again_from_there():
+def test_a_law_with_one_more_term_than_one_that_came_near_is_no_worse_and_so_is_fitted_again_from_there():
     plain, wider = PeriodicForce(), HarmonicForce()
-    best, lost = candidate("a", "periodic_force", 0.1), candidate("a", "periodic_force", 0.5)
-    best.law, lost.law = plain, wider
-    best.fitted = SimpleNamespace(
-        values={"p.a": 3.0, "p.b": -2.0, "p.L": 0.7}, simulator=SimpleNamespace(elements=[Placed("a", plain, "p.")])
-    )
     start = {"a": 1.0, "b": 1.0, "a_2": 1.0, "b_2": 1.0, "L": 0.1}
+    near, lost = fitted("a", plain, 0.1, a=3.0, b=-2.0, L=0.7), fitted("a", wider, 0.5, **start)
+    best = candidate("c", "cubic_stiffness", 0.09)
     scored = [Scored(port, law, 0.1, (start,), None) for port in ("a", "b") for law in (plain, wider)]
-    (more,) = [s for s in passed_over([best, lost], scored) if s.port == "a" and isinstance(s.law, HarmonicForce)]
-    assert more.starts == ({"a": 3.0, "b": -2.0, "a_2": 0.0, "b_2": 0.0, "L": 0.7},)
-    other = SimpleNamespace(**{**vars(lost), "law": Settling()})  # of the same names, but no line is an exponential
-    best.law = Drift()
-    assert passed_over([best, other], [Scored("a", Settling(), 0.1, ({"a": 1.0, "b": 0.0, "T": 2.0},), None)]) == []
-    best.law = plain
-    lost.fitted = SimpleNamespace(
-        values={f"p.{k}": v for k, v in start.items()},
-        simulator=SimpleNamespace(elements=[Placed("a", wider, "p.")]),
-    )
-    assert passed_over([lost, best], scored) == []
+    for others in ([], [best]):
+        (more,) = [s for s in passed_over([*others, near, lost], scored) if isinstance(s.law, HarmonicForce)]
+        assert more.port == "a" and more.starts == ({"a": 3.0, "b": -2.0, "a_2": 0.0, "b_2": 0.0, "L": 0.7},)
+    assert passed_over([candidate("c", "cubic_stiffness", 0.05), near, lost], scored) == []
+    assert passed_over([fitted("a", wider, 0.09, **start), near], scored) == []
+    # of the same names, but no line is an exponential
+    trend = fitted("a", Drift(), 0.1, a=3.0, b=-2.0)
+    settling = fitted("a", Settling(), 0.5, a=1.0, b=0.0, T=2.0)
+    assert passed_over([trend, settling], [Scored("a", Settling(), 0.1, (settling.own,), None)]) == []
+
+
+@pytest.mark.parametrize(("one", "two", "name"), [(Relaxation, TwoStageRelaxation, "k"), (Creep, TwoStageCreep, "c")])
+def test_creep_in_two_stages_goes_on_from_one(one, two, name):
+    own = {next(iter(one.units)): 8.0, "T": 0.5}
+    assert two().starts_as(one(), own) == {f"{name}_1": 4.0, f"{name}_2": 4.0, "T_1": 0.25, "T_2": 1.0}
+    assert two().starts_as(PeriodicForce(), {"a": 1.0, "b": 0.0, "L": 1.0}) == {}
+
+
+def test_where_the_best_is_doubtful_what_takes_its_place_is_the_smallest_that_does_as_well():
+    doubtful = candidate("overflow", "coulomb_friction", 0.090, size=4, doubtful=True)
+    plain, small = candidate("overflow", "viscous_damping", 0.100), candidate("pump", "static_curve", 0.102, size=1)
+    assert choose([doubtful, plain, small], (1.0, 1.0), 1e-4, 500.0).winner is small
 
 
 def spring():

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from diagnosis_rig import DT, recordings, rig
 
+from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.proof import deviations, shown
 from pilfr_casadi.diagnose.rivals import WIDER, rivals_beside
 from pilfr_casadi.diagnose.screen import Scored
+from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.workbench import Workbench
+from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.laws import (
     CATALOGUE,
     CoulombFriction,
@@ -97,3 +100,14 @@ def test_what_a_bound_holds_at_nothing_is_not_shown():
     fitted = bench.fit(rig().with_element("m1-m2", bounded), [{}])
     assert fitted.values[f"{fitted.simulator.elements[-1].prefix}k_v"] == 0.0
     assert shown(bench, fitted) == 0.0
+
+
+def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
+    bench = Workbench.of(rig(), recordings(None, count=1), "zero")
+    stuck = bench.fit(rig((3.0, 1.0, 1.0, 1.0)), solver=GaussNewton(max_iterations=1))
+    search = Search(bench, stuck, Floor(np.full(1, 1e-3), "estimated"), (), 1, lambda *_: None)
+    search.base = bench.fit(rig().with_element("ground-m1", CubicStiffness()))
+    assert search._led_out()
+    assert search.without.cost < 1e-3 * stuck.cost and search.base is search.without
+    search.base = bench.fit(rig().with_element("ground-m1", CubicStiffness()))
+    assert not search._led_out()

@@ -91,19 +91,22 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     def key(c: Candidate) -> float:
         return float(np.log(excess(c)) + 0.5 * c.size * np.log(n) / n)
 
+    def fewest(winner: Candidate) -> Candidate:
+        """What does as well as one with fewer parameters, and is no more doubtful."""
+        close = [c for c in ranked if _near(c, winner, before) and c.size < winner.size]
+        return min((c for c in close if c.doubtful <= winner.doubtful), key=lambda c: (c.size, key(c)), default=winner)
+
     ranked = sorted(usable, key=key)
     winner = ranked[0]
     before = float(np.sqrt(without[0] * without[1]))
-    close = [c for c in ranked if _near(c, winner, before) and c.size < winner.size]
-    if close:  # what does as well with fewer parameters
-        winner = min(close, key=lambda c: (c.size, key(c)))
+    winner = fewest(winner)
     as_small = [c for c in ranked if c.size <= winner.size and not c.at_bound]
     free = [c for c in as_small if _near(c, winner, before) or _fits(c, winner)]
     if winner.at_bound and free:  # what does as well without being held back
         winner = min(free, key=lambda c: (c.size, key(c)))
     plain = [c for c in ranked if c.port == winner.port and not c.doubtful and c.error < NEARLY * winner.error]
     if winner.doubtful and plain:  # what does nearly as well and is what its name says
-        winner = plain[0]
+        winner = fewest(plain[0])
     for rival in ranked[1:]:
         if not rival.doubtful and imitates(winner, rival, floor):
             winner = rival

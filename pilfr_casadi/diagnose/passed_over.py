@@ -4,8 +4,8 @@ A resonance whose frequency is found at the wrong port is found at the right one
 carried along is felt in a narrow band, between whose neighbours on the grid the screen may miss it. A damped resonance,
 too, slips between the lightly damped ones of the grid; the delay or the lag that comes near in its place says at which
 frequency it would be as late. What takes time, such as a delay, looks alike before and behind a simulator that is
-nearly linear: it is put up at the other end. And a law with one more term than the best one is no worse: where it came
-out so, it was started elsewhere.
+nearly linear: it is put up at the other end. And a law with one more term than one that came near is no worse: where it
+came out so, it was started elsewhere.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from .screen import Scored
 
 AHEAD = 1.5  # times the best error beyond which a carried mass, or a special case, is worth another start
 BEHIND = 3.0  # times the best error of a delay or a lag that may stand for a resonance
+NEARLY = 1.25  # times the best error of a law that one with one more term may go on from
 DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in its place
 
 
@@ -86,17 +87,15 @@ def _other_end(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> lis
 
 
 def _refined(candidates: Sequence[Candidate], scored: Sequence[Scored]) -> list[Scored]:
-    """The best law with one more term, where that came out worse: from the best's values, with none of it.
-
-    A term is a strength: at zero the wider law is the best one.
-    """
+    """Laws that came near with one more term, where that came out worse: from their values."""
     best = candidates[0]
-    worse = {type(c.law) for c in candidates[1:] if c.port == best.port and isinstance(c.law, type(best.law))}
-    out: dict[type, Scored] = {}
-    for s in scored:
-        kind = type(s.law)
-        more = set(s.law.units) - set(best.law.units)
-        refines = best.law.units.items() <= s.law.units.items() and more and more <= set(s.law.strength)
-        if s.port == best.port and kind in worse and refines and best.law.strength and kind not in out:
-            out[kind] = replace(s, starts=({**dict.fromkeys(more, 0.0), **best.own},))
+    least = {(c.port, type(c.law)): c.error for c in reversed(candidates)}
+    out: dict[tuple[str, type], Scored] = {}
+    for c in candidates:
+        wider = [s for s in scored if s.port == c.port and type(s.law) is not type(c.law)]
+        for s in wider if c.error < NEARLY * best.error else ():
+            key = s.port, type(s.law)
+            if isinstance(s.law, type(c.law)) and least.get(key, 0.0) > c.error and key not in out:
+                start = s.law.starts_as(c.law, c.own)
+                out |= {key: replace(s, starts=(start,))} if start else {}
     return list(out.values())

@@ -19,7 +19,7 @@ from .candidate import Candidate, attempt, judged
 from .choice import choose, dry_instead
 from .explain import by_cost
 from .kinship import imitates
-from .rivals import rivals_beside
+from .rivals import FITTED, may_stand, rivals_beside
 from .verdict import HINT
 
 if TYPE_CHECKING:
@@ -116,7 +116,30 @@ def look_back(search: Search) -> None:
             search.base = search.base if other is None else other.fitted
             better = replace(first.choice, winner=other or again.winner, alike=again.alike, margin=again.margin)
             search.passes[-2] = replace(first, choice=better)
+            if other is not None:
+                _second_again(search)
     search.timed("look back", began)
+
+
+def _second_again(search: Search) -> None:
+    """The second effect chosen again, beside the law that has come into the first's place."""
+    second = search.passes[-1]
+    assert second.choice is not None
+    winner, kept = second.choice.winner, search.base.simulator.elements[-2]
+    bare = search.base.simulator.without_last_element()
+    others = [c for c in second.candidates if c.error < LED * winner.error and c is not winner]
+    others = [c for c in others if may_stand(c.element, kept)][:FITTED]
+    tasks = [(search.base.simulator, search.base.values, search.base.initial)]
+    for c in others:
+        placed = bare.with_element(c.port, c.law)
+        tasks.append((placed, {**search.base.values, **placed.elements[-1].named(c.own)}, search.base.begin))
+    found = side_by_side(lambda t: attempt(search.bench, t[0], [t[1]], states=t[2]), tasks, search.workers)
+    stay, tried = found[0], [c for c in found if c is not None]
+    again = choose(tried, second.before, search.floor2, search.effective_samples(tried)) if stay is not None else None
+    other = None if again is None or again.winner is stay else search.polished(again.winner)
+    if again is not None and (again.winner is stay or other is not None):
+        search.base = search.base if other is None else other.fitted
+        search.passes[-1] = replace(second, choice=again if other is None else replace(again, winner=other))
 
 
 def _led(search: Search, tried: Sequence[Candidate]) -> list[Candidate]:

@@ -45,11 +45,12 @@ def rivals_beside(search: Search, bare: Simulator, kept: Placed) -> list[Rival]:
         (_never_fitted(search, bare), WIDER),
         (_carried_along(search, bare), CARRIED),
     ):
-        out += islice((r for r in found if _may_stand(r.element, kept)), most)
+        out += islice((r for r in found if may_stand(r.element, kept)), most)
     return out
 
 
-def _may_stand(one: Placed, kept: Placed) -> bool:
+def may_stand(one: Placed, kept: Placed) -> bool:
+    """Whether a law may stand where it does beside another effect."""
     return one.port != kept.port or complements(one.law, kept.law)
 
 

@@ -108,7 +108,7 @@ def diagnose(
         first, ended = search, time.perf_counter()
         ready, search = otherwise_held(simulator, recordings, engine, ready, search, effects)
         search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - prepared_at
-    bench, without = ready.bench, ready.without
+    bench, without = search.bench, search.without
     search.base = without_idle_offsets(bench, search.base)
     gates = (*ready.gates, *tones(bench, search.base))
     accepted = [p for p in search.passes if p.accepted]

@@ -27,7 +27,7 @@ from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .imitated import imitated
 from .kinship import complements
-from .linearise import linearised
+from .linearise import along, linearised
 from .pairs import two_at_once
 from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
@@ -43,6 +43,9 @@ SEEN = 2.5e-5  # mean square error below which what is more than noise is not wo
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 POLISHED = 4  # candidates fitted to everything before one is chosen
 NOTHING = 0.01  # below this share nothing is explained
+LED_OUT = (
+    0.8  # share of the mean square that the simulator alone leaves at most where a law has led it out of a dead end
+)
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
 Seen = tuple[list[Scored], np.ndarray | None]
@@ -137,6 +140,9 @@ class Search:
             assert found.choice is not None
             before, passes = self.base, self.passes[:-1]
             self.base = found.choice.winner.fitted
+            if not number and self._led_out():
+                self.passes = []
+                return self._run(effects)
             prefer_what_leaves_nothing(self)
             put_more_finely(self)
             if number:
@@ -163,6 +169,22 @@ class Search:
         if not named or not explains(named, *left_open(self)):
             return 0.0
         return min(confidence(c, self) for c in named)
+
+    def _led_out(self) -> bool:
+        """Whether the simulator alone, fitted from where the first law has led its parameters, is far better.
+
+        Then it had stayed in a local minimum, and that is what the law has made up for.
+        """
+        try:
+            alone = self.bench.fit(self.bench.simulator, [self.base.values], states=self.base.begin, solver=THOROUGH)
+        except InputError:
+            return False
+        if alone.cost > LED_OUT * self.without.cost:
+            return False
+        self.without = self.base = alone
+        self.bench = replace(self.bench, typical=along(self.bench, alone))
+        self._lower_floor([alone])
+        return True
 
     def _wrongly_held(self) -> bool:
         """Whether, with the effects in place, inputs seem to do the other thing between samples."""

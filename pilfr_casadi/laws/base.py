@@ -153,6 +153,12 @@ class Law:
         """Whether at fitted values the law is hardly what its sentence says."""
         return False
 
+    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Start values that make it a law which it refines, fitted to `own`; none where it refines another."""
+        more = set(self.units) - set(plain.units)
+        refines = plain.strength and plain.units.items() <= self.units.items() and more <= set(self.strength)
+        return {**dict.fromkeys(more, 0.0), **own} if more and refines else {}
+
     def size(self, values: Mapping[str, Any]) -> int:
         """Free numbers of the law at fitted values."""
         return sum(int(np.sum(~p.fixed)) for p in self.parameters().values())

@@ -94,6 +94,9 @@ class TwoStageRelaxation(Relaxation):
         """Both dampers."""
         return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
 
+    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
+        return _in_two(self, own) if type(plain) is Relaxation else {}
+
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield from _two_times(local)
 
@@ -106,6 +109,12 @@ def _two_times(local: Local) -> Iterator[dict[str, Any]]:
     for i, fast in enumerate(times):
         for slow in times[i + 1 :]:
             yield {"T_1": float(fast), "T_2": float(slow)}
+
+
+def _in_two(law: Law, own: Mapping[str, Any]) -> dict[str, Any]:
+    """Two parts about as fast as the one of a creep fitted to `own`, together as strong."""
+    (strength,) = set(own) - {"T"}
+    return {**dict.fromkeys(law.strength, own[strength] / 2), "T_1": own["T"] / 2, "T_2": own["T"] * 2}
 
 
 class Creep(Relaxation):
@@ -142,6 +151,9 @@ class TwoStageCreep(Creep):
     def flow(self, z: Any, q: Any, p: Any) -> Any:
         """Both parts."""
         return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
+
+    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
+        return _in_two(self, own) if type(plain) is Creep else {}
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield from _two_times(local)
