@@ -1,6 +1,6 @@
 """Table 2 and Figs. 3, 7-11 of Krikelis et al. (2024): every model on the two-mass rig with a Masing spring.
 
-    python -m problems.table2                            every row, 29 minutes of processor time
+    python -m problems.table2                            every row, 24 minutes on two slow, busy cores
     python -m problems.table2 --rows PI-LFR LTI          only rows whose name contains one of these
     python -m problems.table2 --figures DIR              the figures as well, and what the paper says of them
 
