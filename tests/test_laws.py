@@ -239,3 +239,19 @@ def test_creep_of_a_signal_goes_on_in_its_direction(kind):
     bounds = kind().bounds(LOCAL)
     assert all(bounds[name] == (0.0, np.inf) for name in kind.strength)
     assert all(bounds[name][1] == 2 * LOCAL.duration for name in kind.units if name.startswith("T"))
+
+
+def test_steps_too_long_for_bouc_wen_do_not_run_away():
+    """A motion faster than what it was fitted to; the step's length alone, for q itself stays within q_0."""
+    law, p = BoucWen(), {"q_0": 1.0, "s": 0.9, "n": 0.9}
+
+    def rate(q):
+        return float(ca.evalf(law.flow(6.0, ca.DM(q), p)))
+
+    q = 0.0
+    for _ in range(30):
+        k = [rate(q)]
+        for share in (0.5, 0.5, 1.0):
+            k.append(rate(q + share * k[-1]))
+        q += (k[0] + 2 * k[1] + 2 * k[2] + k[3]) / 6
+    assert 0.5 < q < 8.0

@@ -170,8 +170,8 @@ class BoucWen(Law):
         return p.k_h * q
 
     def flow(self, dz: Any, q: Any, p: Any) -> Any:
-        """Equation of the hysteretic displacement q."""
-        size = (ca.fabs(q / p["q_0"]) + 1e-9) ** p["n"]
+        """Equation of the hysteretic displacement q, which stays within q_0 but for what a step is too long."""
+        size = (ca.fmin(ca.fabs(q / p["q_0"]), 1) + 1e-9) ** p["n"]
         return dz * (1 - (1 - p["s"]) * size) - p["s"] * ca.fabs(dz) * ca.sign(q) * size
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
