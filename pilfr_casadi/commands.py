@@ -26,11 +26,12 @@ from .metrics import NOTHING_SENTENCE, explains_nothing
 from .option_values import bounds, name_list, number, pairs
 from .order_selection import select_order
 from .progress import progress_bar
-from .readers import read
+from .readers import column_names, read
 from .recording import InputError, Recording, check_for_identification, listed
 from .sensitivities import VirtualMachine
 from .solution import Status
 from .structures import ANY, TAKES, named_structure
+from .timebase import TIME_NAMES
 
 LEAST = {"starts": 1, "seed": 0, "workers": 1, "operators": 0, "channels": 1, "hidden": 1, "lags": 1}
 # options of a search with their defaults; a saved model to start from has them already
@@ -186,11 +187,22 @@ def demo(options: argparse.Namespace) -> int:
     return run_demo(make_folder(options.out), options.workers)
 
 
-def read_file(options: argparse.Namespace, path: str, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Recording:
-    """A recording, as the options say."""
+def read_file(
+    options: argparse.Namespace, path: str, inputs: tuple[str, ...], outputs: tuple[str, ...], glance: bool = False
+) -> Recording:
+    """A recording, as the options say; at a glance columns may be given of names that are not asked for."""
     more = {key: getattr(options, key) for key in ("period", "hold", "skip", "dt", "time_tolerance")}
-    columns = pairs(options.column, "--column")
+    columns = columns_of(options, path)
+    if glance:
+        columns = {name: column for name, column in columns.items() if name in (*inputs, *outputs, *TIME_NAMES)}
     return read(path, inputs, outputs, columns=columns, initial=options.initial or "estimate", **more)
+
+
+def columns_of(options: argparse.Namespace, path: str) -> dict[str, str]:
+    """Name -> column of a file; one that has the name itself, and not the column, is as it should be."""
+    columns = pairs(options.column, "--column")
+    there = column_names(path, list(columns.values())) if columns else ()
+    return {name: column for name, column in columns.items() if column in there or name not in there}
 
 
 def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from .accepted import as_simulator
 from .cli import DONE, INTERRUPTED, NO_RESULT, say
-from .commands import make_folder, read_file
+from .commands import columns_of, make_folder, read_file
 from .export import load, write_atomically
 from .interrupts import deferred_interrupt, insistent
 from .load_simulator import simulator_variable
@@ -177,9 +177,8 @@ def _simulated_names(options: argparse.Namespace, train: Sequence[str]) -> tuple
     if options.inputs or options.outputs:
         raise InputError("Only one of --inputs and --outputs was given; give both.")
     files = [options.simulated, *train, *options.test]
-    columns = {v: k for k, v in pairs(options.column, "--column").items()}
-    shared = [n for n in column_names(files[0]) if all(n in column_names(f) for f in files[1:])]
-    shared = [columns.get(n, n) for n in shared if n not in TIME_NAMES and columns.get(n) not in TIME_NAMES]
+    first, *others = (_named(options, f) for f in files)
+    shared = [n for n in first if n not in TIME_NAMES and all(n in other for other in others)]
     inputs = tuple(n for n in shared if _alike(options, n, files)) or tuple(n for n in shared if n[:1] in "uU")
     if not inputs and len(shared) == 2:
         inputs = _cause(options, shared)
@@ -189,8 +188,29 @@ def _simulated_names(options: argparse.Namespace, train: Sequence[str]) -> tuple
             f"Which of the columns {listed(shared) or '(none is shared)'} of {files[0]} and the recordings are inputs "
             "is not to be seen; give --inputs NAMES and --outputs NAMES."
         )
+    _check_names(files, (first, *others), shared)
     print(f"inputs {listed(inputs)}, outputs {listed(outputs)}, as found in the files", flush=True)
     return inputs, outputs
+
+
+def _named(options: argparse.Namespace, path: str) -> list[str]:
+    """A file's columns by the names that options give them."""
+    names = {column: name for name, column in columns_of(options, path).items()}
+    return [names.get(column, column) for column in column_names(path)]
+
+
+def _check_names(files: Sequence[str], columns: Sequence[Sequence[str]], shared: Sequence[str]) -> None:
+    """Columns that the simulation has and a recording has not are told; perhaps they have another name there."""
+    first, *others = ([n for n in names if n not in TIME_NAMES and n not in shared] for names in columns)
+    for path, names, own in zip(files[1:], columns[1:], others, strict=True):
+        lost = [n for n in first if n not in names]
+        if lost and own:
+            raise InputError(
+                f"{files[0]} has {listed(lost)}, which {path} has not, and {path} has {listed(own)} of its own; say "
+                f"which are the same, as in --column {lost[0]}={own[0]}, or which to use, with --inputs and --outputs."
+            )
+        if lost:
+            print(f"note: {listed(lost)} of {files[0]} is left out, for {path} has no such column", flush=True)
 
 
 def _cause(options: argparse.Namespace, shared: Sequence[str]) -> tuple[str, ...]:
@@ -200,7 +220,7 @@ def _cause(options: argparse.Namespace, shared: Sequence[str]) -> tuple[str, ...
     errors = {}
     for name, other in (shared, shared[::-1]):
         try:
-            errors[name] = surrogate(read_file(options, options.simulated, (name,), (other,)), nx=4)[1]
+            errors[name] = surrogate(read_file(options, options.simulated, (name,), (other,), glance=True), nx=4)[1]
         except InputError:
             errors[name] = np.inf
     best = min(shared, key=lambda n: errors[n])
@@ -209,5 +229,5 @@ def _cause(options: argparse.Namespace, shared: Sequence[str]) -> tuple[str, ...
 
 def _alike(options: argparse.Namespace, name: str, files: Sequence[str]) -> bool:
     """Whether the simulation has the very samples of one of the recordings."""
-    first, *others = (read_file(options, f, (name,), ()).u for f in files)
+    first, *others = (read_file(options, f, (name,), (), glance=True).u for f in files)
     return any(len(o) == len(first) and bool(np.allclose(o, first, rtol=1e-6, atol=0.0)) for o in others)

@@ -21,6 +21,8 @@ from .expressions import Expression, Named, call
 from .parameters import Parameter, ParameterSet
 from .recording import InputError
 
+BUILT_IN = ("actuator:", "sensor:", "equation:")
+
 
 @dataclass(frozen=True, eq=False)
 class Port:
@@ -138,6 +140,11 @@ class Simulator:
         if len(set(names)) != len(names):
             raise InputError(f"The port names {', '.join(names)} are not unique; name each port once.")
         for port in self.ports:
+            if port.name.startswith(BUILT_IN):
+                raise InputError(
+                    f"The port {port.name!r} is declared with a name that begins as those of built-in ones do "
+                    f"({', '.join(BUILT_IN)}), which need no declaration; call it something else."
+                )
             self.into(port, x, u, named, t)
             self.across(port, x, u, named, t)
 

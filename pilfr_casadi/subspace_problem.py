@@ -131,8 +131,15 @@ class SubspaceProblem:
         return models
 
     def complete(self, A: Array, C: Array) -> tuple[Matrices, float]:
-        """Add the best `B` and `D` to `A` and scaled `C`; return the model and its relative error."""
-        blocks = self.reduced(A, C)
+        """Add the best `B` and `D` to `A` and scaled `C`; return the model and its relative error.
+
+        Where `A` is so far from normal that rounding makes it grow without end, the model has no dynamics.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            blocks = self.reduced(A, C)
+        if not all(np.all(np.isfinite(R)) for R in blocks):
+            n_u, C = len(self.u_scale), self.y_scale[:, None] * C
+            return Matrices(0 * A, np.zeros((len(A), n_u)), C, np.zeros((len(C), n_u))), np.inf
         theta = [least_squares(R[:, :-1], R[:, -1]) for R in blocks]
         BD = np.concatenate(theta).reshape(len(self.u_scale), -1)
         B, D = BD[:, : len(A)].T / self.u_scale, BD[:, len(A) :].T / self.u_scale

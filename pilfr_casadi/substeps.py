@@ -58,12 +58,18 @@ def growth(simulator: Simulator, recording: Recording) -> float:
 
 def wanted_substeps(simulator: Simulator, recordings: Sequence[Recording]) -> tuple[int, float]:
     """Sub-steps a sample that keep |λ| h below `REACH`, and the largest |λ|, rad/s; see `choose_substeps`."""
-    p, first = ParameterSet(dict(simulator.parameters)).start, recordings[0]
-    start = _start(simulator, first)
-    rate = float(np.nan_to_num(fastest(simulator, start[None], np.mean(first.u, axis=0)[None], p)[0], nan=1e12))
+    rate, first = at_begin(simulator, recordings[0]), recordings[0]
     if rate * first.dt > 8 * REACH:
-        rate = _along_a_run(simulator, first, p, start, rate)
+        p = ParameterSet(dict(simulator.parameters)).start
+        rate = _along_a_run(simulator, first, p, _start(simulator, first), rate)
     return max(1, int(np.ceil(rate * first.dt / REACH))), rate
+
+
+def at_begin(simulator: Simulator, recording: Recording) -> float:
+    """Largest |λ|, rad/s, where a recording begins; 1e12 where that is infinite."""
+    p, start = ParameterSet(dict(simulator.parameters)).start, _start(simulator, recording)
+    rate = fastest(simulator, start[None], np.mean(recording.u, axis=0)[None], p)[0]
+    return float(np.nan_to_num(rate, nan=1e12))
 
 
 def choose_substeps(simulator: Simulator, recordings: Sequence[Recording]) -> int:

@@ -116,6 +116,7 @@ def test_a_whole_diagnosis(capsys, files):
     assert found["verdict"] == "missing-physics"
     (effect,) = found["effects"]
     assert (effect["port"], effect["law"]) == ("ground-mass", "cubic_stiffness")
+    assert re.search(r"the simulator's own values, refitted:\n(  [kd] = .* given as [\d.]+\n){2}NRMSE", out)
     value = {name: p["value"] for name, p in effect["parameters"].items()}
     at_0_2 = value["k_3"] * 0.2**3 if "k_3" in value else value["k_n"] * 0.2 ** value["n"]
     assert at_0_2 == pytest.approx(32.0, rel=0.05)  # 4000 N/m^3 at 0.2 m
@@ -242,6 +243,31 @@ def test_inputs_of_a_simulation_are_the_columns_that_agree(capsys, files, truth,
     refused(capsys, *given, says=("--inputs", "(none is shared)"))
     refused(capsys, *given, "--inputs", "drive", says=("--inputs and --outputs",))
     refused(capsys, *given, "--inputs", "drive", "--outputs", "here", says=("test.csv", "'drive'"))
+
+
+def test_a_column_that_the_recordings_have_not_is_told(capsys, files, truth, monkeypatch):
+    seen = {}
+
+    def stop(simulator, recordings, **options):
+        seen["outputs"] = recordings[0].outputs
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose"), "diagnose", stop)
+    force, position = truth["train"]
+    time, given = np.arange(len(force)) * DT, arguments(files, simulator=None)[:4]
+    linear = np.convolve(force, 0.01 * 0.9 ** np.arange(200))[: len(force)]
+
+    def table(name, columns):
+        rows = np.column_stack([time, *columns.values()])
+        np.savetxt(files / name, rows, delimiter=",", header=",".join(["t", *columns]), comments="")
+
+    table("simulated.csv", {"force": force, "position": linear, "speed": np.gradient(linear, DT)})
+    status, out, _ = run(capsys, *given, "--out", files / "out")
+    assert status == 130 and "note: speed of" in out and "train.csv has no such column" in out
+    table("train.csv", {"force": force, "position": position, "v": np.gradient(position, DT)})
+    refused(capsys, *given, "--out", files / "out", says=("speed", "of its own", "--column speed=v"))
+    status, _, err = run(capsys, *given, "--out", files / "out", "--column", "speed=v")
+    assert status == 130 and seen["outputs"] == ("position", "speed"), err
 
 
 def test_a_saved_model_is_diagnosed_like_a_simulator(capsys, files, monkeypatch):

@@ -392,3 +392,9 @@ def test_misplaced_laws_are_refused():
     with pytest.raises(InputError, match="no port 'roof'"):
         rig().with_element("roof", CubicStiffness())
     assert ParameterSet(dict(rig().parameters)).size == 3
+
+
+def test_a_port_with_the_name_of_a_built_in_one_is_refused():
+    (port,) = rig().ports[:1]
+    with pytest.raises(InputError, match="'actuator:force' is declared"):
+        rig(ports=(replace(port, name="actuator:force"),))

@@ -21,6 +21,7 @@ from .workbench import QUICK, THOROUGH, Fitted, Workbench
 HEAD = 0.7  # share of each recording that candidates are fitted to
 WEAK, NO_WORSE = 2.0, 1.03  # standard errors within which a part of a law is idle, and error without it
 SHOWN = 3.0  # standard errors that a law's strength is from zero at least
+KNEES = (0.25, 4.0)  # times the width of a knee that a law is started from again
 LONG = 12000  # samples that candidates are fitted to
 
 
@@ -145,8 +146,9 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     bench = _as_fine(bench, candidate)
     placed = candidate.fitted.corrected()  # sub-steps for the law as it was fitted
     out = replace(candidate, head=np.inf, tail=np.inf, full=np.inf)
+    starts = [candidate.fitted.values, *_other_knees(candidate)]
     try:
-        fitted = bench.fit(placed, [candidate.fitted.values], states=candidate.fitted.initial, solver=THOROUGH)
+        fitted = bench.fit(placed, starts, states=candidate.fitted.initial, solver=THOROUGH)
     except InputError:
         return out
     if shown(bench, fitted) < SHOWN:
@@ -158,6 +160,15 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
         done = replace(done, head=finer.head, tail=finer.tail) if finer is not None else done
     plain = simpler(bench, done, deviations(bench, fitted))
     return done if plain is done else polish(bench, plain)
+
+
+def _other_knees(candidate: Candidate) -> list[dict[str, Any]]:
+    """Start values with a sharper and a wider knee: what steps make of a sharp one has minima of its own."""
+    knee = getattr(candidate.law, "knee", "")
+    if not knee:
+        return []
+    name = f"{candidate.element.prefix}{knee}"
+    return [{**candidate.fitted.values, name: times * candidate.fitted.values[name]} for times in KNEES]
 
 
 def _as_fine(bench: Workbench, candidate: Candidate) -> Workbench:
@@ -179,8 +190,10 @@ def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray
     doubt = {
         name: np.nan_to_num(WEAK * std[f"{element.prefix}{name}"]) if std else 0.0 for name in candidate.law.strength
     }
-    idle = [name for name, most in doubt.items() if np.all(np.abs(own[name]) <= most)]
-    if not idle or not getattr(plain, "units", {}) or not set(plain.units) <= set(own) - set(idle):
+    idle = {name for name, most in doubt.items() if np.all(np.abs(own[name]) <= most)}
+    units = set(getattr(plain, "units", {}))
+    less = set(candidate.law.strength) - units  # of several that are idle, one after the other
+    if not units or not less or not less <= idle or not units <= set(own):
         return candidate
     if not set(candidate.law.places) <= set(plain.places):
         return candidate

@@ -19,11 +19,12 @@ from ..recording import InputError
 from .floor import effective_size
 from .gates import CURED, STRAINED, Gate, slips
 from .linearise import linearised
+from .proof import mean_nrmse
 from .remainder import block_diagonal, moved, orthonormal
 from .workbench import THOROUGH, Fitted, Workbench
 
 ROOM = 12.0  # nats that an offset has to gain
-IDLE = 1.02  # times the mean square error that an offset which was none may take away
+STILL = 0.1  # of the value it was found with, that an offset has to keep beside effects to be told
 LEAST = 0.01  # share of the mean square that it has to take away
 WHOLE = 0.1  # share of the mean square that is left where the offsets were the mismatch
 
@@ -83,21 +84,31 @@ def offsets(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Ga
             found = other.fit(with_law, [plain.values], states=plain.initial, solver=THOROUGH)
         except InputError:
             break
-        n = max(effective_size(found.residual), 30.0)
-        if 0.5 * n * np.log(plain.cost / found.cost) - 0.5 * np.log(n) < ROOM:
+        if not _earned(plain, found):
             break
-        kind, name = port.split(":", 1)
-        value = float(found.values[with_law.elements[-1].prefix + "w_0"])
-        where, load = ("input", ", or a constant load acts like one") if kind == "actuator" else ("output", "")
-        sentence = (
-            f"The {where} {name} has a constant offset of about {value:.3g}{load}; with it as a parameter the refitted "
-            f"error falls from {plain.cost**0.5:.3g} to {found.cost**0.5:.3g} of the outputs' deviation."
+        parameter = f"{with_law.elements[-1].prefix}w_0"
+        value = float(found.values[parameter])
+        sentence = _told(port, value) + (
+            f"; with it as a parameter the refitted error falls from {mean_nrmse(bench, plain):.3g} to "
+            f"{mean_nrmse(bench, found):.3g} of the outputs' deviation."
         )
-        gates.append(Gate(name, "offset", value, sentence, True, parameter=with_law.elements[-1].prefix + "w_0"))
+        gates.append(Gate(port.split(":", 1)[1], "offset", value, sentence, True, parameter=parameter))
         bench, plain = other, found
         ports.remove(port)
     whole = plain.cost < WHOLE * before
     return bench, plain, [replace(g, fault=whole) for g in gates]
+
+
+def _earned(plain: Fitted, found: Fitted) -> bool:
+    """Whether a constant makes a fit that much better."""
+    n = max(effective_size(found.residual), 30.0)
+    return bool(0.5 * n * np.log(plain.cost / found.cost) - 0.5 * np.log(n) > ROOM)
+
+
+def _told(port: str, value: float) -> str:
+    kind, name = port.split(":", 1)
+    where, load = ("input", ", or a constant load acts like one") if kind == "actuator" else ("output", "")
+    return f"The {where} {name} has a constant offset of about {value:.3g}{load}"
 
 
 def another_zero(
@@ -120,7 +131,7 @@ def another_zero(
 
 
 def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
-    """A simulator with effects, its offsets held at zero where it does as well: an effect may have looked like one."""
+    """A simulator with effects, offsets that earn nothing held at zero: an effect may have looked like one."""
     before = len(bench.simulator.elements)
     placed = fitted.simulator.elements
     for element in placed[:before] if len(placed) > before else ():
@@ -134,6 +145,28 @@ def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
             found = bench.fit(simulator, [start], states=fitted.initial, solver=THOROUGH)
         except InputError:
             continue
-        if found.cost < IDLE * fitted.cost:
+        if not _earned(found, fitted):
             fitted = found
     return fitted
+
+
+def as_it_came_out(
+    gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
+) -> tuple[Gate, ...]:
+    """Findings with the offsets that are some still, at their fitted values, beside effects or none."""
+    out = []
+    for gate in gates:
+        if not gate.parameter:
+            out.append(gate)
+            continue
+        value, error = float(after.values[gate.parameter]), float(std[gate.parameter])
+        if not (abs(value) > 3 * error and abs(value) > STILL * abs(gate.value)):
+            continue
+        sentence = gate.sentence
+        if effects:  # what it came to without them says little
+            port = next(e.port for e in after.simulator.elements if gate.parameter.startswith(e.prefix))
+            sentence = f"{_told(port, value)}; it is a parameter of the corrected simulator."
+        if not sure:
+            sentence += " As long as the mismatch has no sure name, it may be a part of that."
+        out.append(replace(gate, value=value, sentence=sentence))
+    return tuple(out)

@@ -15,6 +15,7 @@ from .gates import Gate
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
+MOST = 8  # values of the simulator that are printed
 FAR = 3.0  # times the training error that a test error is worth a warning
 
 
@@ -138,13 +139,13 @@ class Diagnosis:
             names = ", ".join(f"{k} ({v:.4g})" for k, v in held.items())
             one = len(held) == 1
             out.append(
-                f"{names} came out at {'its bound' if one else 'their bounds'}; "
-                f"widen {'it' if one else 'them'}, or take it as a sign that more is missing."
+                f"{names} came out at {'its bound' if one else 'their bounds'}: more is missing, or "
+                f"{'it has' if one else 'they have'} too little room."
             )
         test, train = self.errors["test"], self.errors["train"]
         if test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"]):
             out.append(
-                "The test error is far above the training error: what was found does not hold there, or the test "
+                "The test error is far above the training error: what was found is only near what happens, or the test "
                 "recording visits what the training recordings do not."
             )
         return out
@@ -161,6 +162,7 @@ class Diagnosis:
             if e.indistinguishable:
                 others = ", ".join(f"{port}: {law}" for port, law in e.indistinguishable)
                 lines.append(f"  cannot be told apart from {others}")
+        lines += self._own()
         for kind in ("train", "test"):
             errors = self.errors[kind]
             if errors:
@@ -175,6 +177,26 @@ class Diagnosis:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+    def _own(self) -> list[str]:
+        """The simulator's own estimated values, those that moved most first."""
+        own = self.corrected.parameters
+        free = {k: p for k, p in self.parameters.items() if not own[k].fixed.all() and own[k].value.ndim == 0}
+        moved = sorted(free, key=lambda k: -abs(_change(free[k])))
+        lines = []
+        for name in moved[:MOST]:
+            p = free[name]
+            std = "" if p["std"] is None else f" ± {float(p['std']):.2g}"
+            value, nominal = float(p["refit_with"]), float(p["nominal"])
+            lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}")
+        more = [f"  and {len(moved) - MOST} more"] if len(moved) > MOST else []
+        return ["the simulator's own values, refitted:", *lines, *more] if lines else []
+
+
+def _change(row: Mapping[str, Any]) -> float:
+    """Share by which a parameter has moved."""
+    nominal = float(row["nominal"])
+    return (float(row["refit_with"]) - nominal) / (abs(nominal) or 1e-300)
 
 
 def plain(value: Any) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from ..accepted import as_simulator
 from ..interrupts import Progress
 from ..laws import CATALOGUE, SCALABLE, Law, readable_unit, scaled
-from ..recording import InputError, Recording, as_recordings, check_for_identification
+from ..recording import InputError, Recording, as_recordings, check_for_identification, listed
 from ..threads import one_blas_thread, processors
 from .arranged import arranged
 from .candidate import Candidate
@@ -21,11 +20,12 @@ from .experiment import next_experiment, placebo
 from .gates import Gate, said_hold
 from .held import held_value
 from .mismatch import mismatch
-from .offset import without_idle_offsets
+from .offset import as_it_came_out
 from .other_hold import doubted, otherwise_held
 from .prepare import prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
+from .review import let_idle_offsets_go
 from .search import Pass, Search
 from .tones import tones
 from .undeclared import beyond_the_ports
@@ -93,11 +93,12 @@ def diagnose(
                 f"The test recording's step is {r.dt:g} s, the training's {recordings[0].dt:g} s; resample it."
             )
     for name, most in (limits or {}).items():
-        if name not in simulator.inputs or not most > 0:
+        if name not in simulator.inputs:
             raise InputError(
-                f"The limit {name}={most!r} is no amplitude of an input; give a positive number for any of "
-                f"{', '.join(simulator.inputs)}."
+                f"A limit was given for {name!r}, which is no input; there are {listed(simulator.inputs)}."
             )
+        if not most > 0:
+            raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")
     laws = (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
     say("refit", 0, 1, np.inf)
     ready = prepare(simulator, recordings, hold, engine, workers)
@@ -109,7 +110,7 @@ def diagnose(
         ready, search = otherwise_held(simulator, recordings, engine, ready, search, effects)
         search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - prepared_at
     bench, without = search.bench, search.without
-    search.base = without_idle_offsets(bench, search.base)
+    let_idle_offsets_go(search)
     gates = (*ready.gates, *tones(bench, search.base))
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
@@ -145,7 +146,7 @@ def diagnose(
         sentence=sentence,
         effects=effects_found,
         candidates=tuple(_row(c, p) for p in search.passes for c in p.candidates),
-        gates=tuple(g if settled else _apparent(g) for g in gates if _still(g, after, std)),
+        gates=as_it_came_out(gates, after, std, bool(effects_found), settled),
         mismatch=mismatch(
             bench.recordings,
             without.residual,
@@ -210,23 +211,6 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
         indistinguishable=(*([choice.common] if choice.common else []), *(c.name for c in choice.alike)),
         form=winner.law.form,
         placebo={"own": own, "unrelated": unrelated},
-    )
-
-
-def _still(gate: Gate, after: Fitted, std: dict[str, np.ndarray]) -> bool:
-    """Whether an offset is still one with the effects in place."""
-    if not gate.parameter:
-        return True
-    value, error = float(after.values[gate.parameter]), float(std[gate.parameter])
-    return abs(value) > 3 * error and abs(value) > 0.1 * abs(gate.value)
-
-
-def _apparent(gate: Gate) -> Gate:
-    """An offset beside a mismatch that stays unexplained, or has no sure name, may be a part of that."""
-    if gate.finding != "offset":
-        return gate
-    return replace(
-        gate, sentence=f"{gate.sentence} As long as the mismatch has no sure name, it may be a part of that."
     )
 
 

@@ -31,6 +31,8 @@ FREE = 0.3  # share by which parameters may move
 EXACT = 1e-3  # NRMSE at which no higher order is looked for
 HIGHEST = 8
 SMALL = 1e-3  # share of an output below which a coefficient is held
+# how inputs drive a mode's displacement and its rate, and how outputs see them
+GAINS, SEEN = ("gain on the displacement of", "gain of"), ("seen in", "rate seen in")
 Array = np.ndarray
 
 
@@ -129,79 +131,73 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
         held = abs(value) <= SMALL * size
         parameters[name] = Parameter(value, unit=unit, bounds=(value - reach, value + reach), fixed=held)
 
-    for i, mode in enumerate(found, 1):
-        speed = np.array([1.0, max(abs(mode.value), 1 / (len(like) * like.dt))])[
-            : len(mode.into)
-        ]  # v is this much larger than q
+    for i, (name, mode) in enumerate(zip(names, found, strict=True), 1):
+        of = f"mode {name}: "
+        # v is this much larger than q
+        speed = np.array([1.0, max(abs(mode.value), 1 / (len(like) * like.dt))])[: len(mode.into)]
         entering = float(np.max(np.abs(mode.into) * (speed[::-1])[:, None]))
         leaving = float(np.max(np.abs(mode.out) * speed))
         if mode.spring:
             rate = max(abs(mode.value), 1 / (len(like) * like.dt))
-            free(f"stiffness{i}", mode.spring[0], "1/s^2", rate**2)
-            free(f"drag{i}", mode.spring[1], "1/s", rate)
+            free(f"{of}stiffness", mode.spring[0], "1/s^2", rate**2)
+            free(f"{of}drag", mode.spring[1], "1/s", rate)
             states += [f"q{i}", f"v{i}"]
         elif mode.second_order:
             w = abs(mode.value)
-            free(f"frequency{i}", w / (2 * np.pi), "Hz")
-            free(f"damping{i}", -mode.value.real / w)
+            free(f"{of}frequency", w / (2 * np.pi), "Hz")
+            free(f"{of}damping", -mode.value.real / w)
             states += [f"q{i}", f"v{i}"]
         else:
-            parameters[f"rate{i}"] = _rate(-mode.value.real)
+            free(f"{of}rate", -mode.value.real, "1/s")
             states.append(f"q{i}")
-        kinds = ("rate_gain", "gain") if mode.second_order else ("gain",)
-        for row, kind, faster in zip(mode.into, kinds, speed[::-1], strict=True):
-            for name, value in zip(inputs, row, strict=True):
+        for row, kind, faster in zip(mode.into, GAINS[-len(speed) :], speed[::-1], strict=True):
+            for other, value in zip(inputs, row, strict=True):
                 if value == 1.0:  # the gain of the strongest input is one; what is seen of the mode has its size
-                    parameters[f"{kind}{i}_{name}"] = Parameter(1.0, fixed=True)
+                    parameters[f"{of}{kind} {other}"] = Parameter(1.0, fixed=True)
                 else:
-                    free(f"{kind}{i}_{name}", float(value), size=entering / faster)
-        for column, kind, faster in zip(mode.out.T, ("shape", "rate_shape")[: len(speed)], speed, strict=True):
-            for name, value in zip(outputs, column, strict=True):
-                free(f"{kind}{i}_{name}", float(value), like.units.get(name, ""), leaving / faster)
+                    free(f"{of}{kind} {other}", float(value), size=entering / faster)
+        for column, kind, faster in zip(mode.out.T, SEEN, speed, strict=False):
+            for other, value in zip(outputs, column, strict=True):
+                free(f"{of}{kind} {other}", float(value), like.units.get(other, ""), leaving / faster)
     spreads, moved = np.std(like.y[like.skip :], axis=0), np.std(like.u, axis=0)
     for name, row, spread in zip(outputs, matrices[3], spreads, strict=True):
         for other, value, push in zip(inputs, row, moved, strict=True):
-            free(f"direct_{name}_{other}", float(value), size=float(spread / max(push, 1e-300)))
+            free(f"direct: {other} in {name}", float(value), size=float(spread / max(push, 1e-300)))
     for name, value, spread in zip(outputs, offset, spreads, strict=True):
-        parameters[f"offset_{name}"] = Parameter(value, bounds=(value - spread, value + spread))
+        parameters[f"offset: {name}"] = Parameter(value, bounds=(value - spread, value + spread))
 
-    def driven(u: Named, p: Named, kind: str, i: int) -> Any:
-        return sum((p[f"{kind}{i}_{n}"] * u[n] for n in inputs), start=ca.SX(0))
+    def driven(u: Named, p: Named, of: str, kind: str) -> Any:
+        return sum((p[f"{of}{kind} {n}"] * u[n] for n in inputs), start=ca.SX(0))
 
     def dynamics(x: Named, u: Named, p: Named) -> dict[str, Any]:
         out: dict[str, Any] = {}
-        for i, mode in enumerate(found, 1):
+        for i, (name, mode) in enumerate(zip(names, found, strict=True), 1):
+            of = f"mode {name}: "
             if mode.second_order:
                 q, v = x[f"q{i}"], x[f"v{i}"]
                 if mode.spring:
-                    pull = p[f"stiffness{i}"] * q + p[f"drag{i}"] * v
+                    pull = p[f"{of}stiffness"] * q + p[f"{of}drag"] * v
                 else:
-                    w = 2 * np.pi * p[f"frequency{i}"]
-                    pull = w**2 * q + 2 * p[f"damping{i}"] * w * v
-                out[f"q{i}"] = v + driven(u, p, "rate_gain", i)
-                out[f"v{i}"] = driven(u, p, "gain", i) - pull
+                    w = 2 * np.pi * p[f"{of}frequency"]
+                    pull = w**2 * q + 2 * p[f"{of}damping"] * w * v
+                out[f"q{i}"] = v + driven(u, p, of, GAINS[0])
+                out[f"v{i}"] = driven(u, p, of, GAINS[1]) - pull
             else:
-                out[f"q{i}"] = -p[f"rate{i}"] * x[f"q{i}"] + driven(u, p, "gain", i)
+                out[f"q{i}"] = -p[f"{of}rate"] * x[f"q{i}"] + driven(u, p, of, GAINS[1])
         return out
 
     def seen(x: Named, u: Named, p: Named) -> dict[str, Any]:
         out: dict[str, Any] = {}
         for name in outputs:
-            y = p[f"offset_{name}"] + sum((p[f"direct_{name}_{n}"] * u[n] for n in inputs), start=ca.SX(0))
-            for i, mode in enumerate(found, 1):
-                y = y + p[f"shape{i}_{name}"] * x[f"q{i}"]
-                if mode.second_order:
-                    y = y + p[f"rate_shape{i}_{name}"] * x[f"v{i}"]
+            y = p[f"offset: {name}"] + sum((p[f"direct: {n} in {name}"] * u[n] for n in inputs), start=ca.SX(0))
+            for i, (label, mode) in enumerate(zip(names, found, strict=True), 1):
+                for state, kind in zip("qv", SEEN[: len(mode.into)], strict=False):
+                    y = y + p[f"mode {label}: {kind} {name}"] * x[f"{state}{i}"]
             out[name] = y
         return out
 
     ports = tuple(_port(f"mode:{name}", i, mode) for i, (name, mode) in enumerate(zip(names, found, strict=True), 1))
     return Simulator(dynamics, seen, tuple(states), inputs, parameters, ports, units=dict(like.units))
-
-
-def _rate(value: float) -> Parameter:
-    reach = FREE * abs(value)
-    return Parameter(value, unit="1/s", bounds=(value - reach, value + reach))
 
 
 def _port(name: str, i: int, mode: Mode) -> Port:

@@ -18,7 +18,7 @@ from ..problem import Problem
 from ..recording import InputError, Recording
 from ..sensitivities import Engine
 from ..simulator import Simulator
-from ..substeps import MOST, REACH, choose_substeps, fastest, growth, wanted_substeps
+from ..substeps import MOST, REACH, at_begin, choose_substeps, fastest, growth, wanted_substeps
 from ..threads import one_at_a_time
 from .arranged import arranged
 from .standing import standing, stands
@@ -130,6 +130,8 @@ class Workbench:
             return self.substeps
         wanted = wanted_substeps(simulator, self.recordings)[0]
         wanted = wanted if wanted <= MOST else 0
+        if any(getattr(e.law, "knee", "") for e in simulator.elements):  # passed at every reversal, if not stood on
+            wanted = max(wanted, int(np.ceil(at_begin(simulator, self.recordings[0]) * self.dt / REACH)))
         if self.typical is not None:  # a contact is not felt at rest
             p = ParameterSet(dict(simulator.parameters)).start
             rates = fastest(simulator, *self.typical, p)

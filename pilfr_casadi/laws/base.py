@@ -109,6 +109,8 @@ class Law:
         Its memory is a shift register, which takes in the signal at the begin of a step.
     substeps : int
         Integration steps a sample that it needs at least.
+    knee : str
+        Parameter over whose width, of speed about rest, the force turns round; steps have to be fine there.
     scaled_by : str
         Input that the force is multiplied by, where there is one; see `composed.scaled`.
     """
@@ -128,6 +130,7 @@ class Law:
     follows: ClassVar[int] = 0
     shifts: ClassVar[bool] = False
     substeps: ClassVar[int] = 1
+    knee: ClassVar[str] = ""
     scaled_by: ClassVar[str] = ""
 
     values: Mapping[str, Any] = field(default_factory=dict)

@@ -14,6 +14,7 @@ from .base import Law, Local, grid
 KNEE = 0.15  # of the speed at which friction has fallen, that its reversal may take
 SPRINGY = 0.08  # of half the travel, beyond which a contact that springs back is an elasto-plastic part
 MOST = 0.6  # of half the travel, the widest that is tried
+SHARPEST = 1e-4  # of the speed, the narrowest reversal: steps see no narrower one
 WIDE = 0.4  # of the widest reversal that is tried, beyond which it is damping that gives way rather than dry friction
 
 
@@ -28,6 +29,7 @@ class CoulombFriction(Law):
     units: ClassVar[Mapping[str, str]] = {"F_c": "w", "v_0": "z/s"}
     strength: ClassVar[tuple[str, ...]] = ("F_c",)
     dissipative = True
+    knee = "v_0"
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.F_c * ca.tanh(dz / p.v_0)
@@ -36,7 +38,7 @@ class CoulombFriction(Law):
         yield from grid(v_0=local.speed * np.array([0.005, 0.02, 0.06, 0.15]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"v_0": (2e-3 * local.speed, 0.5 * local.speed)}
+        return {"v_0": (SHARPEST * local.speed, 0.5 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """A reversal over much of the speeds there are: the force depends on speed nearly everywhere."""
@@ -118,7 +120,7 @@ class StribeckFriction(CoulombFriction):
                 yield {"v_s": v_s * local.speed, "v_0": v_0 * v_s * local.speed}
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (2e-3 * local.speed, 0.3 * local.speed)}
+        return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (SHARPEST * local.speed, 0.3 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """A knee as wide as the range over which friction falls, or a fall that goes on over all speeds.

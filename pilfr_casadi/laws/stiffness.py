@@ -220,7 +220,7 @@ class SlackSpring(Clearance):
 
     form = "in its own spring"
     equation = "w = -k_g clip(z, -g, g)"
-    sentence = "a clearance in line with a spring that is modelled: it carries load only beyond a gap on either side"
+    sentence = "a clearance in line with a spring of stiffness k_g that is modelled: it carries load only beyond a gap"
     restoring = True  # it takes of a spring away
 
     def force(self, z: Any, p: Any) -> Any:
@@ -232,7 +232,9 @@ class SlackCoupling(SlackSpring):
 
     form = "in its own coupling"
     equation = "w = -k_g clip(z, -g, g) - c_g dz/dt (|z| < g)"
-    sentence = "a clearance in line with a coupling that is modelled: its spring and damper act only beyond a gap"
+    sentence = (
+        "a clearance in line with a coupling that is modelled: its spring k_g and damper c_g act only beyond a gap"
+    )
     units: ClassVar[Mapping[str, str]] = {"k_g": "w/z", "c_g": "w*s/z", "g": "z"}
     strength: ClassVar[tuple[str, ...]] = ("k_g", "c_g")
 

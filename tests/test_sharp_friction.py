@@ -1,0 +1,93 @@
+"""Friction that turns round at once, and offsets that it had looked like."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from diagnosis_rig import DT, recordings, rig
+
+import pilfr_casadi as pilfr
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose.candidate import Candidate
+from pilfr_casadi.diagnose.choice import Choice
+from pilfr_casadi.diagnose.offset import Offset
+from pilfr_casadi.diagnose.review import let_idle_offsets_go
+from pilfr_casadi.diagnose.search import Pass
+from pilfr_casadi.diagnose.workbench import FINER, Workbench
+from pilfr_casadi.integration import discretise
+from pilfr_casadi.laws import AsymmetricFriction, CoulombFriction
+from pilfr_casadi.simulator import Simulator
+
+F_C = 6.0
+
+
+def carriage(friction=None, mass=1.5, drag=6.0):
+    """A carriage on a guide, by itself or with friction in its equations."""
+
+    def dynamics(x, u, p):
+        return dict(pos=x.vel, vel=(u.force - p.d * x.vel - (friction(x.vel) if friction else 0)) / p.m)
+
+    return Simulator(
+        dynamics,
+        lambda x: dict(position=x.pos),
+        ("pos", "vel"),
+        ("force",),
+        dict(
+            m=pilfr.Parameter(mass, unit="kg", bounds=(0.3, 6)), d=pilfr.Parameter(drag, unit="N s/m", bounds=(0, 60))
+        ),
+        (pilfr.Port("guide", lambda p: dict(vel=-1 / p.m), lambda x: x.pos, lambda x: x.vel, "N", "m"),),
+    )
+
+
+def ran(seed, v_0):
+    """A record of the carriage whose friction turns round within v_0, m/s; 40 steps a sample, from rest."""
+    import casadi as ca
+
+    rng, m = np.random.default_rng(seed), 1500
+    force = 25 * pilfr.multisine(m, f_max=15.0, fs=1 / DT, rng=rng)
+    blank = pilfr.Recording(force, force, DT, ("force",), ("position",), initial="zero", hold="zero")
+    model = discretise(carriage(lambda v: F_C * ca.tanh(v / v_0)), DT, "zero", 40)
+    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(2))[0]
+    return blank.with_(y=y + 2e-4 * np.std(y) * rng.standard_normal(y.shape))
+
+
+@pytest.mark.parametrize("v_0", [5e-4, 1e-4])
+def test_friction_that_turns_round_at_once_is_named_as_what_it_is(v_0):
+    train, test = ran(0, v_0), ran(1, v_0)
+    found = pilfr.diagnose(carriage(mass=1.7, drag=5.0), train, test=test)
+    (effect,) = found.effects
+    assert (effect.port, effect.law, effect.form) == ("guide", "coulomb_friction", "smooth"), str(found)
+    assert effect.confidence > 0.9
+    assert effect.parameters["F_c"]["value"] == pytest.approx(F_C, rel=2e-3)
+    assert found.errors["test"]["after"] < 2 * found.floor["nrmse"]
+    assert effect.parameters["v_0"]["value"] < 2 * v_0
+    assert not [g for g in found.gates if g.finding == "offset"]
+
+
+def test_a_sharp_knee_gets_finer_steps_whatever_its_sharpness():
+    record = ran(0, 1e-3).slice(0, 300)
+    bench = Workbench.of(carriage(), [record], "zero")
+    for v_0 in (1e-2, 1e-3, 1e-4, 1e-6):
+        law = CoulombFriction(values={"F_c": F_C, "v_0": v_0})
+        counts = bench.model(bench.simulator.with_element("guide", law)).substeps
+        assert counts == FINER * bench.substeps or v_0 > 1e-3
+
+
+def test_an_offset_and_what_a_law_holds_against_it_go_together():
+    placed = rig().with_element("actuator:force", Offset())
+    law = AsymmetricFriction().at({"v_0": 0.01}, {"v_0": (1e-4, 1.0), "F_c": (0.0, np.inf)})
+    true = CoulombFriction(values={"F_c": 4.0, "v_0": 0.01})
+    bench = Workbench.of(placed, recordings(true, count=1), "zero")
+    both = placed.with_element("ground-m1", law)
+    start = {"actuator:force.w_0": 2.0, "ground-m1.F_c": 4.0, "ground-m1.F_0": 2.0, "ground-m1.v_0": 0.01}
+    fitted = bench.fit(both, [start])
+    winner = Candidate("ground-m1", law, fitted, fitted.cost, fitted.cost, 3, fitted.cost)
+    choice = Choice(winner, (), 100.0, 0.0, 10.0)
+    found = Pass(choice, (winner,), (), (1.0, 1.0), True)
+    search = SimpleNamespace(bench=bench, base=fitted, passes=[found])
+    let_idle_offsets_go(search)
+    assert (
+        search.base.values["actuator:force.w_0"] == 0 and search.base.simulator.parameters["actuator:force.w_0"].fixed
+    )
+    assert type(search.passes[0].choice.winner.law) is CoulombFriction
+    assert search.base.values["ground-m1.F_c"] == pytest.approx(4.0, rel=0.02)
