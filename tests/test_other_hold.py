@@ -16,11 +16,7 @@ def named(port, law, **values):
     """A fitted candidate, as far as `within` reads it."""
     element = Placed(port, law, "l.")
     own = element.named({k: p.value for k, p in law.parameters().items()} | values)
-    fitted = SimpleNamespace(
-        values=own,
-        simulator=SimpleNamespace(elements=[element]),
-        model=SimpleNamespace(parameters=dict.fromkeys(own)),
-    )
+    fitted = SimpleNamespace(values=own, simulator=SimpleNamespace(elements=[element]))
     return Candidate(port, law, fitted, 1.0, 1.0, 1)
 
 
@@ -47,12 +43,12 @@ def test_what_acts_within_a_sample_may_be_the_other_hold(found, within):
 
 @pytest.mark.parametrize("stops", [KeyboardInterrupt, other_hold.InputError])
 def test_what_ends_the_other_search_leaves_the_one_there_is(stops, monkeypatch):
-    def prepare(*_):
+    def ended(*_):
         raise stops("ended")
 
-    monkeypatch.setattr(other_hold, "prepare", prepare)
+    monkeypatch.setattr(other_hold, "prepared_search", ended)
     bench = SimpleNamespace(otherwise_held=lambda: SimpleNamespace(hold="linear"))
-    search, ready = SimpleNamespace(bench=bench, misheld=1.0, workers=1, interrupted=False), object()
+    search, ready = SimpleNamespace(bench=bench, misheld=1.0, workers=1, interrupted=False, laws=(), say=None), object()
     assert other_hold.otherwise_held(None, (), "auto", ready, search, 2) == (ready, search)
     assert search.interrupted is (stops is KeyboardInterrupt)
 
@@ -68,9 +64,7 @@ def test_where_nothing_is_missing_with_the_other_hold_that_is_taken(unsure, take
         unsure=lambda: unsure,
         certainty=lambda: 0.0,
     )
-    again.run = lambda most: again
-    monkeypatch.setattr(other_hold, "prepare", lambda *_: other)
-    monkeypatch.setattr(other_hold, "Search", lambda *_: again)
+    monkeypatch.setattr(other_hold, "prepared_search", lambda *_: (other, again))
     monkeypatch.setattr(other_hold, "hold_note", lambda *_: "held")
     monkeypatch.setattr(other_hold, "replace", lambda of, gates: of)
     bench = SimpleNamespace(otherwise_held=lambda: SimpleNamespace(hold="linear"))

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from diagnosis_rig import DT, recordings, rig
 
+import pilfr_casadi as pilfr
+from pilfr_casadi.diagnose import prepare, prepared_search
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.proof import deviations, shown
 from pilfr_casadi.diagnose.rivals import WIDER, rivals_beside
@@ -108,6 +110,58 @@ def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
     search = Search(bench, stuck, Floor(np.full(1, 1e-3), "estimated"), (), 1, lambda *_: None)
     search.base = bench.fit(rig().with_element("ground-m1", CubicStiffness()))
     assert search._led_out()
-    assert search.without.cost < 1e-3 * stuck.cost and search.base is search.without
+    alone = bench.fit(rig(), [search.led_to])
+    assert alone.cost < 1e-3 * stuck.cost
+    search.without, search.led_to = alone, {}
     search.base = bench.fit(rig().with_element("ground-m1", CubicStiffness()))
-    assert not search._led_out()
+    assert not search._led_out() and not search.led_to
+
+
+@pytest.fixture
+def stuck_refit(monkeypatch):
+    """Recordings that lack nothing, of a simulator whose refit stays in a local minimum."""
+    refit = prepare.refitted
+
+    def stuck(bench, starts=()):
+        if starts:
+            return refit(bench, starts)
+        return bench.fit(bench.simulator, solver=GaussNewton(max_iterations=1))
+
+    monkeypatch.setattr(prepare, "refitted", stuck)
+    return recordings(None, count=1)
+
+
+def test_a_shift_that_only_led_out_of_a_dead_end_is_no_fault(stuck_refit):
+    found = pilfr.diagnose(rig((1.4, 0.8, 0.8, 1.2)), stuck_refit)
+    assert (found.verdict, found.gates) == ("complete", ()), str(found)
+
+
+def test_a_search_begins_anew_from_where_a_law_has_led(monkeypatch):
+    begun, values = [], {"k1": 3.0}
+
+    class Led:
+        def __init__(self, *given, may_be_led=True):
+            self.may_be_led, self.interrupted, self.times = may_be_led, False, {"fits": 2.0}
+            self.led_to, self.passes, self.base, self.without = {}, ["a law"], None, "refitted"
+
+        def run(self, effects):
+            self.led_to = values if self.may_be_led else {}
+            return self
+
+    def prepare(*given):
+        begun.append(given[5:])
+        if stops and len(begun) == 2:
+            raise KeyboardInterrupt
+        return SimpleNamespace(bench=None, without=None, floor=None)
+
+    monkeypatch.setattr(prepared_search, "prepare", prepare)
+    monkeypatch.setattr(prepared_search, "Search", Led)
+    given = rig(), (), "zero", "auto", (), 1, None, True, 2
+    stops = False
+    _, search = prepared_search.prepared_search(*given)
+    assert begun == [(), ([values],)] and not search.may_be_led
+    assert list(search.times) == ["gates and refit", "fits"]
+    begun.clear()
+    stops = True
+    _, search = prepared_search.prepared_search(*given)
+    assert search.interrupted and search.passes == [] and search.base == "refitted"

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..recording import InputError, Recording
 from .gates import hold_note
-from .prepare import Prepared, prepare
+from .prepare import Prepared
+from .prepared_search import prepared_search
 from .search import MISHELD, Search
 
 
@@ -33,21 +34,21 @@ def otherwise_held(
     wrong = search.misheld > MISHELD
     try:
         hold = search.bench.otherwise_held().hold
-        other = prepare(simulator, recordings, hold, engine, search.workers)
-        for most in (effects,) if wrong else (1, effects):  # one effect shows whether it is worth the search for two
-            again = Search(other.bench, other.without, other.floor, search.laws, search.workers, search.say).run(most)
-            if not wrong and again.base.cost > search.base.cost:
-                search.interrupted = again.interrupted
-                return ready, search
-            if again.interrupted or not again.much():
-                break
+        given = simulator, recordings, hold, engine, search.laws, search.workers, search.say, True
+        # one effect shows whether it is worth the search for two
+        other, again = prepared_search(*given, effects if wrong else 1)
+        nearer = again.base.cost <= search.base.cost
+        if not wrong and nearer and effects > 1 and again.much() and not again.interrupted:
+            other, again = prepared_search(*given, effects, other)
+            nearer = again.base.cost <= search.base.cost
     except InputError:  # it cannot be run so
         return ready, search
     except KeyboardInterrupt:
         search.interrupted = True
         return ready, search
     nothing = not any(p.accepted for p in again.passes) and not again.unsure()  # is missing, where inputs do the other
-    if not wrong and not nothing and again.certainty() <= search.certainty():
+    surer = nearer and (nothing or again.certainty() > search.certainty())
+    if not wrong and not surer:
         search.interrupted = again.interrupted
         return ready, search
     ratio = search.misheld if wrong else float(np.sqrt(search.base.cost / max(again.base.cost, 1e-300)))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -48,9 +49,14 @@ class Prepared:
 
 
 def prepare(
-    simulator: Simulator, recordings: Sequence[Recording], hold: str | None, engine: str, workers: int = 1
+    simulator: Simulator,
+    recordings: Sequence[Recording],
+    hold: str | None,
+    engine: str,
+    workers: int = 1,
+    starts: Sequence[Mapping[str, Any]] = (),
 ) -> Prepared:
-    """Open the bench, look at the dull causes, refit, and measure the floor."""
+    """Open the bench, look at the dull causes, refit from the user's values and from `starts`, measure the floor."""
     recordings, spikes = without_glitches(recordings)
     recordings, transients = without_transients(recordings)
     bench, gates = opened(simulator, recordings, hold or "zero", engine)
@@ -58,18 +64,19 @@ def prepare(
     between, notes = choose_hold(simulator, bench.recordings, hold, engine)
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, bench.model(simulator))
-    without = refitted(bench)
+    without = refitted(bench, starts)
     unsaid = said_hold(simulator, recordings, hold) is None
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     noise2 = float(np.mean((first.deviation / bench.scale) ** 2))
     if without.cost > SUSPECT * noise2 and without.cost > LEAST:
         raw, found = bench, _slips(bench, without, noise2, unsaid, workers)
+        without = found[1]
         if found[2]:  # what looked better on wrong data says nothing
             asked, (between, notes) = between, choose_hold(simulator, found[0].recordings, hold, engine)
             if between != asked:  # of two units that are near, the wrong hold may have fitted the wrong one
                 found = _slips_again(raw, between, noise2, unsaid, workers) or found
             bench = Workbench.of(simulator, found[0].recordings, between, engine)
-            without = bench.fit(simulator, [found[1].values, {}], solver=THOROUGH)
+            without = bench.fit(simulator, [found[1].values, {}, *starts], solver=THOROUGH)
             gates = [*gates, *found[2]]
     gates = [*gates, *notes]
     bench, without, more = unclip(bench, without)
@@ -117,7 +124,7 @@ def _slips(
     if not found[2] or found[1].cost <= STRAINED:
         return found
     late = timing(bench, without, noise2, 0.5 if unsaid else 1.0)
-    return late if late[2] and late[1].cost < CURED * found[1].cost else found
+    return late if late[1].cost < CURED * found[1].cost else found
 
 
 def _slips_again(
@@ -132,9 +139,9 @@ def _slips_again(
     return found if found[2] else None
 
 
-def refitted(bench: Workbench) -> Fitted:
-    """The simulator fitted from the user's values; where that stays far off, led there by an observer as well."""
-    plain = bench.fit(bench.simulator, solver=THOROUGH)
+def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitted:
+    """The simulator fitted from the user's values and from others; far off, led there by an observer as well."""
+    plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
     if plain.cost < FAR:
         return plain
     probe, runs = linearised(bench, as_given(bench, plain))

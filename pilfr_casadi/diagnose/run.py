@@ -22,7 +22,7 @@ from .held import held_value
 from .mismatch import mismatch
 from .offset import as_it_came_out
 from .other_hold import doubted, otherwise_held
-from .prepare import prepare
+from .prepared_search import prepared_search
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .review import let_idle_offsets_go
@@ -101,14 +101,12 @@ def diagnose(
             raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")
     laws = (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
     say("refit", 0, 1, np.inf)
-    ready = prepare(simulator, recordings, hold, engine, workers)
-    prepared_at = time.perf_counter()
     said = said_hold(simulator, recordings, hold) is not None
-    search = Search(ready.bench, ready.without, ready.floor, laws, workers, say, said).run(effects)
+    ready, search = prepared_search(simulator, recordings, hold, engine, laws, workers, say, said, effects)
     if not said and doubted(search):
         first, ended = search, time.perf_counter()
         ready, search = otherwise_held(simulator, recordings, engine, ready, search, effects)
-        search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - prepared_at
+        search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - began
     bench, without = search.bench, search.without
     let_idle_offsets_go(search)
     gates = (*ready.gates, *tones(bench, search.base))
@@ -140,7 +138,7 @@ def diagnose(
         verdict in ("complete", "recording-fault") or min((e.confidence for e in effects_found), default=0) > UNSURE
     )
     now = time.perf_counter()
-    times = {"gates and refit": prepared_at - began, **search.times, "proof": now - searched_at}
+    times = {**search.times, "proof": now - searched_at}
     return Diagnosis(
         verdict=verdict,
         sentence=sentence,

@@ -8,7 +8,7 @@ share a port, when the second removes nearly all. What was accepted is looked at
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -27,7 +27,7 @@ from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .imitated import imitated
 from .kinship import complements
-from .linearise import along, linearised
+from .linearise import linearised
 from .pairs import two_at_once
 from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
@@ -43,9 +43,7 @@ SEEN = 2.5e-5  # mean square error below which what is more than noise is not wo
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 POLISHED = 4  # candidates fitted to everything before one is chosen
 NOTHING = 0.01  # below this share nothing is explained
-LED_OUT = (
-    0.8  # share of the mean square that the simulator alone leaves at most where a law has led it out of a dead end
-)
+LED_OUT = 0.8  # share of the mean square that is left at most by a simulator that a law has led out of a dead end
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
 Seen = tuple[list[Scored], np.ndarray | None]
@@ -75,6 +73,10 @@ class Search:
         Share of the residual that a flexible force explains, by port, without and with the effects.
     hold_said : bool
         Whether somebody said what inputs do between samples; else each effect is a new chance to tell.
+    may_be_led : bool
+        Whether the refit may have stayed in a local minimum that a law leads out of.
+    led_to : dict
+        Values that the simulator alone is far better at, where a law has led there; the search has ended then.
     misheld : float
         By how much the error falls, with the effects in place, where inputs do the other thing between samples.
     """
@@ -87,6 +89,8 @@ class Search:
     say: Progress
     hold_said: bool = True
     misheld: float = 1.0
+    may_be_led: bool = True
+    led_to: Mapping[str, np.ndarray] = field(default_factory=dict)
     base: Fitted = field(init=False)
     passes: list[Pass] = field(default_factory=list)
     open_before: dict[str, float] = field(default_factory=dict)
@@ -141,8 +145,7 @@ class Search:
             before, passes = self.base, self.passes[:-1]
             self.base = found.choice.winner.fitted
             if not number and self._led_out():
-                self.passes = []
-                return self._run(effects)
+                return
             prefer_what_leaves_nothing(self)
             put_more_finely(self)
             if number:
@@ -175,27 +178,33 @@ class Search:
 
         Then it had stayed in a local minimum, and that is what the law has made up for.
         """
+        if not self.may_be_led:
+            return False
+        began = time.perf_counter()
         try:
             alone = self.bench.fit(self.bench.simulator, [self.base.values], states=self.base.begin, solver=THOROUGH)
         except InputError:
             return False
+        finally:
+            self.timed("look back", began)
         if alone.cost > LED_OUT * self.without.cost:
             return False
-        self.without = self.base = alone
-        self.bench = replace(self.bench, typical=along(self.bench, alone))
-        self._lower_floor([alone])
+        self.led_to = alone.values
         return True
 
     def _wrongly_held(self) -> bool:
         """Whether, with the effects in place, inputs seem to do the other thing between samples."""
         if self.hold_said:
             return False
+        began = time.perf_counter()
         try:
             other = self.bench.otherwise_held().fit(
                 self.base.simulator, [self.base.values], states=self.base.initial, solver=THOROUGH
             )
         except InputError:
             return False
+        finally:
+            self.timed("look back", began)
         self.misheld = float(np.sqrt(self.base.cost / max(other.cost, 1e-300)))
         return self.misheld > MISHELD
 

@@ -81,6 +81,9 @@ def timing(bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0) ->
     if best is None or best[0] > DROP * plain.cost:
         return bench, plain, []
     relative, name, what, value, other, found, change = best
+    back = refit(bench, found)
+    if back is not None and relative > DROP * back.cost:  # it only led the refit out of a local minimum
+        return bench, back, []
     late, alone = what == "alignment" and value > 0, 3.0 if what == "alignment" else ALONE
     if (late or what == "clock") and relative > max(NOTHING * plain.cost, alone**2 * noise2):
         return bench, plain, []  # what comes late or runs slow, next to something else that is wrong, may be physics
