@@ -72,6 +72,10 @@ class Placed:
         """The law's values by its own names, of values by full name."""
         return {name: values[f"{self.prefix}{name}"] for name in self.law.parameters()}
 
+    def of(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The law's values by full name, of all values."""
+        return self.named(self.own(values))
+
     def named(self, own: Mapping[str, Any]) -> dict[str, Any]:
         """Values of the law by full name."""
         return {f"{self.prefix}{name}": value for name, value in own.items()}

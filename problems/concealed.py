@@ -60,7 +60,7 @@ def scored(path: Path) -> dict[int, Score]:
 @cache
 def code() -> str:
     """A digest of the package's files and of the cases': results of different code do not make one score."""
-    files = [*Path(pilfr_casadi.__file__).parent.rglob("*.py"), *Path(__file__).parent.glob("*.py")]
+    files = [*Path(pilfr_casadi.__file__).parent.rglob("*.py"), *Path(__file__).parent.glob("concealed*.py")]
     return hashlib.sha256(b"".join(f.read_bytes() for f in sorted(files))).hexdigest()[:16]
 
 

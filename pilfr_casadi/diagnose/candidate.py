@@ -21,7 +21,11 @@ from .workbench import QUICK, THOROUGH, Fitted, Workbench
 HEAD = 0.7  # share of each recording that candidates are fitted to
 WEAK, NO_WORSE = 2.0, 1.03  # standard errors within which a part of a law is idle, and error without it
 SHOWN = 3.0  # standard errors that a law's strength is from zero at least
+NARROW = 0.05  # of the widest that is tried, of a knee that is sharp
 KNEES = (0.25, 4.0)  # times the width of a knee that a law is started from again
+MOVED = 1.2  # times the width, of a knee that is another
+# times the lower limit of a knee, the next limit and where to start; share of the mean square that is left at most
+SHARPER, BETTER = (0.1, 0.4), 0.9
 LONG = 12000  # samples that candidates are fitted to
 
 
@@ -60,13 +64,19 @@ class Candidate:
     @property
     def at_bound(self) -> bool:
         """Whether a parameter of the law is held back by one of its bounds."""
-        return any(np.any(self.fitted.at_bound(k)) for k in self.element.named(self.own))
+        return any(np.any(self.fitted.at_bound(k)) for k in self.element.of(self.fitted.values))
 
     @property
     def held_back(self) -> bool:
         """Whether an upper bound holds one back: at a lower one it is as sharp or as small as the data can tell."""
         p, values = self.fitted.model.parameters, self.fitted.values
-        return any(np.any(values[k] >= p[k].bounds[1]) for k in self.element.named(self.own))
+        return any(np.any(values[k] >= p[k].bounds[1]) for k in self.element.of(values))
+
+    @property
+    def knee(self) -> str:
+        """Full name of the width over which the law's force turns round, where it has one."""
+        knee = getattr(self.law, "knee", "")
+        return f"{self.element.prefix}{knee}" if knee else ""
 
     @property
     def doubtful(self) -> bool:
@@ -146,29 +156,55 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     bench = _as_fine(bench, candidate)
     placed = candidate.fitted.corrected()  # sub-steps for the law as it was fitted
     out = replace(candidate, head=np.inf, tail=np.inf, full=np.inf)
-    starts = [candidate.fitted.values, *_other_knees(candidate)]
     try:
-        fitted = bench.fit(placed, starts, states=candidate.fitted.initial, solver=THOROUGH)
+        fitted = bench.fit(placed, _knees(candidate), states=candidate.fitted.initial, solver=THOROUGH)
     except InputError:
         return out
+    fitted = _sharper(bench, candidate, fitted)
     if shown(bench, fitted) < SHOWN:
         return out
     done = replace(candidate, fitted=fitted, full=fitted.cost)
-    if fitted.model.substeps > candidate.fitted.model.substeps:  # what coarse steps cost is no fault of the law
+    # what coarse steps, or a knee that stayed where it was, cost is no fault of the law
+    if fitted.model.substeps > candidate.fitted.model.substeps or _knee_moved(candidate, done):
         own = {"states": fitted.begin, "model": fitted.model, "engine": fitted.engine}
-        finer = attempt(bench, placed, [fitted.values], **own)
-        done = replace(done, head=finer.head, tail=finer.tail) if finer is not None else done
+        again = attempt(bench, fitted.simulator, [fitted.values], **own)
+        done = replace(done, head=again.head, tail=again.tail) if again is not None else done
     plain = simpler(bench, done, deviations(bench, fitted))
     return done if plain is done else polish(bench, plain)
 
 
-def _other_knees(candidate: Candidate) -> list[dict[str, Any]]:
-    """Start values with a sharper and a wider knee: what steps make of a sharp one has minima of its own."""
-    knee = getattr(candidate.law, "knee", "")
-    if not knee:
-        return []
-    name = f"{candidate.element.prefix}{knee}"
-    return [{**candidate.fitted.values, name: times * candidate.fitted.values[name]} for times in KNEES]
+def _knees(candidate: Candidate) -> list[dict[str, Any]]:
+    """Fitted values, also with a sharper and a wider knee: what steps make of a sharp one has minima of its own."""
+    values, knee = candidate.fitted.values, candidate.knee
+    if not knee or values[knee] > NARROW * candidate.fitted.model.parameters[knee].bounds[1]:
+        return [values]
+    return [values, *({**values, knee: times * values[knee]} for times in KNEES)]
+
+
+def _sharper(bench: Workbench, candidate: Candidate, fitted: Fitted) -> Fitted:
+    """A fit with a sharper knee than steps can follow at rest, where a limit holds it back and that is clearly better."""
+    if not candidate.knee:
+        return fitted
+    given = fitted.simulator.parameters[candidate.knee]
+    low, high = given.bounds
+    if fitted.values[candidate.knee] > low:
+        return fitted
+    freed = replace(given, value=SHARPER[1] * low, bounds=(SHARPER[0] * low, high))
+    placed = fitted.simulator.with_parameters({**fitted.simulator.parameters, candidate.knee: freed})
+    start = {**fitted.values, candidate.knee: freed.value}
+    try:
+        found = bench.fit(placed, [start], states=fitted.initial, solver=THOROUGH)
+    except InputError:
+        return fitted
+    return found if found.cost < BETTER * fitted.cost else fitted
+
+
+def _knee_moved(before: Candidate, after: Candidate) -> bool:
+    """Whether the knee is another than the one that the first part was fitted with."""
+    if not after.knee:
+        return False
+    ratio = float(after.fitted.values[after.knee] / before.fitted.values[after.knee])
+    return abs(np.log(ratio)) > np.log(MOVED)
 
 
 def _as_fine(bench: Workbench, candidate: Candidate) -> Workbench:
@@ -197,9 +233,9 @@ def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray
         return candidate
     if not set(candidate.law.places) <= set(plain.places):
         return candidate
-    law = plain().at(
-        {k: own[k] for k in plain.units}, {k: v for k, v in candidate.law.limits.items() if k in plain.units}
-    )
+    given = candidate.fitted.model.parameters
+    limits = {k: given[f"{element.prefix}{k}"].bounds for k in plain.units if k in candidate.law.limits}
+    law = plain().at({k: own[k] for k in plain.units}, limits)
     placed = candidate.fitted.simulator.without_last_element().with_element(element.port, law)
     found = attempt(_as_fine(bench, candidate), placed, [candidate.fitted.values], states=candidate.fitted.begin)
     return found if found is not None and found.error < (NO_WORSE if std else 1.01) * candidate.error else candidate

@@ -285,7 +285,8 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     rate = WALL * FINER * bench.substeps / bench.dt
     lift, push = (np.max([getattr(r, name) for r in runs], axis=0) for name in ("lift", "push"))
     with np.errstate(divide="ignore", over="ignore"):  # a force that does not move the port has no limit
-        stiffest = np.where(lift > 0, rate / lift, rate**2 / push)
+        stiffest, firmest = np.where(lift > 0, rate / lift, rate**2 / push), rate / push
     inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in runs]).T, strict=True))
     rest = tuple(r.from_zero for r in runs)
-    return [Local(z[:, j], dz[:, j], bench.dt, lengths, float(k), inputs, rest) for j, k in enumerate(stiffest)]
+    pairs = enumerate(zip(stiffest.tolist(), firmest.tolist(), strict=True))
+    return [Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, inputs, rest) for j, (k, d) in pairs]

@@ -7,15 +7,16 @@ well alone.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..compiled import make_engine
 from ..laws import FINER
 from ..recording import InputError
+from ..simulator import Simulator
 from ..threads import side_by_side
 from .candidate import Candidate, attempt, judged, polish
 from .choice import choose, dry_instead
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from .search import Search
 
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
+Task = tuple[Simulator, Mapping[str, Any], Sequence[np.ndarray]]  # what is fitted, from which values and states
 LED = 2.0  # times the error of the nearest rival, of those that are fitted again from where it is
 
 
@@ -104,23 +106,18 @@ def look_back(search: Search) -> None:
         return
     winner = first.choice.winner
     others = rivals_beside(search, bare, kept)
-    tasks = [(o.placed(kept), {**search.base.values, **o.values}, search.base.begin) for o in others]
-    tasks.append((search.base.simulator, search.base.values, search.base.initial))
-    *found, own_now = side_by_side(lambda t: attempt(search.bench, t[0], [t[1]], states=t[2]), tasks, search.workers)
+    now = search.base.simulator, search.base.values, search.base.initial
+    own_now, *found = _tried(
+        search, [now, *((o.placed(kept), {**search.base.values, **o.values}, search.base.begin) for o in others)]
+    )
     if own_now is not None and any(found):
         every = _led(search, [own_now, *(c for c in found if c is not None)])
         elements = [e for e, c in zip((o.element for o in others), found, strict=True) if c is not None]
         stay = replace(every[0], port=winner.port, law=winner.law, size=winner.size)
         pairs = zip(elements, every[1:], strict=True)
         rivals = [replace(c, port=e.port, law=e.law, size=e.law.size(e.own(c.fitted.values))) for e, c in pairs]
-        again = choose([stay, *rivals], first.before, search.floor2, search.effective_samples([stay, *rivals]))
-        other = None if again is None or again.winner is stay else search.polished(again.winner)
-        if again is not None and (again.winner is stay or other is not None):
-            search.base = search.base if other is None else other.fitted
-            better = replace(first.choice, winner=other or again.winner, alike=again.alike, margin=again.margin)
-            search.passes[-2] = replace(first, choice=better)
-            if other is not None:
-                _second_again(search)
+        if _gives_way(search, -2, stay, rivals):
+            _second_again(search)
     search.timed("look back", began)
 
 
@@ -131,18 +128,34 @@ def _second_again(search: Search) -> None:
     winner, kept = second.choice.winner, search.base.simulator.elements[-2]
     bare = search.base.simulator.without_last_element()
     others = [c for c in second.candidates if c.error < LED * winner.error and c is not winner]
-    others = [c for c in others if may_stand(c.element, kept)][:FITTED]
-    tasks = [(search.base.simulator, search.base.values, search.base.initial)]
-    for c in others:
+    tasks: list[Task] = [(search.base.simulator, search.base.values, search.base.initial)]
+    for c in [c for c in others if may_stand(c.element, kept)][:FITTED]:
         placed = bare.with_element(c.port, c.law)
         tasks.append((placed, {**search.base.values, **placed.elements[-1].named(c.own)}, search.base.begin))
-    found = side_by_side(lambda t: attempt(search.bench, t[0], [t[1]], states=t[2]), tasks, search.workers)
-    stay, tried = found[0], [c for c in found if c is not None]
-    again = choose(tried, second.before, search.floor2, search.effective_samples(tried)) if stay is not None else None
-    other = None if again is None or again.winner is stay else search.polished(again.winner)
-    if again is not None and (again.winner is stay or other is not None):
-        search.base = search.base if other is None else other.fitted
-        search.passes[-1] = replace(second, choice=again if other is None else replace(again, winner=other))
+    stay, *found = _tried(search, tasks)
+    if stay is not None:
+        _gives_way(search, -1, stay, [c for c in found if c is not None])
+
+
+def _tried(search: Search, tasks: Sequence[Task]) -> list[Candidate | None]:
+    return side_by_side(lambda t: attempt(search.bench, t[0], [t[1]], states=t[2]), tasks, search.workers)
+
+
+def _gives_way(search: Search, index: int, stay: Candidate, rivals: Sequence[Candidate]) -> bool:
+    """Choose again between an effect and its rivals; whether another takes its place."""
+    step, tried = search.passes[index], [stay, *rivals]
+    assert step.choice is not None
+    again = choose(tried, step.before, search.floor2, search.effective_samples(tried))
+    if again is None:
+        return False
+    gives_way = again.winner is not stay
+    winner = search.polished(again.winner) if gives_way else stay
+    if winner is None:
+        return False
+    search.base = winner.fitted if gives_way else search.base
+    better = replace(step.choice, winner=winner, alike=again.alike, margin=again.margin)
+    search.passes[index] = replace(step, choice=better)
+    return gives_way
 
 
 def _led(search: Search, tried: Sequence[Candidate]) -> list[Candidate]:
@@ -156,7 +169,7 @@ def _led(search: Search, tried: Sequence[Candidate]) -> list[Candidate]:
         first, second = c.fitted.simulator.elements[-2:]
         if c is best or c.error > LED * best.error or first.port == second.port:
             return c
-        own = first.named(first.own(c.fitted.values))
+        own = first.of(c.fitted.values)
         shared = {k: v for k, v in best.fitted.values.items() if k in c.fitted.values}
         again = attempt(search.bench, c.fitted.simulator, [{**shared, **own}], states=c.fitted.begin)
         return again if again is not None and again.error < c.error else c

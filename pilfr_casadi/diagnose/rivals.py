@@ -62,7 +62,7 @@ def _fitted_before(search: Search, bare: Simulator) -> Iterator[Rival]:
     for c in first.candidates:
         if c.port == winner.port and type(c.law) is not type(winner.law):
             own = c.fitted.simulator.elements[-1]
-            yield Rival(bare.with_element(own.port, own.law), own.named(own.own(c.fitted.values)))
+            yield Rival(bare.with_element(own.port, own.law), own.of(c.fitted.values))
 
 
 def _never_fitted(search: Search, bare: Simulator) -> Iterator[Rival]:

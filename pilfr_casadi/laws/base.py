@@ -36,6 +36,8 @@ class Local:
         Samples of each recording.
     stiffest : float
         Largest stiffness (w/z) that the simulation's steps can follow at the port: a harder contact is a wall.
+    firmest : float
+        Largest damping (w*s/z) that the steps can follow at the port.
     inputs : mapping of str to array, shape (M,)
         The simulator's inputs, for laws that one of them scales.
     from_zero : tuple of bool
@@ -47,6 +49,7 @@ class Local:
     dt: float
     lengths: tuple[int, ...]
     stiffest: float = np.inf
+    firmest: float = np.inf
     inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
     from_zero: tuple[bool, ...] = ()
 

@@ -14,7 +14,8 @@ from .base import Law, Local, grid
 KNEE = 0.15  # of the speed at which friction has fallen, that its reversal may take
 SPRINGY = 0.08  # of half the travel, beyond which a contact that springs back is an elasto-plastic part
 MOST = 0.6  # of half the travel, the widest that is tried
-SHARPEST = 1e-4  # of the speed, the narrowest reversal: steps see no narrower one
+SHARP, SHARPEST = 2e-3, 1e-4  # of the speed, the narrowest reversal that is tried anyhow, and where steps can follow
+STABLE = 2.5  # |λ| h with which a Runge-Kutta step is stable
 WIDE = 0.4  # of the widest reversal that is tried, beyond which it is damping that gives way rather than dry friction
 
 
@@ -38,7 +39,7 @@ class CoulombFriction(Law):
         yield from grid(v_0=local.speed * np.array([0.005, 0.02, 0.06, 0.15]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"v_0": (SHARPEST * local.speed, 0.5 * local.speed)}
+        return {"v_0": (_sharpest(self, local), 0.5 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """A reversal over much of the speeds there are: the force depends on speed nearly everywhere."""
@@ -120,7 +121,7 @@ class StribeckFriction(CoulombFriction):
                 yield {"v_s": v_s * local.speed, "v_0": v_0 * v_s * local.speed}
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (SHARPEST * local.speed, 0.3 * local.speed)}
+        return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (_sharpest(self, local), 0.3 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """A knee as wide as the range over which friction falls, or a fall that goes on over all speeds.
@@ -156,6 +157,17 @@ class PreslidingStribeckFriction(PreslidingFriction):
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """As without the fall, or one that goes on over all speeds: at rest there is no friction that is larger."""
         return super().doubtful(values) or _falls_everywhere(self, values)
+
+
+def _sharpest(law: Law, local: Local) -> float:
+    """Narrowest reversal, z/s: stuck in a narrower one, a simulation would chatter on its steps."""
+    force = sum(
+        abs(float(law.values.get(name, 0.0))) for name in law.strength if name.startswith("F") and name != "F_0"
+    )
+    followed = 0.0 if law.scaled_by else force / (STABLE * local.firmest)
+    if not followed:
+        return SHARP * local.speed
+    return float(np.clip(followed, SHARPEST * local.speed, SHARP * local.speed))
 
 
 def _falls_everywhere(law: Law, values: Mapping[str, Any]) -> bool:
