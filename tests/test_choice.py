@@ -51,7 +51,7 @@ def test_behind_a_free_integrator_no_sensor_is_blamed_for_what_is_left(port, rem
     assert only_drifts(search, SimpleNamespace(winner=winner, remains=remains)) is drifts
 
 
-def candidate(port, law, error, size=2, at_bound=False, doubtful=False, form=""):
+def candidate(port, law, error, size=2, at_bound=False, doubtful=False, form="", knee=""):
     """What the choice reads of a fitted candidate."""
     return SimpleNamespace(
         port=port,
@@ -62,12 +62,23 @@ def candidate(port, law, error, size=2, at_bound=False, doubtful=False, form="")
         at_bound=at_bound,
         doubtful=doubtful,
         name=(port, law),
+        knee=knee,
     )
 
 
 def fitted(port, law, error, **own):
     """The same of a law of the catalogue, with its fitted values."""
     return SimpleNamespace(port=port, law=law, error=error, size=len(own), own=own)
+
+
+@pytest.mark.parametrize(("left", "named"), [(4.2e-4, "coulomb_friction"), (4.2e-3, "stribeck_friction")])
+def test_between_frictions_next_to_nothing_does_not_decide(left, named):
+    falls = candidate("guide", "stribeck_friction", 3.5e-4, 4, knee="guide.v_0")
+    dry = candidate("guide", "coulomb_friction", left, 2, knee="guide.v_0")
+    choice = choose([falls, dry], (0.13, 0.15), 3e-4**2, 500.0)
+    assert choice.winner.law.id == named and choice.margin > 1.0
+    elsewhere = candidate("belt", "coulomb_friction", left, 2, knee="belt.v_0")
+    assert choose([falls, elsewhere], (0.13, 0.15), 3e-4**2, 500.0).winner is falls
 
 
 def test_of_two_that_do_as_well_the_one_that_no_bound_holds_back_is_taken():

@@ -140,8 +140,8 @@ def test_a_search_begins_anew_from_where_a_law_has_led(monkeypatch):
     begun, values = [], {"k1": 3.0}
 
     class Led:
-        def __init__(self, *given, may_be_led=True):
-            self.may_be_led, self.interrupted, self.times = may_be_led, False, {"fits": 2.0}
+        def __init__(self, *given):
+            self.interrupted, self.may_be_led, self.times = False, True, {}
             self.led_to, self.passes, self.base, self.without = {}, ["a law"], None, "refitted"
 
         def run(self, effects):
@@ -149,18 +149,18 @@ def test_a_search_begins_anew_from_where_a_law_has_led(monkeypatch):
             return self
 
     def prepare(*given):
-        begun.append(given[5:])
+        begun.append(given[5])
         if stops and len(begun) == 2:
             raise KeyboardInterrupt
-        return SimpleNamespace(bench=None, without=None, floor=None)
+        return SimpleNamespace(bench=None, without=None, floor=None, gates=())
 
     monkeypatch.setattr(prepared_search, "prepare", prepare)
     monkeypatch.setattr(prepared_search, "Search", Led)
     given = rig(), (), "zero", "auto", (), 1, None, True, 2
     stops = False
     _, search = prepared_search.prepared_search(*given)
-    assert begun == [(), ([values],)] and not search.may_be_led
-    assert list(search.times) == ["gates and refit", "fits"]
+    assert begun == [(), [values]] and not search.may_be_led
+    assert list(search.times) == ["gates and refit"]
     begun.clear()
     stops = True
     _, search = prepared_search.prepared_search(*given)

@@ -48,7 +48,7 @@ def ran(seed, v_0):
     blank = pilfr.Recording(force, force, DT, ("force",), ("position",), initial="zero", hold="zero")
     model = discretise(carriage(lambda v: F_C * ca.tanh(v / v_0)), DT, "zero", 40)
     y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(2))[0]
-    return blank.with_(y=y + 2e-4 * np.std(y) * rng.standard_normal(y.shape))
+    return blank.with_(y=y + 5e-4 * np.std(y) * rng.standard_normal(y.shape))
 
 
 @pytest.mark.parametrize("v_0", [5e-4, 1e-4])

@@ -11,21 +11,19 @@ from typing import Any
 
 import numpy as np
 
+from ..compiled import make_engine
 from ..laws import Law
 from ..recording import InputError, Recording
 from ..simulator import Placed, Simulator, in_series
 from .arranged import opened_at_the_start
+from .knees import knees, moved, on_finer_steps, sharper
 from .proof import deviations, shown
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 HEAD = 0.7  # share of each recording that candidates are fitted to
 WEAK, NO_WORSE = 2.0, 1.03  # standard errors within which a part of a law is idle, and error without it
+TINY = 1e-3  # of another strength, of one that is nothing beside it
 SHOWN = 3.0  # standard errors that a law's strength is from zero at least
-NARROW = 0.05  # of the widest that is tried, of a knee that is sharp
-KNEES = (0.25, 4.0)  # times the width of a knee that a law is started from again
-MOVED = 1.2  # times the width, of a knee that is another
-# times the lower limit of a knee, the next limit and where to start; share of the mean square that is left at most
-SHARPER, BETTER = (0.1, 0.4), 0.9
 LONG = 12000  # samples that candidates are fitted to
 
 
@@ -156,16 +154,22 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     bench = _as_fine(bench, candidate)
     placed = candidate.fitted.corrected()  # sub-steps for the law as it was fitted
     out = replace(candidate, head=np.inf, tail=np.inf, full=np.inf)
+    model = bench.model(placed)
+    engine = make_engine(model, bench.engine)
+    starts, states = knees(candidate), candidate.fitted.initial
     try:
-        fitted = bench.fit(placed, _knees(candidate), states=candidate.fitted.initial, solver=THOROUGH)
+        if len(starts) > 1:
+            quick = bench.fit(placed, starts, states=states, model=model, engine=engine)
+            starts, states = [quick.values], quick.initial
+        fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
     except InputError:
         return out
-    fitted = _sharper(bench, candidate, fitted)
+    fitted = sharper(bench, candidate.knee, on_finer_steps(bench, fitted)) if candidate.knee else fitted
     if shown(bench, fitted) < SHOWN:
         return out
     done = replace(candidate, fitted=fitted, full=fitted.cost)
     # what coarse steps, or a knee that stayed where it was, cost is no fault of the law
-    if fitted.model.substeps > candidate.fitted.model.substeps or _knee_moved(candidate, done):
+    if fitted.model.substeps > candidate.fitted.model.substeps or moved(candidate, done):
         own = {"states": fitted.begin, "model": fitted.model, "engine": fitted.engine}
         again = attempt(bench, fitted.simulator, [fitted.values], **own)
         done = replace(done, head=again.head, tail=again.tail) if again is not None else done
@@ -173,43 +177,15 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
     return done if plain is done else polish(bench, plain)
 
 
-def _knees(candidate: Candidate) -> list[dict[str, Any]]:
-    """Fitted values, also with a sharper and a wider knee: what steps make of a sharp one has minima of its own."""
-    values, knee = candidate.fitted.values, candidate.knee
-    if not knee or values[knee] > NARROW * candidate.fitted.model.parameters[knee].bounds[1]:
-        return [values]
-    return [values, *({**values, knee: times * values[knee]} for times in KNEES)]
-
-
-def _sharper(bench: Workbench, candidate: Candidate, fitted: Fitted) -> Fitted:
-    """A fit with a sharper knee than steps can follow at rest, where a limit holds it back and that is clearly better."""
-    if not candidate.knee:
-        return fitted
-    given = fitted.simulator.parameters[candidate.knee]
-    low, high = given.bounds
-    if fitted.values[candidate.knee] > low:
-        return fitted
-    freed = replace(given, value=SHARPER[1] * low, bounds=(SHARPER[0] * low, high))
-    placed = fitted.simulator.with_parameters({**fitted.simulator.parameters, candidate.knee: freed})
-    start = {**fitted.values, candidate.knee: freed.value}
-    try:
-        found = bench.fit(placed, [start], states=fitted.initial, solver=THOROUGH)
-    except InputError:
-        return fitted
-    return found if found.cost < BETTER * fitted.cost else fitted
-
-
-def _knee_moved(before: Candidate, after: Candidate) -> bool:
-    """Whether the knee is another than the one that the first part was fitted with."""
-    if not after.knee:
-        return False
-    ratio = float(after.fitted.values[after.knee] / before.fitted.values[after.knee])
-    return abs(np.log(ratio)) > np.log(MOVED)
-
-
 def _as_fine(bench: Workbench, candidate: Candidate) -> Workbench:
     """The bench with steps at least as fine as a candidate's: on coarser ones its knee would look wider."""
-    return replace(bench, substeps=max(bench.substeps, candidate.fitted.model.substeps))
+    return replace(bench, at_least=max(bench.at_least, candidate.fitted.model.substeps))
+
+
+def _next_to_nothing(candidate: Candidate, name: str) -> float:
+    """Strength that is nothing beside another of the same unit: standard errors do not know what steps do to a run."""
+    own, units = candidate.own, candidate.law.units
+    return TINY * max(float(np.max(np.abs(own[k]))) for k in candidate.law.strength if units[k] == units[name])
 
 
 def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray] | None = None) -> Candidate:
@@ -224,7 +200,10 @@ def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray
     own = element.own(candidate.fitted.values)
     # at a bound there is no standard error: there only nothing is nothing
     doubt = {
-        name: np.nan_to_num(WEAK * std[f"{element.prefix}{name}"]) if std else 0.0 for name in candidate.law.strength
+        name: np.maximum(np.nan_to_num(WEAK * std[f"{element.prefix}{name}"]), _next_to_nothing(candidate, name))
+        if std
+        else 0.0
+        for name in candidate.law.strength
     }
     idle = {name for name, most in doubt.items() if np.all(np.abs(own[name]) <= most)}
     units = set(getattr(plain, "units", {}))

@@ -21,6 +21,7 @@ from .kinship import CONTAINS, handicap, imitates
 LIKE, AS_MUCH = 0.03, 0.995
 CLEARLY = 1.1  # times the error above the floor of a friction that falls with speed, of a hysteresis that does better
 NEARLY = 1.25  # times the error of a law that is hardly what its name says, of one that is
+TRACE = 5e-6  # of the mean square without any law, which is next to nothing
 CARRIED = 1.5  # times the error of a mode beside the path, of the carried mass that it may stand for
 
 
@@ -58,6 +59,12 @@ def _as_much(candidate: Candidate, winner: Candidate, before: float) -> bool:
     return bool(before - candidate.error**2 >= AS_MUCH * (before - winner.error**2))
 
 
+def _within_steps(candidate: Candidate, winner: Candidate, before: float, floor: float) -> bool:
+    """Whether all that one of two frictions at a port leaves is next to what steps make of a force that turns round."""
+    both = candidate.knee and winner.knee and candidate.port == winner.port
+    return bool(both and candidate.error**2 - floor < TRACE * before)
+
+
 def _fits(candidate: Candidate, winner: Candidate) -> bool:
     """Whether a law at the same port follows everything as well, fitted to everything."""
     return candidate.port == winner.port and candidate.full < (1 + LIKE) * winner.full
@@ -93,7 +100,8 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
 
     def fewest(winner: Candidate) -> Candidate:
         """What does as well as one with fewer parameters, and is no more doubtful."""
-        close = [c for c in ranked if _near(c, winner, before) and c.size < winner.size]
+        close = [c for c in ranked if c.size < winner.size]
+        close = [c for c in close if _near(c, winner, before) or _within_steps(c, winner, before, floor)]
         return min((c for c in close if c.doubtful <= winner.doubtful), key=lambda c: (c.size, key(c)), default=winner)
 
     ranked = sorted(usable, key=key)
@@ -129,7 +137,8 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     for c in first.values():
         ratio = c.error / winner.error
         contains = winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > 1 - LIKE
-        refines = c.name == given_up or (c.port in ports and (_near(c, winner, before) or contains))
+        refines = c.name == given_up or (c.size > winner.size and _within_steps(winner, c, before, floor))
+        refines = refines or (c.port in ports and (_near(c, winner, before) or contains))
         if c.name not in alike and not refines:  # nor a refinement of what cannot be told from the winner
             margin = min(margin, max(ratio, float(np.exp(key(c) - key(winner)))))
     remains = (winner.error**2 - floor) / max(before - floor, 1e-300)

@@ -55,8 +55,12 @@ def prepare(
     engine: str,
     workers: int = 1,
     starts: Sequence[Mapping[str, Any]] = (),
+    early: bool = True,
 ) -> Prepared:
-    """Open the bench, look at the dull causes, refit from the user's values and from `starts`, measure the floor."""
+    """Open the bench, look at the dull causes, refit from the user's values and from `starts`, measure the floor.
+
+    Without `early` a channel that seems early is so only where it is all that is wrong.
+    """
     recordings, spikes = without_glitches(recordings)
     recordings, transients = without_transients(recordings)
     bench, gates = opened(simulator, recordings, hold or "zero", engine)
@@ -69,12 +73,12 @@ def prepare(
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     noise2 = float(np.mean((first.deviation / bench.scale) ** 2))
     if without.cost > SUSPECT * noise2 and without.cost > LEAST:
-        raw, found = bench, _slips(bench, without, noise2, unsaid, workers)
+        raw, found = bench, _slips(bench, without, noise2, unsaid, workers, early)
         without = found[1]
         if found[2]:  # what looked better on wrong data says nothing
             asked, (between, notes) = between, choose_hold(simulator, found[0].recordings, hold, engine)
             if between != asked:  # of two units that are near, the wrong hold may have fitted the wrong one
-                found = _slips_again(raw, between, noise2, unsaid, workers) or found
+                found = _slips_again(raw, between, noise2, unsaid, workers, early) or found
             bench = Workbench.of(simulator, found[0].recordings, between, engine)
             without = bench.fit(simulator, [found[1].values, {}, *starts], solver=THOROUGH)
             gates = [*gates, *found[2]]
@@ -93,10 +97,10 @@ def prepare(
         noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
     given, before = bench, without
     # where inputs are taken as held but are interpolated, a late channel is late by half a sample more or less
-    bench, without, more = timing(given, before, noise2, 0.5 if unsaid else 1.0)
+    bench, without, more = timing(given, before, noise2, 0.5 if unsaid else 1.0, early)
     if more and unsaid:  # out of step, what looked better says nothing
         other = given.otherwise_held()
-        found = timing(other, other.fit(other.simulator, [before.values], states=before.initial), noise2, 0.5)
+        found = timing(other, other.fit(other.simulator, [before.values], states=before.initial), noise2, 0.5, early)
         costs = _honest(without, more, bench.dt), _honest(found[1], found[2], bench.dt)
         if costs[1] < costs[0]:
             bench, without, more = found
@@ -117,23 +121,23 @@ def prepare(
 
 
 def _slips(
-    bench: Workbench, without: Fitted, noise2: float, unsaid: bool, workers: int
+    bench: Workbench, without: Fitted, noise2: float, unsaid: bool, workers: int, early: bool
 ) -> tuple[Workbench, Fitted, list[Gate]]:
     """Signs, units and exchanged channels; or a shift in time, since late by half a swing looks like another sign."""
     found = another_zero(bench, without, slips(bench, without, workers), workers)
     if not found[2] or found[1].cost <= STRAINED:
         return found
-    late = timing(bench, without, noise2, 0.5 if unsaid else 1.0)
+    late = timing(bench, without, noise2, 0.5 if unsaid else 1.0, early)
     return late if late[1].cost < CURED * found[1].cost else found
 
 
 def _slips_again(
-    raw: Workbench, hold: str, noise2: float, unsaid: bool, workers: int
+    raw: Workbench, hold: str, noise2: float, unsaid: bool, workers: int, early: bool
 ) -> tuple[Workbench, Fitted, list[Gate]] | None:
     """The same on the recordings as given, with the other hold; None where that shows no slip or cannot be run."""
     try:
         bench = Workbench.of(raw.simulator, raw.recordings, hold, raw.engine)
-        found = _slips(bench, refitted(bench), noise2, unsaid, workers)
+        found = _slips(bench, refitted(bench), noise2, unsaid, workers, early)
     except InputError:
         return None
     return found if found[2] else None

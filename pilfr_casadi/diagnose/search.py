@@ -42,6 +42,7 @@ MORE, LOUD = 0.03, 3.0  # share of the excess, or times the noise, that has to b
 SEEN = 2.5e-5  # mean square error below which what is more than noise is not worth a second effect
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 POLISHED = 4  # candidates fitted to everything before one is chosen
+NEAR, NEAR_KNEE = 1.5, 3.0  # times the best error of those
 NOTHING = 0.01  # below this share nothing is explained
 LED_OUT = 0.8  # share of the mean square that is left at most by a simulator that a law has led out of a dead end
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
@@ -240,7 +241,12 @@ class Search:
         self.timed("fits", began)
         began = time.perf_counter()
         best = candidates[0].error
-        near = [c for c in candidates[:POLISHED] if c.error < 1.5 * best or self.bench.too_coarse(c.fitted)]
+        # what coarse steps, and knees that steps are too coarse for, cost is not to decide
+        near = [
+            c
+            for c in candidates[:POLISHED]
+            if c.error < (NEAR_KNEE if c.knee else NEAR) * best or self.bench.too_coarse(c.fitted)
+        ]
         with ThreadPoolExecutor(self.workers) as pool:
             bare = pool.submit(self._judged, self.base)
             kept = [*pool.map(lambda c: polish(self.bench, c), near), *(c for c in candidates if c not in near)]

@@ -53,10 +53,13 @@ def _remainder(bench: Workbench, fitted: Fitted, basis: np.ndarray, change: Chan
     return value if np.isfinite(value) else np.inf
 
 
-def timing(bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0) -> tuple[Workbench, Fitted, list[Gate]]:
+def timing(
+    bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0, early: bool = True
+) -> tuple[Workbench, Fitted, list[Gate]]:
     """Look for a shifted channel or clock; returns the corrected bench where it is a fault of the recording.
 
-    A late channel counts as shifted where it is late by a multiple of `part` samples.
+    A late channel counts as shifted where it is late by a multiple of `part` samples; and, as an early one without
+    `early`, where it is all that is wrong.
     """
     if plain.cost < 4 * noise2:
         return bench, plain, []
@@ -85,7 +88,7 @@ def timing(bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0) ->
     if back is not None and relative > DROP * back.cost:  # it only led the refit out of a local minimum
         return bench, back, []
     late, alone = what == "alignment" and value > 0, 3.0 if what == "alignment" else ALONE
-    if (late or what == "clock") and relative > max(NOTHING * plain.cost, alone**2 * noise2):
+    if (late or what == "clock" or not early) and relative > max(NOTHING * plain.cost, alone**2 * noise2):
         return bench, plain, []  # what comes late or runs slow, next to something else that is wrong, may be physics
     gate = _gate(name, what, value, dt, plain.cost, relative, change, part, noise2)
     return (other, found, [gate]) if gate else (bench, plain, [])

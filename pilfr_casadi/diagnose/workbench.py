@@ -92,6 +92,7 @@ class Workbench:
     substeps: int
     scale: np.ndarray
     engine: str = "auto"
+    at_least: int = 1  # sub-steps of simulators with laws
     typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
 
     @classmethod
@@ -137,7 +138,7 @@ class Workbench:
             rates = fastest(simulator, *self.typical, p)
             if np.any(np.isfinite(rates)):
                 wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / REACH)))
-        least = max(self.substeps, *(getattr(e.law, "substeps", 1) for e in simulator.elements))
+        least = max(self.substeps, self.at_least, *(getattr(e.law, "substeps", 1) for e in simulator.elements))
         return int(np.clip(wanted, least, max(FINER * self.substeps, least)))
 
     def too_coarse(self, fitted: Fitted) -> bool:
