@@ -9,7 +9,7 @@ from test_missing_flows import axis, moved
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.diagnose.choice import choose
 from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.gates import Gate
+from pilfr_casadi.diagnose.gates import Gate, hold_note
 from pilfr_casadi.diagnose.passed_over import passed_over
 from pilfr_casadi.diagnose.screen import Scored
 from pilfr_casadi.diagnose.search import Search
@@ -201,14 +201,16 @@ def spring():
     )
 
 
-def shaken(hold, clock=0.0, m=3000, dt=0.02):
-    """The spring recorded; `clock`: by how much each of the outputs' samples takes longer."""
+def shaken(hold, clock=0.0, m=3000, dt=0.02, law=None, early=0):
+    """The spring recorded; `clock`: by how much each of the outputs' samples takes longer, `early`: how many early."""
     rng = np.random.default_rng(3)
     u = np.convolve(rng.standard_normal(m), np.ones(4) / 2, "same")
     true = spring().with_parameters({"k": Parameter(100.0), "d": Parameter(1.4)})
+    true = true.with_element("ground", law) if law else true
     blank = Recording(u, rng.standard_normal((m, 2)), dt, ("force",), ("pos", "vel"), initial="zero")
     model = Workbench.of(true, [blank], hold).model(true)
     y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(2))[0]
+    u, y = u[: m - early], y[early:]
     if clock:
         at = np.arange(m) * (1 + clock)
         u, y = u[at < m - 1], np.stack([np.interp(at[at < m - 1], np.arange(m), c) for c in y.T], axis=1)
@@ -232,6 +234,21 @@ def test_a_clock_between_the_rates_looked_at_is_found_and_is_that_of_both_output
     assert [(g.channel, g.finding) for g in gates] == [("pos, vel", "clock")] and isinstance(gates[0], Gate)
     assert gates[0].value == pytest.approx(-3.36e-3, rel=0.02)
     assert found.cost**0.5 < 0.02
+
+
+@pytest.mark.parametrize("stiffening", [0.0, 1e4])
+def test_what_seems_early_while_more_is_wrong_may_be_no_fault(stiffening):
+    law = CubicStiffness(values={"k_3": stiffening})
+    bench = Workbench.of(spring(), [shaken("zero", law=law, early=6)], "zero")
+    plain = bench.fit(spring())
+    for early in (True, False):
+        gates = timing(bench, plain, 1e-8, early=early)[2]
+        assert [g.finding for g in gates] == (["alignment"] if early or not stiffening else [])
+
+
+@pytest.mark.parametrize(("ratio", "why"), [(1.3, "fits better"), (1.0, "gives the surer answer")])
+def test_why_a_hold_was_chosen_is_said(ratio, why):
+    assert why in hold_note(spring(), "linear", ratio).sentence
 
 
 @pytest.mark.parametrize(("bounds", "halved"), [((20, 500), False), ((101.0, 500), True)])

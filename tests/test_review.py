@@ -7,12 +7,13 @@ import pytest
 from diagnosis_rig import DT, recordings, rig
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.diagnose import prepare, prepared_search
+from pilfr_casadi.diagnose import prepare, prepared_search, review
+from pilfr_casadi.diagnose.choice import Choice
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.proof import deviations, shown
 from pilfr_casadi.diagnose.rivals import WIDER, rivals_beside
 from pilfr_casadi.diagnose.screen import Scored
-from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.search import Pass, Search
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.laws import (
@@ -165,3 +166,52 @@ def test_a_search_begins_anew_from_where_a_law_has_led(monkeypatch):
     stops = True
     _, search = prepared_search.prepared_search(*given)
     assert search.interrupted and search.passes == [] and search.base == "refitted"
+
+
+@pytest.mark.parametrize("nearer", [True, False])
+def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monkeypatch, nearer):
+    asked = []
+
+    class Unsure:
+        def __init__(self, *given):
+            self.interrupted, self.led_to = False, {}
+            early = asked[-1]
+            self.base = SimpleNamespace(cost=1.0 if early else 0.1 if nearer else 0.9)
+
+        def run(self, effects):
+            return self
+
+        def certainty(self):
+            return 0.1
+
+    def prepare(*given):
+        asked.append(given[6])
+        return SimpleNamespace(bench=None, without=None, floor=None, gates=gates if given[6] else ())
+
+    gates = (SimpleNamespace(finding="alignment", value=-0.1),)
+    monkeypatch.setattr(prepared_search, "prepare", prepare)
+    monkeypatch.setattr(prepared_search, "Search", Unsure)
+    ready, _ = prepared_search.prepared_search(rig(), (), "zero", "auto", (), 1, None, True, 2)
+    assert asked == [True, False] and ready.gates == (() if nearer else gates)
+
+
+@pytest.mark.parametrize(
+    ("wins", "holds", "gives"), [("rival", True, True), ("rival", False, False), ("stay", True, False)]
+)
+def test_an_effect_gives_way_to_a_rival_that_wins_and_holds_on_everything(monkeypatch, wins, holds, gives):
+    both = {name: SimpleNamespace(name=name, fitted=f"{name} fitted") for name in ("stay", "rival")}
+    won = Choice(both[wins], (), 50.0, 0.1, 3.0)
+    monkeypatch.setattr(review, "choose", lambda *_: won)
+    step = Pass(Choice(both["stay"], (), 40.0, 0.2, 2.0), (), (), (1.0, 1.0), True)
+    search = SimpleNamespace(
+        passes=[step],
+        floor2=1e-6,
+        base="as it was",
+        effective_samples=lambda tried: 100.0,
+        polished=lambda c: c if holds else None,
+    )
+    assert review._gives_way(search, 0, both["stay"], [both["rival"]]) is gives
+    assert search.base == ("rival fitted" if gives else "as it was")
+    assert search.passes[0].choice.margin == (3.0 if holds else 2.0)
+    monkeypatch.setattr(review, "choose", lambda *_: None)
+    assert not review._gives_way(search, 0, both["stay"], [])
