@@ -177,6 +177,21 @@ def test_a_power_of_one_is_a_gain_and_no_curve(kind, values, doubtful):
     assert kind().doubtful(values) is doubtful
 
 
+@pytest.mark.parametrize(
+    ("values", "doubtful"),
+    [
+        ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.1, "v_0": 0.002}, False),
+        ({"F_c": 1.0, "F_e": 0.02, "v_s": 0.1, "v_0": 0.002}, True),  # a fall that is slight
+        ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.01, "v_0": 0.001}, True),  # is over at once
+        ({"F_c": 1.0, "F_e": 0.4, "v_s": 1.0, "v_0": 0.002}, True),  # goes on over all speeds
+        ({"F_c": 1.0, "F_e": 0.4, "v_s": 0.1, "v_0": 0.05}, True),  # is as narrow as the knee
+    ],
+)
+def test_friction_that_hardly_falls_is_no_stribeck_friction(values, doubtful):
+    law = laws.StribeckFriction().at(values, {"v_s": (0.01, 1.0)})
+    assert law.doubtful(values) is doubtful
+
+
 def test_plays_beside_a_bend_that_does_it_all_are_hardly_a_hysteresis():
     law = GeneralizedHysteresis().at({}, {"r": (1e-5, 0.97)})
     plays = {"r": np.linspace(0.0, 0.9, 6), "a_2": 0.0, "a_3": 0.0, "b_2": 0.3}

@@ -136,7 +136,9 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     ports, margin = {winner.port, *(port for port, _ in alike)}, np.inf
     for c in first.values():
         ratio = c.error / winner.error
-        contains = winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > 1 - LIKE
+        # friction that hardly falls may come a little nearer than one that does not
+        least = 1 / NEARLY if c.doubtful and c.knee and winner.knee else 1 - LIKE
+        contains = winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > least
         refines = c.name == given_up or (c.size > winner.size and _within_steps(winner, c, before, floor))
         refines = refines or (c.port in ports and (_near(c, winner, before) or contains))
         if c.name not in alike and not refines:  # nor a refinement of what cannot be told from the winner

@@ -202,7 +202,7 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
     return Effect(
         port=winner.port,
         law=winner.law.id,
-        confidence=confidence(choice, search) / (2 if choice.common else 1),  # two readings, as likely
+        confidence=confidence(choice, search),
         sentence=winner.law.sentence,
         equation=winner.law.equation,
         parameters=shown,

@@ -161,7 +161,8 @@ def confidence(choice: Choice, search: Search) -> float:
     others = len({c.law.id for c in choice.alike} - {winner.law.id})
     pressed = (times2 > AT_FLOOR**2 and strained(search.base)) or (times2 > WELL_ABOVE**2 and winner.held_back)
     driven = DRIVEN if pressed or winner.doubtful else 1.0
-    return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99))
+    readings = 2 if choice.common else 1  # as likely
+    return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99)) / readings
 
 
 def _share(choice: Choice, search: Search) -> float:

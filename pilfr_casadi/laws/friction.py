@@ -12,6 +12,7 @@ from ..operators import play
 from .base import Law, Local, grid
 
 KNEE = 0.15  # of the speed at which friction has fallen, that its reversal may take
+FALL = 0.05  # of dry friction, the least by which it is larger at rest
 SPRINGY = 0.08  # of half the travel, beyond which a contact that springs back is an elasto-plastic part
 MOST = 0.6  # of half the travel, the widest that is tried
 SHARP, SHARPEST = 2e-3, 1e-4  # of the speed, the narrowest reversal that is tried anyhow, and where steps can follow
@@ -124,11 +125,8 @@ class StribeckFriction(CoulombFriction):
         return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (_sharpest(self, local), 0.3 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """A knee as wide as the range over which friction falls, or a fall that goes on over all speeds.
-
-        At rest there is none that is larger then.
-        """
-        return bool(values["v_0"] > KNEE * values["v_s"]) or _falls_everywhere(self, values)
+        """A knee as wide as the range over which friction falls, or no fall to speak of."""
+        return bool(values["v_0"] > KNEE * values["v_s"]) or _hardly_falls(self, values)
 
 
 class PreslidingStribeckFriction(PreslidingFriction):
@@ -155,8 +153,8 @@ class PreslidingStribeckFriction(PreslidingFriction):
         return {**super().bounds(local), "v_s": (4e-3 * local.speed, 0.8 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """As without the fall, or one that goes on over all speeds: at rest there is no friction that is larger."""
-        return super().doubtful(values) or _falls_everywhere(self, values)
+        """As without the fall, or no fall to speak of."""
+        return super().doubtful(values) or _hardly_falls(self, values)
 
 
 def _sharpest(law: Law, local: Local) -> float:
@@ -170,8 +168,10 @@ def _sharpest(law: Law, local: Local) -> float:
     return float(np.clip(followed, SHARPEST * local.speed, SHARP * local.speed))
 
 
-def _falls_everywhere(law: Law, values: Mapping[str, Any]) -> bool:
-    return bool(values["v_s"] >= law.parameters()["v_s"].bounds[1])
+def _hardly_falls(law: Law, values: Mapping[str, Any]) -> bool:
+    """Whether a fall is slight, or goes on over all speeds, or is over at once: no friction is larger at rest then."""
+    (low, high), (dry, more) = law.parameters()["v_s"].bounds, (abs(float(values[k])) for k in law.strength[:2])
+    return bool(values["v_s"] >= high or values["v_s"] <= low or more < FALL * dry)
 
 
 class ViscousDamping(Law):
