@@ -8,6 +8,7 @@ from test_missing_flows import axis, moved
 
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.diagnose.choice import choose
+from pilfr_casadi.diagnose.first_effect import wrongly_held
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.gates import Gate, hold_note
 from pilfr_casadi.diagnose.passed_over import passed_over
@@ -224,7 +225,7 @@ def shaken(hold, clock=0.0, m=3000, dt=0.02, law=None, early=0):
 def test_how_inputs_are_held_is_asked_again_with_an_effect_in_place(used, said, wrong):
     search = searching(Workbench.of(spring(), [shaken("linear")], used), said)
     search.base = search.without
-    assert search._wrongly_held() is wrong
+    assert wrongly_held(search) is wrong
     assert (search.misheld > 2) is wrong
 
 

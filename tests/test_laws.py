@@ -226,14 +226,16 @@ def test_more_plays_begin_near_those_that_they_refine(plain):
 @pytest.mark.parametrize("kind", (StribeckFriction, PreslidingStribeckFriction))
 def test_friction_that_falls_over_all_speeds_is_hardly_larger_at_rest(kind):
     law = kind().at({}, {"v_s": (0.01, 2.0)})
-    sharp = {"v_0": 0.01, "r": 0.001}
+    sharp = {"v_0": 0.01, "r": 0.001, **dict.fromkeys(kind.strength, 1.0)}
     assert law.doubtful({"v_s": 2.0, **sharp}) and not law.doubtful({"v_s": 0.5, **sharp})
 
 
 @pytest.mark.parametrize("kind", (laws.PreslidingFriction, PreslidingStribeckFriction))
 def test_friction_that_springs_back_over_much_of_the_travel_is_hardly_friction(kind):
     law = kind().at({"v_s": 0.1}, kind().bounds(LOCAL))
-    slight, much = ({"r": share * LOCAL.half, "v_s": 0.1} for share in (0.03, 0.14))
+    slight, much = (
+        {"r": share * LOCAL.half, "v_s": 0.1, **dict.fromkeys(kind.strength, 1.0)} for share in (0.03, 0.14)
+    )
     assert law.doubtful(much) and not law.doubtful(slight)
 
 

@@ -9,6 +9,7 @@ from diagnosis_rig import DT, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import prepare, prepared_search, review
 from pilfr_casadi.diagnose.choice import Choice
+from pilfr_casadi.diagnose.first_effect import led_out
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.proof import deviations, shown
 from pilfr_casadi.diagnose.rivals import WIDER, rivals_beside
@@ -110,12 +111,12 @@ def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
     stuck = bench.fit(rig((3.0, 1.0, 1.0, 1.0)), solver=GaussNewton(max_iterations=1))
     search = Search(bench, stuck, Floor(np.full(1, 1e-3), "estimated"), (), 1, lambda *_: None)
     search.base = bench.fit(rig().with_element("ground-m1", CubicStiffness()))
-    assert search._led_out()
+    assert led_out(search)
     alone = bench.fit(rig(), [search.led_to])
     assert alone.cost < 1e-3 * stuck.cost
     search.without, search.led_to = alone, {}
     search.base = bench.fit(rig().with_element("ground-m1", CubicStiffness()))
-    assert not search._led_out() and not search.led_to
+    assert not led_out(search) and not search.led_to
 
 
 @pytest.fixture

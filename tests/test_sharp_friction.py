@@ -10,8 +10,8 @@ import pilfr_casadi as pilfr
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.diagnose.candidate import Candidate
 from pilfr_casadi.diagnose.choice import Choice
+from pilfr_casadi.diagnose.first_effect import let_idle_offsets_go
 from pilfr_casadi.diagnose.offset import Offset
-from pilfr_casadi.diagnose.review import let_idle_offsets_go
 from pilfr_casadi.diagnose.search import Pass
 from pilfr_casadi.diagnose.workbench import FINER, Workbench
 from pilfr_casadi.integration import discretise

@@ -41,12 +41,12 @@ def on_finer_steps(bench: Workbench, fitted: Fitted) -> Fitted:
     finer, placed = replace(bench, at_least=FINER * fitted.model.substeps), fitted.corrected()
     model = finer.model(placed)
     engine = make_engine(model, bench.engine)
-    there = bench.result(placed, fitted.values, fitted.initial, engine, model)
+    states = bench.begun(placed, model, model.parameters.pack(fitted.values), fitted.begin)  # a delay's are others here
+    there = bench.result(placed, fitted.values, states, engine, model)
     if abs(there.cost / fitted.cost - 1) < SAME:
         return fitted
-    states = fitted.initial
     try:
-        return finer.fit(placed, [fitted.values], states=states, solver=THOROUGH, model=model, engine=engine)
+        return finer.fit(placed, [fitted.values], states=fitted.begin, solver=THOROUGH, model=model, engine=engine)
     except InputError:
         return fitted
 

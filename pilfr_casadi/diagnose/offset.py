@@ -67,26 +67,33 @@ def first_order(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[
 
 
 def offsets(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Constants at inputs and outputs, the most useful first, as parameters of the simulator."""
+    """Constants at inputs and outputs, the most useful first, as parameters of the simulator; laws stay where they are.
+
+    They are a fault where they were the mismatch.
+    """
     gates: list[Gate] = []
-    before = plain.cost
+    before, laws = plain.cost, plain.simulator.elements[len(bench.simulator.elements) :]
     ports = [f"actuator:{n}" for n in bench.simulator.inputs]
     ports += [f"sensor:{n}" for n in bench.simulator.output_names]
+    taken = {e.port for e in plain.simulator.elements}
+    ports = [port for port in ports if port not in taken]
     while ports:
         share = first_order(bench, plain, ports)
         port = max(share, key=lambda name: share[name])
         if share[port] < LEAST:
             break
-        placed = bench.simulator.with_element(port, Offset())
-        other = replace(bench, simulator=placed)
-        with_law = plain.simulator.with_element(port, Offset())
+        other = replace(bench, simulator=bench.simulator.with_element(port, Offset()))
+        parameter = f"{other.simulator.elements[-1].prefix}w_0"
+        placed = other.simulator
+        for e in laws:
+            placed = placed.with_element(e.port, e.law)
+        placed = placed.with_parameters({**placed.parameters, **plain.simulator.parameters})  # as they are bounded now
         try:
-            found = other.fit(with_law, [plain.values], states=plain.initial, solver=THOROUGH)
+            found = other.fit(placed, [plain.values], states=plain.initial, solver=THOROUGH)
         except InputError:
             break
         if not _earned(plain, found):
             break
-        parameter = f"{with_law.elements[-1].prefix}w_0"
         value = float(found.values[parameter])
         sentence = _told(port, value) + (
             f"; with it as a parameter the refitted error falls from {mean_nrmse(bench, plain):.3g} to "
@@ -95,7 +102,7 @@ def offsets(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Ga
         gates.append(Gate(port.split(":", 1)[1], "offset", value, sentence, True, parameter=parameter))
         bench, plain = other, found
         ports.remove(port)
-    whole = plain.cost < WHOLE * before
+    whole = plain.cost < WHOLE * before and not laws
     return bench, plain, [replace(g, fault=whole) for g in gates]
 
 

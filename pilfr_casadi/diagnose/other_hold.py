@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from ..recording import InputError, Recording
+from .first_effect import MISHELD
 from .gates import hold_note
 from .prepare import Prepared
 from .prepared_search import prepared_search
-from .search import MISHELD, Search
+from .search import Search
 
 
 def doubted(search: Search) -> bool:

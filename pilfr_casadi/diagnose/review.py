@@ -18,11 +18,10 @@ from ..laws import FINER
 from ..recording import InputError
 from ..simulator import Simulator
 from ..threads import side_by_side
-from .candidate import Candidate, attempt, judged, polish
+from .candidate import Candidate, attempt, judged
 from .choice import choose, dry_instead
 from .explain import by_cost
 from .kinship import imitates
-from .offset import without_idle_offsets
 from .rivals import FITTED, may_stand, rivals_beside
 from .verdict import HINT
 
@@ -175,18 +174,3 @@ def _led(search: Search, tried: Sequence[Candidate]) -> list[Candidate]:
         return again if again is not None and again.error < c.error else c
 
     return side_by_side(led, tried, search.workers)
-
-
-def let_idle_offsets_go(search: Search) -> None:
-    """Offsets that an effect had looked like are none, nor is then what of the last law stood against them."""
-    found = without_idle_offsets(search.bench, search.base)
-    if found is search.base:
-        return
-    search.base = found
-    last = max(i for i, p in enumerate(search.passes) if p.accepted)
-    choice = search.passes[last].choice
-    assert choice is not None
-    done = polish(search.bench, replace(choice.winner, fitted=found)) if choice.winner.law.signed else None
-    if done is not None and np.isfinite(done.full):
-        search.base = done.fitted
-        search.passes[last] = replace(search.passes[last], choice=replace(choice, winner=done))

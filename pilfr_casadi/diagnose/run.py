@@ -17,6 +17,7 @@ from .arranged import arranged
 from .candidate import Candidate
 from .clipping import clipped_input
 from .experiment import next_experiment, placebo
+from .first_effect import let_idle_offsets_go
 from .gates import Gate, said_hold
 from .held import held_value
 from .mismatch import mismatch
@@ -25,7 +26,6 @@ from .other_hold import doubted, otherwise_held
 from .prepared_search import prepared_search
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
-from .review import let_idle_offsets_go
 from .search import Pass, Search
 from .tones import tones
 from .undeclared import beyond_the_ports
@@ -109,7 +109,7 @@ def diagnose(
         search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - began
     bench, without = search.bench, search.without
     let_idle_offsets_go(search)
-    gates = (*ready.gates, *tones(bench, search.base))
+    gates = (*ready.gates, *search.gates, *tones(bench, search.base))
     accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
     held = held_value(search) if verdict == "missing-physics" else None

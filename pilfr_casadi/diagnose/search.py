@@ -16,15 +16,16 @@ import numpy as np
 
 from ..interrupts import Progress
 from ..laws import Law
-from ..recording import InputError
 from ..simulator import Placed
 from .candidate import Candidate, heads, judged, polish
 from .choice import Choice, choose
 from .every_sensor import every_sensor
 from .exchange import exchange
 from .explain import explain
+from .first_effect import led_out, offset_beside, wrongly_held
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
+from .gates import Gate
 from .imitated import imitated
 from .kinship import complements
 from .linearise import linearised
@@ -44,8 +45,6 @@ NEARLY = 0.05  # share of the excess that a law leaves behind which others are n
 POLISHED = 4  # candidates fitted to everything before one is chosen
 NEAR, NEAR_KNEE = 1.5, 3.0  # times the best error of those
 NOTHING = 0.01  # below this share nothing is explained
-LED_OUT = 0.8  # share of the mean square that is left at most by a simulator that a law has led out of a dead end
-MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
 Seen = tuple[list[Scored], np.ndarray | None]
 
@@ -78,6 +77,8 @@ class Search:
         Whether the refit may have stayed in a local minimum that a law leads out of.
     led_to : dict
         Values that the simulator alone is far better at, where a law has led there; the search has ended then.
+    gates : tuple of Gate
+        What was found of the recordings on the way.
     misheld : float
         By how much the error falls, with the effects in place, where inputs do the other thing between samples.
     """
@@ -93,6 +94,7 @@ class Search:
     may_be_led: bool = True
     led_to: Mapping[str, np.ndarray] = field(default_factory=dict)
     base: Fitted = field(init=False)
+    gates: tuple[Gate, ...] = ()
     passes: list[Pass] = field(default_factory=list)
     open_before: dict[str, float] = field(default_factory=dict)
     open_after: dict[str, float] = field(default_factory=dict)
@@ -145,7 +147,7 @@ class Search:
             assert found.choice is not None
             before, passes = self.base, self.passes[:-1]
             self.base = found.choice.winner.fitted
-            if not number and self._led_out():
+            if not number and led_out(self):
                 return
             prefer_what_leaves_nothing(self)
             put_more_finely(self)
@@ -155,8 +157,10 @@ class Search:
                 if mends(self, before):
                     self.base, self.passes = before, [*passes, replace(found, accepted=False)]
                     break
-            if self._wrongly_held():
+            if wrongly_held(self):
                 return
+            if not number:
+                offset_beside(self)
             self.open_after = self.flexible(self.base)
         if effects > 1 and self.unsure():
             two_at_once(self)
@@ -173,41 +177,6 @@ class Search:
         if not named or not explains(named, *left_open(self)):
             return 0.0
         return min(confidence(c, self) for c in named)
-
-    def _led_out(self) -> bool:
-        """Whether the simulator alone, fitted from where the first law has led its parameters, is far better.
-
-        Then it had stayed in a local minimum, and that is what the law has made up for.
-        """
-        if not self.may_be_led:
-            return False
-        began = time.perf_counter()
-        try:
-            alone = self.bench.fit(self.bench.simulator, [self.base.values], states=self.base.begin, solver=THOROUGH)
-        except InputError:
-            return False
-        finally:
-            self.timed("look back", began)
-        if alone.cost > LED_OUT * self.without.cost:
-            return False
-        self.led_to = alone.values
-        return True
-
-    def _wrongly_held(self) -> bool:
-        """Whether, with the effects in place, inputs seem to do the other thing between samples."""
-        if self.hold_said:
-            return False
-        began = time.perf_counter()
-        try:
-            other = self.bench.otherwise_held().fit(
-                self.base.simulator, [self.base.values], states=self.base.initial, solver=THOROUGH
-            )
-        except InputError:
-            return False
-        finally:
-            self.timed("look back", began)
-        self.misheld = float(np.sqrt(self.base.cost / max(other.cost, 1e-300)))
-        return self.misheld > MISHELD
 
     def much(self) -> bool:
         """Whether enough is left to look further."""

@@ -26,6 +26,7 @@ FAR = 0.04  # mean square error of a refit that may have gone astray
 PROMISING = 0.7  # share of the remainder that a shift or clock rate worth a refit leaves
 NOTHING = 0.02  # share of the mean square that a late channel which is all that is wrong leaves at most
 ALONE = 5.0  # times the noise that a shift or a clock leaves which is not all that is wrong
+AVERAGED = 0.4  # of a channel's noise, which reading it between its samples takes away
 DROP = 0.3  # share of the mean square that has to be left at most
 
 Trial = tuple[float, str, str, float, str, tuple[int, ...]]  # share left, channel, what, value, "u" or "y", columns
@@ -76,7 +77,7 @@ def timing(
         at, now, current = settled
         if what == "alignment":
             near = _refit_at(bench, cut, round(at / dt) * dt, current)
-            if near is not None and near[1].cost < 1.02 * current.cost:
+            if near is not None and near[1].cost < 1.02 * current.cost + AVERAGED * noise2:
                 at, (now, current) = round(at / dt) * dt, near
         relative = current.cost * float(np.mean((now.scale / bench.scale) ** 2))
         if best is None or relative < best[0]:

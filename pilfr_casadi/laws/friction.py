@@ -171,7 +171,7 @@ def _sharpest(law: Law, local: Local) -> float:
 def _hardly_falls(law: Law, values: Mapping[str, Any]) -> bool:
     """Whether a fall is slight, or goes on over all speeds, or is over at once: no friction is larger at rest then."""
     (low, high), (dry, more) = law.parameters()["v_s"].bounds, (abs(float(values[k])) for k in law.strength[:2])
-    return bool(values["v_s"] >= high or values["v_s"] <= low or more < FALL * dry)
+    return bool(not low < values["v_s"] < high or more < FALL * dry)
 
 
 class ViscousDamping(Law):
