@@ -45,11 +45,11 @@ def run_diagnosis(options: argparse.Namespace) -> int:
     _check_apart([*zip(train, recordings, strict=True)], [*zip(options.test, tests, strict=True)])
     _check_steps([*zip([*train, *options.test], [*recordings, *tests], strict=True)])
     folder = make_folder(options.out)
-    notes: list[str] = []
+    notes, error = list[str](), 0.0
     if source is not None:
         simulator = as_simulator(given, recordings)
     else:
-        simulator, notes = _surrogate(options, inputs, outputs)
+        simulator, error, notes = _surrogate(options, inputs, outputs)
     _announce(simulator, source, [("training", train, recordings), ("test", options.test, tests)])
     for note in notes:
         print(note, flush=True)
@@ -64,6 +64,7 @@ def run_diagnosis(options: argparse.Namespace) -> int:
                 hold=options.hold,
                 limits=amplitudes(options.limit),
                 workers=options.workers,
+                stand_in_error=error,
                 progress=progress,
             )
     except KeyboardInterrupt:
@@ -156,18 +157,21 @@ def _announce(
 
 def _surrogate(
     options: argparse.Namespace, inputs: tuple[str, ...], outputs: tuple[str, ...]
-) -> tuple[Simulator, list[str]]:
+) -> tuple[Simulator, float, list[str]]:
     with deferred_interrupt():
         from .diagnose.surrogate import POOR, surrogate
     simulated = read_file(options, options.simulated, inputs, outputs)
     simulator, error = surrogate(simulated)
-    notes = [f"A linear model stands for the simulation {options.simulated}, which it follows to NRMSE {error:.4f}."]
+    notes = [
+        f"A linear model stands for the simulation {options.simulated}, which it follows to NRMSE {error:.4f}; "
+        "an error of this size counts as noise."
+    ]
     if error > POOR:
         notes.append(
             "note: that is poor; the simulation is not linear there, and what the surrogate misses will show up as "
             "missing physics. Give the simulator itself where it can be had."
         )
-    return simulator, notes
+    return simulator, error, notes
 
 
 def _simulated_names(options: argparse.Namespace, train: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -209,8 +213,9 @@ def _check_names(files: Sequence[str], columns: Sequence[Sequence[str]], shared:
                 f"{files[0]} has {listed(lost)}, which {path} has not, and {path} has {listed(own)} of its own; say "
                 f"which are the same, as in --column {lost[0]}={own[0]}, or which to use, with --inputs and --outputs."
             )
-        if lost:
-            print(f"note: {listed(lost)} of {files[0]} is left out, for {path} has no such column", flush=True)
+        for extra, there, lacks in ((lost, files[0], path), (own, path, files[0])):
+            if extra:
+                print(f"note: {listed(extra)} of {there} is left out, for {lacks} has no such column", flush=True)
 
 
 def _cause(options: argparse.Namespace, shared: Sequence[str]) -> tuple[str, ...]:

@@ -219,6 +219,17 @@ def test_what_a_simulation_answered_stands_in_for_it(capsys, files):
     assert found["fit"]["test"]["after"] < 0.1 * found["fit"]["test"]["before"]
 
 
+def test_what_stands_for_a_simulation_is_not_to_be_nearer_the_machine_than_to_it(capsys, files):
+    """A simulation that stiffens as the machine does, of which a linear model cannot tell."""
+    write_csv(files / "simulated.csv", *rig(5, m=1200, k=95.0))
+    names = ("--inputs", "force", "--outputs", "position")
+    status, out, err = run(capsys, *arguments(files, "--hold", "zero", "--initial", "zero", *names, simulator=None))
+    assert status == 0, err
+    assert err == "" and "Nothing is seen that the simulation lacks" in out
+    found = json.loads((files / "out" / "diagnosis.json").read_text())
+    assert (found["verdict"], found["effects"]) == ("complete", [])
+
+
 def test_inputs_of_a_simulation_are_the_columns_that_agree(capsys, files, truth, monkeypatch):
     seen = {}
 

@@ -48,7 +48,10 @@ def test_what_ends_the_other_search_leaves_the_one_there_is(stops, monkeypatch):
 
     monkeypatch.setattr(other_hold, "prepared_search", ended)
     bench = SimpleNamespace(otherwise_held=lambda: SimpleNamespace(hold="linear"))
-    search, ready = SimpleNamespace(bench=bench, misheld=1.0, workers=1, interrupted=False, laws=(), say=None), object()
+    search, ready = (
+        SimpleNamespace(bench=bench, misheld=1.0, workers=1, interrupted=False, laws=(), say=None, stand_in_error=0.0),
+        object(),
+    )
     assert other_hold.otherwise_held(None, (), "auto", ready, search, 2) == (ready, search)
     assert search.interrupted is (stops is KeyboardInterrupt)
 
@@ -75,6 +78,7 @@ def test_where_nothing_is_missing_with_the_other_hold_that_is_taken(unsure, take
         interrupted=False,
         laws=(),
         say=None,
+        stand_in_error=0.0,
         base=SimpleNamespace(cost=1.0),
         certainty=lambda: 0.6,
     )

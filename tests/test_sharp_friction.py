@@ -60,7 +60,7 @@ def test_friction_that_turns_round_at_once_is_named_as_what_it_is(v_0):
     assert effect.confidence > 0.9
     assert effect.parameters["F_c"]["value"] == pytest.approx(F_C, rel=2e-3)
     assert found.errors["test"]["after"] < 2 * found.floor["nrmse"]
-    assert effect.parameters["v_0"]["value"] < 2 * v_0
+    assert effect.parameters["v_0"]["value"] < 3 * v_0  # as sharp as the steps can follow
     assert not [g for g in found.gates if g.finding == "offset"]
 
 

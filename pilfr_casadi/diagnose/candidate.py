@@ -16,12 +16,13 @@ from ..laws import Law
 from ..recording import InputError, Recording
 from ..simulator import Placed, Simulator, in_series
 from .arranged import opened_at_the_start
-from .knees import knees, moved, on_finer_steps, sharper
+from .knees import knees, moved, on_finer_steps
 from .proof import deviations, shown
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 HEAD = 0.7  # share of each recording that candidates are fitted to
 WEAK, NO_WORSE = 2.0, 1.03  # standard errors within which a part of a law is idle, and error without it
+MUCH_AS_WELL = 1.1  # the same of a part that is nothing beside another
 TINY = 1e-3  # of another strength, of one that is nothing beside it
 SHOWN = 3.0  # standard errors that a law's strength is from zero at least
 LONG = 12000  # samples that candidates are fitted to
@@ -164,7 +165,7 @@ def polish(bench: Workbench, candidate: Candidate) -> Candidate:
         fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
     except InputError:
         return out
-    fitted = sharper(bench, candidate.knee, on_finer_steps(bench, fitted)) if candidate.knee else fitted
+    fitted = on_finer_steps(bench, fitted, candidate.knee) if candidate.knee else fitted
     if shown(bench, fitted) < SHOWN:
         return out
     done = replace(candidate, fitted=fitted, full=fitted.cost)
@@ -217,4 +218,6 @@ def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray
     law = plain().at({k: own[k] for k in plain.units}, limits)
     placed = candidate.fitted.simulator.without_last_element().with_element(element.port, law)
     found = attempt(_as_fine(bench, candidate), placed, [candidate.fitted.values], states=candidate.fitted.begin)
-    return found if found is not None and found.error < (NO_WORSE if std else 1.01) * candidate.error else candidate
+    tiny = all(np.all(np.abs(own[name]) <= _next_to_nothing(candidate, name)) for name in less)
+    worse = 1.01 if not std else MUCH_AS_WELL if tiny else NO_WORSE
+    return found if found is not None and found.error < worse * candidate.error else candidate

@@ -25,6 +25,10 @@ class Floor:
     deviation: np.ndarray
     source: str
 
+    def beside(self, deviation: np.ndarray) -> Floor:
+        """With another error that is nobody's fault."""
+        return Floor(np.hypot(self.deviation, deviation), self.source)
+
     def nrmse(self, scale: np.ndarray) -> float:
         """Averaged over outputs, in units of their deviation."""
         return float(np.mean(self.deviation / scale))

@@ -30,6 +30,7 @@ GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 HOPELESS, STRAINED = 0.1, 0.01
 MOST_AT_BOUNDS = 0.3  # share of the parameters at their bounds, beyond which a unit of time has bent the simulator
 CURED = 0.12  # share of the mean square that a sign or a unit put right leaves at most
+SEVERAL = 0.8  # share of the mean square that one channel in another unit leaves, for all to be
 NEAR = 6.0  # a factor is tried where it brings the simulated and the measured size this near
 
 
@@ -53,8 +54,8 @@ class Gate:
         return {k: getattr(self, k) for k in keys}
 
 
-def scaled(kind: str, index: int, factor: float) -> Change:
-    """Multiply one channel."""
+def scaled(kind: str, index: int | list[int], factor: float) -> Change:
+    """Multiply one channel, or several."""
 
     def change(r: Recording) -> Recording:
         values = np.array(getattr(r, kind))
@@ -227,6 +228,10 @@ def slips(bench: Workbench, plain: Fitted, workers: int, beside: str = "") -> tu
     for i, name in enumerate(bench.simulator.inputs):
         trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
         trials += [(name, "unit", f, scaled("u", i, f)) for f in factors if lost or any(_near(v / f) for v in sizes)]
+    names = bench.simulator.output_names
+    for f in FACTORS if len(names) > 1 else ():
+        if lost or all(_near(f * size) for size in sizes):
+            trials.append((", ".join(names), "unit", f, scaled("y", list(range(len(names))), f)))
     if beside:
         return _best_slip(bench, plain, [t for t in trials if t[0] == beside], workers, " and an offset")
     for kind, names in (("y", bench.simulator.output_names), ("u", bench.simulator.inputs)):
@@ -243,6 +248,7 @@ def _best_slip(
 ) -> tuple[Workbench, Fitted, list[Gate]]:
     """The trial after which the simulator follows best, where that is far better than without."""
     best, found = plain, None
+    channels = (*bench.simulator.inputs, *bench.simulator.output_names)
 
     def tried(trial: Trial) -> tuple[Workbench, Fitted | None]:
         other: Workbench = changed(bench, trial[3])
@@ -257,7 +263,9 @@ def _best_slip(
 
     for trial, (other, result) in zip(trials, side_by_side(tried, trials, workers), strict=True):
         bent = trial[1] == "time-unit" and result is not None and result.at_bounds > MOST_AT_BOUNDS
-        if result is not None and result.cost < best.cost and not bent:
+        # for a linear simulator, a unit of all outputs is one of its input
+        clearly = SEVERAL if trial[1] == "unit" and trial[0] not in channels else 1.0
+        if result is not None and result.cost < clearly * best.cost and not bent:
             best, found = result, (*trial, other)
     if found is None or best.cost > CURED * plain.cost or best.cost > 0.3:
         return bench, plain, []
@@ -267,8 +275,8 @@ def _best_slip(
     elif finding == "exchange":
         words = f"{value[0]} and {value[1]} are exchanged"
     else:
-        what = name if finding == "unit" else "the time"
-        words = f"{what} is off by a factor of {1 / value:.4g}{more}, as from a wrong unit"
+        what, be = (name, "are" if name not in channels else "is") if finding == "unit" else ("the time", "is")
+        words = f"{what} {be} off by a factor of {1 / value:.4g}{more}, as from a wrong unit"
     sentence = (
         f"In the recordings {words}: with it corrected the refitted simulator's error falls from "
         f"{np.sqrt(plain.cost):.3g} to {np.sqrt(best.cost):.3g} of the outputs' deviation."

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 NARROW = 0.05  # of the widest that is tried, of a knee that is sharp
 KNEES = (0.25, 4.0)  # times the width of a knee that a law is started from again
 MOVED = 1.2  # times the width, of a knee that is another
-# times the lower limit of a knee, the next limit and where to start; share of the mean square that is left at most
-SHARPER, BETTER = (0.1, 0.4), 0.9
 FINEST, SAME = 16, 0.1  # times the sub-steps at most, and the share by which finer ones may change the mean square
 
 
@@ -34,37 +32,31 @@ def knees(candidate: Candidate) -> list[dict[str, Any]]:
     return [values, *({**values, knee: times * values[knee]} for times in KNEES)]
 
 
-def on_finer_steps(bench: Workbench, fitted: Fitted) -> Fitted:
-    """Fitted again on finer steps, where what the simulation does depends on them."""
+def on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
+    """Fitted again on finer steps, where what the simulation does depends on them or they hold a sharper knee back.
+
+    The knee may be sharper there, as far as these steps can follow it at rest.
+    """
+    given = fitted.simulator.parameters[knee]
+    low, high = given.bounds
     if fitted.model.substeps * FINER > FINEST * bench.substeps:
         return fitted
     finer, placed = replace(bench, at_least=FINER * fitted.model.substeps), fitted.corrected()
+    sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER, high))
+    placed = placed.with_parameters({**placed.parameters, knee: sharper})
     model = finer.model(placed)
     engine = make_engine(model, bench.engine)
     states = bench.begun(placed, model, model.parameters.pack(fitted.values), fitted.begin)  # a delay's are others here
     there = bench.result(placed, fitted.values, states, engine, model)
-    if abs(there.cost / fitted.cost - 1) < SAME:
+    held = fitted.values[knee] <= low
+    if not held and abs(there.cost / fitted.cost - 1) < SAME:
         return fitted
+    starts = [fitted.values, *([{**fitted.values, knee: low / 2}] if held else [])]
     try:
-        return finer.fit(placed, [fitted.values], states=fitted.begin, solver=THOROUGH, model=model, engine=engine)
+        found = finer.fit(placed, starts, states=fitted.begin, solver=THOROUGH, model=model, engine=engine)
     except InputError:
         return fitted
-
-
-def sharper(bench: Workbench, knee: str, fitted: Fitted) -> Fitted:
-    """With a sharper knee than steps can follow at rest, where a limit holds it back and that is far better."""
-    given = fitted.simulator.parameters[knee]
-    low, high = given.bounds
-    if fitted.values[knee] > low:
-        return fitted
-    freed = replace(given, value=SHARPER[1] * low, bounds=(SHARPER[0] * low, high))
-    placed = fitted.simulator.with_parameters({**fitted.simulator.parameters, knee: freed})
-    finer = replace(bench, at_least=fitted.model.substeps)
-    try:
-        found = finer.fit(placed, [{**fitted.values, knee: freed.value}], states=fitted.initial, solver=THOROUGH)
-    except InputError:
-        return fitted
-    return found if found.cost < BETTER * fitted.cost else fitted
+    return found if found.cost < max(fitted.cost, there.cost) else fitted
 
 
 def moved(before: Candidate, after: Candidate) -> bool:

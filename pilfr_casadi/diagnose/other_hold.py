@@ -37,10 +37,10 @@ def otherwise_held(
         hold = search.bench.otherwise_held().hold
         given = simulator, recordings, hold, engine, search.laws, search.workers, search.say, True
         # one effect shows whether it is worth the search for two
-        other, again = prepared_search(*given, effects if wrong else 1)
+        other, again = prepared_search(*given, effects if wrong else 1, search.stand_in_error)
         nearer = again.base.cost <= search.base.cost
         if not wrong and nearer and effects > 1 and again.much() and not again.interrupted:
-            other, again = prepared_search(*given, effects, other)
+            other, again = prepared_search(*given, effects, search.stand_in_error, other)
             nearer = again.base.cost <= search.base.cost
     except InputError:  # it cannot be run so
         return ready, search

@@ -31,6 +31,7 @@ def prepared_search(
     say: Progress,
     hold_said: bool,
     effects: int,
+    stand_in_error: float = 0.0,
     ready: Prepared | None = None,
 ) -> tuple[Prepared, Search]:
     """What a search starts from, made here unless given, and the search; its times hold those of the preparation."""
@@ -42,22 +43,30 @@ def prepared_search(
         began = time.perf_counter()
         ready = ready or prepare(simulator, recordings, hold, engine, workers, starts, early)
         times["gates and refit"] = times.get("gates and refit", 0.0) + time.perf_counter() - began
-        search = Search(ready.bench, ready.without, ready.floor, laws, workers, say, hold_said)
-        search.times, search.may_be_led = times, not starts
+        floor = ready.floor.beside(stand_in_error * ready.bench.scale) if stand_in_error else ready.floor
+        search = Search(ready.bench, ready.without, floor, laws, workers, say, hold_said)
+        search.times, search.may_be_led, search.stand_in_error = times, not starts, stand_in_error
         return ready, search.run(effects)
 
-    ready, search = searched(ready)
-    try:
-        if search.led_to:
-            ready, search = searched(starts=[search.led_to])
-        if _early(ready) and not search.interrupted and (search.certainty() <= UNSURE or search.much()):
-            other = searched(early=False)
-            if other[1].base.cost < FURTHER * search.base.cost:
-                ready, search = other
-    except KeyboardInterrupt:
-        search.interrupted = True
-        if search.led_to:  # what was named is no physics
-            search.passes, search.base = [], search.without
+    def settled(ready: Prepared | None = None, early: bool = True) -> tuple[Prepared, Search]:
+        ready, search = searched(ready, early=early)
+        if not search.led_to or search.interrupted:
+            return ready, search
+        try:
+            return searched(starts=[search.led_to], early=early)
+        except KeyboardInterrupt:  # what was named is no physics
+            search.interrupted, search.passes, search.base = True, [], search.without
+            return ready, search
+
+    ready, search = settled(ready)
+    if _early(ready) and not search.interrupted and (search.certainty() <= UNSURE or search.much()):
+        try:
+            other = settled(early=False)
+        except KeyboardInterrupt:
+            search.interrupted = True
+            return ready, search
+        if other[1].base.cost < FURTHER * search.base.cost:
+            return other
     return ready, search
 
 

@@ -16,6 +16,7 @@ from .gates import Gate
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 MOST = 8  # values of the simulator that are printed
+LEFT = 2.0  # times the noise that is left, to be told
 FAR = 3.0  # times the training error that a test error is worth a warning
 
 
@@ -143,6 +144,9 @@ class Diagnosis:
                 f"{'it has' if one else 'they have'} too little room."
             )
         test, train = self.errors["test"], self.errors["train"]
+        times = train["after"] / max(self.floor["nrmse"], 1e-300) if train and self.effects else 1.0
+        if times > LEFT:
+            out.append(f"What is left is {times:.2g} times the noise: more is missing, or a law is only near.")
         if test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"]):
             out.append(
                 "The test error is far above the training error: what was found is only near what happens, or the test "

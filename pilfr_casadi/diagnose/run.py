@@ -46,6 +46,7 @@ def diagnose(
     limits: Mapping[str, float] | None = None,
     workers: int | None = None,
     engine: str = "auto",
+    stand_in_error: float = 0.0,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Find what a simulator leaves out, from recordings of the machine.
@@ -68,6 +69,8 @@ def diagnose(
         Largest amplitude of each input that a next experiment may have; by default what was recorded.
     workers : int, optional
         Fits run side by side, by default one a processor, at most four.
+    stand_in_error : float
+        NRMSE by which the simulator misses what it stands for (a surrogate: another simulation); it counts as noise.
     progress : callable
         Called with (stage, done, total, smallest error so far).
 
@@ -102,7 +105,9 @@ def diagnose(
     laws = (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
     say("refit", 0, 1, np.inf)
     said = said_hold(simulator, recordings, hold) is not None
-    ready, search = prepared_search(simulator, recordings, hold, engine, laws, workers, say, said, effects)
+    ready, search = prepared_search(
+        simulator, recordings, hold, engine, laws, workers, say, said, effects, stand_in_error
+    )
     if not said and doubted(search):
         first, ended = search, time.perf_counter()
         ready, search = otherwise_held(simulator, recordings, engine, ready, search, effects)

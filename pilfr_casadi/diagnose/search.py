@@ -73,6 +73,8 @@ class Search:
         Share of the residual that a flexible force explains, by port, without and with the effects.
     hold_said : bool
         Whether somebody said what inputs do between samples; else each effect is a new chance to tell.
+    stand_in_error : float
+        NRMSE by which the simulator misses what it stands for; the floor holds it too.
     may_be_led : bool
         Whether the refit may have stayed in a local minimum that a law leads out of.
     led_to : dict
@@ -91,6 +93,7 @@ class Search:
     say: Progress
     hold_said: bool = True
     misheld: float = 1.0
+    stand_in_error: float = 0.0
     may_be_led: bool = True
     led_to: Mapping[str, np.ndarray] = field(default_factory=dict)
     base: Fitted = field(init=False)
@@ -262,7 +265,8 @@ class Search:
 
     def _lower_floor(self, fits: Sequence[Fitted]) -> None:
         if self.floor.source == "estimated":
-            found = [self.floor.deviation, *(white_part(f.residual) for f in fits)]
+            known = self.stand_in_error * self.bench.scale
+            found = [self.floor.deviation, *(np.hypot(white_part(f.residual), known) for f in fits)]
             self.floor = Floor(np.min(found, axis=0), "estimated")
 
     def polished(self, candidate: Candidate) -> Candidate | None:

@@ -37,6 +37,7 @@ UNSURE = 0.5  # confidence below which a name is called likely
 NOT_AT_ALL, HARDLY = 0.02, 0.1
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
+AS_NEAR = 1.5  # times what a surrogate misses of the simulation itself, within which nothing can be said
 PURE = 0.05  # share of model error in a residual that is taken for noise
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
 
@@ -67,6 +68,11 @@ def _swells(search: Search) -> bool:
 
 def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     """Verdict and its sentence."""
+    if _said(search) < AS_NEAR * search.stand_in_error:
+        return "complete", (
+            f"Nothing is seen that the simulation lacks: refitted, what stands for it follows the recordings to "
+            f"{_said(search):.3g} of the outputs' deviation, and the simulation itself to {search.stand_in_error:.3g}."
+        )
     accepted = [p.choice for p in search.passes if p.accepted and p.choice is not None]
     remains, still = left_open(search)
     faults = [g for g in gates if g.fault]

@@ -52,6 +52,7 @@ class AsymmetricFriction(CoulombFriction):
 
     form = "asymmetric"
     equation = "w = F_c tanh(dz/dt / v_0) + F_0"
+    sentence = "dry friction that differs between the two directions, or that has a constant load beside it"
     units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_0": "w", "v_0": "z/s"}
     strength: ClassVar[tuple[str, ...]] = ("F_c", "F_0")
     signed: ClassVar[tuple[str, ...]] = ("F_0",)
@@ -65,7 +66,9 @@ class DirectionalFriction(AsymmetricFriction):
 
     form = "directional"
     equation = "w = F_c tanh(dz/dt / v_0) + F_0 + c_0 |dz/dt|"
-    sentence = "dry friction, and friction that grows with speed, both different in the two directions"
+    sentence = (
+        "dry friction, and friction that grows with speed, both different in the two directions (or a constant load)"
+    )
     units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_0": "w", "c_0": "w*s/z", "v_0": "z/s"}
     strength: ClassVar[tuple[str, ...]] = ("F_c", "F_0", "c_0")
     signed: ClassVar[tuple[str, ...]] = ("F_0", "c_0")
