@@ -199,10 +199,13 @@ def read_file(
 
 
 def columns_of(options: argparse.Namespace, path: str) -> dict[str, str]:
-    """Name -> column of a file; one that has the name itself, and not the column, is as it should be."""
+    """Name -> column of a file; beside a simulation, a file may have the name itself and another file the column."""
     columns = pairs(options.column, "--column")
-    there = column_names(path, list(columns.values())) if columns else ()
-    return {name: column for name, column in columns.items() if column in there or name not in there}
+    if not columns or not getattr(options, "simulated", None):
+        return columns
+    names = {f: column_names(f, list(columns.values())) for f in (options.simulated, *options.files, *options.test)}
+    there, elsewhere = names[path], {name for found in names.values() for name in found}
+    return {n: c for n, c in columns.items() if c in there or n not in there or c not in elsewhere}
 
 
 def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> None:

@@ -164,6 +164,7 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
     search = SimpleNamespace(
         passes=[found],
         floor2=1e-6,
+        stand_in_error=0.0,
         floor=SimpleNamespace(source="estimated"),
         base=SimpleNamespace(cost=0.2, simulator=SimpleNamespace(parameters={}, elements=())),
         without=SimpleNamespace(cost=1.0),
@@ -189,6 +190,7 @@ def test_two_names_that_are_hardly_sure_are_no_answer(sure, verdict, monkeypatch
     search = SimpleNamespace(
         passes=[SimpleNamespace(accepted=True, choice=c) for c in choices],
         floor2=1e-6,
+        stand_in_error=0.0,
         floor=SimpleNamespace(source="repeats"),
         base=SimpleNamespace(cost=0.01),
         without=SimpleNamespace(cost=1.0),

@@ -68,7 +68,7 @@ def _swells(search: Search) -> bool:
 
 def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     """Verdict and its sentence."""
-    if _said(search) < AS_NEAR * search.stand_in_error:
+    if search.stand_in_error and _said(search) < AS_NEAR * search.stand_in_error:
         return "complete", (
             f"Nothing is seen that the simulation lacks: refitted, what stands for it follows the recordings to "
             f"{_said(search):.3g} of the outputs' deviation, and the simulation itself to {search.stand_in_error:.3g}."
