@@ -45,14 +45,13 @@ def run_diagnosis(options: argparse.Namespace) -> int:
     _check_apart([*zip(train, recordings, strict=True)], [*zip(options.test, tests, strict=True)])
     _check_steps([*zip([*train, *options.test], [*recordings, *tests], strict=True)])
     folder = make_folder(options.out)
-    notes, error = list[str](), 0.0
+    error = 0.0
     if source is not None:
         simulator = as_simulator(given, recordings)
     else:
-        simulator, error, notes = _surrogate(options, inputs, outputs)
-    _announce(simulator, source, [("training", train, recordings), ("test", options.test, tests)])
-    for note in notes:
-        print(note, flush=True)
+        simulator, error = _surrogate(options, inputs, outputs)
+    name = f"simulator: {source}" if source else f"surrogate of {options.simulated} (NRMSE {error:.4f})"
+    _announce(simulator, name, [("training", train, recordings), ("test", options.test, tests)])
     with deferred_interrupt():
         from .diagnose import diagnose
     try:
@@ -141,11 +140,8 @@ def _check_steps(given: Sequence[tuple[str, Recording]]) -> None:
             raise InputError(f"{other} has a step of {r.dt:g} s, {path} one of {first.dt:g} s; resample one of them.")
 
 
-def _announce(
-    simulator: Simulator, source: str | None, kinds: Sequence[tuple[str, Sequence[str], Sequence[Recording]]]
-) -> None:
+def _announce(simulator: Simulator, name: str, kinds: Sequence[tuple[str, Sequence[str], Sequence[Recording]]]) -> None:
     ports = listed([port.name for port in simulator.all_ports()])
-    name = f"simulator: {source}" if source else "surrogate of the simulation"
     free = sum(not bool(np.all(p.fixed)) for p in simulator.parameters.values())
     counts = f"{len(simulator.states)} states, {len(simulator.parameters)} parameters ({free} free)"
     print(f"{name}, {counts}; ports {ports}", flush=True)
@@ -157,21 +153,10 @@ def _announce(
 
 def _surrogate(
     options: argparse.Namespace, inputs: tuple[str, ...], outputs: tuple[str, ...]
-) -> tuple[Simulator, float, list[str]]:
+) -> tuple[Simulator, float]:
     with deferred_interrupt():
-        from .diagnose.surrogate import POOR, surrogate
-    simulated = read_file(options, options.simulated, inputs, outputs)
-    simulator, error = surrogate(simulated)
-    notes = [
-        f"A linear model stands for the simulation {options.simulated}, which it follows to NRMSE {error:.4f}; "
-        "an error of this size counts as noise."
-    ]
-    if error > POOR:
-        notes.append(
-            "note: that is poor; the simulation is not linear there, and what the surrogate misses will show up as "
-            "missing physics. Give the simulator itself where it can be had."
-        )
-    return simulator, error, notes
+        from .diagnose.surrogate import surrogate
+    return surrogate(read_file(options, options.simulated, inputs, outputs))
 
 
 def _simulated_names(options: argparse.Namespace, train: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

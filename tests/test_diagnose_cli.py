@@ -211,8 +211,11 @@ def test_what_a_simulation_answered_stands_in_for_it(capsys, files):
     status, out, err = run(capsys, *arguments(files, "--hold", "zero", "--initial", "zero", simulator=None))
     assert status == 0 and err == ""
     assert "inputs force, outputs position, as found in the files" in out
-    assert "which it follows to NRMSE 0.00" in out and "ports mode:1.5" in out
+    assert "simulated.csv (NRMSE 0.00" in out and "ports mode:1.5" in out
     found = json.loads((files / "out" / "diagnosis.json").read_text())
+    assert found["gates"][0]["finding"] == "surrogate"
+    assert "A linear model stands for the simulation" in found["gates"][0]["sentence"]
+    assert "A linear model stands for the simulation" in (files / "out" / "report.html").read_text()
     assert found["verdict"] == "missing-physics"
     effect = found["effects"][0]
     assert effect["port"].startswith("mode:1.5") and effect["law"] == "cubic_stiffness"

@@ -6,10 +6,16 @@ import pytest
 
 from pilfr_casadi.diagnose import other_hold
 from pilfr_casadi.diagnose.candidate import Candidate
+from pilfr_casadi.diagnose.prepared_search import Asked
 from pilfr_casadi.laws.dynamic import Delay, Mode, Relaxation
 from pilfr_casadi.simulator import Placed
 
 DT = 2e-3
+
+
+def asked():
+    """A diagnosis of two effects, of nothing in particular."""
+    return Asked(None, (), (), None, "auto", 1, 2, 0.0, None)
 
 
 def named(port, law, **values):
@@ -48,11 +54,8 @@ def test_what_ends_the_other_search_leaves_the_one_there_is(stops, monkeypatch):
 
     monkeypatch.setattr(other_hold, "prepared_search", ended)
     bench = SimpleNamespace(otherwise_held=lambda: SimpleNamespace(hold="linear"))
-    search, ready = (
-        SimpleNamespace(bench=bench, misheld=1.0, workers=1, interrupted=False, laws=(), say=None, stand_in_error=0.0),
-        object(),
-    )
-    assert other_hold.otherwise_held(None, (), "auto", ready, search, 2) == (ready, search)
+    search, ready = SimpleNamespace(bench=bench, misheld=1.0, interrupted=False), object()
+    assert other_hold.otherwise_held(asked(), ready, search) == (ready, search)
     assert search.interrupted is (stops is KeyboardInterrupt)
 
 
@@ -69,18 +72,9 @@ def test_where_nothing_is_missing_with_the_other_hold_that_is_taken(unsure, take
     )
     monkeypatch.setattr(other_hold, "prepared_search", lambda *_: (other, again))
     monkeypatch.setattr(other_hold, "hold_note", lambda *_: "held")
-    monkeypatch.setattr(other_hold, "replace", lambda of, gates: of)
+    monkeypatch.setattr(other_hold, "replace", lambda of, **_: of)
     bench = SimpleNamespace(otherwise_held=lambda: SimpleNamespace(hold="linear"))
-    search = SimpleNamespace(
-        bench=bench,
-        misheld=1.0,
-        workers=1,
-        interrupted=False,
-        laws=(),
-        say=None,
-        stand_in_error=0.0,
-        base=SimpleNamespace(cost=1.0),
-        certainty=lambda: 0.6,
-    )
-    found = other_hold.otherwise_held(None, (), "auto", "ready", search, 2)
+    base = SimpleNamespace(cost=1.0)
+    search = SimpleNamespace(bench=bench, misheld=1.0, interrupted=False, base=base, certainty=lambda: 0.6)
+    found = other_hold.otherwise_held(asked(), "ready", search)
     assert found == ((other, again) if taken else ("ready", search))

@@ -11,6 +11,7 @@ from pilfr_casadi.diagnose import prepare, prepared_search, review
 from pilfr_casadi.diagnose.choice import Choice
 from pilfr_casadi.diagnose.first_effect import led_out
 from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.prepared_search import Asked
 from pilfr_casadi.diagnose.proof import deviations, shown
 from pilfr_casadi.diagnose.rivals import WIDER, rivals_beside
 from pilfr_casadi.diagnose.screen import Scored
@@ -142,8 +143,8 @@ def test_a_search_begins_anew_from_where_a_law_has_led(monkeypatch):
     begun, values = [], {"k1": 3.0}
 
     class Led:
-        def __init__(self, *given):
-            self.interrupted, self.may_be_led, self.times = False, True, {}
+        def __init__(self, *given, may_be_led, times, **more):
+            self.interrupted, self.may_be_led, self.times = False, may_be_led, times
             self.led_to, self.passes, self.base, self.without = {}, ["a law"], None, "refitted"
 
         def run(self, effects):
@@ -158,25 +159,25 @@ def test_a_search_begins_anew_from_where_a_law_has_led(monkeypatch):
 
     monkeypatch.setattr(prepared_search, "prepare", prepare)
     monkeypatch.setattr(prepared_search, "Search", Led)
-    given = rig(), (), "zero", "auto", (), 1, None, True, 2
+    asked = Asked(rig(), (), (), "zero", "auto", 1, 2, 0.0, None)
     stops = False
-    _, search = prepared_search.prepared_search(*given)
+    _, search = prepared_search.prepared_search(asked)
     assert begun == [(), [values]] and not search.may_be_led
     assert list(search.times) == ["gates and refit"]
     begun.clear()
     stops = True
-    _, search = prepared_search.prepared_search(*given)
+    _, search = prepared_search.prepared_search(asked)
     assert search.interrupted and search.passes == [] and search.base == "refitted"
 
 
 @pytest.mark.parametrize("nearer", [True, False])
 def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monkeypatch, nearer):
-    asked = []
+    early_or_not = []
 
     class Unsure:
-        def __init__(self, *given):
+        def __init__(self, *given, **more):
             self.interrupted, self.led_to = False, {}
-            early = asked[-1]
+            early = early_or_not[-1]
             self.base = SimpleNamespace(cost=1.0 if early else 0.1 if nearer else 0.9)
 
         def run(self, effects):
@@ -186,14 +187,14 @@ def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monk
             return 0.1
 
     def prepare(*given):
-        asked.append(given[6])
+        early_or_not.append(given[6])
         return SimpleNamespace(bench=None, without=None, floor=None, gates=gates if given[6] else ())
 
     gates = (SimpleNamespace(finding="alignment", value=-0.1),)
     monkeypatch.setattr(prepared_search, "prepare", prepare)
     monkeypatch.setattr(prepared_search, "Search", Unsure)
-    ready, _ = prepared_search.prepared_search(rig(), (), "zero", "auto", (), 1, None, True, 2)
-    assert asked == [True, False] and ready.gates == (() if nearer else gates)
+    ready, _ = prepared_search.prepared_search(Asked(rig(), (), (), "zero", "auto", 1, 2, 0.0, None))
+    assert early_or_not == [True, False] and ready.gates == (() if nearer else gates)
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,11 @@ import pilfr_casadi as pilfr
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.diagnose.candidate import Candidate
 from pilfr_casadi.diagnose.choice import Choice
+from pilfr_casadi.diagnose.finer_steps import GAINED, on_steps_as_fine
 from pilfr_casadi.diagnose.first_effect import let_idle_offsets_go
 from pilfr_casadi.diagnose.offset import Offset
 from pilfr_casadi.diagnose.search import Pass
-from pilfr_casadi.diagnose.workbench import FINER, Workbench
+from pilfr_casadi.diagnose.workbench import FINER, THOROUGH, Workbench
 from pilfr_casadi.integration import discretise
 from pilfr_casadi.laws import AsymmetricFriction, CoulombFriction
 from pilfr_casadi.simulator import Simulator
@@ -21,11 +22,11 @@ from pilfr_casadi.simulator import Simulator
 F_C = 6.0
 
 
-def carriage(friction=None, mass=1.5, drag=6.0):
-    """A carriage on a guide, by itself or with friction in its equations."""
+def carriage(friction=None, mass=1.5, drag=6.0, **more):
+    """A carriage on a guide, by itself or with friction(velocity, parameters) in its equations."""
 
     def dynamics(x, u, p):
-        return dict(pos=x.vel, vel=(u.force - p.d * x.vel - (friction(x.vel) if friction else 0)) / p.m)
+        return dict(pos=x.vel, vel=(u.force - p.d * x.vel - (friction(x.vel, p) if friction else 0)) / p.m)
 
     return Simulator(
         dynamics,
@@ -33,7 +34,9 @@ def carriage(friction=None, mass=1.5, drag=6.0):
         ("pos", "vel"),
         ("force",),
         dict(
-            m=pilfr.Parameter(mass, unit="kg", bounds=(0.3, 6)), d=pilfr.Parameter(drag, unit="N s/m", bounds=(0, 60))
+            m=pilfr.Parameter(mass, unit="kg", bounds=(0.3, 6)),
+            d=pilfr.Parameter(drag, unit="N s/m", bounds=(0, 60)),
+            **more,
         ),
         (pilfr.Port("guide", lambda p: dict(vel=-1 / p.m), lambda x: x.pos, lambda x: x.vel, "N", "m"),),
     )
@@ -46,7 +49,7 @@ def ran(seed, v_0):
     rng, m = np.random.default_rng(seed), 1500
     force = 25 * pilfr.multisine(m, f_max=15.0, fs=1 / DT, rng=rng)
     blank = pilfr.Recording(force, force, DT, ("force",), ("position",), initial="zero", hold="zero")
-    model = discretise(carriage(lambda v: F_C * ca.tanh(v / v_0)), DT, "zero", 40)
+    model = discretise(carriage(lambda v, p: F_C * ca.tanh(v / v_0)), DT, "zero", 40)
     y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(2))[0]
     return blank.with_(y=y + 5e-4 * np.std(y) * rng.standard_normal(y.shape))
 
@@ -62,6 +65,43 @@ def test_friction_that_turns_round_at_once_is_named_as_what_it_is(v_0):
     assert found.errors["test"]["after"] < 2 * found.floor["nrmse"]
     assert effect.parameters["v_0"]["value"] < 3 * v_0  # as sharp as the steps can follow
     assert not [g for g in found.gates if g.finding == "offset"]
+
+
+def sharp(friction=F_C, **own):
+    """The carriage with dry friction that turns round at once in its own equations."""
+    import casadi as ca
+
+    free = pilfr.Parameter(friction, unit="N", bounds=(0, 40))
+    return carriage(lambda v, p: p.F * ca.sign(v), F=free, **own)
+
+
+def test_friction_that_is_in_the_simulator_already_gets_the_steps_that_it_asks_for():
+    found = pilfr.diagnose(sharp(5.0, mass=1.7, drag=5.0), ran(0, 1e-4), test=ran(1, 1e-4), laws=(CoulombFriction,))
+    assert (found.verdict, found.effects) == ("complete", ()), str(found)
+    assert found.substeps >= FINER
+    assert found.errors["test"]["after"] < 2 * found.floor["nrmse"]
+    assert found.corrected.parameters["F"].value == pytest.approx(F_C, rel=2e-3)
+
+
+def test_finer_steps_only_where_the_run_depends_on_them_and_gains():
+    plain = Workbench.of(carriage(), [ran(0, 1e-4)], "zero")
+    fitted = plain.fit(carriage())
+    assert on_steps_as_fine(plain, fitted) == (plain, fitted)  # far off, but not for its steps
+    bench = Workbench.of(sharp(), plain.recordings, "zero")
+    coarse = bench.fit(sharp(), solver=THOROUGH)
+    finer, better = on_steps_as_fine(bench, coarse)
+    assert finer.substeps > bench.substeps and better.model.substeps == finer.substeps
+    assert better.cost < GAINED * coarse.cost
+
+
+def test_what_takes_the_place_of_the_simulators_own_is_told():
+    found = pilfr.diagnose(carriage(mass=1.7, drag=5.0), ran(0, 1e-3), laws=(CoulombFriction,))
+    assert found.sentence == "The simulator leaves out coulomb friction at guide."
+    wrong = carriage(lambda v, p: p.c * v * v * v, c=pilfr.Parameter(1.0, unit="N s³/m³", bounds=(0, 100)))
+    found = pilfr.diagnose(wrong, ran(0, 1e-3), laws=(CoulombFriction,))
+    assert found.sentence.startswith("The simulator leaves out coulomb friction at guide."), str(found)
+    gone = found.corrected.parameters["c"].value == 0
+    assert gone == found.sentence.endswith(" Beside it, c comes out as zero.")
 
 
 def test_a_sharp_knee_gets_finer_steps_whatever_its_sharpness():

@@ -8,8 +8,8 @@ them by a clear factor first.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -49,20 +49,98 @@ class Choice:
     common: tuple[str, str] | None = None
 
 
-def _near(candidate: Candidate, winner: Candidate, before: float) -> bool:
-    """Whether a law does as well; `before` is the mean square error without any."""
-    return candidate.error < (1 + LIKE) * winner.error and _as_much(candidate, winner, before)
+@dataclass(frozen=True, eq=False)
+class _Contest:
+    """Candidates with finite errors, and what they are measured by: all squared but `n`, the effective samples."""
 
+    ranked: Sequence[Candidate]
+    before: float  # without any law
+    floor: float
+    n: float
 
-def _as_much(candidate: Candidate, winner: Candidate, before: float) -> bool:
-    """Whether a law takes away as much of the mean square."""
-    return bool(before - candidate.error**2 >= AS_MUCH * (before - winner.error**2))
+    @classmethod
+    def of(cls, candidates: Sequence[Candidate], before: float, floor: float, n: float) -> _Contest:
+        """Ranked by the criterion."""
+        contest = cls(candidates, before, floor, n)
+        return replace(contest, ranked=sorted(candidates, key=contest.key))
 
+    def key(self, c: Candidate) -> float:
+        """The criterion a sample; a handicap counts for what lies above the floor, where something is to imitate."""
+        noise = min(self.floor, c.error**2)
+        excess = float(np.sqrt(noise + (c.error**2 - noise) * handicap(c.law) ** 2))
+        return float(np.log(excess) + 0.5 * c.size * np.log(self.n) / self.n)
 
-def _within_steps(candidate: Candidate, winner: Candidate, before: float, floor: float) -> bool:
-    """Whether all that one of two frictions at a port leaves is next to what steps make of a force that turns round."""
-    both = candidate.knee and winner.knee and candidate.port == winner.port
-    return bool(both and candidate.error**2 - floor < TRACE * before)
+    def near(self, c: Candidate, winner: Candidate) -> bool:
+        """Whether a law does as well."""
+        return c.error < (1 + LIKE) * winner.error and self.as_much(c, winner)
+
+    def as_much(self, c: Candidate, winner: Candidate) -> bool:
+        """Whether a law takes away as much of the mean square."""
+        return bool(self.before - c.error**2 >= AS_MUCH * (self.before - winner.error**2))
+
+    def within_steps(self, c: Candidate, winner: Candidate) -> bool:
+        """Whether all that one of two frictions at a port leaves is what steps make of a force that turns round."""
+        both = c.knee and winner.knee and c.port == winner.port
+        return bool(both and c.error**2 - self.floor < TRACE * self.before)
+
+    def fewest(self, winner: Candidate) -> Candidate:
+        """What does as well as one with fewer parameters, and is no more doubtful."""
+        close = [c for c in self.ranked if c.size < winner.size and c.doubtful <= winner.doubtful]
+        close = [c for c in close if self.near(c, winner) or self.within_steps(c, winner)]
+        return min(close, key=lambda c: (c.size, self.key(c)), default=winner)
+
+    def winner(self) -> Candidate:
+        """The first, unless another is preferred for what it is."""
+        winner = self.held_by_nothing(self.fewest(self.ranked[0]))
+        plain = [c for c in self.there(winner) if not c.doubtful and c.error < NEARLY * winner.error]
+        if winner.doubtful and plain:  # what does nearly as well and is what its name says
+            winner = self.fewest(plain[0])
+        rivals = (c for c in self.ranked[1:] if not c.doubtful and imitates(winner, c, self.floor))
+        return next(rivals, winner)
+
+    def held_by_nothing(self, winner: Candidate) -> Candidate:
+        """Instead of a law that a bound holds back, what does as well without."""
+        as_small = [c for c in self.ranked if c.size <= winner.size and not c.at_bound]
+        free = [c for c in as_small if self.near(c, winner) or _fits(c, winner)]
+        return min(free, key=lambda c: (c.size, self.key(c))) if winner.at_bound and free else winner
+
+    def there(self, winner: Candidate) -> list[Candidate]:
+        """Candidates at the winner's port."""
+        return [c for c in self.ranked if c.port == winner.port]
+
+    def of_its_kind(self, winner: Candidate) -> Candidate:
+        """Of laws that are one another's special case, the one to speak of."""
+        carried = [c for c in self.ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]
+        if winner.law.form == "mode" and carried and self.as_much(carried[0], winner):
+            return carried[0]  # any pair of a pole and a zero is a mode: a part that is carried along is one
+        if winner.law.id != "drift":  # what an actuator's would have to be tuned for, a sensor's is by itself
+            return winner
+        slow = [c for c in self.ranked if c.law.id == "drift" and c.port.startswith("sensor:")]
+        return next((c for c in slow if c.size <= winner.size and self.near(c, winner)), winner)
+
+    def alike(self, winner: Candidate) -> dict[tuple[str, str], Candidate]:
+        """What no larger does as well, by name, the least near first."""
+        modes = [c for c in self.ranked[::-1] if c.law.form == "mode" and c.error < (1 + LIKE) * winner.error]
+        beside = modes if winner.law.form == "attached mass" else []
+        no_larger = [c for c in self.ranked[::-1] if self.near(c, winner) and c.size <= winner.size]
+        return {c.name: c for c in (*beside, *no_larger) if c.name != winner.name}
+
+    def margin(self, winner: Candidate, alike: Collection[tuple[str, str]], given_up: tuple[str, str] | None) -> float:
+        """Smallest ratio of a true rival's error: none is a refinement of what cannot be told from the winner."""
+        ports, margin = {winner.port, *(port for port, _ in alike)}, np.inf
+        for c in {c.name: c for c in self.ranked[::-1]}.values():  # the best of each name
+            if c.name in (winner.name, given_up, *alike) or self._refines(c, winner, ports):
+                continue
+            margin = min(margin, max(c.error / winner.error, float(np.exp(self.key(c) - self.key(winner)))))
+        return float(margin)
+
+    def _refines(self, c: Candidate, winner: Candidate, ports: Collection[str]) -> bool:
+        if c.size > winner.size and self.within_steps(winner, c):
+            return True
+        # friction that hardly falls may come a little nearer than one that does not
+        least = 1 / NEARLY if c.doubtful and c.knee and winner.knee else 1 - LIKE
+        contains = winner.law.id in CONTAINS.get(c.law.id, ()) and c.error > least * winner.error
+        return c.port in ports and (self.near(c, winner) or contains)
 
 
 def _fits(candidate: Candidate, winner: Candidate) -> bool:
@@ -89,59 +167,13 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     usable = [c for c in candidates if np.isfinite(c.error)]
     if not usable:
         return None
-
-    def excess(c: Candidate) -> float:
-        # a handicap counts for what lies above the floor: at the floor nothing is left to imitate
-        noise = min(floor, c.error**2)
-        return float(np.sqrt(noise + (c.error**2 - noise) * handicap(c.law) ** 2))
-
-    def key(c: Candidate) -> float:
-        return float(np.log(excess(c)) + 0.5 * c.size * np.log(n) / n)
-
-    def fewest(winner: Candidate) -> Candidate:
-        """What does as well as one with fewer parameters, and is no more doubtful."""
-        close = [c for c in ranked if c.size < winner.size]
-        close = [c for c in close if _near(c, winner, before) or _within_steps(c, winner, before, floor)]
-        return min((c for c in close if c.doubtful <= winner.doubtful), key=lambda c: (c.size, key(c)), default=winner)
-
-    ranked = sorted(usable, key=key)
-    winner = ranked[0]
     before = float(np.sqrt(without[0] * without[1]))
-    winner = fewest(winner)
-    as_small = [c for c in ranked if c.size <= winner.size and not c.at_bound]
-    free = [c for c in as_small if _near(c, winner, before) or _fits(c, winner)]
-    if winner.at_bound and free:  # what does as well without being held back
-        winner = min(free, key=lambda c: (c.size, key(c)))
-    plain = [c for c in ranked if c.port == winner.port and not c.doubtful and c.error < NEARLY * winner.error]
-    if winner.doubtful and plain:  # what does nearly as well and is what its name says
-        winner = fewest(plain[0])
-    for rival in ranked[1:]:
-        if not rival.doubtful and imitates(winner, rival, floor):
-            winner = rival
-            break
-    dry = dry_instead(winner, ranked, floor)
-    winner, given_up = (winner, None) if dry is None else (dry, winner.name)
-    carried = [c for c in ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]
-    if winner.law.form == "mode" and carried and _as_much(carried[0], winner, before):
-        winner = carried[0]  # any pair of a pole and a zero is a mode: a part that is carried along is one
-    modes = [c for c in reversed(ranked) if c.law.form == "mode" and c.error < (1 + LIKE) * winner.error]
-    beside = modes if winner.law.form == "attached mass" else []
-    if winner.law.id == "drift":  # what an actuator's would have to be tuned for, a sensor's is by itself
-        slow = [c for c in ranked if c.law.id == "drift" and c.port.startswith("sensor:") and c.size <= winner.size]
-        winner = next((c for c in slow if _near(c, winner, before)), winner)
+    contest = _Contest.of(usable, before, floor, n)
+    found = contest.winner()
+    dry = dry_instead(found, contest.ranked, floor)
+    winner = contest.of_its_kind(dry or found)
+    alike = contest.alike(winner)
     gain = n * (0.5 * np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
-    first = {c.name: c for c in reversed(ranked) if c.name != winner.name}  # the best of each name
-    no_larger = [c for c in reversed(ranked) if c.name in first and _near(c, winner, before) and c.size <= winner.size]
-    alike = {c.name: c for c in (*beside, *no_larger) if c.name != winner.name}
-    ports, margin = {winner.port, *(port for port, _ in alike)}, np.inf
-    for c in first.values():
-        ratio = c.error / winner.error
-        # friction that hardly falls may come a little nearer than one that does not
-        least = 1 / NEARLY if c.doubtful and c.knee and winner.knee else 1 - LIKE
-        contains = winner.law.id in CONTAINS.get(c.law.id, ()) and ratio > least
-        refines = c.name == given_up or (c.size > winner.size and _within_steps(winner, c, before, floor))
-        refines = refines or (c.port in ports and (_near(c, winner, before) or contains))
-        if c.name not in alike and not refines:  # nor a refinement of what cannot be told from the winner
-            margin = min(margin, max(ratio, float(np.exp(key(c) - key(winner)))))
     remains = (winner.error**2 - floor) / max(before - floor, 1e-300)
-    return Choice(winner, tuple(alike.values())[::-1], float(gain), float(np.clip(remains, 0, 1)), float(margin))
+    margin = contest.margin(winner, alike, found.name if dry else None)
+    return Choice(winner, tuple(alike.values())[::-1], float(gain), float(np.clip(remains, 0, 1)), margin)

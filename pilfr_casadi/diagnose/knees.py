@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..compiled import make_engine
 from ..recording import InputError
 from .workbench import FINER, THOROUGH, Fitted, Workbench
 
@@ -44,16 +43,14 @@ def on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
     finer, placed = replace(bench, at_least=FINER * fitted.model.substeps), fitted.corrected()
     sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER, high))
     placed = placed.with_parameters({**placed.parameters, knee: sharper})
-    model = finer.model(placed)
-    engine = make_engine(model, bench.engine)
-    states = bench.begun(placed, model, model.parameters.pack(fitted.values), fitted.begin)  # a delay's are others here
-    there = bench.result(placed, fitted.values, states, engine, model)
+    there = finer.rerun(fitted, placed)
     held = fitted.values[knee] <= low
     if not held and abs(there.cost / fitted.cost - 1) < SAME:
         return fitted
     starts = [fitted.values, *([{**fitted.values, knee: low / 2}] if held else [])]
+    states, model, engine = fitted.begin, there.model, there.engine
     try:
-        found = finer.fit(placed, starts, states=fitted.begin, solver=THOROUGH, model=model, engine=engine)
+        found = finer.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
     except InputError:
         return fitted
     return found if found.cost < max(fitted.cost, there.cost) else fitted

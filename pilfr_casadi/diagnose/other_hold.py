@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from ..recording import InputError, Recording
+from ..recording import InputError
 from .first_effect import MISHELD
 from .gates import hold_note
 from .prepare import Prepared
-from .prepared_search import prepared_search
+from .prepared_search import Asked, prepared_search
 from .search import Search
 
 
@@ -28,19 +26,17 @@ def doubted(search: Search) -> bool:
     return (search.much() or any(c.within(search.bench.dt) for c in named)) if named else search.unsure()
 
 
-def otherwise_held(
-    simulator: Any, recordings: Sequence[Recording], engine: str, ready: Prepared, search: Search, effects: int
-) -> tuple[Prepared, Search]:
+def otherwise_held(asked: Asked, ready: Prepared, search: Search) -> tuple[Prepared, Search]:
     """A search with the other hold where inputs seem to be held so or names are surer then; else the one there is."""
     wrong = search.misheld > MISHELD
     try:
         hold = search.bench.otherwise_held().hold
-        given = simulator, recordings, hold, engine, search.laws, search.workers, search.say, True
+        held = replace(asked, hold=hold)
         # one effect shows whether it is worth the search for two
-        other, again = prepared_search(*given, effects if wrong else 1, search.stand_in_error)
+        other, again = prepared_search(held if wrong else replace(held, effects=1))
         nearer = again.base.cost <= search.base.cost
-        if not wrong and nearer and effects > 1 and again.much() and not again.interrupted:
-            other, again = prepared_search(*given, effects, search.stand_in_error, other)
+        if not wrong and nearer and asked.effects > 1 and again.much() and not again.interrupted:
+            other, again = prepared_search(held, other)
             nearer = again.base.cost <= search.base.cost
     except InputError:  # it cannot be run so
         return ready, search
@@ -53,4 +49,4 @@ def otherwise_held(
         search.interrupted = again.interrupted
         return ready, search
     ratio = search.misheld if wrong else float(np.sqrt(search.base.cost / max(again.base.cost, 1e-300)))
-    return replace(other, gates=(*other.gates, hold_note(simulator, hold, ratio))), again
+    return replace(other, gates=(*other.gates, hold_note(asked.simulator, hold, ratio))), again

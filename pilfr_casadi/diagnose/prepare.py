@@ -11,6 +11,7 @@ import numpy as np
 from ..recording import InputError, Recording
 from ..simulator import Simulator
 from .clipping import unclip
+from .finer_steps import on_steps_as_fine
 from .floor import Floor, measured_floor, white_part
 from .gaps import gaps
 from .gates import CURED, STRAINED, Gate, choose_hold, hold_note, opened, said_hold, slips
@@ -95,6 +96,7 @@ def prepare(
             gates, notes = [g for g in gates if g not in notes] + held, held
         floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
         noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
+    bench, without = on_steps_as_fine(bench, without)
     given, before = bench, without
     # where inputs are taken as held but are interpolated, a late channel is late by half a sample more or less
     bench, without, more = timing(given, before, noise2, 0.5 if unsaid else 1.0, early)

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from ..interrupts import Progress
 from ..laws import Law
 from ..recording import Recording
 from ..simulator import Simulator
+from .gates import said_hold
 from .prepare import Prepared, prepare
 from .search import Search
 from .verdict import UNSURE
@@ -21,19 +23,47 @@ from .verdict import UNSURE
 FURTHER = 0.5  # share of the mean square that is left at most where a channel that seemed early is not
 
 
-def prepared_search(
-    simulator: Simulator,
-    recordings: Sequence[Recording],
-    hold: str | None,
-    engine: str,
-    laws: Sequence[type[Law]],
-    workers: int,
-    say: Progress,
-    hold_said: bool,
-    effects: int,
-    stand_in_error: float = 0.0,
-    ready: Prepared | None = None,
-) -> tuple[Prepared, Search]:
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What is diagnosed, and how; see `diagnose`."""
+
+    simulator: Simulator
+    recordings: Sequence[Recording]
+    laws: Sequence[type[Law]]
+    hold: str | None
+    engine: str
+    workers: int
+    effects: int
+    stand_in_error: float
+    say: Progress
+
+    @property
+    def hold_said(self) -> bool:
+        """Whether somebody said what inputs do between samples."""
+        return said_hold(self.simulator, self.recordings, self.hold) is not None
+
+    def prepared(self, starts: Sequence[Mapping[str, Any]] = (), early: bool = True) -> Prepared:
+        """What a search starts from; see `prepare`."""
+        return prepare(self.simulator, self.recordings, self.hold, self.engine, self.workers, starts, early)
+
+    def search(self, ready: Prepared, times: dict[str, float], may_be_led: bool) -> Search:
+        """A search that has not begun; its stages are added to `times`."""
+        floor = ready.floor.beside(self.stand_in_error * ready.bench.scale) if self.stand_in_error else ready.floor
+        return Search(
+            ready.bench,
+            ready.without,
+            floor,
+            self.laws,
+            self.workers,
+            self.say,
+            hold_said=self.hold_said,
+            stand_in_error=self.stand_in_error,
+            may_be_led=may_be_led,
+            times=times,
+        )
+
+
+def prepared_search(asked: Asked, ready: Prepared | None = None) -> tuple[Prepared, Search]:
     """What a search starts from, made here unless given, and the search; its times hold those of the preparation."""
     times: dict[str, float] = {}
 
@@ -41,12 +71,9 @@ def prepared_search(
         ready: Prepared | None = None, starts: Sequence[Mapping[str, Any]] = (), early: bool = True
     ) -> tuple[Prepared, Search]:
         began = time.perf_counter()
-        ready = ready or prepare(simulator, recordings, hold, engine, workers, starts, early)
+        ready = ready or asked.prepared(starts, early)
         times["gates and refit"] = times.get("gates and refit", 0.0) + time.perf_counter() - began
-        floor = ready.floor.beside(stand_in_error * ready.bench.scale) if stand_in_error else ready.floor
-        search = Search(ready.bench, ready.without, floor, laws, workers, say, hold_said)
-        search.times, search.may_be_led, search.stand_in_error = times, not starts, stand_in_error
-        return ready, search.run(effects)
+        return ready, asked.search(ready, times, not starts).run(asked.effects)
 
     def settled(ready: Prepared | None = None, early: bool = True) -> tuple[Prepared, Search]:
         ready, search = searched(ready, early=early)

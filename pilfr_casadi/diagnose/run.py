@@ -18,15 +18,16 @@ from .candidate import Candidate
 from .clipping import clipped_input
 from .experiment import next_experiment, placebo
 from .first_effect import let_idle_offsets_go
-from .gates import Gate, said_hold
+from .gates import Gate
 from .held import held_value
 from .mismatch import mismatch
 from .offset import as_it_came_out
 from .other_hold import doubted, otherwise_held
-from .prepared_search import prepared_search
+from .prepared_search import Asked, prepared_search
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import Pass, Search
+from .surrogate import told_of_surrogate
 from .tones import tones
 from .undeclared import beyond_the_ports
 from .varying import varying
@@ -104,13 +105,11 @@ def diagnose(
             raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")
     laws = (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
     say("refit", 0, 1, np.inf)
-    said = said_hold(simulator, recordings, hold) is not None
-    ready, search = prepared_search(
-        simulator, recordings, hold, engine, laws, workers, say, said, effects, stand_in_error
-    )
-    if not said and doubted(search):
+    asked = Asked(simulator, recordings, laws, hold, engine, workers, effects, stand_in_error, say)
+    ready, search = prepared_search(asked)
+    if not asked.hold_said and doubted(search):
         first, ended = search, time.perf_counter()
-        ready, search = otherwise_held(simulator, recordings, engine, ready, search, effects)
+        ready, search = otherwise_held(asked, ready, search)
         search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - began
     bench, without = search.bench, search.without
     let_idle_offsets_go(search)
@@ -149,7 +148,7 @@ def diagnose(
         sentence=sentence,
         effects=effects_found,
         candidates=tuple(_row(c, p) for p in search.passes for c in p.candidates),
-        gates=as_it_came_out(gates, after, std, bool(effects_found), settled),
+        gates=(*told_of_surrogate(stand_in_error), *as_it_came_out(gates, after, std, bool(effects_found), settled)),
         mismatch=mismatch(
             bench.recordings,
             without.residual,

@@ -24,9 +24,10 @@ from ..metrics import nrmse
 from ..parameters import Parameter
 from ..recording import InputError, Recording, as_recordings, check_for_identification
 from ..simulator import Port, Simulator
+from .gates import Gate
 from .modes import Mode, modes, to_continuous
 
-POOR = 0.02  # NRMSE above which the simulation is not linear enough for a surrogate to stand for it
+POOR = 0.02  # NRMSE above which a simulation is not linear enough for a surrogate to stand for it
 FREE = 0.3  # share by which parameters may move
 EXACT = 1e-3  # NRMSE at which no higher order is looked for
 HIGHEST = 8
@@ -76,6 +77,19 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     least = min(error for error, _ in found)
     error, simulator = next(f for f in found if f[0] <= max(1.1 * least, EXACT))
     return simulator, error
+
+
+def told_of_surrogate(error: float) -> tuple[Gate, ...]:
+    """A note on what misses its simulation by an NRMSE of `error`; none where that is zero."""
+    if not error:
+        return ()
+    words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
+    if error > POOR:
+        words += (
+            " It is poor: the simulation is not linear there, and what the model misses may show up as missing "
+            "physics. Give the simulator itself where it can be had."
+        )
+    return (Gate("simulation", "surrogate", error, words, False),)
 
 
 def _identified(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:

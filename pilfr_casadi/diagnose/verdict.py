@@ -87,9 +87,9 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         alone = len(accepted) == 1 and (accepted[0].margin > CLEAR or remains < PARTLY)
         if max(sure) > (NOT_AT_ALL if alone else HARDLY) or (alone and remains < LITTLE):
             return "missing-physics", (
-                f"The simulator leaves out {words}."
+                f"The simulator leaves out {words}.{_gone(search)}"
                 if min(sure) > UNSURE
-                else f"The simulator most likely leaves out {words}; the name is not certain."
+                else f"The simulator most likely leaves out {words}; the name is not certain.{_gone(search)}"
             )
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
@@ -129,6 +129,13 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         f"{near.law.id.replace('_', ' ')} at {near.port}, leaves {remains:.0%} of the excess, and a flexible force "
         f"explains {still:.0%} of what it leaves."
     )
+
+
+def _gone(search: Search) -> str:
+    """What of the simulator's own is nothing beside the effects, in a sentence: they may stand in its place."""
+    given, values = search.bench.simulator.parameters, search.base.values
+    gone = [k for k, p in given.items() if np.any(p.value) and not np.all(p.fixed) and not np.any(values[k])]
+    return f" Beside it, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
 
 
 def _said(search: Search) -> float:

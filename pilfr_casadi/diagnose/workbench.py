@@ -278,6 +278,14 @@ class Workbench:
             out.append(np.append(state, full[len(state) :]))
         return out
 
+    def rerun(self, fitted: Fitted, simulator: Simulator | None = None) -> Fitted:
+        """The same values on this bench's steps, with a law's parameters as in `simulator` where that is given."""
+        simulator = simulator or fitted.simulator
+        model = self.model(simulator)
+        engine = make_engine(model, self.engine)
+        states = self.begun(simulator, model, model.parameters.pack(fitted.values), fitted.begin)
+        return self.result(simulator, fitted.values, states, engine, model)
+
     def result(
         self,
         simulator: Simulator,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,8 +34,10 @@ class _Case:
 
     @classmethod
     def of(cls, d: Diagnosis) -> _Case:
-        bench = Workbench.of(d.refitted, d.train, d.hold)
-        search = d.evidence.get("search")
+        search, without = d.evidence.get("search"), d.evidence.get("without")
+        bench = replace(Workbench.of(d.refitted, d.train, d.hold), at_least=d.substeps)
+        if without is not None:
+            bench = replace(bench, substeps=without.model.substeps)
         noise = float(d.floor["nrmse"]) * bench.scale if search is None else np.asarray(search.floor.deviation)
         noise = np.nan_to_num(noise)
         before = replay(bench, d.refitted)
