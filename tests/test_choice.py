@@ -90,6 +90,15 @@ def test_of_two_that_do_as_well_the_one_that_no_bound_holds_back_is_taken():
     assert choose([held, worse], (1.0, 1.0), 1e-4, 500.0).winner is held
 
 
+@pytest.mark.parametrize(("whole", "form"), [(0.02, "progressive"), (0.09, "")])
+def test_a_form_of_the_named_law_that_follows_everything_far_better_is_taken(whole, form):
+    """A first part with little in it asks for no second term, and the rest is then foretold as badly without."""
+    plain, other = candidate("support", "quadratic_stiffness", 0.1), candidate("support", "clearance", 0.3)
+    finer = candidate("support", "quadratic_stiffness", 0.1, size=3, form="progressive")
+    finer.full = whole
+    assert choose([plain, finer, other], (1.0, 1.0), 1e-6, 200.0).winner.law.form == form
+
+
 def test_what_is_hardly_what_its_name_says_gives_way_to_what_is():
     named = dict(port="sensor:x", law="saturation", error=0.1)
     thin, plain = candidate(**named, doubtful=True), candidate("sensor:x", "dead_zone", 0.108)

@@ -1,5 +1,7 @@
 """Simple laws that a flexible one stands for are found by the force that it makes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -79,3 +81,18 @@ def test_a_simple_law_stands_for_itself():
     local = felt(on, best.fitted, "actuator:force")
     np.testing.assert_allclose(local.z, on.recordings[0].u[:, 0])
     assert imitated(on, [best], [Scored("actuator:force", DeadZone(), 0.1, ({},), local)]) == []
+
+
+def test_a_rate_that_is_no_number_is_compared_with_nothing(monkeypatch):
+    """As of a root where a tank runs empty."""
+    on = bench("actuator:force", DeadZone().at({"g": 3.0}))
+    without = on.fit(cart())
+    local = felt(on, without, "actuator:force")
+    shape = next(iter(PlayHysteresis().shapes(local)))
+    law = PlayHysteresis().at({**shape, "w": np.append(-0.3, np.full(5, 0.05))}, PlayHysteresis().bounds(local))
+    best = attempt(on, cart().with_element("actuator:force", law), [without.values], states=without.begin)
+    entries = [Scored("actuator:force", DeadZone(), 0.1, ({},), local)]
+    assert imitated(on, [best], entries)
+    nowhere = replace(local, dz=np.where(np.arange(len(local.dz)) == 7, np.nan, local.dz))
+    monkeypatch.setitem(imitated.__globals__, "felt", lambda *_: nowhere)
+    assert imitated(on, [best], entries) == []

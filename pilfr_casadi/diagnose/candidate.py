@@ -199,14 +199,10 @@ def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray
         return candidate
     plain: Any = type(candidate.law).__base__
     own = element.own(candidate.fitted.values)
+    nothing = {name: _next_to_nothing(candidate, name) if std else 0.0 for name in candidate.law.strength}
     # at a bound there is no standard error: there only nothing is nothing
-    doubt = {
-        name: np.maximum(np.nan_to_num(WEAK * std[f"{element.prefix}{name}"]), _next_to_nothing(candidate, name))
-        if std
-        else 0.0
-        for name in candidate.law.strength
-    }
-    idle = {name for name, most in doubt.items() if np.all(np.abs(own[name]) <= most)}
+    doubt = {name: np.nan_to_num(WEAK * std[f"{element.prefix}{name}"]) if std else 0.0 for name in nothing}
+    idle = {name for name in nothing if np.all(np.abs(own[name]) <= np.maximum(doubt[name], nothing[name]))}
     units = set(getattr(plain, "units", {}))
     less = set(candidate.law.strength) - units  # of several that are idle, one after the other
     if not units or not less or not less <= idle or not units <= set(own):
@@ -218,6 +214,6 @@ def simpler(bench: Workbench, candidate: Candidate, std: Mapping[str, np.ndarray
     law = plain().at({k: own[k] for k in plain.units}, limits)
     placed = candidate.fitted.simulator.without_last_element().with_element(element.port, law)
     found = attempt(_as_fine(bench, candidate), placed, [candidate.fitted.values], states=candidate.fitted.begin)
-    tiny = all(np.all(np.abs(own[name]) <= _next_to_nothing(candidate, name)) for name in less)
+    tiny = all(np.all(np.abs(own[name]) <= nothing[name]) for name in less)
     worse = 1.01 if not std else MUCH_AS_WELL if tiny else NO_WORSE
     return found if found is not None and found.error < worse * candidate.error else candidate

@@ -118,6 +118,12 @@ class _Contest:
         slow = [c for c in self.ranked if c.law.id == "drift" and c.port.startswith("sensor:")]
         return next((c for c in slow if c.size <= winner.size and self.near(c, winner)), winner)
 
+    def best_form(self, winner: Candidate) -> Candidate:
+        """The named law in a form that is far nearer fitted to everything: the first part may not have asked for it."""
+        forms = [c for c in self.ranked if c.name == winner.name and not c.doubtful]
+        forms = [c for c in forms if c.full < winner.full / NEARLY**2 and c.error < NEARLY * winner.error]
+        return min(forms, key=lambda c: c.full, default=winner)
+
     def alike(self, winner: Candidate) -> dict[tuple[str, str], Candidate]:
         """What no larger does as well, by name, the least near first."""
         modes = [c for c in self.ranked[::-1] if c.law.form == "mode" and c.error < (1 + LIKE) * winner.error]
@@ -171,7 +177,7 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     contest = _Contest.of(usable, before, floor, n)
     found = contest.winner()
     dry = dry_instead(found, contest.ranked, floor)
-    winner = contest.of_its_kind(dry or found)
+    winner = contest.best_form(contest.of_its_kind(dry or found))
     alike = contest.alike(winner)
     gain = n * (0.5 * np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
     remains = (winner.error**2 - floor) / max(before - floor, 1e-300)

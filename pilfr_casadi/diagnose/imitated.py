@@ -40,7 +40,7 @@ def imitated(bench: Workbench, candidates: Sequence[Candidate], scored: Sequence
         if s.port == best.port and s.law.id not in FLEXIBLE and type(s.law) not in near:
             entries.setdefault(type(s.law), s)
     local = felt(bench, best.fitted, best.port)
-    if not entries or not max(np.max(np.abs(local.z)), np.max(np.abs(local.dz))) < HUGE:
+    if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):  # nor nan, as of a root below zero
         return []
     values, law = best.own, best.law
     force = trace(law.at(values), local, [_shape(law, values)])[:, 0] @ _strengths(law, values)
