@@ -45,13 +45,15 @@ def run_diagnosis(options: argparse.Namespace) -> int:
     _check_apart([*zip(train, recordings, strict=True)], [*zip(options.test, tests, strict=True)])
     _check_steps([*zip([*train, *options.test], [*recordings, *tests], strict=True)])
     folder = make_folder(options.out)
-    error = 0.0
+    error, poor = 0.0, ""
     if source is not None:
         simulator = as_simulator(given, recordings)
     else:
-        simulator, error = _surrogate(options, inputs, outputs)
+        simulator, error, poor = _surrogate(options, inputs, outputs)
     name = f"simulator: {source}" if source else f"surrogate of {options.simulated} (NRMSE {error:.4f})"
     _announce(simulator, name, [("training", train, recordings), ("test", options.test, tests)])
+    if poor:
+        print(f"note: {poor}", flush=True)
     with deferred_interrupt():
         from .diagnose import diagnose
     try:
@@ -153,10 +155,11 @@ def _announce(simulator: Simulator, name: str, kinds: Sequence[tuple[str, Sequen
 
 def _surrogate(
     options: argparse.Namespace, inputs: tuple[str, ...], outputs: tuple[str, ...]
-) -> tuple[Simulator, float]:
+) -> tuple[Simulator, float, str]:
     with deferred_interrupt():
-        from .diagnose.surrogate import surrogate
-    return surrogate(read_file(options, options.simulated, inputs, outputs))
+        from .diagnose.surrogate import POOR, TOO_POOR, surrogate
+    simulator, error = surrogate(read_file(options, options.simulated, inputs, outputs))
+    return simulator, error, TOO_POOR if error > POOR else ""
 
 
 def _simulated_names(options: argparse.Namespace, train: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

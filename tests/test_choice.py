@@ -90,13 +90,34 @@ def test_of_two_that_do_as_well_the_one_that_no_bound_holds_back_is_taken():
     assert choose([held, worse], (1.0, 1.0), 1e-4, 500.0).winner is held
 
 
-@pytest.mark.parametrize(("whole", "form"), [(0.02, "progressive"), (0.09, "")])
-def test_a_form_of_the_named_law_that_follows_everything_far_better_is_taken(whole, form):
+@pytest.mark.parametrize(
+    ("whole", "at_bound", "form"), [(0.02, False, "progressive"), (0.09, False, ""), (0.02, True, "")]
+)
+def test_a_form_of_the_named_law_that_follows_everything_far_better_is_taken(whole, at_bound, form):
     """A first part with little in it asks for no second term, and the rest is then foretold as badly without."""
     plain, other = candidate("support", "quadratic_stiffness", 0.1), candidate("support", "clearance", 0.3)
-    finer = candidate("support", "quadratic_stiffness", 0.1, size=3, form="progressive")
-    finer.full = whole
+    finer = candidate("support", "quadratic_stiffness", 0.1, size=3, form="progressive", at_bound=at_bound)
+    plain.full, finer.full = 0.1**2, whole**2
     assert choose([plain, finer, other], (1.0, 1.0), 1e-6, 200.0).winner.law.form == form
+
+
+def test_of_forms_the_one_that_speaks_of_a_part_stays_and_steps_do_not_decide():
+    parts = candidate("cart", "extra_mode", 0.010, form="mode"), candidate("cart", "extra_mode", 0.013)
+    parts[1].law.form, parts[0].full, parts[1].full = "attached mass", 1e-4, 1.69e-4
+    assert choose(parts, (1.0, 1.0), 6.4e-5, 500.0).winner is parts[1]
+    frictions = [candidate("guide", "coulomb_friction", e, size=n, knee="v") for e, n in ((2e-3, 2), (1.2e-3, 3))]
+    frictions[0].full, frictions[1].full = 4e-6, 1.44e-6
+    assert choose(frictions, (1.0, 1.0), 1e-8, 500.0).winner is frictions[0]
+
+
+@pytest.mark.parametrize(
+    ("part", "floor", "named"), [(0.0202, 1e-8, 1), (0.028, 1e-4, 1), (0.028, 4e-4, 0), (0.04, 1e-4, 0)]
+)
+def test_creep_that_may_be_a_parts_as_well_as_a_signals_is_the_parts(part, floor, named):
+    creeps = candidate("sensor:x", "creep", 0.02), candidate("equation:vel", "creep", part)
+    choice = choose(creeps, (1.0, 1.0), floor, 500.0)
+    assert choice.winner is creeps[named]
+    assert choice.readings == 1 + named
 
 
 def test_what_is_hardly_what_its_name_says_gives_way_to_what_is():

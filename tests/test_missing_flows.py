@@ -12,6 +12,7 @@ from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi.diagnose.candidate import Candidate, simpler
 from pilfr_casadi.diagnose.linearise import Probe, locals_of, run
 from pilfr_casadi.diagnose.screen import _gain
+from pilfr_casadi.diagnose.second_effect import not_named
 from pilfr_casadi.diagnose.verdict import judge
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.gauss_newton import GaussNewton
@@ -159,14 +160,14 @@ def test_a_fit_goes_on_from_given_states():
 def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
     judged = {"error": 0.4, "head": 0.16, "tail": 0.16, "held_back": False, "doubtful": False}
     winner = SimpleNamespace(port="guide", law=SimpleNamespace(id="coulomb_friction"), **judged)
-    choice = SimpleNamespace(winner=winner, margin=margin, alike=(), common=None)
+    choice = SimpleNamespace(winner=winner, margin=margin, alike=(), common=None, readings=1)
     found = SimpleNamespace(accepted=True, choice=choice, before=(1.0, 1.0))
     search = SimpleNamespace(
         passes=[found],
         floor2=1e-6,
         stand_in_error=0.0,
         floor=SimpleNamespace(source="estimated"),
-        base=SimpleNamespace(cost=0.2, values={}, simulator=SimpleNamespace(parameters={}, elements=())),
+        base=SimpleNamespace(cost=0.2, simulator=SimpleNamespace(parameters={}, elements=())),
         bench=SimpleNamespace(simulator=SimpleNamespace(parameters={})),
         without=SimpleNamespace(cost=1.0),
         open_before={"guide": 0.9},
@@ -180,11 +181,20 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
     assert judge(search, [])[0] == "unexplained"
 
 
-@pytest.mark.parametrize(("sure", "verdict"), [((0.07, 0.05), "unexplained"), ((0.3, 0.05), "missing-physics")])
-def test_two_names_that_are_hardly_sure_are_no_answer(sure, verdict, monkeypatch):
+@pytest.mark.parametrize(
+    ("sure", "verdict", "told"),
+    [
+        ((0.07, 0.05), "unexplained", ()),
+        ((0.3, 0.05), "missing-physics", ("delay at a",)),
+        ((0.3, 0.7), "missing-physics", ("delay at a", "delay at b")),
+    ],
+)
+def test_two_names_that_are_hardly_sure_are_no_answer_and_a_second_is_named_where_it_is_sure(
+    sure, verdict, told, monkeypatch
+):
     law = SimpleNamespace(id="delay")
     choices = [
-        SimpleNamespace(winner=SimpleNamespace(port=p, law=law), margin=2.0, common=None, sure=c)
+        SimpleNamespace(winner=SimpleNamespace(port=p, law=law, name=(p, law.id)), margin=2.0, common=None, sure=c)
         for p, c in zip(("a", "b"), sure, strict=True)
     ]
     monkeypatch.setitem(judge.__globals__, "confidence", lambda choice, search: choice.sure)
@@ -193,7 +203,7 @@ def test_two_names_that_are_hardly_sure_are_no_answer(sure, verdict, monkeypatch
         floor2=1e-6,
         stand_in_error=0.0,
         floor=SimpleNamespace(source="repeats"),
-        base=SimpleNamespace(cost=0.01, values={}),
+        base=SimpleNamespace(cost=0.01),
         bench=SimpleNamespace(simulator=SimpleNamespace(parameters={})),
         without=SimpleNamespace(cost=1.0),
         open_before={"a": 0.9},
@@ -201,7 +211,13 @@ def test_two_names_that_are_hardly_sure_are_no_answer(sure, verdict, monkeypatch
     )
     found, sentence = judge(search, [])
     assert found == verdict
-    assert ("delay at a and delay at b" in sentence) is (verdict == "missing-physics")
+    if told:
+        assert f"most likely leaves out {' and '.join(told)};" in sentence
+        assert ("Something more is missing" in sentence) is (len(told) == 1)
+    monkeypatch.setitem(not_named.__globals__, "mean_nrmse", lambda bench, fitted: 0.1)
+    notes = not_named(search)
+    assert [g.channel for g in notes] == ([] if len(told) == 2 else ["b"])
+    assert all("delay at b brings the error to 0.1" in g.sentence for g in notes)
 
 
 def test_a_refinement_that_comes_out_as_zero_is_the_law_that_it_refines():

@@ -11,13 +11,13 @@ import pilfr_casadi as pilfr
 from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.diagnose.candidate import Candidate
 from pilfr_casadi.diagnose.choice import Choice
-from pilfr_casadi.diagnose.finer_steps import GAINED, on_steps_as_fine
+from pilfr_casadi.diagnose.finer_steps import on_steps_as_fine
 from pilfr_casadi.diagnose.first_effect import let_idle_offsets_go
 from pilfr_casadi.diagnose.offset import Offset
 from pilfr_casadi.diagnose.search import Pass
 from pilfr_casadi.diagnose.workbench import FINER, THOROUGH, Workbench
 from pilfr_casadi.integration import discretise
-from pilfr_casadi.laws import AsymmetricFriction, CoulombFriction
+from pilfr_casadi.laws import AsymmetricFriction, CoulombFriction, Delay, Polynomial
 from pilfr_casadi.simulator import Simulator
 
 F_C = 6.0
@@ -84,15 +84,30 @@ def test_friction_that_is_in_the_simulator_already_gets_the_steps_that_it_asks_f
     assert found.corrected.parameters["F"].value == pytest.approx(F_C, rel=2e-3)
 
 
-def test_finer_steps_only_where_the_run_depends_on_them_and_gains():
+def test_finer_steps_only_where_the_run_depends_on_them_whatever_else_is_missing():
     plain = Workbench.of(carriage(), [ran(0, 1e-4)], "zero")
     fitted = plain.fit(carriage())
     assert on_steps_as_fine(plain, fitted) == (plain, fitted)  # far off, but not for its steps
-    bench = Workbench.of(sharp(), plain.recordings, "zero")
-    coarse = bench.fit(sharp(), solver=THOROUGH)
-    finer, better = on_steps_as_fine(bench, coarse)
-    assert finer.substeps > bench.substeps and better.model.substeps == finer.substeps
-    assert better.cost < GAINED * coarse.cost
+    for records in (plain.recordings, [r.with_(y=r.y + 0.3 * r.y**2 / np.std(r.y)) for r in plain.recordings]):
+        bench = Workbench.of(sharp(), records, "zero")
+        coarse = bench.fit(sharp(), solver=THOROUGH)
+        finer, found = on_steps_as_fine(bench, coarse)
+        assert finer.substeps == found.model.substeps >= FINER * bench.substeps
+        law = CoulombFriction(values={"F_c": F_C, "v_0": 1e-6})  # counted from the steps that were chosen first
+        assert finer.model(sharp().with_element("guide", law)).substeps == finer.substeps
+
+
+def test_what_is_missing_beside_friction_that_turns_round_is_named():
+    def late(r, samples):
+        return r.with_(y=np.vstack([np.zeros((samples, 1)), r.y[:-samples]]))
+
+    found = pilfr.diagnose(sharp(5.0, mass=1.7, drag=5.0), late(ran(0, 1e-4), 8), laws=(CoulombFriction, Delay))
+    assert found.verdict == "recording-fault", str(found)
+    assert [(g.channel, g.finding) for g in found.gates] == [("position", "alignment")]
+    bent = [r.with_(y=r.y + 0.02 * r.y**3 / np.std(r.y) ** 2) for r in (ran(0, 1e-4), ran(1, 1e-4))]
+    found = pilfr.diagnose(sharp(5.0, mass=1.7, drag=5.0), bent[0], test=bent[1], laws=(CoulombFriction, Polynomial))
+    assert [(e.port, e.law) for e in found.effects] == [("sensor:position", "static_curve")], str(found)
+    assert found.errors["test"]["after"] < 2 * found.floor["nrmse"]
 
 
 def test_what_takes_the_place_of_the_simulators_own_is_told():

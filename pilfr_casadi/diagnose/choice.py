@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..simulator import in_series
 from .candidate import Candidate
 from .kinship import CONTAINS, handicap, imitates
 
@@ -22,7 +23,8 @@ LIKE, AS_MUCH = 0.03, 0.995
 CLEARLY = 1.1  # times the error above the floor of a friction that falls with speed, of a hysteresis that does better
 NEARLY = 1.25  # times the error of a law that is hardly what its name says, of one that is
 TRACE = 5e-6  # of the mean square without any law, which is next to nothing
-CARRIED = 1.5  # times the error of a mode beside the path, of the carried mass that it may stand for
+CARRIED = 1.5  # times the error of a mode beside the path, or of a creeping signal, of the part that it may stand for
+ABOVE = 1.15  # times the noise that is left by what does not follow everything
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,12 @@ class Choice:
     remains: float
     margin: float
     common: tuple[str, str] | None = None
+
+    @property
+    def readings(self) -> int:
+        """Of how many kinds of physics, which are one and the same to the recordings, one is named."""
+        creeps = {in_series(c.port) for c in (self.winner, *self.alike) if c.law.id == "creep"}
+        return 2 if self.common or (self.winner.law.id == "creep" and len(creeps) > 1) else 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +121,27 @@ class _Contest:
         carried = [c for c in self.ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]
         if winner.law.form == "mode" and carried and self.as_much(carried[0], winner):
             return carried[0]  # any pair of a pole and a zero is a mode: a part that is carried along is one
-        if winner.law.id != "drift":  # what an actuator's would have to be tuned for, a sensor's is by itself
-            return winner
-        slow = [c for c in self.ranked if c.law.id == "drift" and c.port.startswith("sensor:")]
-        return next((c for c in slow if c.size <= winner.size and self.near(c, winner)), winner)
+        same = [c for c in self.ranked if c.law.id == winner.law.id and c.size <= winner.size and self.near(c, winner)]
+        if winner.law.id == "drift":  # what an actuator's would have to be tuned for, a sensor's is by itself
+            return next((c for c in same if c.port.startswith("sensor:")), winner)
+        if winner.law.id == "creep" and in_series(winner.port):
+            return next((c for c in self.ranked if self._relaxes(c, winner)), winner)
+        return winner
+
+    def _relaxes(self, c: Candidate, winner: Candidate) -> bool:
+        """Whether a part relaxes as well as a signal creeps: the commoner of the two, and one transfer function.
+
+        Where neither follows all there is, the one that a few time constants bring nearer is nearer by chance.
+        """
+        if c.law.id != "creep" or in_series(c.port) or c.size > winner.size:
+            return False
+        by_chance = winner.error**2 > ABOVE**2 * self.floor and c.error < CARRIED * winner.error
+        return self.near(c, winner) or (by_chance and self.as_much(c, winner))
 
     def best_form(self, winner: Candidate) -> Candidate:
         """The named law in a form that is far nearer fitted to everything: the first part may not have asked for it."""
-        forms = [c for c in self.ranked if c.name == winner.name and not c.doubtful]
+        forms = [c for c in self.ranked if c.name == winner.name and not c.doubtful and not c.at_bound]
+        forms = [c for c in forms if not self.within_steps(winner, c)]
         forms = [c for c in forms if c.full < winner.full / NEARLY**2 and c.error < NEARLY * winner.error]
         return min(forms, key=lambda c: c.full, default=winner)
 
@@ -137,7 +158,10 @@ class _Contest:
         for c in {c.name: c for c in self.ranked[::-1]}.values():  # the best of each name
             if c.name in (winner.name, given_up, *alike) or self._refines(c, winner, ports):
                 continue
-            margin = min(margin, max(c.error / winner.error, float(np.exp(self.key(c) - self.key(winner)))))
+            ratio = max(c.error / winner.error, float(np.exp(self.key(c) - self.key(winner))))
+            if np.isfinite(c.full) and np.isfinite(winner.full):  # what cannot follow everything is refuted by that
+                ratio = max(ratio, (c.full / max(winner.full, 1e-300)) ** 0.5)
+            margin = min(margin, ratio)
         return float(margin)
 
     def _refines(self, c: Candidate, winner: Candidate, ports: Collection[str]) -> bool:
@@ -177,7 +201,7 @@ def choose(candidates: Sequence[Candidate], without: tuple[float, float], floor:
     contest = _Contest.of(usable, before, floor, n)
     found = contest.winner()
     dry = dry_instead(found, contest.ranked, floor)
-    winner = contest.best_form(contest.of_its_kind(dry or found))
+    winner = contest.of_its_kind(contest.best_form(dry or found))
     alike = contest.alike(winner)
     gain = n * (0.5 * np.log(before) - np.log(winner.error)) - 0.5 * winner.size * np.log(n)
     remains = (winner.error**2 - floor) / max(before - floor, 1e-300)

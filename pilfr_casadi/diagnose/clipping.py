@@ -44,11 +44,11 @@ def unclip(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gat
 def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | None:
     """The clipped input beyond whose limits most of the mismatch lies, where no law leaves less (`remains`) of it.
 
-    What went into the machine there is not in the recording; a parabola over each time at a limit stands for it.
+    What went into the machine there is not in the recording; what goes on as smoothly stands for it (`_beyond_limit`).
     """
     for i, low, high, count in clipped(bench.recordings, "u"):
         name = bench.simulator.inputs[i]
-        left = 1 - _beyond(bench, without, i, low, high)
+        left = 1 - _explained(bench, without, i, low, high)
         if left < min(HALF, remains):
             at = " and ".join(f"{v:.6g}" for v in _said(low, high))
             sentence = (
@@ -60,7 +60,7 @@ def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | N
     return None
 
 
-def _beyond(bench: Workbench, without: Fitted, i: int, low: float, high: float) -> float:
+def _explained(bench: Workbench, without: Fitted, i: int, low: float, high: float) -> float:
     """Share of the error that input i beyond its limits explains, on blocks that it was not fitted to."""
     probe, runs = linearised(bench, without)
     port = probe.ports.index(f"actuator:{bench.simulator.inputs[i]}")
@@ -68,7 +68,7 @@ def _beyond(bench: Workbench, without: Fitted, i: int, low: float, high: float) 
     limits = [(v, sign) for v, sign in ((low, -1.0), (high, 1.0)) if np.isfinite(v)]
     phi, error = [], []
     for run, r in zip(runs, bench.recordings, strict=True):
-        beyond = np.column_stack([sign * _bulges(r.u[:, i] == v) for v, sign in limits])
+        beyond = np.column_stack([sign * _beyond_limit(r.u[:, i], v) for v, sign in limits])
         phi.append(moved(bench, run, [(port, beyond)], r.skip)[:, -len(limits) :])
         error.append((run.error / bench.scale)[r.skip :].ravel())
     base = followed(bench, runs, skips)
@@ -80,12 +80,13 @@ def _beyond(bench: Workbench, without: Fitted, i: int, low: float, high: float) 
     return held_out(columns, left, folds(len(left), len(runs)))
 
 
-def _bulges(at: np.ndarray) -> np.ndarray:
-    """A parabola of curvature one over each stretch of a mask."""
-    out = np.zeros(len(at))
-    for begin, end in stretches(at):
-        t = np.arange(end - begin) + 0.5
-        out[begin:end] = t * (end - begin - t) / 2
+def _beyond_limit(u: np.ndarray, limit: float) -> np.ndarray:
+    """How far a signal may have been beyond a limit: the cubic that leaves and comes back with its slopes around it."""
+    out, rise = np.zeros(len(u)), np.abs(np.diff(u, prepend=u[0], append=u[-1]))
+    for begin, end in stretches(u == limit):  # the step to the limit is cut short, the one before it may be
+        leaves, back = np.max(rise[max(begin - 1, 0) : begin + 1]), np.max(rise[end : end + 2])
+        t = (np.arange(end - begin) + 0.5) / (end - begin)
+        out[begin:end] = (end - begin) * t * (1 - t) * (leaves * (1 - t) + back * t)
     return out
 
 

@@ -12,24 +12,27 @@ import numpy as np
 
 from ..recording import InputError
 from ..substeps import MOST
+from .floor import white_part
+from .knees import FINEST
 from .workbench import FINER, THOROUGH, Fitted, Workbench
 
-FINEST = 16  # times the sub-steps at most
-DEPENDS = 0.3  # of what is left: as much as finer steps change, to be tried
-GAINED = 0.8  # share of the mean square that finer steps leave at most
+DEPENDS = 0.3  # of the noise: as much as finer steps may change at least, to be taken
+QUIET = 3e-4  # of the outputs' deviation: noise below which nothing is to be seen for steps either
+WORSE = 1.1  # times the mean square that is left on finer steps at most
 
 
 def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
-    """The bench on finer steps, where the simulator follows the recordings better on them, and the fit there."""
-    most = min(FINEST * bench.substeps, MOST)
-    tried, best = bench, (bench, fitted)
-    while FINER * tried.substeps <= most and not fitted.simulator.discrete:
-        tried = replace(tried, substeps=FINER * tried.substeps)
+    """The bench on steps whose error is less than the noise, whatever else is missing, and the fit there."""
+    noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), QUIET**2)
+    most, steps = min(FINEST * bench.chosen, MOST), fitted.model.substeps
+    while FINER * steps <= most and not fitted.simulator.discrete:
+        steps = FINER * steps
+        tried = replace(bench, substeps=steps)
         try:
             there = tried.rerun(fitted)
-            if not _changed(tried, there, fitted):
+            if _apart2(bench, there, fitted) < DEPENDS**2 * noise2:
                 break
-            fitted = tried.fit(
+            found = tried.fit(
                 fitted.simulator,
                 [fitted.values],
                 states=fitted.begin,
@@ -39,13 +42,13 @@ def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitte
             )
         except InputError:
             break
-        if fitted.cost < GAINED * best[1].cost:
-            best = tried, fitted
-    return best
+        if found.cost > WORSE * fitted.cost:
+            break
+        bench, fitted = tried, found
+    return bench, fitted
 
 
-def _changed(bench: Workbench, one: Fitted, other: Fitted) -> bool:
-    """Whether two runs differ by a good part of what is left."""
+def _apart2(bench: Workbench, one: Fitted, other: Fitted) -> float:
+    """Mean square of the difference of two runs."""
     both = zip(one.residual, other.residual, bench.recordings, strict=True)
-    apart = np.concatenate([((a - b) / bench.scale)[r.skip :] for a, b, r in both])
-    return bool(np.mean(apart**2) > DEPENDS**2 * other.cost)
+    return float(np.mean(np.concatenate([((a - b) / bench.scale)[r.skip :] for a, b, r in both]) ** 2))

@@ -38,7 +38,7 @@ def on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
     """
     given = fitted.simulator.parameters[knee]
     low, high = given.bounds
-    if fitted.model.substeps * FINER > FINEST * bench.substeps:
+    if fitted.model.substeps * FINER > FINEST * bench.chosen:
         return fitted
     finer, placed = replace(bench, at_least=FINER * fitted.model.substeps), fitted.corrected()
     sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER, high))

@@ -115,8 +115,9 @@ def prepare(
     gates += more
     bench, without, more = offsets(bench, without)
     gates += more
-    if gates:
-        without = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
+    if gates:  # values and states that wrong data led to may be a dead end
+        led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
+        without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     bench = replace(bench, typical=along(bench, without))
     return Prepared(bench, without, nominal, tuple(gates), floor)

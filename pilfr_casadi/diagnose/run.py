@@ -27,11 +27,12 @@ from .prepared_search import Asked, prepared_search
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import Pass, Search
+from .second_effect import not_named
 from .surrogate import told_of_surrogate
 from .tones import tones
 from .undeclared import beyond_the_ports
 from .varying import varying
-from .verdict import UNSURE, confidence, judge, left_open
+from .verdict import UNSURE, confidence, judge, left_open, named
 from .workbench import Fitted
 
 
@@ -136,8 +137,10 @@ def diagnose(
         "train": {"nominal": ready.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
         "test": test_errors(bench, tests, gates, simulator, without, after) if tests else None,
     }
-    effects_found = tuple(_effect(search, p, after, std) for p in accepted) if explained else ()
-    experiment = _next(search, accepted, limits) if explained else None
+    told = named(search) if explained else []
+    effects_found = tuple(_effect(search, p, after, std) for p in told)
+    gates = (*gates, *not_named(search)) if explained else gates
+    experiment = _next(search, told, limits)
     settled = (
         verdict in ("complete", "recording-fault") or min((e.confidence for e in effects_found), default=0) > UNSURE
     )

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .choice import Choice
+from .gates import Gate
 from .kinship import FLEXIBLE
 from .linearise import linearised
 from .own_shape import own_shape
-from .verdict import CLEAR, LITTLE
+from .proof import mean_nrmse
+from .verdict import CLEAR, LITTLE, named
 from .workbench import Fitted
 
 if TYPE_CHECKING:
@@ -40,6 +42,21 @@ def _stands(search: Search, choice: Choice, unseen: float) -> bool:
     sure = winner.law.id not in FLEXIBLE and left < MOSTLY and winner.tail < NO_WORSE * unseen
     ahead = left < NEARLY_ALL and choice.margin > CLEAR and winner.tail < unseen
     return clear or sure or ahead
+
+
+def not_named(search: Search) -> tuple[Gate, ...]:
+    """Notes on effects whose names are not sure beside the first: they are closed in, and not named."""
+    told, gates = named(search), []
+    for p in search.passes:
+        if p.accepted and p.choice is not None and p not in told:
+            port, law = p.choice.winner.name
+            sentence = (
+                f"Beside it something more is missing: {law.replace('_', ' ')} at {port} brings the error to "
+                f"{mean_nrmse(search.bench, search.base):.3g} of the outputs' deviation. What it is is not sure: it is "
+                "in the corrected simulator, but not named."
+            )
+            gates.append(Gate(port, "unsure", law, sentence, False))
+    return tuple(gates)
 
 
 def only_drifts(search: Search, choice: Choice) -> bool:

@@ -28,6 +28,10 @@ from .gates import Gate
 from .modes import Mode, modes, to_continuous
 
 POOR = 0.02  # NRMSE above which a simulation is not linear enough for a surrogate to stand for it
+TOO_POOR = (
+    "The linear model is poor: the simulation is not linear there, and what the model misses may show up as missing "
+    "physics. Give the simulator itself where it can be had."
+)
 FREE = 0.3  # share by which parameters may move
 EXACT = 1e-3  # NRMSE at which no higher order is looked for
 HIGHEST = 8
@@ -84,11 +88,7 @@ def told_of_surrogate(error: float) -> tuple[Gate, ...]:
     if not error:
         return ()
     words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
-    if error > POOR:
-        words += (
-            " It is poor: the simulation is not linear there, and what the model misses may show up as missing "
-            "physics. Give the simulator itself where it can be had."
-        )
+    words += f" {TOO_POOR}" if error > POOR else ""
     return (Gate("simulation", "surrogate", error, words, False),)
 
 

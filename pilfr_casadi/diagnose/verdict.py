@@ -14,7 +14,7 @@ from .proof import mean_nrmse
 from .ringing import ringing
 
 if TYPE_CHECKING:
-    from .search import Search
+    from .search import Pass, Search
     from .workbench import Fitted
 
 AT_FLOOR, WELL_ABOVE = 1.15, 3.0  # times the floor that counts as being at it, and as being far from it
@@ -33,8 +33,7 @@ DRIVEN = 0.5  # share of a name's confidence where it takes a parameter at its b
 FAR_OFF, FAR_AHEAD = 16.0, 4.0
 SLIGHT = 3e-3  # share of the whole excess that halves the confidence of an effect which explains no more
 UNSURE = 0.5  # confidence below which a name is called likely
-# confidence below which a name is no answer, and below which two are none, or one that leaves much with rivals near
-NOT_AT_ALL, HARDLY = 0.02, 0.1
+HARDLY = 0.2  # confidence below which names that leave something are no answer
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
 AS_NEAR = 1.5  # times what a surrogate misses of the simulation itself, within which nothing can be said
@@ -80,17 +79,19 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     if cured and search.without.cost < HALVED**2 * search.base.cost:  # next to the fault an effect is nothing
         return "recording-fault", faults[0].sentence
     if accepted and explains(accepted, remains, still):
-        words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in accepted)
-        common = next((c.common for c in accepted if c.common), None)
+        told = [p.choice for p in named(search) if p.choice is not None]
+        words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in told)
+        common = next((c.common for c in told if c.common), None)
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
-        sure = [confidence(c, search) for c in accepted]
-        alone = len(accepted) == 1 and (accepted[0].margin > CLEAR or remains < PARTLY)
-        if max(sure) > (NOT_AT_ALL if alone else HARDLY) or (alone and remains < LITTLE):
-            return "missing-physics", (
-                f"The simulator leaves out {words}.{_gone(search)}"
+        sure = [confidence(c, search) for c in told]
+        if max(sure) >= HARDLY or (len(accepted) == 1 and remains < LITTLE):
+            said = (
+                f"The simulator leaves out {words}."
                 if min(sure) > UNSURE
-                else f"The simulator most likely leaves out {words}; the name is not certain.{_gone(search)}"
+                else f"The simulator most likely leaves out {words}; the name is not certain."
             )
+            more = " Something more is missing, of which no name is sure." if len(told) < len(accepted) else ""
+            return "missing-physics", said + more + _gone(search, len(accepted))
     where = max(search.open_before, key=lambda k: search.open_before[k], default="")
     error, floor = search.without.cost**0.5, search.floor2**0.5
     open_now = max(search.open_before.values(), default=0.0)
@@ -131,11 +132,26 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     )
 
 
-def _gone(search: Search) -> str:
+def named(search: Search) -> list[Pass]:
+    """The first effect, and others whose names are sure; one filter in every sensor is one effect."""
+    accepted = [p for p in search.passes if p.accepted and p.choice is not None]
+    return [p for p in accepted if p is accepted[0] or _sure_beside(p.choice, accepted[0].choice, search)]
+
+
+def _sure_beside(choice: Choice | None, first: Choice | None, search: Search) -> bool:
+    assert choice is not None
+    assert first is not None
+    ends = (choice.winner, first.winner)
+    one_filter = ends[0].law.id == ends[1].law.id and all(c.port.startswith("sensor:") for c in ends)
+    return one_filter or confidence(choice, search) > UNSURE
+
+
+def _gone(search: Search, effects: int) -> str:
     """What of the simulator's own is nothing beside the effects, in a sentence: they may stand in its place."""
-    given, values = search.bench.simulator.parameters, search.base.values
-    gone = [k for k, p in given.items() if np.any(p.value) and not np.all(p.fixed) and not np.any(values[k])]
-    return f" Beside it, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
+    names = search.bench.simulator.parameters
+    gone = [k for k in names if np.any(search.without.values[k]) and not np.any(search.base.values[k])]
+    beside = "them" if effects > 1 else "it"
+    return f" Beside {beside}, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
 
 
 def _said(search: Search) -> float:
@@ -159,7 +175,8 @@ def confidence(choice: Choice, search: Search) -> float:
     (the error of another effect may be that), a residual that stays many times the noise, an error on what is not
     fitted far above that on what is, values at which the law is hardly what its name says, and a bound that holds a
     parameter of the law or of the simulator back short of the noise (other than zero, where a damper is that friction
-    has replaced).
+    has replaced). Of readings that are one and the same to the recordings, as of a sensor that creeps and a part that
+    relaxes, each is as likely.
     """
     winner, (remains, still) = choice.winner, left_open(search)
     error2 = max(winner.error**2, 1e-300)
@@ -174,8 +191,7 @@ def confidence(choice: Choice, search: Search) -> float:
     others = len({c.law.id for c in choice.alike} - {winner.law.id})
     pressed = (times2 > AT_FLOOR**2 and strained(search.base)) or (times2 > WELL_ABOVE**2 and winner.held_back)
     driven = DRIVEN if pressed or winner.doubtful else 1.0
-    readings = 2 if choice.common else 1  # as likely
-    return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99)) / readings
+    return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99)) / choice.readings
 
 
 def _share(choice: Choice, search: Search) -> float:

@@ -94,6 +94,7 @@ class Workbench:
     engine: str = "auto"
     at_least: int = 1  # sub-steps of simulators with laws
     typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
+    chosen: int = 1  # sub-steps of the simulator as they were chosen first, which limits are counted from
 
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
@@ -104,7 +105,8 @@ class Workbench:
             given = ", ".join(f"{r.dt:g} s" for r in ordered)
             raise InputError(f"The recordings have different steps ({given}); resample them to one.")
         scale = np.std(np.concatenate([r.y[r.skip :] for r in ordered]), axis=0)
-        return cls(simulator, ordered, hold, choose_substeps(simulator, ordered), scale, engine)
+        chosen = choose_substeps(simulator, ordered)
+        return cls(simulator, ordered, hold, chosen, scale, engine, chosen=chosen)
 
     @property
     def dt(self) -> float:
@@ -139,7 +141,9 @@ class Workbench:
             if np.any(np.isfinite(rates)):
                 wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / REACH)))
         least = max(self.substeps, self.at_least, *(getattr(e.law, "substeps", 1) for e in simulator.elements))
-        return int(np.clip(wanted, least, max(FINER * self.substeps, least)))
+        if any(getattr(e.law, "shifts", False) for e in simulator.elements):  # its memory has a place for every step
+            least = min(least, FINER * self.chosen)
+        return int(np.clip(wanted, least, max(FINER * self.chosen, least)))
 
     def too_coarse(self, fitted: Fitted) -> bool:
         """Whether a law came out faster than the sub-steps it was fitted on, which were chosen where it started."""

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
+from ..parameters import Parameter
 from .base import Law, Local, grid
 
 DEAF = 0.707  # damping ratio from which on a second-order response has no peak
@@ -35,7 +36,18 @@ class Delay(Law):
     @property
     def memory(self) -> int:
         """Steps that the delay may reach back."""
-        return int(np.ceil(self.limits["T"][1] / self.h)) if self.h and "T" in self.limits else 24
+        most = self.limits.get("T", self._about)[1]
+        return int(np.ceil(most / self.h)) if self.h and np.isfinite(most) else 24
+
+    @property
+    def _about(self) -> tuple[float, float]:
+        """Where nothing limits it: up to twice where it starts."""
+        return 0.0, 2 * float(np.asarray(self.values.get("T", np.inf)))
+
+    def parameters(self) -> dict[str, Parameter]:
+        """The delay, within what its memory holds."""
+        out = super().parameters()
+        return out if "T" in self.limits else {"T": replace(out["T"], bounds=self._about)}
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         """A shift register, read between two of its places."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..plots import diagnosis as pictures
 from ..plots import diagnosis_proof as proof
 from . import diagnosis_tables as tables
 from .diagnosis_hidden import force_blocks
-from .diagnosis_runs import Comparison, comparisons, replay
+from .diagnosis_runs import Comparison, comparisons, replay, steps
 from .diagnosis_tables import words
 from .page import Block, Code, Page, Picture, Section, Text
 
@@ -34,14 +34,12 @@ class _Case:
 
     @classmethod
     def of(cls, d: Diagnosis) -> _Case:
-        search, without = d.evidence.get("search"), d.evidence.get("without")
-        bench = replace(Workbench.of(d.refitted, d.train, d.hold), at_least=d.substeps)
-        if without is not None:
-            bench = replace(bench, substeps=without.model.substeps)
+        bench = Workbench.of(d.refitted, d.train, d.hold)
+        search = d.evidence.get("search")
         noise = float(d.floor["nrmse"]) * bench.scale if search is None else np.asarray(search.floor.deviation)
         noise = np.nan_to_num(noise)
-        before = replay(bench, d.refitted)
-        after = replay(bench, d.corrected) if d.corrected.elements else before
+        before = replay(bench, d.refitted, steps(d, "without"))
+        after = replay(bench, d.corrected, steps(d, "after")) if d.corrected.elements else before
         found = d.mismatch
         if "map" not in found and before is not None:
             simulated = [e + r.y for e, r in zip(before.residual, bench.recordings, strict=True)]
@@ -162,7 +160,7 @@ def _hidden(case: _Case) -> list[Block]:
         nearest = search.passes[0].choice if search is not None and search.passes else None
         if nearest is not None:
             winner = nearest.winner
-            fitted = replay(case.bench, winner.fitted.corrected())
+            fitted = replay(case.bench, winner.fitted.corrected(), winner.fitted.model.substeps)
             if fitted is not None:
                 number, name = len(fitted.simulator.elements) - 1, f"{words(winner.law.id)} (the nearest law)"
                 out += force_blocks(case.bench, case.noise, fitted, winner.port, number, name)

@@ -11,17 +11,24 @@ from ..compiled import make_engine
 from ..diagnose import Diagnosis
 from ..diagnose.workbench import Fitted, Workbench
 from ..gauss_newton import GaussNewton
+from ..integration import discretise
 from ..recording import InputError, Recording
 from ..simulator import Simulator
 
 
-def replay(bench: Workbench, simulator: Simulator) -> Fitted | None:
+def steps(diagnosis: Diagnosis, name: str) -> int | None:
+    """Steps a sample in which the simulator "without" or "after" was fitted, where that is known."""
+    fitted = diagnosis.evidence.get(name)
+    return None if fitted is None else int(fitted.model.substeps)
+
+
+def replay(bench: Workbench, simulator: Simulator, substeps: int | None = None) -> Fitted | None:
     """Run a simulator at its own values, initial states fitted; None where it diverges."""
     held = simulator.with_parameters({k: replace(p, fixed=True) for k, p in simulator.parameters.items()})
     try:
-        model = bench.model(held)
+        model = bench.model(held) if substeps is None else discretise(held, bench.dt, bench.hold, substeps)
         if model.n_state and any(r.begins == "estimate" for r in bench.recordings):
-            return bench.fit(held, solver=GaussNewton(max_iterations=20))
+            return bench.fit(held, solver=GaussNewton(max_iterations=20), model=model)
         engine = make_engine(model, bench.engine)
         freed = model.with_parameters(model.parameters.change(**{k: {"fixed": False} for k in model.parameters}))
         problem = bench.problem(freed, engine)
@@ -50,8 +57,9 @@ def comparisons(bench: Workbench, recordings: Sequence[Recording], diagnosis: Di
     for change in (getattr(g, "change", None) for g in diagnosis.gates if role == "test"):
         recordings = [change(r) for r in recordings] if change is not None else recordings
     part = bench.on(recordings)
-    before = replay(part, diagnosis.refitted)
-    after = replay(part, diagnosis.corrected) if diagnosis.corrected.elements or diagnosis.let_go else None
+    before = replay(part, diagnosis.refitted, steps(diagnosis, "without"))
+    other = diagnosis.corrected.elements or diagnosis.let_go
+    after = replay(part, diagnosis.corrected, steps(diagnosis, "after")) if other else None
     out = []
     for i, r in enumerate(part.recordings):
         named = r.with_(name=r.name or (role if len(part.recordings) == 1 else f"{role} {i + 1}"))
