@@ -167,11 +167,11 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
         floor2=1e-6,
         stand_in_error=0.0,
         floor=SimpleNamespace(source="estimated"),
-        base=SimpleNamespace(cost=0.2, simulator=SimpleNamespace(parameters={}, elements=())),
+        base=SimpleNamespace(cost=0.1, simulator=SimpleNamespace(parameters={}, elements=())),
         bench=SimpleNamespace(simulator=SimpleNamespace(parameters={})),
         without=SimpleNamespace(cost=1.0),
         open_before={"guide": 0.9},
-        open_after={"guide": 0.5},
+        open_after={"guide": 0.2},
     )
     assert judge(search, [])[0] == verdict
     search.open_after = {"guide": 0.8}  # what is left is a force at the port: the law is another

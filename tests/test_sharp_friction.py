@@ -84,11 +84,16 @@ def test_friction_that_is_in_the_simulator_already_gets_the_steps_that_it_asks_f
     assert found.corrected.parameters["F"].value == pytest.approx(F_C, rel=2e-3)
 
 
+def bent(r):
+    """A record by a sensor that is not straight."""
+    return r.with_(y=r.y + 1.3 * r.y**3)
+
+
 def test_finer_steps_only_where_the_run_depends_on_them_whatever_else_is_missing():
     plain = Workbench.of(carriage(), [ran(0, 1e-4)], "zero")
     fitted = plain.fit(carriage())
     assert on_steps_as_fine(plain, fitted) == (plain, fitted)  # far off, but not for its steps
-    for records in (plain.recordings, [r.with_(y=r.y + 0.3 * r.y**2 / np.std(r.y)) for r in plain.recordings]):
+    for records in (plain.recordings, [bent(r) for r in plain.recordings]):
         bench = Workbench.of(sharp(), records, "zero")
         coarse = bench.fit(sharp(), solver=THOROUGH)
         finer, found = on_steps_as_fine(bench, coarse)
@@ -104,8 +109,9 @@ def test_what_is_missing_beside_friction_that_turns_round_is_named():
     found = pilfr.diagnose(sharp(5.0, mass=1.7, drag=5.0), late(ran(0, 1e-4), 8), laws=(CoulombFriction, Delay))
     assert found.verdict == "recording-fault", str(found)
     assert [(g.channel, g.finding) for g in found.gates] == [("position", "alignment")]
-    bent = [r.with_(y=r.y + 0.02 * r.y**3 / np.std(r.y) ** 2) for r in (ran(0, 1e-4), ran(1, 1e-4))]
-    found = pilfr.diagnose(sharp(5.0, mass=1.7, drag=5.0), bent[0], test=bent[1], laws=(CoulombFriction, Polynomial))
+    records = [bent(ran(seed, 1e-4)) for seed in (0, 1)]
+    laws = (CoulombFriction, Polynomial)
+    found = pilfr.diagnose(sharp(5.0, mass=1.7, drag=5.0), records[0], test=records[1], laws=laws)
     assert [(e.port, e.law) for e in found.effects] == [("sensor:position", "static_curve")], str(found)
     assert found.errors["test"]["after"] < 2 * found.floor["nrmse"]
 

@@ -18,7 +18,6 @@ from .workbench import FINER, THOROUGH, Fitted, Workbench
 
 DEPENDS = 0.3  # of the noise: as much as finer steps may change at least, to be taken
 QUIET = 3e-4  # of the outputs' deviation: noise below which nothing is to be seen for steps either
-WORSE = 1.1  # times the mean square that is left on finer steps at most
 
 
 def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
@@ -32,9 +31,9 @@ def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitte
             there = tried.rerun(fitted)
             if _apart2(bench, there, fitted) < DEPENDS**2 * noise2:
                 break
-            found = tried.fit(
+            fitted = tried.fit(
                 fitted.simulator,
-                [fitted.values],
+                [fitted.values, {}],
                 states=fitted.begin,
                 solver=THOROUGH,
                 model=there.model,
@@ -42,9 +41,7 @@ def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitte
             )
         except InputError:
             break
-        if found.cost > WORSE * fitted.cost:
-            break
-        bench, fitted = tried, found
+        bench = tried
     return bench, fitted
 
 
