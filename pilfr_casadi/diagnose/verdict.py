@@ -133,8 +133,13 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
 
 
 def named(search: Search) -> list[Pass]:
-    """The first effect, and others whose names are sure; one filter in every sensor is one effect."""
+    """The first effect, and others whose names are sure or that leave nothing but noise.
+
+    One filter in every sensor is one effect.
+    """
     accepted = [p for p in search.passes if p.accepted and p.choice is not None]
+    if search.base.cost < AT_FLOOR**2 * search.floor2:
+        return accepted
     return [p for p in accepted if p is accepted[0] or _sure_beside(p.choice, accepted[0].choice, search)]
 
 
