@@ -121,9 +121,9 @@ class _Contest:
         carried = [c for c in self.ranked if c.law.form == "attached mass" and c.error < CARRIED * winner.error]
         if winner.law.form == "mode" and carried and self.as_much(carried[0], winner):
             return carried[0]  # any pair of a pole and a zero is a mode: a part that is carried along is one
-        same = [c for c in self.ranked if c.law.id == winner.law.id and c.size <= winner.size and self.near(c, winner)]
         if winner.law.id == "drift":  # what an actuator's would have to be tuned for, a sensor's is by itself
-            return next((c for c in same if c.port.startswith("sensor:")), winner)
+            slow = [c for c in self.ranked if c.law.id == "drift" and c.port.startswith("sensor:")]
+            return next((c for c in slow if c.size <= winner.size and self.near(c, winner)), winner)
         if winner.law.id == "creep" and in_series(winner.port):
             return next((c for c in self.ranked if self._relaxes(c, winner)), winner)
         return winner
