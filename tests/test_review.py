@@ -217,3 +217,26 @@ def test_an_effect_gives_way_to_a_rival_that_wins_and_holds_on_everything(monkey
     assert search.passes[0].choice.margin == (3.0 if holds else 2.0)
     monkeypatch.setattr(review, "choose", lambda *_: None)
     assert not review._gives_way(search, 0, both["stay"], [])
+
+
+@pytest.mark.parametrize(("error", "alone"), [(1.02, True), (1.2, False)])
+def test_what_has_come_into_the_firsts_place_may_do_without_the_second(monkeypatch, error, alone):
+    first, second = CubicStiffness(), CoulombFriction().at({"F_c": 1.0, "v_0": 0.01})
+    both = rig().with_element("ground-m1", first).with_element("m1-m2", second)
+    values = {k: p.value for k, p in both.parameters.items()}
+    tried = []
+
+    def attempt(bench, simulator, starts, **_):
+        tried.append([e.port for e in simulator.elements])
+        return SimpleNamespace(error=error, fitted="the first alone")
+
+    monkeypatch.setattr(review, "attempt", attempt)
+    search = SimpleNamespace(
+        bench=None,
+        base=SimpleNamespace(simulator=both, values=values, begin=[]),
+        passes=[Pass(Choice(SimpleNamespace(error=1.0), (), 1.0, 0.1, 2.0), (), (), (1.0, 1.0), True)] * 2,
+        polished=lambda c: c,
+    )
+    assert review._does_alone(search) is alone
+    assert tried == [["ground-m1"]] and len(search.passes) == (1 if alone else 2)
+    assert (search.base == "the first alone") is alone

@@ -1,7 +1,7 @@
 """What was accepted, looked at again: a closer law at its port, a finer form, and rivals beside a second effect.
 
-With the second effect in place, the first law is put up again against its rivals, and dropped where the second does as
-well alone.
+With the second effect in place, the first law is put up again against its rivals; either is dropped where the other
+does as well alone.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..recording import InputError
 from ..simulator import Simulator
 from ..threads import side_by_side
 from .candidate import Candidate, attempt, judged
-from .choice import choose, dry_instead
+from .choice import LIKE, choose, dry_instead
 from .explain import by_cost
 from .kinship import imitates
 from .rivals import FITTED, may_stand, rivals_beside
@@ -115,9 +115,28 @@ def look_back(search: Search) -> None:
         stay = replace(every[0], port=winner.port, law=winner.law, size=winner.size)
         pairs = zip(elements, every[1:], strict=True)
         rivals = [replace(c, port=e.port, law=e.law, size=e.law.size(e.own(c.fitted.values))) for e, c in pairs]
-        if _gives_way(search, -2, stay, rivals):
+        if _gives_way(search, -2, stay, rivals) and not _does_alone(search):
             _second_again(search)
     search.timed("look back", began)
+
+
+def _does_alone(search: Search) -> bool:
+    """Whether the law that has come into the first's place does as well without the second, which then goes."""
+    first, second = search.passes[-2:]
+    assert first.choice is not None
+    assert second.choice is not None
+    kept = search.base.simulator.elements[-2]
+    placed = search.base.simulator.without_last_element().without_last_element().with_element(kept.port, kept.law)
+    own = placed.elements[-1].named(kept.own(search.base.values))
+    alone = attempt(search.bench, placed, [{**search.base.values, **own}], states=search.base.begin)
+    if alone is None or alone.error > (1 + LIKE) * first.choice.winner.error:
+        return False
+    alone = search.polished(alone)
+    if alone is None:
+        return False
+    search.base = alone.fitted
+    search.passes[-2:] = [replace(first, choice=replace(first.choice, winner=alone))]
+    return True
 
 
 def _second_again(search: Search) -> None:
