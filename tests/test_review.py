@@ -219,24 +219,21 @@ def test_an_effect_gives_way_to_a_rival_that_wins_and_holds_on_everything(monkey
     assert not review._gives_way(search, 0, both["stay"], [])
 
 
-@pytest.mark.parametrize(("error", "alone"), [(1.02, True), (1.2, False)])
-def test_what_has_come_into_the_firsts_place_may_do_without_the_second(monkeypatch, error, alone):
+@pytest.mark.parametrize(("errors", "alone"), [((1.02, 5.0), 0), ((5.0, 1.02), 1), ((1.2, 1.2), None)])
+def test_one_of_two_effects_that_does_as_well_alone_stays_alone(monkeypatch, errors, alone):
     first, second = CubicStiffness(), CoulombFriction().at({"F_c": 1.0, "v_0": 0.01})
-    both = rig().with_element("ground-m1", first).with_element("m1-m2", second)
-    values = {k: p.value for k, p in both.parameters.items()}
-    tried = []
+    both = rig().with_element("m1-m2", second).with_element("ground-m1", first)  # as found together: in any order
+    ports, values = ("ground-m1", "m1-m2"), {k: p.value for k, p in both.parameters.items()}
 
     def attempt(bench, simulator, starts, **_):
-        tried.append([e.port for e in simulator.elements])
-        return SimpleNamespace(error=error, fitted="the first alone")
+        (port,) = (e.port for e in simulator.elements)
+        return SimpleNamespace(error=errors[ports.index(port)], fitted=f"{port} alone")
 
     monkeypatch.setattr(review, "attempt", attempt)
-    search = SimpleNamespace(
-        bench=None,
-        base=SimpleNamespace(simulator=both, values=values, begin=[]),
-        passes=[Pass(Choice(SimpleNamespace(error=1.0), (), 1.0, 0.1, 2.0), (), (), (1.0, 1.0), True)] * 2,
-        polished=lambda c: c,
-    )
-    assert review._does_alone(search) is alone
-    assert tried == [["ground-m1"]] and len(search.passes) == (1 if alone else 2)
-    assert (search.base == "the first alone") is alone
+    winners = [SimpleNamespace(error=1.0, name=(p, law.id)) for p, law in zip(ports, (first, second), strict=True)]
+    passes = [Pass(Choice(w, (), 1.0, 0.1, 2.0), (), (), (1.0, 1.0), True) for w in winners]
+    base = SimpleNamespace(simulator=both, values=values, begin=[])
+    search = SimpleNamespace(bench=None, base=base, passes=list(passes), polished=lambda c: c)
+    assert review.one_does_alone(search) is (alone is not None)
+    assert len(search.passes) == (2 if alone is None else 1)
+    assert search.base == (base if alone is None else f"{ports[alone]} alone")

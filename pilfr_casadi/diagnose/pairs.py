@@ -24,6 +24,7 @@ from .explain import BRIEF, closed
 from .kinship import handicap
 from .linearise import linearised
 from .remainder import Dose, Remainder, held_out, orthonormal
+from .review import one_does_alone
 from .screen import Scored, start_values
 from .workbench import Fitted, started
 
@@ -146,7 +147,10 @@ def two_at_once(search: Search) -> None:
     certainty = search.certainty()
     try:
         found = _two(search)
-        better = found is not None and _better(search, found, before[0].cost) and search.certainty() > certainty
+        better = found is not None and _better(search, found, before[0].cost)
+        if better and one_does_alone(search):
+            search.open_after = search.flexible(search.base)
+        better = better and search.certainty() > certainty
     finally:  # an interrupt leaves what there was
         if not better:
             search.base, search.passes, search.open_after, search.floor = before

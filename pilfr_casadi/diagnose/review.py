@@ -115,28 +115,31 @@ def look_back(search: Search) -> None:
         stay = replace(every[0], port=winner.port, law=winner.law, size=winner.size)
         pairs = zip(elements, every[1:], strict=True)
         rivals = [replace(c, port=e.port, law=e.law, size=e.law.size(e.own(c.fitted.values))) for e, c in pairs]
-        if _gives_way(search, -2, stay, rivals) and not _does_alone(search):
+        if _gives_way(search, -2, stay, rivals) and not one_does_alone(search):
             _second_again(search)
     search.timed("look back", began)
 
 
-def _does_alone(search: Search) -> bool:
-    """Whether the law that has come into the first's place does as well without the second, which then goes."""
-    first, second = search.passes[-2:]
-    assert first.choice is not None
-    assert second.choice is not None
-    kept = search.base.simulator.elements[-2]
-    placed = search.base.simulator.without_last_element().without_last_element().with_element(kept.port, kept.law)
-    own = placed.elements[-1].named(kept.own(search.base.values))
-    alone = attempt(search.bench, placed, [{**search.base.values, **own}], states=search.base.begin)
-    if alone is None or alone.error > (1 + LIKE) * first.choice.winner.error:
-        return False
-    alone = search.polished(alone)
-    if alone is None:
-        return False
-    search.base = alone.fitted
-    search.passes[-2:] = [replace(first, choice=replace(first.choice, winner=alone))]
-    return True
+def one_does_alone(search: Search) -> bool:
+    """Whether one of the last two effects does as well without the other, which then goes."""
+    elements = search.base.simulator.elements[-2:]
+    bare = search.base.simulator.without_last_element().without_last_element()
+    steps = search.passes[-2:]
+    together = min(p.choice.winner.error for p in steps if p.choice is not None)
+    for step in steps:
+        assert step.choice is not None
+        kept = next((e for e in elements if (e.port, e.law.id) == step.choice.winner.name), None)
+        if kept is None:
+            continue
+        placed = bare.with_element(kept.port, kept.law)
+        own = placed.elements[-1].named(kept.own(search.base.values))
+        alone = attempt(search.bench, placed, [{**search.base.values, **own}], states=search.base.begin)
+        alone = search.polished(alone) if alone is not None and alone.error < (1 + LIKE) * together else None
+        if alone is not None:
+            search.base = alone.fitted
+            search.passes[-2:] = [replace(step, choice=replace(step.choice, winner=alone))]
+            return True
+    return False
 
 
 def _second_again(search: Search) -> None:
