@@ -1,5 +1,8 @@
 """A valve that only opens: dead zones seen from one side, offsets that are none, inputs that the recorder clipped."""
 
+import importlib
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -93,6 +96,17 @@ def test_what_lies_beyond_a_limit_is_told_from_what_is_felt():
     gate = clipped_input(bench, ready, 1.0)
     assert gate is not None and gate.channel == "drive" and "explains 9" in gate.sentence
     assert clipped_input(bench, ready, 0.001) is None  # a law leaves less
+
+
+@pytest.mark.parametrize(("verdict", "most"), [("unexplained", 1.0), ("missing-physics", 0.07), ("complete", None)])
+def test_laws_that_explain_nothing_do_not_stand_against_a_lost_input(monkeypatch, verdict, most):
+    run, asked = importlib.import_module("pilfr_casadi.diagnose.run"), []
+    monkeypatch.setattr(run, "confidence", lambda *_: 0.1)
+    monkeypatch.setattr(run, "left_open", lambda *_: (0.07, 0.9))
+    monkeypatch.setattr(run, "clipped_input", lambda bench, without, remains: asked.append(remains))
+    search = SimpleNamespace(passes=[SimpleNamespace(accepted=True, choice="a law")], bench=None, without=None)
+    run._lost_input(search, verdict)
+    assert asked == ([] if most is None else [most])
 
 
 def _prepared(u, y):

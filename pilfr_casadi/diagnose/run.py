@@ -183,7 +183,8 @@ def _lost_input(search: Search, verdict: str) -> Gate | None:
     sure = verdict == "missing-physics" and min(confidence(c, search) for c in named) >= UNSURE
     if sure or verdict not in ("missing-physics", "unexplained"):
         return None
-    return clipped_input(search.bench, search.without, left_open(search)[0] if named else 1.0)
+    remains = left_open(search)[0] if verdict == "missing-physics" else 1.0
+    return clipped_input(search.bench, search.without, remains)
 
 
 def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
