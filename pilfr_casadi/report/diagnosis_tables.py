@@ -42,7 +42,9 @@ def percent(value: float | None) -> str:
 def mended(diagnosis: Diagnosis) -> str:
     """What was put right in the corrected simulator, in words; nothing where it was only refitted."""
     if diagnosis.effects:
-        return f"with {' and '.join(words(e.law) for e in diagnosis.effects)} put back"
+        more = [g.finding == "unsure" for g in diagnosis.gates]
+        names = [*(words(e.law) for e in diagnosis.effects), *(["what is not sure"] if any(more) else [])]
+        return f"with {' and '.join(names)} put back"
     return f"with {diagnosis.let_go} let go" if diagnosis.let_go else ""
 
 
