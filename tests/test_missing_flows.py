@@ -161,9 +161,9 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
     judged = {"error": 0.4, "head": 0.16, "tail": 0.16, "held_back": False, "doubtful": False}
     winner = SimpleNamespace(port="guide", law=SimpleNamespace(id="coulomb_friction"), **judged)
     choice = SimpleNamespace(winner=winner, margin=margin, alike=(), common=None, readings=1)
-    found = SimpleNamespace(accepted=True, choice=choice, before=(1.0, 1.0))
     search = SimpleNamespace(
-        passes=[found],
+        accepted=[choice],
+        passes=[SimpleNamespace(choice=choice, before=(1.0, 1.0))],
         floor2=1e-6,
         stand_in_error=0.0,
         floor=SimpleNamespace(source="estimated"),
@@ -199,7 +199,7 @@ def test_two_names_that_are_hardly_sure_are_no_answer_and_a_second_is_named_wher
     ]
     monkeypatch.setitem(judge.__globals__, "confidence", lambda choice, search: choice.sure)
     search = SimpleNamespace(
-        passes=[SimpleNamespace(accepted=True, choice=c) for c in choices],
+        accepted=choices,
         floor2=1e-6,
         stand_in_error=0.0,
         floor=SimpleNamespace(source="repeats"),

@@ -104,7 +104,7 @@ def test_laws_that_explain_nothing_do_not_stand_against_a_lost_input(monkeypatch
     monkeypatch.setattr(run, "confidence", lambda *_: 0.1)
     monkeypatch.setattr(run, "left_open", lambda *_: (0.07, 0.9))
     monkeypatch.setattr(run, "clipped_input", lambda bench, without, remains: asked.append(remains))
-    search = SimpleNamespace(passes=[SimpleNamespace(accepted=True, choice="a law")], bench=None, without=None)
+    search = SimpleNamespace(accepted=["a law"], bench=None, without=None)
     run._lost_input(search, verdict)
     assert asked == ([] if most is None else [most])
 

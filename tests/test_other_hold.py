@@ -38,10 +38,8 @@ def named(port, law, **values):
 )
 def test_what_acts_within_a_sample_may_be_the_other_hold(found, within):
     assert found.within(DT) is within
-    step = SimpleNamespace(accepted=True, choice=SimpleNamespace(winner=found))
-    search = SimpleNamespace(
-        interrupted=False, misheld=1.0, passes=[step], much=lambda: False, bench=SimpleNamespace(dt=DT)
-    )
+    named, bench = [SimpleNamespace(winner=found)], SimpleNamespace(dt=DT)
+    search = SimpleNamespace(interrupted=False, misheld=1.0, accepted=named, much=lambda: False, bench=bench)
     assert other_hold.doubted(search) is within
     search.interrupted = True
     assert not other_hold.doubted(search)
@@ -65,7 +63,7 @@ def test_where_nothing_is_missing_with_the_other_hold_that_is_taken(unsure, take
     again = SimpleNamespace(
         base=SimpleNamespace(cost=1.0),
         interrupted=False,
-        passes=[],
+        accepted=[],
         much=lambda: False,
         unsure=lambda: unsure,
         certainty=lambda: 0.0,

@@ -25,10 +25,10 @@ BETTER = 1.15  # times nearer that one in each sensor has to come, of more param
 def every_sensor(search: Search) -> None:
     """Take filters in every sensor for those named, where that comes nearer; told where it comes as near."""
     names, own = search.bench.simulator.output_names, search.base.simulator.elements
-    accepted = [p for p in search.passes if p.accepted and p.choice is not None]
-    steps = [p for p in accepted if p.choice is not None and p.choice.winner.law.id in FILTERS]
+    found = [p for p in search.passes if p.accepted]
+    steps = [p for p in found if p.choice is not None and p.choice.winner.law.id in FILTERS]
     behind = [p for p in steps if p.choice is not None and p.choice.winner.port.startswith("actuator:")]
-    if not behind or len(names) < 2 or len(own) - len(search.bench.simulator.elements) != len(accepted):
+    if not behind or len(names) < 2 or len(own) - len(search.bench.simulator.elements) != len(found):
         return
     began, first = time.perf_counter(), behind[0]
     assert first.choice is not None

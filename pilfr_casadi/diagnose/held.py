@@ -33,7 +33,7 @@ class Held:
 
 def held_value(search: Search) -> Held | None:
     """The held parameter that does as well, let go, as the one linear law that was named; None where there is none."""
-    named = [p.choice.winner for p in search.passes if p.accepted and p.choice is not None]
+    named = [c.winner for c in search.accepted]
     if len(named) != 1 or named[0].law.id not in LINEAR:
         return None
     bench, without = search.bench, search.without

@@ -22,7 +22,7 @@ def doubted(search: Search) -> bool:
     """
     if search.interrupted or search.misheld > MISHELD:
         return not search.interrupted
-    named = [p.choice.winner for p in search.passes if p.accepted and p.choice is not None]
+    named = [c.winner for c in search.accepted]
     return (search.much() or any(c.within(search.bench.dt) for c in named)) if named else search.unsure()
 
 
@@ -43,7 +43,7 @@ def otherwise_held(asked: Asked, ready: Prepared, search: Search) -> tuple[Prepa
     except KeyboardInterrupt:
         search.interrupted = True
         return ready, search
-    nothing = not any(p.accepted for p in again.passes) and not again.unsure()  # is missing, where inputs do the other
+    nothing = not again.accepted and not again.unsure()  # is missing, where inputs do the other
     surer = nearer and (nothing or again.certainty() > search.certainty())
     if not wrong and not surer:
         search.interrupted = again.interrupted

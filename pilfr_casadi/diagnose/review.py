@@ -26,10 +26,11 @@ from .rivals import FITTED, may_stand, rivals_beside
 from .verdict import HINT
 
 if TYPE_CHECKING:
-    from .search import Search
+    from .search import Pass, Search
 
 FINER_BY = 0.94  # share of the mean square that a finer form of the named law leaves at most
 Task = tuple[Simulator, Mapping[str, Any], Sequence[np.ndarray]]  # what is fitted, from which values and states
+NEARLY = 1.1  # times a second effect's error that it may come to without the first, which then goes
 LED = 2.0  # times the error of the nearest rival, of those that are fitted again from where it is
 
 
@@ -91,19 +92,11 @@ def look_back(search: Search) -> None:
     first, second = search.passes[-2], search.passes[-1]
     assert first.choice is not None
     assert second.choice is not None
-    kept = search.base.simulator.elements[-1]
-    bare = search.base.simulator.without_last_element().without_last_element()
-    by_itself = bare.with_element(kept.port, kept.law)
-    own = by_itself.elements[-1].named(kept.own(search.base.values))
-    alone = attempt(search.bench, by_itself, [{**search.base.values, **own}], states=search.base.begin)
-    near = alone is not None and alone.error < 1.1 * second.choice.winner.error
-    alone = search.polished(alone) if alone is not None and near else None
-    if alone is not None:
-        search.base = alone.fitted
-        search.passes[-2:] = [replace(second, choice=replace(second.choice, winner=alone))]
+    if _does_alone(search, second, NEARLY * second.choice.winner.error):
         search.timed("look back", began)
         return
-    winner = first.choice.winner
+    winner, kept = first.choice.winner, search.base.simulator.elements[-1]
+    bare = search.base.simulator.without_last_element().without_last_element()
     others = rivals_beside(search, bare, kept)
     now = search.base.simulator, search.base.values, search.base.initial
     own_now, *found = _tried(
@@ -122,24 +115,27 @@ def look_back(search: Search) -> None:
 
 def one_does_alone(search: Search) -> bool:
     """Whether one of the last two effects does as well without the other, which then goes."""
-    elements = search.base.simulator.elements[-2:]
-    bare = search.base.simulator.without_last_element().without_last_element()
     steps = search.passes[-2:]
     together = min(p.choice.winner.error for p in steps if p.choice is not None)
-    for step in steps:
-        assert step.choice is not None
-        kept = next((e for e in elements if (e.port, e.law.id) == step.choice.winner.name), None)
-        if kept is None:
-            continue
-        placed = bare.with_element(kept.port, kept.law)
-        own = placed.elements[-1].named(kept.own(search.base.values))
-        alone = attempt(search.bench, placed, [{**search.base.values, **own}], states=search.base.begin)
-        alone = search.polished(alone) if alone is not None and alone.error < (1 + LIKE) * together else None
-        if alone is not None:
-            search.base = alone.fitted
-            search.passes[-2:] = [replace(step, choice=replace(step.choice, winner=alone))]
-            return True
-    return False
+    return any(_does_alone(search, step, (1 + LIKE) * together) for step in steps)
+
+
+def _does_alone(search: Search, step: Pass, enough: float) -> bool:
+    """Whether an error below `enough` is left without the other of the last two effects, which then goes."""
+    assert step.choice is not None
+    elements = search.base.simulator.elements[-2:]
+    kept = next((e for e in elements if (e.port, e.law.id) == step.choice.winner.name), None)
+    if kept is None:
+        return False
+    placed = search.base.simulator.without_last_element().without_last_element().with_element(kept.port, kept.law)
+    own = placed.elements[-1].named(kept.own(search.base.values))
+    alone = attempt(search.bench, placed, [{**search.base.values, **own}], states=search.base.begin)
+    alone = search.polished(alone) if alone is not None and alone.error < enough else None
+    if alone is None:
+        return False
+    search.base = alone.fitted
+    search.passes[-2:] = [replace(step, choice=replace(step.choice, winner=alone))]
+    return True
 
 
 def _second_again(search: Search) -> None:

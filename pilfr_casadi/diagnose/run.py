@@ -15,6 +15,7 @@ from ..recording import InputError, Recording, as_recordings, check_for_identifi
 from ..threads import one_blas_thread, processors
 from .arranged import arranged
 from .candidate import Candidate
+from .choice import Choice
 from .clipping import clipped_input
 from .experiment import next_experiment, placebo
 from .first_effect import let_idle_offsets_go
@@ -115,7 +116,6 @@ def diagnose(
     bench, without = search.bench, search.without
     let_idle_offsets_go(search)
     gates = (*ready.gates, *search.gates, *tones(bench, search.base))
-    accepted = [p for p in search.passes if p.accepted]
     verdict, sentence = judge(search, gates)
     held = held_value(search) if verdict == "missing-physics" else None
     if held is not None:
@@ -124,7 +124,7 @@ def diagnose(
         verdict, sentence, gates = "recording-fault", lost.sentence, (*gates, lost)
     elif verdict == "unexplained":
         gates = (*gates, *beyond_the_ports(search), *varying(search))
-    if search.interrupted and not accepted:
+    if search.interrupted and not search.accepted:
         sentence = (
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "
             f"{mean_nrmse(bench, without):.3g} of the outputs' deviation."
@@ -138,7 +138,7 @@ def diagnose(
         "test": test_errors(bench, tests, gates, simulator, without, after) if tests else None,
     }
     told = named(search) if explained else []
-    effects_found = tuple(_effect(search, p, after, std) for p in told)
+    effects_found = tuple(_effect(search, c, after, std) for c in told)
     gates = (*gates, *not_named(search)) if explained else gates
     experiment = _next(search, told, limits)
     settled = (
@@ -179,17 +179,14 @@ def diagnose(
 
 def _lost_input(search: Search, verdict: str) -> Gate | None:
     """The clipped input that a mismatch without a sure name comes from."""
-    named = [p.choice for p in search.passes if p.accepted and p.choice is not None]
-    sure = verdict == "missing-physics" and min(confidence(c, search) for c in named) >= UNSURE
+    sure = verdict == "missing-physics" and min(confidence(c, search) for c in search.accepted) >= UNSURE
     if sure or verdict not in ("missing-physics", "unexplained"):
         return None
     remains = left_open(search)[0] if verdict == "missing-physics" else 1.0
     return clipped_input(search.bench, search.without, remains)
 
 
-def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
-    choice = found.choice
-    assert choice is not None
+def _effect(search: Search, choice: Choice, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
     winner, bench = choice.winner, search.bench
     own, unrelated = placebo(bench, search.without, winner.port, winner.law)
     element = next(e for e in fitted.simulator.elements if e.port == winner.port and type(e.law) is type(winner.law))
@@ -220,14 +217,13 @@ def _effect(search: Search, found: Pass, fitted: Fitted, std: dict[str, np.ndarr
     )
 
 
-def _next(search: Search, accepted: Sequence[Pass], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
+def _next(search: Search, told: Sequence[Choice], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
     """The experiment that would separate the first tie, where there is one."""
-    for found in accepted:
-        choice = found.choice
-        if choice is not None and choice.common:
+    for choice in told:
+        if choice.common:
             sentence = "These inputs do not separate them; look up how the sensors are filtered and sampled."
             return {"between": [list(choice.winner.name), list(choice.common)], "sentence": sentence}
-        if choice is not None and choice.alike:
+        if choice.alike:
             one, other = choice.winner, choice.alike[0]
             best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits)
             names = [[c.port, c.law.id] for c in (one, other)]

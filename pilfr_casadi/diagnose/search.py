@@ -109,6 +109,11 @@ class Search:
         """Mean square of the noise in units of the outputs' variance."""
         return float(np.mean((self.floor.deviation / self.bench.scale) ** 2))
 
+    @property
+    def accepted(self) -> list[Choice]:
+        """The effects accepted so far."""
+        return [p.choice for p in self.passes if p.accepted and p.choice is not None]
+
     def timed(self, stage: str, began: float) -> None:
         """Add the seconds since `began` to a stage."""
         self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - began
@@ -176,10 +181,9 @@ class Search:
 
     def certainty(self) -> float:
         """Confidence of the least sure name; nothing where nothing is named, or what is named does not explain."""
-        named = [p.choice for p in self.passes if p.accepted and p.choice is not None]
-        if not named or not explains(named, *left_open(self)):
+        if not self.accepted or not explains(self.accepted, *left_open(self)):
             return 0.0
-        return min(confidence(c, self) for c in named)
+        return min(confidence(c, self) for c in self.accepted)
 
     def much(self) -> bool:
         """Whether enough is left to look further."""

@@ -47,9 +47,9 @@ def _stands(search: Search, choice: Choice, unseen: float) -> bool:
 def not_named(search: Search) -> tuple[Gate, ...]:
     """Notes on effects whose names are not sure beside the first: they are closed in, and not named."""
     told, gates = named(search), []
-    for p in search.passes:
-        if p.accepted and p.choice is not None and p not in told:
-            port, law = p.choice.winner.name
+    for choice in search.accepted:
+        if choice not in told:
+            port, law = choice.winner.name
             sentence = (
                 f"Beside it something more is missing: {law.replace('_', ' ')} at {port} brings the error to "
                 f"{mean_nrmse(search.bench, search.base):.3g} of the outputs' deviation. What it is is not sure: it is "

@@ -14,7 +14,7 @@ from .proof import mean_nrmse
 from .ringing import ringing
 
 if TYPE_CHECKING:
-    from .search import Pass, Search
+    from .search import Search
     from .workbench import Fitted
 
 AT_FLOOR, WELL_ABOVE = 1.15, 3.0  # times the floor that counts as being at it, and as being far from it
@@ -72,14 +72,14 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
             f"Nothing is seen that the simulation lacks: refitted, what stands for it follows the recordings to "
             f"{_said(search):.3g} of the outputs' deviation, and the simulation itself to {search.stand_in_error:.3g}."
         )
-    accepted = [p.choice for p in search.passes if p.accepted and p.choice is not None]
+    accepted = search.accepted
     remains, still = left_open(search)
     faults = [g for g in gates if g.fault]
     cured = min((g.left for g in faults), default=1.0) < CURES
     if cured and search.without.cost < HALVED**2 * search.base.cost:  # next to the fault an effect is nothing
         return "recording-fault", faults[0].sentence
     if accepted and explains(accepted, remains, still):
-        told = [p.choice for p in named(search) if p.choice is not None]
+        told = named(search)
         words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in told)
         common = next((c.common for c in told if c.common), None)
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
@@ -132,20 +132,18 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
     )
 
 
-def named(search: Search) -> list[Pass]:
+def named(search: Search) -> list[Choice]:
     """The first effect, and others whose names are sure or that leave nothing but noise.
 
     One filter in every sensor is one effect.
     """
-    accepted = [p for p in search.passes if p.accepted and p.choice is not None]
+    accepted = search.accepted
     if search.base.cost < AT_FLOOR**2 * search.floor2:
         return accepted
-    return [p for p in accepted if p is accepted[0] or _sure_beside(p.choice, accepted[0].choice, search)]
+    return [c for c in accepted if c is accepted[0] or _sure_beside(c, accepted[0], search)]
 
 
-def _sure_beside(choice: Choice | None, first: Choice | None, search: Search) -> bool:
-    assert choice is not None
-    assert first is not None
+def _sure_beside(choice: Choice, first: Choice, search: Search) -> bool:
     ends = (choice.winner, first.winner)
     one_filter = ends[0].law.id == ends[1].law.id and all(c.port.startswith("sensor:") for c in ends)
     return one_filter or confidence(choice, search) > UNSURE
