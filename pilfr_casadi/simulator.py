@@ -258,6 +258,8 @@ class Simulator:
             raise InputError(f"The law {law.id!r} cannot stand in {kind} at {port!r}; choose another port or law.")
         if getattr(law, "channels", 1) != 1:
             raise InputError(f"The element has {law.channels} channels, the port {port!r} has one; give as many.")
+        if lacks := getattr(law, "lacks", ""):
+            raise InputError(f"The law {law.id!r} cannot be closed in at {port!r} yet: {lacks}.")
         count = sum(e.port == port for e in self.elements)
         prefix = f"{port}." if not count else f"{port}#{count + 1}."
         placed = Placed(port, law, prefix)

@@ -181,6 +181,15 @@ def test_two_laws_at_two_ports(record):
     assert np.max(np.abs(run(closed, record, substeps=16) - expected)) < 1e-7
 
 
+def test_a_delay_of_which_nothing_says_how_long_it_is_is_refused(record):
+    for law in (Delay(), Delay(limits={"T": (0.0, np.inf)})):
+        with pytest.raises(InputError, match=r"'sensor:position' yet: give the time that it starts at"):
+            rig().with_element("sensor:position", law)
+    late = rig().with_element("sensor:position", Delay().at({"T": 40 * DT}))  # more than the screen tries
+    expected = np.r_[np.zeros(40), run(rig(), record)[:-40, 0]]
+    assert np.max(np.abs(run(late, record)[:, 0] - expected)) < 1e-12
+
+
 @pytest.mark.parametrize(
     ("port", "steps"), [("sensor:position", 3.0), ("sensor:position", 2.25), ("actuator:force", 2.0)]
 )

@@ -155,6 +155,11 @@ class Law:
         """Why the data cannot speak to this law, or nothing."""
         return ""
 
+    @property
+    def lacks(self) -> str:
+        """What has to be said of the law before it can stand in a port, or nothing."""
+        return ""
+
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Whether at fitted values the law is hardly what its sentence says."""
         return False

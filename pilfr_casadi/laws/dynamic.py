@@ -12,6 +12,7 @@ import numpy as np
 from ..parameters import Parameter
 from .base import Law, Local, grid
 
+SCREENED = 24  # steps of a delay in the screen, which tries none that is longer
 DEAF = 0.707  # damping ratio from which on a second-order response has no peak
 
 
@@ -37,7 +38,13 @@ class Delay(Law):
     def memory(self) -> int:
         """Steps that the delay may reach back."""
         most = self.limits.get("T", self._about)[1]
-        return int(np.ceil(most / self.h)) if self.h and np.isfinite(most) else 24
+        return int(np.ceil(most / self.h)) if self.h and np.isfinite(most) else SCREENED
+
+    @property
+    def lacks(self) -> str:
+        """A start value or a limit, without which nothing says how far back it reaches."""
+        known = np.isfinite(self.limits.get("T", self._about)[1])
+        return "" if known else "give the time that it starts at, as in Delay().at({'T': 0.01}); it may come to double"
 
     @property
     def _about(self) -> tuple[float, float]:
