@@ -1,6 +1,5 @@
 """A valve that only opens: dead zones seen from one side, offsets that are none, inputs that the recorder clipped."""
 
-import importlib
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
+from pilfr_casadi.diagnose import conclusion
 from pilfr_casadi.diagnose.clipping import clipped, clipped_input
 from pilfr_casadi.diagnose.prepare import prepare
 
@@ -100,12 +100,12 @@ def test_what_lies_beyond_a_limit_is_told_from_what_is_felt():
 
 @pytest.mark.parametrize(("verdict", "most"), [("unexplained", 1.0), ("missing-physics", 0.07), ("complete", None)])
 def test_laws_that_explain_nothing_do_not_stand_against_a_lost_input(monkeypatch, verdict, most):
-    run, asked = importlib.import_module("pilfr_casadi.diagnose.run"), []
-    monkeypatch.setattr(run, "confidence", lambda *_: 0.1)
-    monkeypatch.setattr(run, "left_open", lambda *_: (0.07, 0.9))
-    monkeypatch.setattr(run, "clipped_input", lambda bench, without, remains: asked.append(remains))
+    asked = []
+    monkeypatch.setattr(conclusion, "confidence", lambda *_: 0.1)
+    monkeypatch.setattr(conclusion, "left_open", lambda *_: (0.07, 0.9))
+    monkeypatch.setattr(conclusion, "clipped_input", lambda bench, without, remains: asked.append(remains))
     search = SimpleNamespace(accepted=["a law"], bench=None, without=None)
-    run._lost_input(search, verdict)
+    conclusion._lost_input(search, verdict)
     assert asked == ([] if most is None else [most])
 
 

@@ -16,24 +16,20 @@ from ..threads import one_blas_thread, processors
 from .arranged import arranged
 from .candidate import Candidate
 from .choice import Choice
-from .clipping import clipped_input
+from .conclusion import Conclusion, concluded
 from .experiment import next_experiment, placebo
 from .first_effect import let_idle_offsets_go
-from .gates import Gate
-from .held import held_value
 from .mismatch import mismatch
 from .offset import as_it_came_out
 from .other_hold import doubted, otherwise_held
+from .prepare import Prepared
 from .prepared_search import Asked, prepared_search
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import Pass, Search
-from .second_effect import not_named
 from .surrogate import told_of_surrogate
 from .tones import tones
-from .undeclared import beyond_the_ports
-from .varying import varying
-from .verdict import UNSURE, confidence, judge, left_open, named
+from .verdict import UNSURE, confidence
 from .workbench import Fitted
 
 
@@ -113,45 +109,42 @@ def diagnose(
         first, ended = search, time.perf_counter()
         ready, search = otherwise_held(asked, ready, search)
         search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - began
-    bench, without = search.bench, search.without
     let_idle_offsets_go(search)
-    gates = (*ready.gates, *search.gates, *tones(bench, search.base))
-    verdict, sentence = judge(search, gates)
-    held = held_value(search) if verdict == "missing-physics" else None
-    if held is not None:
-        verdict, sentence = "complete", held.sentence
-    if (lost := _lost_input(search, verdict)) is not None:
-        verdict, sentence, gates = "recording-fault", lost.sentence, (*gates, lost)
-    elif verdict == "unexplained":
-        gates = (*gates, *beyond_the_ports(search), *varying(search))
-    if search.interrupted and not search.accepted:
-        sentence = (
-            "The search was interrupted before it came to an answer; refitted, the simulator is off by "
-            f"{mean_nrmse(bench, without):.3g} of the outputs' deviation."
-        )
-    explained = verdict == "missing-physics"
-    after = search.base if explained else held.fitted if held else without
+    found = concluded(search, (*ready.gates, *search.gates, *tones(search.bench, search.base)))
+    return _told(asked, ready, search, found, tests, limits, began)
+
+
+def _told(
+    asked: Asked,
+    ready: Prepared,
+    search: Search,
+    found: Conclusion,
+    tests: tuple[Recording, ...],
+    limits: Mapping[str, float] | None,
+    began: float,
+) -> Diagnosis:
+    """What the search came to, with its proof."""
+    proving = time.perf_counter()
+    bench, without, after = search.bench, search.without, found.fitted
     std = deviations(bench, after)
-    searched_at = time.perf_counter()
     errors = {
         "train": {"nominal": ready.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
-        "test": test_errors(bench, tests, gates, simulator, without, after) if tests else None,
+        "test": test_errors(bench, tests, found.gates, asked.simulator, without, after) if tests else None,
     }
-    told = named(search) if explained else []
-    effects_found = tuple(_effect(search, c, after, std) for c in told)
-    gates = (*gates, *not_named(search)) if explained else gates
-    experiment = _next(search, told, limits)
-    settled = (
-        verdict in ("complete", "recording-fault") or min((e.confidence for e in effects_found), default=0) > UNSURE
-    )
+    effects = tuple(_effect(search, choice, after, std) for choice in found.named)
+    sure = min((e.confidence for e in effects), default=0) > UNSURE
+    settled = found.verdict in ("complete", "recording-fault") or sure
+    experiment = _next(search, found.named, limits)
     now = time.perf_counter()
-    times = {**search.times, "proof": now - searched_at}
     return Diagnosis(
-        verdict=verdict,
-        sentence=sentence,
-        effects=effects_found,
+        verdict=found.verdict,
+        sentence=found.sentence,
+        effects=effects,
         candidates=tuple(_row(c, p) for p in search.passes for c in p.candidates),
-        gates=(*told_of_surrogate(stand_in_error), *as_it_came_out(gates, after, std, bool(effects_found), settled)),
+        gates=(
+            *told_of_surrogate(asked.stand_in_error),
+            *as_it_came_out(found.gates, after, std, bool(effects), settled),
+        ),
         mismatch=mismatch(
             bench.recordings,
             without.residual,
@@ -159,7 +152,7 @@ def diagnose(
             search.floor.deviation,
             bench.scale,
         ),
-        parameters=parameter_table(simulator, without, after, std),
+        parameters=parameter_table(asked.simulator, without, after, std),
         errors=errors,
         floor={"nrmse": search.floor.nrmse(bench.scale), "source": search.floor.source},
         corrected=after.corrected(),
@@ -169,21 +162,12 @@ def diagnose(
         test=tests,
         next_experiment=experiment,
         seconds=now - began,
-        times=times,
+        times={**search.times, "proof": now - proving},
         interrupted=search.interrupted,
         evidence={"search": search, "without": without, "after": after},
         substeps=after.model.substeps,
-        let_go=held.name if held else "",
+        let_go=found.let_go,
     )
-
-
-def _lost_input(search: Search, verdict: str) -> Gate | None:
-    """The clipped input that a mismatch without a sure name comes from."""
-    sure = verdict == "missing-physics" and min(confidence(c, search) for c in search.accepted) >= UNSURE
-    if sure or verdict not in ("missing-physics", "unexplained"):
-        return None
-    remains = left_open(search)[0] if verdict == "missing-physics" else 1.0
-    return clipped_input(search.bench, search.without, remains)
 
 
 def _effect(search: Search, choice: Choice, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
