@@ -101,6 +101,17 @@ def test_a_form_of_the_named_law_that_follows_everything_far_better_is_taken(who
     assert choose([plain, finer, other], (1.0, 1.0), 1e-6, 200.0).winner.law.form == form
 
 
+def test_a_rival_that_cannot_follow_everything_is_refuted_by_that():
+    """A first part that asks for little leaves laws near each other which the rest tells apart."""
+    near, rival = candidate("support", "clearance", 0.10), candidate("support", "saturation", 0.12)
+    near.full, rival.full = 0.1**2, 0.12**2
+    assert choose([near, rival], (1.0, 1.0), 1e-6, 200.0).margin == pytest.approx(1.2)
+    rival.full = 0.5**2
+    assert choose([near, rival], (1.0, 1.0), 1e-6, 200.0).margin == pytest.approx(5.0)
+    rival.full = np.inf  # not fitted to everything
+    assert choose([near, rival], (1.0, 1.0), 1e-6, 200.0).margin == pytest.approx(1.2)
+
+
 def test_of_forms_the_one_that_speaks_of_a_part_stays_and_steps_do_not_decide():
     parts = candidate("cart", "extra_mode", 0.010, form="mode"), candidate("cart", "extra_mode", 0.013)
     parts[1].law.form, parts[0].full, parts[1].full = "attached mass", 1e-4, 1.69e-4

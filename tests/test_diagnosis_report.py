@@ -6,6 +6,7 @@ import sys
 import types
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from pilfr_casadi.recording import InputError, Recording
 from pilfr_casadi.report import diagnosis_report
 from pilfr_casadi.report.diagnosis_files import diagnosis_report as same
 from pilfr_casadi.report.diagnosis_force import hidden_force
-from pilfr_casadi.report.diagnosis_runs import replay
+from pilfr_casadi.report.diagnosis_runs import comparisons, replay
 from pilfr_casadi.report.diagnosis_tables import usage
 from pilfr_casadi.simulator import Port, Simulator
 
@@ -197,6 +198,25 @@ def test_it_says_what_makes_the_answer_less_certain(tmp_path):
     worse = {**d.errors, "test": {**d.errors["test"], "after": 100 * d.errors["train"]["after"]}}
     text = Reader(diagnosis_report(replace(d, errors=worse), tmp_path).read_text()).text
     assert "The test error is far above the training error" in text
+
+
+def test_what_is_closed_in_without_a_name_is_said_with_the_error(tmp_path):
+    d, note = example(), Gate("ground", "unsure", "creep", "Beside it something more is missing.", False)
+    assert "what is not sure" not in Reader(diagnosis_report(d, tmp_path).read_text()).text
+    text = Reader(diagnosis_report(replace(d, gates=(note,)), tmp_path).read_text()).text
+    assert "with cubic stiffness and what is not sure put back" in text
+
+
+def test_it_is_simulated_in_the_steps_of_the_fits():
+    d = example()
+    bench = Workbench.of(rig(), d.train, "zero")
+    steps = {"without": 2, "after": 5}
+    fine = replace(d, evidence={k: SimpleNamespace(model=SimpleNamespace(substeps=n)) for k, n in steps.items()})
+    found, known = (comparisons(bench, d.train, each, "train")[0] for each in (fine, d))
+    for name, simulator, n in (("before", d.refitted, 2), ("after", d.corrected, 5)):
+        expected = replay(bench, simulator, n)
+        assert np.array_equal(getattr(found, name), expected.residual[0] + d.train[0].y)
+        assert not np.array_equal(getattr(found, name), getattr(known, name))
 
 
 def test_old_figures_go_and_other_files_stay(tmp_path):
