@@ -171,9 +171,11 @@ def test_the_catalogue_has_no_law_twice():
         (laws.Power, {"a": 37.0, "n": 1.002}, True),
         (laws.Power, {"a": 0.2, "n": 0.5}, False),
         (laws.Orifice, {"a": 0.2, "z_t": 0.1}, False),
+        (laws.SlackCoupling, {"k_g": 0.0, "c_g": 2.0, "g": 0.1}, True),
+        (laws.SlackCoupling, {"k_g": 30.0, "c_g": 0.0, "g": 0.1}, False),
     ],
 )
-def test_a_power_of_one_is_a_gain_and_no_curve(kind, values, doubtful):
+def test_a_power_of_one_is_no_curve_and_a_damper_without_a_spring_no_clearance(kind, values, doubtful):
     assert kind().doubtful(values) is doubtful
 
 

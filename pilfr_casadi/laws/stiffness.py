@@ -241,6 +241,10 @@ class SlackCoupling(SlackSpring):
     def force(self, z: Any, dz: Any, p: Any) -> Any:  # type: ignore[override]
         return super().force(z, p) - p.c_g * dz * (1 - beyond(z, p.g))
 
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """No spring at all: damping that differs from place to place."""
+        return not np.any(values["k_g"])
+
 
 class SoftClearance(Clearance):
     """A gap between curved bodies: Hertz's contact on either side."""
