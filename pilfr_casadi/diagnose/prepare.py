@@ -70,6 +70,7 @@ def prepare(
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, bench.model(simulator))
     without = refitted(bench, starts)
+    bench.check_followed(without)
     unsaid = said_hold(simulator, recordings, hold) is None
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     noise2 = float(np.mean((first.deviation / bench.scale) ** 2))

@@ -206,6 +206,12 @@ class Workbench:
                 return f" ({name} is out of all bounds {k * r.dt:.3g} s into {r.label})"
         return ""
 
+    def check_followed(self, fitted: Fitted) -> None:
+        """Refuse a fit that is worse than a constant because the simulator is unstable."""
+        if fitted.cost > 1 and (why := self._unstable(self.simulator)):
+            off = f"{fitted.cost**0.5:.3g} times the outputs' deviation"
+            raise InputError(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
+
     def _unstable(self, simulator: Simulator) -> str:
         """What to do about a simulator that no recording of a controlled machine can be followed with, or nothing."""
         rate = growth(simulator, self.recordings[0])
