@@ -13,7 +13,7 @@ from pilfr_casadi.diagnose.candidate import Candidate, simpler
 from pilfr_casadi.diagnose.linearise import Probe, locals_of, run
 from pilfr_casadi.diagnose.screen import _gain
 from pilfr_casadi.diagnose.second_effect import not_named
-from pilfr_casadi.diagnose.verdict import judge
+from pilfr_casadi.diagnose.verdict import _gone, judge
 from pilfr_casadi.diagnose.workbench import Workbench
 from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.laws.base import Local
@@ -168,7 +168,7 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
         stand_in_error=0.0,
         floor=SimpleNamespace(source="estimated"),
         base=SimpleNamespace(cost=0.1, simulator=SimpleNamespace(parameters={}, elements=())),
-        bench=SimpleNamespace(simulator=SimpleNamespace(parameters={})),
+        bench=SimpleNamespace(simulator=SimpleNamespace(parameters={}, elements=())),
         without=SimpleNamespace(cost=1.0),
         open_before={"guide": 0.9},
         open_after={"guide": 0.2},
@@ -204,7 +204,7 @@ def test_two_names_that_are_hardly_sure_are_no_answer_and_a_second_is_named_wher
         stand_in_error=0.0,
         floor=SimpleNamespace(source="repeats"),
         base=SimpleNamespace(cost=0.01),
-        bench=SimpleNamespace(simulator=SimpleNamespace(parameters={})),
+        bench=SimpleNamespace(simulator=SimpleNamespace(parameters={}, elements=())),
         without=SimpleNamespace(cost=1.0),
         open_before={"a": 0.9},
         open_after={"a": 0.0},
@@ -218,6 +218,16 @@ def test_two_names_that_are_hardly_sure_are_no_answer_and_a_second_is_named_wher
     notes = not_named(search)
     assert [g.channel for g in notes] == ([] if len(told) == 2 else ["b"])
     assert all("delay at b brings the error to 0.1" in g.sentence for g in notes)
+
+
+def test_only_what_is_the_users_own_is_told_to_come_out_as_zero():
+    """An offset that was looked for is none of it."""
+    offset = SimpleNamespace(prefix="actuator:u.", law=SimpleNamespace(id="offset"))
+    drag = SimpleNamespace(prefix="guide.", law=SimpleNamespace(id="coulomb_friction"))
+    own = SimpleNamespace(parameters=dict.fromkeys(("d", "actuator:u.w_0", "guide.F_c")), elements=(offset, drag))
+    fits = [SimpleNamespace(values=dict.fromkeys(own.parameters, v)) for v in (1.0, 0.0)]
+    search = SimpleNamespace(bench=SimpleNamespace(simulator=own), without=fits[0], base=fits[1])
+    assert _gone(search, 1) == " Beside it, d and guide.F_c come out as zero."
 
 
 def test_a_refinement_that_comes_out_as_zero_is_the_law_that_it_refines():

@@ -151,7 +151,9 @@ def _sure_beside(choice: Choice, first: Choice, search: Search) -> bool:
 
 def _gone(search: Search, effects: int) -> str:
     """What of the simulator's own is nothing beside the effects, in a sentence: they may stand in its place."""
-    names = search.bench.simulator.parameters
+    simulator = search.bench.simulator
+    offsets = tuple(e.prefix for e in simulator.elements if e.law.id == "offset")
+    names = [k for k in simulator.parameters if not k.startswith(offsets)]
     gone = [k for k in names if np.any(search.without.values[k]) and not np.any(search.base.values[k])]
     beside = "them" if effects > 1 else "it"
     return f" Beside {beside}, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
