@@ -1,5 +1,6 @@
 """Choosing among laws, and what is looked at again once one is in place."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +19,7 @@ from pilfr_casadi.diagnose.second_effect import only_drifts
 from pilfr_casadi.diagnose.timing import timing
 from pilfr_casadi.diagnose.verdict import strained
 from pilfr_casadi.diagnose.workbench import Workbench
+from pilfr_casadi.gauss_newton import GaussNewton
 from pilfr_casadi.laws import CubicStiffness, LinearStiffness
 from pilfr_casadi.laws.dynamic import (
     Creep,
@@ -33,6 +35,7 @@ from pilfr_casadi.laws.periodic import HarmonicForce, PeriodicForce
 from pilfr_casadi.parameters import Parameter
 from pilfr_casadi.recording import Recording
 from pilfr_casadi.simulator import Port, Simulator
+from pilfr_casadi.solution import Status
 
 
 def searching(bench, said=True):
@@ -50,6 +53,21 @@ def test_behind_a_free_integrator_no_sensor_is_blamed_for_what_is_left(port, rem
     search = searching(Workbench.of(axis(), [moved(0)], "zero"))
     winner = SimpleNamespace(port=port, law=SimpleNamespace(id="hysteresis"))
     assert only_drifts(search, SimpleNamespace(winner=winner, remains=remains)) is drifts
+
+
+def test_an_interrupt_that_a_fit_has_kept_to_itself_ends_the_search():
+    """A solver returns its best so far then; without a word the search would go on with that."""
+
+    class Interrupted(GaussNewton):
+        def solve(self, *given):
+            return replace(super().solve(*given), status=Status.INTERRUPTED)
+
+    bench = Workbench.of(axis(), [moved(0)], "zero")
+    search = searching(bench)
+    assert not search.run(1).interrupted
+    bench.fit(bench.simulator, solver=Interrupted())
+    search = searching(bench)
+    assert search.run(1).interrupted and search.accepted == []
 
 
 def candidate(port, law, error, size=2, at_bound=False, doubtful=False, form="", knee=""):

@@ -219,6 +219,19 @@ def test_it_is_simulated_in_the_steps_of_the_fits():
         assert not np.array_equal(getattr(found, name), getattr(known, name))
 
 
+def test_a_test_that_gets_worse_a_refit_that_follows_nothing_and_an_interrupt_are_said(tmp_path):
+    d = example()
+    worse = {role: {**e, "before": 0.97, "after": 1.4} for role, e in d.errors.items()}
+    found = replace(d, errors=worse, interrupted=True)
+    notes = " ".join(found.warnings())
+    assert "worse with what is named (1.4 of the outputs' deviation) than refitted without (0.97)" in notes
+    assert "hardly better than a constant (error 0.97" in notes and "The search was interrupted" in notes
+    written = json.loads((diagnosis_report(found, tmp_path).parent / "diagnosis.json").read_text())
+    text = Reader((tmp_path / "report.html").read_text()).text
+    assert written["interrupted"] and written["notes"] == found.warnings()
+    assert all(note in text and note in str(found) for note in found.warnings())
+
+
 def test_old_figures_go_and_other_files_stay(tmp_path):
     (tmp_path / "figures").mkdir()
     old, mine = (tmp_path / "figures" / name for name in ("diagnosis-99-old.png", "mine.png"))

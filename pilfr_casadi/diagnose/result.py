@@ -17,6 +17,8 @@ VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 MOST = 8  # values of the simulator that are printed
 LEFT = 2.0  # times the noise that is left, to be told
+CONSTANT = 0.9  # error of a refitted simulator that follows next to nothing
+INTERRUPTED = "The search was interrupted: this is what was found until then, and the rest was not tried."
 FAR = 3.0  # times the training error that a test error is worth a warning
 
 
@@ -107,6 +109,8 @@ class Diagnosis:
             "parameters": self.parameters,
             "fit": {**self.errors, "noise_floor": self.floor},
             "next_experiment": self.next_experiment,
+            "notes": self.warnings(),
+            "interrupted": self.interrupted,
         }
         clean: dict[str, Any] = plain(raw)
         return clean
@@ -128,11 +132,11 @@ class Diagnosis:
         diagnosis_report(self, folder)
 
     def warnings(self) -> list[str]:
-        """What makes the answer less certain than it looks: parameters at bounds, a test error far above training's.
+        """What makes the answer less certain than it looks: an interrupt, parameters at bounds, errors that stay large.
 
         At zero is what a named effect has replaced, such as a damper that was there for friction.
         """
-        out, own = [], self.corrected.parameters
+        out, own = [INTERRUPTED] if self.interrupted else [], self.corrected.parameters
         ends = {k: (np.asarray(own[k].value), *own[k].bounds) for k in self.parameters if not own[k].fixed}
         held = {k: np.ravel(v)[0] for k, (v, low, high) in ends.items() if np.any((v <= low) | (v >= high))}
         held = {k: v for k, v in held.items() if v or not self.effects}
@@ -144,10 +148,20 @@ class Diagnosis:
                 f"{'it has' if one else 'they have'} too little room."
             )
         test, train = self.errors["test"], self.errors["train"]
+        if train and train["before"] > CONSTANT and self.verdict in ("missing-physics", "unexplained"):
+            out.append(
+                f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
+                "outputs' deviation): look at its values, their units and their bounds before anything that is named."
+            )
         times = train["after"] / max(self.floor["nrmse"], 1e-300) if train and self.effects else 1.0
         if times > LEFT:
             out.append(f"What is left is {times:.2g} times the noise: more is missing, or a law is only near.")
-        if test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"]):
+        if test and self.effects and test["after"] > test["before"]:
+            out.append(
+                f"On the test recording the simulator is worse with what is named ({test['after']:.3g} of the outputs' "
+                f"deviation) than refitted without ({test['before']:.3g}): do not rely on it there."
+            )
+        elif test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"]):
             out.append(
                 "The test error is far above the training error: what was found is only near what happens, or the test "
                 "recording visits what the training recordings do not."
@@ -155,8 +169,7 @@ class Diagnosis:
         return out
 
     def __str__(self) -> str:
-        lines = ["Interrupted: this is what was found until then."] if self.interrupted else []
-        lines.append(self.sentence)
+        lines = [self.sentence]
         for e in self.effects:
             lines.append(f"{e.port}: {e.law}{f' ({e.form})' if e.form else ''}, confidence {e.confidence:.2f}")
             lines.append(f"  {e.sentence}: {e.equation}")

@@ -115,8 +115,16 @@ class Search:
         return [p.choice for p in self.passes if p.accepted and p.choice is not None]
 
     def timed(self, stage: str, began: float) -> None:
-        """Add the seconds since `began` to a stage."""
+        """Add the seconds since `began` to a stage; a fit in it may have ended early, and the search is to end then.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If a fit was interrupted, which returns its best so far and goes no further with that.
+        """
         self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - began
+        if self.bench.struck:
+            raise KeyboardInterrupt
 
     def flexible(self, fitted: Fitted) -> dict[str, float]:
         """Share of a fit's residual that a flexible force explains, by port."""

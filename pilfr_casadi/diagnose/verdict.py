@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..simulator import in_series
 from .choice import Choice
 from .floor import swells_with
 from .gates import Gate
@@ -37,6 +38,7 @@ HARDLY = 0.2  # confidence below which names that leave something are no answer
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
 AS_NEAR = 1.5  # times what a surrogate misses of the simulation itself, within which nothing can be said
+HELPLESS = 0.9  # error of a refitted simulator that follows next to nothing
 PURE = 0.05  # share of model error in a residual that is taken for noise
 MOST_OPEN = 0.4  # share of the excess that no named law may leave
 
@@ -195,7 +197,9 @@ def confidence(choice: Choice, search: Search) -> float:
     doubt *= share / (share + SLIGHT * (1 - share))
     others = len({c.law.id for c in choice.alike} - {winner.law.id})
     pressed = (times2 > AT_FLOOR**2 and strained(search.base)) or (times2 > WELL_ABOVE**2 and winner.held_back)
-    driven = DRIVEN if pressed or winner.doubtful else 1.0
+    # in series with what follows nothing, a law makes the signal by itself; a shift in time does not
+    helpless = search.without.cost > HELPLESS**2 and in_series(winner.port) and not winner.law.shifts
+    driven = DRIVEN if pressed or winner.doubtful or helpless else 1.0
     return float(np.clip(driven * lead * doubt / (1 + others), 0.0, 0.99)) / choice.readings
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from ..problem import Problem
 from ..recording import InputError, Recording
 from ..sensitivities import Engine
 from ..simulator import Simulator
+from ..solution import Status
 from ..substeps import MOST, REACH, at_begin, choose_substeps, fastest, growth, wanted_substeps
 from ..threads import one_at_a_time
 from .arranged import arranged
@@ -95,6 +96,7 @@ class Workbench:
     at_least: int = 1  # sub-steps of simulators with laws
     typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
     chosen: int = 1  # sub-steps of the simulator as they were chosen first, which limits are counted from
+    struck: list[Status] = field(default_factory=list)  # by an interrupt: fits that it has ended
 
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
@@ -267,6 +269,8 @@ class Workbench:
                     solution = solver.solve(problem, theta)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 continue
+            if solution.status is Status.INTERRUPTED:
+                self.struck.append(solution.status)
             if np.all(np.isfinite(solution.theta)):
                 vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
         if problem is None:

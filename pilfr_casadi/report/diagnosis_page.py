@@ -182,7 +182,7 @@ def _tried(d: Diagnosis) -> list[Block]:
         own = {(d.effects[k].port, d.effects[k].law)} if k < len(d.effects) else set() if k else chosen
         title = "Every port and law that was fitted"
         if k:
-            before = " and ".join(f"{words(e.law)} at {e.port}" for e in d.effects[:k]) or "the first in place"
+            before = " and ".join(f"{words(e.law)} at {e.port}" for e in d.effects[:k]) or "the first"
             title = f"A second look, with {before} in place"
         cells = [(r["port"], words(r["law"]), tables.score(r)) for r in rows]
         framed = [(port, words(law)) for port, law in own]
