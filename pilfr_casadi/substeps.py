@@ -148,7 +148,11 @@ def _sentence(simulator: Simulator, what: str, x: np.ndarray, u: np.ndarray) -> 
     values += [(k, 0.0) for k, v in simulator.parameters.items() if v.value.ndim == 0 and float(v.value) == 0]
     shown = ", ".join(f"{name} = {float(value):.4g}" for name, value in values[:SHOWN])
     more = f" and {len(values) - SHOWN} more" if len(values) > SHOWN else ""
+    at_rest = (
+        " Where the machine is never at zero, write the equations about its working point, or say where a recording "
+        "begins: Recording(initial=[...])."
+    )
     return (
         f"{what} is not finite at {shown}{more}; check what the equations divide by, or take a root or a logarithm of, "
-        "and the parameters' values."
+        f"and the parameters' values.{'' if np.any(x) else at_rest}"
     )
