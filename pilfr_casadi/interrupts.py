@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 
+ENDS = 2.0  # seconds that the thread behind a pool may take when its processes are gone
 Progress = Callable[[str, int, int, float], None]
 
 
@@ -114,11 +115,14 @@ def worker_pool(count: int) -> Iterator[Executor | None]:
     try:
         yield pool
     finally:
+        manager = getattr(pool, "_executor_manager_thread", None)
         try:
             _forget(pool)
         finally:
             for worker in set(multiprocessing.active_children()) - others:
                 worker.kill()
+            if manager is not None:  # at its end it closes a pipe that Python, at its own, would write to
+                manager.join(ENDS)
 
 
 def _forget(pool: ProcessPoolExecutor) -> None:
