@@ -144,10 +144,6 @@ BAD_SIMULATORS = {
         ("- p.d * x.vel", "+ 1e3 * x.vel"),
         ("diverges", "position is out", "s into", "it is unstable", "put the controller into the simulator"),
     ),
-    "growing simulator": (
-        ("- p.k * x.pos - p.d", "+ 7 * x.pos - 0.2 * p.d"),
-        ("Refitted, the simulation runs away", "times the outputs' deviation", "put the controller into the simulator"),
-    ),
     "decides by a symbol": (("p.k * x.pos", "p.k * max(x.pos, 0)"), ("casadi.if_else", "casadi.fmax")),
     "math's functions": (("p.k * x.pos", "p.k * __import__('math').sin(x.pos)"), ("equation of 'vel'", "ca.sin")),
     "diverging at once": (("- p.d * x.vel", "+ 1e6 * x.vel**3"), ("diverges",)),

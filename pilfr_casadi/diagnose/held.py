@@ -14,7 +14,7 @@ import numpy as np
 
 from ..recording import InputError
 from .choice import LIKE
-from .verdict import AT_FLOOR
+from .verdict import AT_FLOOR, WELL_ABOVE
 from .workbench import THOROUGH, Fitted
 
 if TYPE_CHECKING:
@@ -45,7 +45,8 @@ def held_value(search: Search) -> Held | None:
     bench, without = search.bench, search.without
     if not linear and without.cost < HELPLESS**2:
         return None
-    enough = (1 + LIKE) ** 2 * search.base.cost if named else AT_FLOOR**2 * search.floor2
+    as_well = (1 + LIKE) ** 2 * search.base.cost if named else np.inf
+    enough = min(as_well, (WELL_ABOVE if named else AT_FLOOR) ** 2 * search.floor2)  # else something is missing
     best: tuple[str, Fitted] | None = None
     for name, p in bench.simulator.parameters.items():
         stays = bool((linear and np.all(p.fixed)) or np.all(without.at_bound(name)))
@@ -54,12 +55,20 @@ def held_value(search: Search) -> Held | None:
         free = replace(p, fixed=False, bounds=(0.0 if float(p.value) > 0 else -np.inf, np.inf))
         simulator = bench.simulator.with_parameters({**bench.simulator.parameters, name: free})
         far = () if linear else FAR
-        starts = [without.values, *({**without.values, name: without.values[name] * by} for by in far)]
+        starts = [without.values, *({**without.values, name: p.value * by} for by in far)]
         try:
             found = bench.fit(simulator, starts, states=without.initial, solver=THOROUGH)
         except InputError:
             continue
-        if best is None or found.cost < best[1].cost:
+        except KeyboardInterrupt:
+            search.interrupted = True
+            return None
+        if bench.struck:
+            search.interrupted = True
+            return None
+        (low, high), value = p.bounds, float(found.values[name])
+        beyond = bool(np.all(p.fixed)) or not np.all((low <= value) & (value <= high))
+        if beyond and (best is None or found.cost < best[1].cost):
             best = name, found
     if best is None or best[1].cost > enough:
         return None

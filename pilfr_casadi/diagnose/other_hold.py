@@ -45,7 +45,7 @@ def otherwise_held(asked: Asked, ready: Prepared, search: Search) -> tuple[Prepa
         return ready, search
     nothing = not again.accepted and not again.unsure()  # is missing, where inputs do the other
     surer = nearer and (nothing or again.certainty() > search.certainty())
-    if not wrong and not surer:
+    if (not wrong and not surer) or (again.interrupted and not again.accepted):
         search.interrupted = again.interrupted
         return ready, search
     ratio = search.misheld if wrong else float(np.sqrt(search.base.cost / max(again.base.cost, 1e-300)))

@@ -70,7 +70,6 @@ def prepare(
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, bench.model(simulator))
     without = refitted(bench, starts)
-    bench.check_followed(without)
     unsaid = said_hold(simulator, recordings, hold) is None
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     noise2 = float(np.mean((first.deviation / bench.scale) ** 2))
@@ -120,6 +119,7 @@ def prepare(
         led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
         without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+    bench.check_followed(without)
     bench = replace(bench, typical=along(bench, without))
     return Prepared(bench, without, nominal, tuple(gates), floor)
 

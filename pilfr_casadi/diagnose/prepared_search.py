@@ -92,6 +92,7 @@ def prepared_search(asked: Asked, ready: Prepared | None = None) -> tuple[Prepar
         except KeyboardInterrupt:
             search.interrupted = True
             return ready, search
+        search.interrupted = other[1].interrupted
         if other[1].base.cost < FURTHER * search.base.cost:
             return other
     return ready, search

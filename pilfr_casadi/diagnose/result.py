@@ -17,6 +17,7 @@ VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 MOST = 8  # values of the simulator that are printed
 LEFT = 2.0  # times the noise that is left, to be told
+WORSE = 1.05  # times the test error without the effects that one with them is worth a warning
 CONSTANT = 0.9  # error of a refitted simulator that follows next to nothing
 INTERRUPTED = "The search was interrupted: this is what was found until then, and the rest was not tried."
 FAR = 3.0  # times the training error that a test error is worth a warning
@@ -156,7 +157,7 @@ class Diagnosis:
         times = train["after"] / max(self.floor["nrmse"], 1e-300) if train and self.effects else 1.0
         if times > LEFT:
             out.append(f"What is left is {times:.2g} times the noise: more is missing, or a law is only near.")
-        if test and self.effects and test["after"] > test["before"]:
+        if test and self.effects and test["after"] > WORSE * test["before"]:
             out.append(
                 f"On the test recording the simulator is worse with what is named ({test['after']:.3g} of the outputs' "
                 f"deviation) than refitted without ({test['before']:.3g}): do not rely on it there."

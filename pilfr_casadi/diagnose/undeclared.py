@@ -26,7 +26,7 @@ def beyond_the_ports(search: Search) -> Sequence[Gate]:
     except KeyboardInterrupt:
         search.interrupted = True
         return ()
-    named = other.accepted
+    search.interrupted, named = other.interrupted, other.accepted
     if other.certainty() <= UNSURE or not named or not named[0].winner.port.startswith("equation:"):
         return ()
     state, law = named[0].winner.port.removeprefix("equation:"), named[0].winner.law.id.replace("_", " ")

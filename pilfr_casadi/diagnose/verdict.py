@@ -34,7 +34,7 @@ DRIVEN = 0.5  # share of a name's confidence where it takes a parameter at its b
 FAR_OFF, FAR_AHEAD = 16.0, 4.0
 SLIGHT = 3e-3  # share of the whole excess that halves the confidence of an effect which explains no more
 UNSURE = 0.5  # confidence below which a name is called likely
-HARDLY = 0.2  # confidence below which names that leave something are no answer
+HARDLY = 0.2  # confidence below which names that leave something, with rivals near, are no answer
 CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
 HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
 AS_NEAR = 1.5  # times what a surrogate misses of the simulation itself, within which nothing can be said
@@ -86,7 +86,10 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         common = next((c.common for c in told if c.common), None)
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
         sure = [confidence(c, search) for c in told]
-        if max(sure) >= HARDLY or (len(accepted) == 1 and remains < LITTLE):
+        ahead = (
+            accepted[0].margin > CLEAR
+        )  # real machines have more that is not modelled, which says little of the name
+        if max(sure) >= HARDLY or ahead or (len(accepted) == 1 and remains < LITTLE):
             said = (
                 f"The simulator leaves out {words}."
                 if min(sure) > UNSURE

@@ -26,6 +26,7 @@ from .standing import standing, stands
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 HUGE, ENDLESS = 1e6, 1e20  # times the largest measured value, and mean square error, of what grows without end
+AWAY = 10.0  # times the outputs' deviation; what swings within bounds about another point is off by less
 BEYOND = 20.0  # e-folds within a recording that no estimate of a state survives
 FINER = 4  # times as many sub-steps for a law at most
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
@@ -209,8 +210,8 @@ class Workbench:
         return ""
 
     def check_followed(self, fitted: Fitted) -> None:
-        """Refuse a fit that is worse than a constant because the simulator is unstable."""
-        if fitted.cost > 1 and (why := self._unstable(self.simulator)):
+        """Refuse a fit that is far beyond what was recorded because the simulator is unstable."""
+        if fitted.cost > AWAY**2 and (why := self._unstable(self.simulator)):
             off = f"{fitted.cost**0.5:.3g} times the outputs' deviation"
             raise InputError(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
 

@@ -1,0 +1,55 @@
+"""Machines that are unstable: refused where no fit can follow them, and not where they swing within bounds."""
+
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from pilfr_casadi import Parameter, Recording, Simulator
+from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose.prepare import prepare
+from pilfr_casadi.diagnose.workbench import Workbench
+from pilfr_casadi.integration import discretise
+from pilfr_casadi.recording import InputError
+
+DT, SAMPLES = 0.02, 600
+
+
+def pendulum(a=20.0, sign=1.0):
+    """Its angle is measured from the upper position; with another sign, from the lower."""
+    return Simulator(
+        lambda x, u, p: {"q": x.v, "v": sign * p.a * ca.sin(x.q) - p.d * x.v + u.f},
+        lambda x: {"y": x.q},
+        states=("q", "v"),
+        inputs=("f",),
+        parameters={"a": Parameter(a, bounds=(5, 80)), "d": Parameter(1.0, bounds=(0, 10))},
+    )
+
+
+def fell(gain=1.0):
+    """Let go near the upper position, and driven."""
+    rng, t = np.random.default_rng(0), np.arange(SAMPLES) * DT
+    phases = rng.uniform(0, 6.28, 20)
+    u = 5 / 3 * np.sum(np.cos(2 * np.pi * np.linspace(0.2, 2.5, 20)[:, None] * t + phases[:, None]), axis=0)[:, None]
+    blank = Recording(u, u, DT, ("f",), ("y",), hold="zero")
+    model = discretise(pendulum(), DT, "zero", 6)
+    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.array([0.1, 0.0]))[0]
+    y = y + 1e-3 * np.std(y) * rng.standard_normal(y.shape)
+    return blank.with_(y=gain * y, initial=[0.1, 0.0])
+
+
+@pytest.mark.parametrize(("gain", "finding"), [(-1.0, "sign"), (180 / np.pi, "unit")])
+def test_a_pendulum_that_falls_from_its_upper_position_is_followed_and_faults_are_told(gain, finding):
+    ready = prepare(pendulum(21.0), [fell(gain)], None, "auto")
+    assert [g.finding for g in ready.gates] == [finding]
+    assert ready.without.cost**0.5 < 2e-3
+
+
+def test_what_an_unstable_simulator_is_far_from_is_refused():
+    benches = [Workbench.of(pendulum(sign=s), [fell()], "zero") for s in (1.0, -1.0)]
+    near, far = SimpleNamespace(cost=50.0), SimpleNamespace(cost=4e4)
+    benches[0].check_followed(near)
+    benches[1].check_followed(far)  # a wrong one need not be unstable
+    with pytest.raises(InputError, match=r"by 200 times the outputs' deviation; it is unstable .* put the controller"):
+        benches[0].check_followed(far)
