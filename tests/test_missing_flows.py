@@ -186,6 +186,7 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
     [
         ((0.07, 0.05), 1.2, "unexplained", ()),
         ((0.07, 0.05), 1.5, "missing-physics", ("delay at a",)),
+        ((0.06, 0.05), 1.5, "unexplained", ()),  # doubtful, see below
         ((0.3, 0.05), 1.2, "missing-physics", ("delay at a",)),
         ((0.3, 0.7), 1.2, "missing-physics", ("delay at a", "delay at b")),
     ],
@@ -195,7 +196,12 @@ def test_two_names_that_are_hardly_sure_are_no_answer_and_a_second_is_named_wher
 ):
     law = SimpleNamespace(id="delay")
     choices = [
-        SimpleNamespace(winner=SimpleNamespace(port=p, law=law, name=(p, law.id)), margin=margin, common=None, sure=c)
+        SimpleNamespace(
+            winner=SimpleNamespace(port=p, law=law, name=(p, law.id), doubtful=c == 0.06),
+            margin=margin,
+            common=None,
+            sure=c,
+        )
         for p, c in zip(("a", "b"), sure, strict=True)
     ]
     monkeypatch.setitem(judge.__globals__, "confidence", lambda choice, search: choice.sure)

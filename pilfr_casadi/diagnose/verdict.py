@@ -86,9 +86,8 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         common = next((c.common for c in told if c.common), None)
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
         sure = [confidence(c, search) for c in told]
-        ahead = (
-            accepted[0].margin > CLEAR
-        )  # real machines have more that is not modelled, which says little of the name
+        # a real machine has more that is in no simulator: a lead counts of a law that is what its name says
+        ahead = accepted[0].margin > CLEAR and not accepted[0].winner.doubtful
         if max(sure) >= HARDLY or ahead or (len(accepted) == 1 and remains < LITTLE):
             said = (
                 f"The simulator leaves out {words}."
