@@ -42,7 +42,8 @@ class Conclusion:
 def concluded(search: Search, gates: tuple[Gate, ...]) -> Conclusion:
     """The verdict, unless a value that is held or an input that was clipped says the same; notes where none is sure."""
     verdict, sentence = judge(search, gates)
-    held = held_value(search) if verdict in ("missing-physics", "unexplained") and not search.interrupted else None
+    unfinished = search.interrupted  # what comes below only adds to an answer that is there
+    held = held_value(search) if verdict in ("missing-physics", "unexplained") and not unfinished else None
     if held is not None:
         return Conclusion("complete", held.sentence, gates, held.fitted, [], held.name)
     if (lost := _lost_input(search, verdict)) is not None:
@@ -51,7 +52,7 @@ def concluded(search: Search, gates: tuple[Gate, ...]) -> Conclusion:
         return Conclusion(verdict, sentence, (*gates, *not_named(search)), search.base, named(search))
     if verdict == "unexplained":
         gates = (*gates, *beyond_the_ports(search), *varying(search))
-    if search.interrupted and verdict != "recording-fault":
+    if unfinished and verdict != "recording-fault":
         sentence = (
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "
             f"{mean_nrmse(search.bench, search.without):.3g} of the outputs' deviation."
