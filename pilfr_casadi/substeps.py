@@ -149,8 +149,8 @@ def _sentence(simulator: Simulator, what: str, x: np.ndarray, u: np.ndarray) -> 
     shown = ", ".join(f"{name} = {float(value):.4g}" for name, value in values[:SHOWN])
     more = f" and {len(values) - SHOWN} more" if len(values) > SHOWN else ""
     at_rest = (
-        "; where the machine is never at zero, write the equations about its working point, or say where a recording "
-        "begins, with Recording(initial=[...])"
+        "; where the machine is never at zero, write the equations about its working point, or in Python say where a "
+        "recording begins, by the argument `initial` of Recording"
     )
     return (
         f"{what} is not finite at {shown}{more}; check what the equations divide by, or take a root or a logarithm of, "

@@ -148,7 +148,10 @@ BAD_SIMULATORS = {
     "math's functions": (("p.k * x.pos", "p.k * __import__('math').sin(x.pos)"), ("equation of 'vel'", "ca.sin")),
     "diverging at once": (("- p.d * x.vel", "+ 1e6 * x.vel**3"), ("diverges",)),
     "far too fast": (("p.k * x.pos", "1e16 * x.pos"), ("fast",)),
-    "no mass": (("m=Parameter(1.0", "m=Parameter(0.0"), ("derivative of the state 'vel' is not finite", "m = 0;")),
+    "no mass": (
+        ("m=Parameter(1.0", "m=Parameter(0.0"),
+        ("derivative of the state 'vel' is not finite", "m = 0;", "by the argument `initial` of Recording"),
+    ),
 }
 
 
