@@ -1,10 +1,10 @@
 """Concealed cases on which `diagnose` has to find the physics that was left out of a simulator.
 
 `case(seed)` draws a rig, what it hides, and its recordings; `score` judges a diagnosis. Truths are simulated apart from
-the package and, mostly, by formulas that are not the catalogue's. Seeds 0 to 4099 are for development; results are
-reported on seeds from 4730 on.
+the package and, mostly, by formulas that are not the catalogue's. Results are reported on seeds that nobody has seen,
+from the default first seed on.
 
-    python -m problems.concealed --cases 200 --first-seed 4730 --workers 2
+    python -m problems.concealed --cases 200 --workers 2
     python -m problems.concealed --export DIR --cases 5 --first-seed 0      (files for the command line)
 """
 

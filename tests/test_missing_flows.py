@@ -182,22 +182,22 @@ def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
 
 
 @pytest.mark.parametrize(
-    ("sure", "margin", "verdict", "told"),
+    ("sure", "margin", "doubtful", "verdict", "told"),
     [
-        ((0.07, 0.05), 1.2, "unexplained", ()),
-        ((0.07, 0.05), 1.5, "missing-physics", ("delay at a",)),
-        ((0.06, 0.05), 1.5, "unexplained", ()),  # doubtful, see below
-        ((0.3, 0.05), 1.2, "missing-physics", ("delay at a",)),
-        ((0.3, 0.7), 1.2, "missing-physics", ("delay at a", "delay at b")),
+        ((0.07, 0.05), 1.2, False, "unexplained", ()),
+        ((0.07, 0.05), 1.5, False, "missing-physics", ("delay at a",)),
+        ((0.07, 0.05), 1.5, True, "unexplained", ()),
+        ((0.3, 0.05), 1.2, False, "missing-physics", ("delay at a",)),
+        ((0.3, 0.7), 1.2, False, "missing-physics", ("delay at a", "delay at b")),
     ],
 )
 def test_two_names_that_are_hardly_sure_are_no_answer_and_a_second_is_named_where_it_is_sure(
-    sure, margin, verdict, told, monkeypatch
+    sure, margin, doubtful, verdict, told, monkeypatch
 ):
     law = SimpleNamespace(id="delay")
     choices = [
         SimpleNamespace(
-            winner=SimpleNamespace(port=p, law=law, name=(p, law.id), doubtful=c == 0.06),
+            winner=SimpleNamespace(port=p, law=law, name=(p, law.id), doubtful=doubtful),
             margin=margin,
             common=None,
             sure=c,
