@@ -1,7 +1,7 @@
 """Black-box models beside a PI-LFR on the same recordings: what the structure of the element buys."""
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.demo import demo_recordings
+from pilfr_casadi.cli.demo import demo_recordings
 
 records = demo_recordings()
 train = records["train"].slice(0, 2048)  # the first of three realizations

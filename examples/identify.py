@@ -1,7 +1,7 @@
 """Identify a rig with a hysteretic spring from one recording, and judge the model on two others."""
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.demo import demo_recordings
+from pilfr_casadi.cli.demo import demo_recordings
 
 records = demo_recordings()  # or pilfr.read_csv("train.csv", inputs="u", outputs="x2", initial="zero")
 

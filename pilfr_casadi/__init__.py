@@ -1,134 +1,107 @@
-"""Identify dynamic models with hysteresis from recordings, and find the physics that a simulator leaves out.
+"""Identify dynamic models with hysteresis from recordings, and find the physics that a simulator leaves out."""
 
-Every public name is reachable as ``pilfr_casadi.<name>``; its module is imported when the name is first used, so that
-``import pilfr_casadi`` itself costs next to nothing.
-"""
+from typing import TYPE_CHECKING
 
-import importlib
-import sys
-import types
-from typing import Any
+from ._base.lazy import lazy_face
+from ._base.version import __version__ as __version__
+from .diagnose import diagnose as diagnose
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from . import control as control, laws as laws, plots as plots
+    from ._base import InputError as InputError
+    from .control import (
+        PredictiveController as PredictiveController,
+        do_mpc_controller as do_mpc_controller,
+        do_mpc_model as do_mpc_model,
+        feedforward as feedforward,
+        inverse_element as inverse_element,
+        kalman_filter as kalman_filter,
+        response_bound as response_bound,
+        visibility as visibility,
+    )
+    from .data import (
+        Recording as Recording,
+        as_recordings as as_recordings,
+        mean_period as mean_period,
+        multisine as multisine,
+        noise_weights as noise_weights,
+        nrmse as nrmse,
+        orthogonal_multisine as orthogonal_multisine,
+        period_noise as period_noise,
+        prbs as prbs,
+        read as read,
+        read_csv as read_csv,
+        read_mat as read_mat,
+        read_npz as read_npz,
+        rmse as rmse,
+        sine_sweep as sine_sweep,
+        tukey_realizations as tukey_realizations,
+    )
+    from .diagnose import Diagnosis as Diagnosis
+    from .export import Exported as Exported, exported as exported, load as load, save as save, to_casadi as to_casadi
+    from .identify import (
+        Fit as Fit,
+        RegularizationPath as RegularizationPath,
+        fit as fit,
+        one_step as one_step,
+        prune as prune,
+        regularization_path as regularization_path,
+        standard_errors as standard_errors,
+    )
+    from .laws import Law as Law, Local as Local
+    from .linear import (
+        BLA as BLA,
+        frequency_subspace as frequency_subspace,
+        modal as modal,
+        plain_bla as plain_bla,
+        robust_bla as robust_bla,
+        select_order as select_order,
+        time_subspace as time_subspace,
+    )
+    from .models import (
+        NARX as NARX,
+        NOE as NOE,
+        PILFR as PILFR,
+        Combined as Combined,
+        Envelope as Envelope,
+        GeneralizedPlay as GeneralizedPlay,
+        Model as Model,
+        Parameter as Parameter,
+        ParameterSet as ParameterSet,
+        Part as Part,
+        Play as Play,
+        PrandtlIshlinskii as PrandtlIshlinskii,
+        Products as Products,
+        StaticNetwork as StaticNetwork,
+        Stop as Stop,
+        close_loop as close_loop,
+        generalized_play as generalized_play,
+        hammerstein as hammerstein,
+        network_lfr as network_lfr,
+        normalise as normalise,
+        open_model as open_model,
+        play as play,
+        ssnn as ssnn,
+        stop as stop,
+        to_plays as to_plays,
+        to_stops as to_stops,
+        wiener as wiener,
+    )
+    from .optimise import (
+        Constraint as Constraint,
+        GaussNewton as GaussNewton,
+        Ipopt as Ipopt,
+        Limit as Limit,
+        Problem as Problem,
+        Solution as Solution,
+        Status as Status,
+        dc_gain as dc_gain,
+        ordered as ordered,
+        stable as stable,
+    )
+    from .report import fit_report as fit_report, write_report as write_report
+    from .simulators import Port as Port, Simulator as Simulator
+    from .studies import campaign as campaign, read_run as read_run, run as run
 
-# public name -> submodule that defines it
-_EXPORTS = {
-    "Limit": "limits",
-    "RegularizationPath": "sparse",
-    "dc_gain": "known",
-    "ordered": "known",
-    "prune": "sparse",
-    "regularization_path": "sparse",
-    "diagnose": "diagnose",
-    "Simulator": "simulator",
-    "Port": "simulator",
-    "Local": "laws",
-    "Law": "laws",
-    "Diagnosis": "diagnose",
-    "BLA": "bla",
-    "Combined": "combined",
-    "Constraint": "constraints",
-    "Envelope": "envelope",
-    "Part": "combined",
-    "Products": "products",
-    "mean_period": "periods",
-    "noise_weights": "periods",
-    "period_noise": "periods",
-    "Exported": "export",
-    "Fit": "fit",
-    "GaussNewton": "gauss_newton",
-    "GeneralizedPlay": "operators",
-    "InputError": "recording",
-    "Ipopt": "ipopt",
-    "Model": "model",
-    "NARX": "baselines",
-    "NOE": "baselines",
-    "StaticNetwork": "elements",
-    "network_lfr": "baselines",
-    "one_step": "baselines",
-    "ssnn": "baselines",
-    "PILFR": "lfr",
-    "Parameter": "parameters",
-    "ParameterSet": "parameters",
-    "Play": "operators",
-    "PrandtlIshlinskii": "elements",
-    "Problem": "problem",
-    "PredictiveController": "feedback",
-    "Recording": "recording",
-    "Solution": "solution",
-    "Status": "solution",
-    "Stop": "operators",
-    "as_recordings": "recording",
-    "campaign": "runs",
-    "close_loop": "model",
-    "exported": "export",
-    "do_mpc_controller": "feedback",
-    "do_mpc_model": "feedback",
-    "feedforward": "feedback",
-    "fit": "fit",
-    "fit_report": "report",
-    "frequency_subspace": "subspace",
-    "generalized_play": "operators",
-    "hammerstein": "lfr",
-    "inverse_element": "feedback",
-    "kalman_filter": "feedback",
-    "load": "export",
-    "modal": "modal",
-    "multisine": "signals",
-    "normalise": "normal_form",
-    "nrmse": "metrics",
-    "open_model": "model",
-    "orthogonal_multisine": "signals",
-    "plain_bla": "local_polynomial",
-    "play": "operators",
-    "prbs": "signals",
-    "read": "readers",
-    "read_csv": "readers",
-    "read_mat": "readers",
-    "read_npz": "readers",
-    "rmse": "metrics",
-    "robust_bla": "bla",
-    "read_run": "runs",
-    "response_bound": "response_bound",
-    "run": "runs",
-    "save": "export",
-    "select_order": "order_selection",
-    "sine_sweep": "signals",
-    "stable": "constraints",
-    "standard_errors": "gauge",
-    "stop": "operators",
-    "time_subspace": "subspace",
-    "to_casadi": "export",
-    "to_plays": "conversion",
-    "to_stops": "conversion",
-    "tukey_realizations": "signals",
-    "visibility": "feedback",
-    "wiener": "lfr",
-    "write_report": "report",
-}
-
-__all__ = sorted(_EXPORTS)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _EXPORTS:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_EXPORTS[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_EXPORTS})
-
-
-class _Package(types.ModuleType):
-    """This package: where a public name equals its submodule's (``fit`` in ``fit.py``), the public name wins."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if isinstance(value, types.ModuleType) and _EXPORTS.get(name) == name:
-            value = getattr(value, name)
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+__all__ += ["__version__", "diagnose"]

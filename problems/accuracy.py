@@ -13,8 +13,8 @@ from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 
-from pilfr_casadi.demo import FLOOR, SETS, structure
-from pilfr_casadi.fit import fit
+from pilfr_casadi.cli.demo import FLOOR, SETS, structure
+from pilfr_casadi.identify import fit
 
 from .masing_data import benchmark
 

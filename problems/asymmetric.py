@@ -14,11 +14,9 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import Fit, fit
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.data import Recording
+from pilfr_casadi.identify import Fit, fit
+from pilfr_casadi.models import PILFR, GeneralizedPlay, Play, PrandtlIshlinskii, Stop
 
 from .shape_memory import NOISE, records, temperature
 

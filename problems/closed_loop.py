@@ -15,14 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.feedback import (
-    PredictiveController,
-    do_mpc_controller,
-    feedforward,
-    kalman_filter,
-)
-from pilfr_casadi.fit import Fit
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.control import PredictiveController, do_mpc_controller, feedforward, kalman_filter
+from pilfr_casadi.data import Recording
+from pilfr_casadi.identify import Fit
 
 from .controllers import ByDoMpc, Compensated, Controller, Given, Plant, Predictive, ProportionalIntegral
 

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 import pilfr_casadi
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.data import Recording
 
 from .concealed_case import KINDS, Case, case
 from .concealed_score import Score, line, score, summary

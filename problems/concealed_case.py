@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.data import Recording
 
 from . import concealed_noise as dull
 from .concealed_draw import LEAST, MOST, Draw, Unsuited

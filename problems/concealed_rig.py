@@ -86,8 +86,8 @@ class Rig:
 
     def module(self, source: str) -> dict[str, Any]:
         """Run a source; the names are given to it, so that it also runs where they are not exported."""
-        from pilfr_casadi.parameters import Parameter
-        from pilfr_casadi.simulator import Port, Simulator
+        from pilfr_casadi.models import Parameter
+        from pilfr_casadi.simulators import Port, Simulator
 
         space: dict[str, Any] = {"Parameter": Parameter, "Port": Port, "Simulator": Simulator, "__name__": "rig"}
         exec(source.replace("from pilfr_casadi import Parameter, Port, Simulator\n", ""), space)

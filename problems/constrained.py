@@ -19,15 +19,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pilfr_casadi.constraints import Constraint
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import Fit, fit
-from pilfr_casadi.known import dc_gain, ordered
-from pilfr_casadi.lfr import PILFR, hammerstein
-from pilfr_casadi.operators import Play, play
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.signals import multisine, sine_sweep
-from pilfr_casadi.sparse import regularization_path
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording, multisine, sine_sweep
+from pilfr_casadi.identify import Fit, fit, regularization_path
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, hammerstein, play
+from pilfr_casadi.optimise import Constraint, dc_gain, ordered
 
 from .masing import MasingRig, simulate
 from .masing_data import F_MAX, FS, benchmark

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pilfr_casadi.feedback import Feedforward, KalmanFilter, PredictiveController
+from pilfr_casadi.control import Feedforward, KalmanFilter, PredictiveController
 
 Array = np.ndarray
 

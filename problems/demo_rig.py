@@ -7,7 +7,7 @@
 The second mass slides with LuGre friction (Canudas de Wit et al. 1995), which is not a formula of the catalogue. The
 simulator's parameters are off by up to 15 %.
 
-    python -m problems.demo_rig        writes rig_train.csv and rig_test.csv into pilfr_casadi/demo_data
+    python -m problems.demo_rig        writes rig_train.csv and rig_test.csv into pilfr_casadi/cli/demo_data
 """
 
 from __future__ import annotations
@@ -16,11 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.signals import multisine
+from pilfr_casadi.data import Recording, multisine
 
 DT, SAMPLES, NOISE, FINE = 0.01, 1000, 1e-4, 100
-FOLDER = Path(__file__).parent.parent / "pilfr_casadi" / "demo_data"
+FOLDER = Path(__file__).parent.parent / "pilfr_casadi" / "cli" / "demo_data"
 M1, M2, K1, K2, D1, D2 = 1.2, 0.8, 420.0, 900.0, 2.0, 1.5
 SIGMA0, SIGMA1, F_C, F_S, V_S = 5000.0, 5.0, 1.1, 1.25, 0.05
 

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.diagnose.result import Diagnosis
-from pilfr_casadi.diagnose.workbench import THOROUGH, Fitted, Workbench
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.simulator import Simulator
+from pilfr_casadi.data import Recording
+from pilfr_casadi.diagnose import Diagnosis, Fitted, Workbench
+from pilfr_casadi.diagnose.workbench import THOROUGH
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.simulators import Simulator
 
 
 def free_run(simulator: Simulator, recording: Recording, hold: str, first: int = 0) -> np.ndarray:

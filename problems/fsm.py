@@ -23,14 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.constraints import stable
-from pilfr_casadi.fit import Fit, fit
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.periods import mean_period, noise_weights, period_noise
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.response_bound import response_bound
+from pilfr_casadi.control import response_bound
+from pilfr_casadi.data import Recording, mean_period, noise_weights, period_noise
+from pilfr_casadi.identify import Fit, fit
+from pilfr_casadi.models import PILFR
+from pilfr_casadi.optimise import GaussNewton, Problem, stable
 
 from .fsm_linear import LINES, Y_UNIT, Spectra, first_modes, fitted_levels, simulated
 from .fsm_model import combined, envelope_alone, pure

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pilfr_casadi.bla import BLA
-from pilfr_casadi.subspace import frequency_subspace
+from pilfr_casadi.linear import BLA, frequency_subspace
 
 Array = np.ndarray
 U_UNIT, Y_UNIT = 0.1, 1e-6  # V, m

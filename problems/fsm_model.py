@@ -11,12 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.combined import Combined, Part
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.envelope import CREST, Envelope
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.operators import Play, Stop, stop
-from pilfr_casadi.products import Products
+from pilfr_casadi.models import PILFR, Combined, Envelope, Part, Play, PrandtlIshlinskii, Products, Stop, stop
+from pilfr_casadi.models.envelope import CREST
 
 from .fsm_linear import U_UNIT, Y_UNIT, Levels, in_modes
 

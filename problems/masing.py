@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
 
 from .masing_spring import Branch, MasingSpring
 

@@ -12,8 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.signals import sine_sweep, steady_periods, tukey_realizations
+from pilfr_casadi.data import Recording, sine_sweep, tukey_realizations
+from pilfr_casadi.data.signals import steady_periods
 
 from .masing import MasingRig, Motion, simulate
 
@@ -114,4 +114,4 @@ def write_demo(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    write_demo(Path(__file__).parents[1] / "pilfr_casadi" / "demo_data")
+    write_demo(Path(__file__).parents[1] / "pilfr_casadi" / "cli" / "demo_data")

@@ -13,10 +13,9 @@ import resource
 from collections.abc import Sequence
 from typing import Any
 
-from pilfr_casadi.diagnose import diagnose
-from pilfr_casadi.diagnose.result import Diagnosis
-from pilfr_casadi.parameters import Parameter
-from pilfr_casadi.simulator import Port, Simulator
+from pilfr_casadi.diagnose import Diagnosis, diagnose
+from pilfr_casadi.models import Parameter
+from pilfr_casadi.simulators import Port, Simulator
 
 from .diagnosed import answer, rmse, table
 from .masing import MasingRig

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pilfr_casadi import plots
-from pilfr_casadi.bla import BLA, robust_bla
-from pilfr_casadi.demo import FLOOR, PUBLISHED, SETS
-from pilfr_casadi.fit import Fit
-from pilfr_casadi.operators import play, stop
-from pilfr_casadi.subspace import frequency_subspace
+from pilfr_casadi.cli.demo import FLOOR, PUBLISHED, SETS
+from pilfr_casadi.identify import Fit
+from pilfr_casadi.linear import BLA, frequency_subspace, robust_bla
+from pilfr_casadi.models import play, stop
 
 from .masing_data import FS, Benchmark, benchmark
 

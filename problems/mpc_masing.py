@@ -10,10 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import fit
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.operators import Play
+from pilfr_casadi.identify import fit
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 
 from .closed_loop import Outcome, Task, compare, program
 from .masing import MasingRig, State, advance, stepper

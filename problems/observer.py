@@ -16,13 +16,11 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from pilfr_casadi.demo import demo_recordings
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.feedback import kalman_filter
-from pilfr_casadi.feedback.kalman import ekf_step
-from pilfr_casadi.fit import fit
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.operators import Play
+from pilfr_casadi.cli.demo import demo_recordings
+from pilfr_casadi.control import kalman_filter
+from pilfr_casadi.control.kalman import ekf_step
+from pilfr_casadi.identify import fit
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 
 Array = np.ndarray
 WINDOW = 400  # samples that are judged

@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.diagnose import diagnose
-from pilfr_casadi.diagnose.result import Diagnosis
-from pilfr_casadi.parameters import Parameter
-from pilfr_casadi.simulator import Simulator
+from pilfr_casadi.diagnose import Diagnosis, diagnose
+from pilfr_casadi.models import Parameter
+from pilfr_casadi.simulators import Simulator
 
 from .diagnosed import answer, free_run, rmse, table
 from .measured_data import measured

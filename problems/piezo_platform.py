@@ -19,8 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.signals import multisine
+from pilfr_casadi.data import Recording, multisine
 
 FS = 10_000.0  # Hz
 N_PERIOD = 8192

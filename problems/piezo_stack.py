@@ -16,12 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import Fit, fit
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.operators import Play
-from pilfr_casadi.readers import read_csv
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.data import Recording, read_csv
+from pilfr_casadi.identify import Fit, fit
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 
 from .measured_data import measured
 

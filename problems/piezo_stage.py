@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.signals import multisine
+from pilfr_casadi.data import Recording, multisine
 
 FS = 1000.0  # Hz
 RANGE = (0.0, 100.0)  # V

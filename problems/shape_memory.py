@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.signals import multisine
+from pilfr_casadi.data import Recording, multisine
 
 FS = 10.0  # Hz
 N_PERIOD = 2048

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.compiled import compiler
+from pilfr_casadi.engine import compiler
 
 from .speed_pieces import PLAYS, Figures, structure
 
@@ -34,10 +34,9 @@ ONE_THREAD = {key: "1" for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "M
 
 def prepare(folder: Path) -> None:
     """Write the case: training record, a start of the default pipeline, and a point on the way from it."""
-    from pilfr_casadi.gauss_newton import GaussNewton
-    from pilfr_casadi.linear_model import linear_model
-    from pilfr_casadi.problem import Problem
-    from pilfr_casadi.start import grid_start, unit_states
+    from pilfr_casadi.identify.linear_model import linear_model
+    from pilfr_casadi.identify.start import grid_start, unit_states
+    from pilfr_casadi.optimise import GaussNewton, Problem
 
     from .masing_data import records
 

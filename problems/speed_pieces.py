@@ -45,8 +45,8 @@ def clock(action: Callable[[], Any], repeats: int = 7, budget: float = 5.0) -> f
 
 def load(folder: Path, engine: str = "auto", samples: int | None = None, point: str = "start") -> Any:
     """The problem of the case, at its start or at a point on the way, the record cut or repeated to `samples`."""
-    from pilfr_casadi.problem import Problem
-    from pilfr_casadi.recording import Recording
+    from pilfr_casadi.data import Recording
+    from pilfr_casadi.optimise import Problem
 
     with np.load(folder / f"{point}.npz") as case:
         values = dict(case)
@@ -58,9 +58,7 @@ def load(folder: Path, engine: str = "auto", samples: int | None = None, point: 
 
 def structure() -> Any:
     """Five states and 20 plays."""
-    from pilfr_casadi.elements import PrandtlIshlinskii
-    from pilfr_casadi.lfr import PILFR
-    from pilfr_casadi.operators import Play
+    from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 
     return PILFR(ORDER, PrandtlIshlinskii(Play, PLAYS))
 
@@ -115,9 +113,8 @@ def growth(folder: Path, samples: int) -> Figures:
 
 def one_start(folder: Path, engine: str) -> Figures:
     """One start run to the end, as the pipeline would: with its constraints, code generation and building included."""
-    from pilfr_casadi.gauss_newton import GaussNewton
-    from pilfr_casadi.problem import Problem
-    from pilfr_casadi.stability import stability
+    from pilfr_casadi.optimise import GaussNewton, Problem
+    from pilfr_casadi.optimise.stability import stability
 
     model = load(folder, "vm", 200).model
     record = load(folder, "vm").recordings
@@ -132,7 +129,7 @@ def one_start(folder: Path, engine: str) -> Figures:
 
 def pipeline(folder: Path, starts: int) -> Figures:
     """The default identification of the record."""
-    from pilfr_casadi.fit import fit
+    from pilfr_casadi.identify import fit
 
     record = load(folder, "vm").recordings
     began = time.perf_counter()
@@ -145,7 +142,7 @@ def least_squares(folder: Path, way: str, limit: int) -> Figures:
     problem = load(folder, "auto")
     began = time.perf_counter()
     if way == "ours":
-        from pilfr_casadi.gauss_newton import GaussNewton
+        from pilfr_casadi.optimise import GaussNewton
 
         solution = GaussNewton().solve(problem)
         theta, count, ended = solution.theta, solution.iterations, solution.status.converged
@@ -170,14 +167,14 @@ def imports(folder: Path, what: str) -> Figures:
     if what == "package":
         import pilfr_casadi  # noqa: F401
     else:
-        from pilfr_casadi import fit  # noqa: F401
+        pass
     return {"casadi": middle - began, "more": time.perf_counter() - middle}
 
 
 def building(folder: Path) -> Figures:
     """Time until a compiled engine is ready to run."""
     model = load(folder, "vm", 200).model
-    from pilfr_casadi.compiled import make_engine
+    from pilfr_casadi.engine import make_engine
 
     began = time.perf_counter()
     make_engine(model, "c")
@@ -209,7 +206,7 @@ def exported_step(folder: Path, optimisation: str = "-O2") -> Figures:
     """One step of the exported model in a C program, and of its CasADi function called from Python."""
     import subprocess
 
-    from pilfr_casadi.compiled import compiler
+    from pilfr_casadi.engine import compiler
     from pilfr_casadi.export import exported
 
     step = exported(load(folder, "vm", 200, "way").model, dt=1 / 120, name="rig")

@@ -38,17 +38,24 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.baselines import NARX, NOE, Lagged, network_lfr, ssnn
-from pilfr_casadi.bla import robust_bla
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.demo import FLOOR, PUBLISHED, SETS, structure
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import Fit, fit
-from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.operators import Play
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.subspace import frequency_subspace
+from pilfr_casadi.cli.demo import FLOOR, PUBLISHED, SETS, structure
+from pilfr_casadi.data import Recording
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.identify import Fit, fit
+from pilfr_casadi.linear import frequency_subspace, robust_bla
+from pilfr_casadi.models import (
+    NARX,
+    NOE,
+    PILFR,
+    Lagged,
+    Play,
+    PrandtlIshlinskii,
+    hammerstein,
+    network_lfr,
+    ssnn,
+    wiener,
+)
+from pilfr_casadi.optimise import Problem
 
 from .masing_data import Benchmark, benchmark
 

@@ -37,14 +37,10 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.baselines import NOE, Lagged, ssnn
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import Fit, fit
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.lfr import PILFR, hammerstein
-from pilfr_casadi.modal import modal
-from pilfr_casadi.operators import Play
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.data import Recording
+from pilfr_casadi.identify import Fit, fit
+from pilfr_casadi.models import NOE, PILFR, Lagged, Play, PrandtlIshlinskii, hammerstein, modal, ssnn
+from pilfr_casadi.optimise import GaussNewton
 
 from .measured_data import measured
 from .piezo_platform import Platform, measure

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from pilfr_casadi import plots
-from pilfr_casadi.bla import robust_bla
-from pilfr_casadi.fit import Fit
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.subspace import frequency_subspace
+from pilfr_casadi.data import Recording
+from pilfr_casadi.identify import Fit
+from pilfr_casadi.linear import frequency_subspace, robust_bla
 
 from .piezo_platform import Measurement
 

@@ -23,12 +23,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from pilfr_casadi.diagnose import diagnose
-from pilfr_casadi.diagnose.result import Diagnosis
-from pilfr_casadi.parameters import Parameter
-from pilfr_casadi.readers import read_csv
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.simulator import Port, Simulator
+from pilfr_casadi.data import Recording, read_csv
+from pilfr_casadi.diagnose import Diagnosis, diagnose
+from pilfr_casadi.models import Parameter
+from pilfr_casadi.simulators import Port, Simulator
 
 from .diagnosed import answer, rmse, started, table
 from .measured_data import measured

@@ -16,8 +16,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.ipopt import Ipopt
+from pilfr_casadi.optimise import GaussNewton, Ipopt
 
 from .zoo_blocks import asymmetric, backlash_loop, lti, mimo_lfr, pi_hammerstein, pi_wiener
 from .zoo_case import Case

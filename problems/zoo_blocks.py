@@ -8,11 +8,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.model import close_loop, open_model
-from pilfr_casadi.operators import GeneralizedPlay, Play
-from pilfr_casadi.parameters import Parameter, ParameterSet
+from pilfr_casadi.models import (
+    PILFR,
+    GeneralizedPlay,
+    Parameter,
+    ParameterSet,
+    Play,
+    PrandtlIshlinskii,
+    close_loop,
+    hammerstein,
+    open_model,
+    wiener,
+)
 
 from .zoo_case import Case, excitation, identified, noisy, plays, simulate_lfr
 

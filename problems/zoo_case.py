@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.model import Model
-from pilfr_casadi.multisines import multisine
-from pilfr_casadi.placement import direction_fixed
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.start import grid_start, unit_states
-from pilfr_casadi.subspace import subspace_matrices
+from pilfr_casadi.data import Recording, multisine
+from pilfr_casadi.identify.start import grid_start, unit_states
+from pilfr_casadi.linear import subspace_matrices
+from pilfr_casadi.models import PILFR, Model, direction_fixed
+from pilfr_casadi.optimise import Problem
 
 Blocks = dict[str, np.ndarray]
 

@@ -7,10 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.model import Model, close_loop, open_model
-from pilfr_casadi.operators import Stop
-from pilfr_casadi.parameters import Parameter, ParameterSet
+from pilfr_casadi.models import Model, Parameter, ParameterSet, PrandtlIshlinskii, Stop, close_loop, open_model
 
 from . import masing, masing_data
 from .zoo_case import Case

@@ -2,12 +2,10 @@
 
 import numpy as np
 
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.integration import discretise
-from pilfr_casadi.parameters import Parameter
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.simulator import Port, Simulator
-from pilfr_casadi.substeps import choose_substeps
+from pilfr_casadi.data import Recording
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.models import Parameter
+from pilfr_casadi.simulators import Port, Simulator, choose_substeps, discretise
 
 DT, SAMPLES = 2e-3, 2500
 

@@ -2,11 +2,8 @@
 
 import numpy as np
 
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.lfr import PILFR, block_shapes
-from pilfr_casadi.multisines import multisine
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.data import Recording, multisine
+from pilfr_casadi.models import PILFR, GeneralizedPlay, Play, PrandtlIshlinskii, Stop, block_shapes
 
 
 def random_lfr(seed, nx=3, n_u=1, n_y=1, n_w=1, n=4, operator=Play, radius=0.8, gain=0.1, **options):

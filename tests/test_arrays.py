@@ -4,7 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pilfr_casadi.arrays import BLOCK, accumulated, mapped
+from pilfr_casadi.models import accumulated, mapped
+from pilfr_casadi.models.arrays import BLOCK
 
 
 @pytest.fixture(scope="module")

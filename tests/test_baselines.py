@@ -8,13 +8,14 @@ import pytest
 from random_models import random_input
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.baselines import lagged_states, reading_output
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.early_stopping import hold_back, solve_watched
+from pilfr_casadi._base import InputError
+from pilfr_casadi.engine import make_engine
 from pilfr_casadi.export.digests import ordered_digest
-from pilfr_casadi.gauge import gauge_tangents
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import InputError
+from pilfr_casadi.identify.early_stopping import hold_back, solve_watched
+from pilfr_casadi.identify.gauge import gauge_tangents
+from pilfr_casadi.models import reading_output
+from pilfr_casadi.models.baselines import lagged_states
+from pilfr_casadi.optimise import Problem
 
 NOISE = 0.01
 rng = np.random.default_rng(5)

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from random_models import simulate_lti
 
-from pilfr_casadi.bla import BLA, output_spectra, robust_bla
-from pilfr_casadi.local_polynomial import plain_bla
-from pilfr_casadi.lti import frequency_response
-from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.linear import BLA, output_spectra, plain_bla, robust_bla
+from pilfr_casadi.linear.statespace import frequency_response
 
 DT = 0.01
 

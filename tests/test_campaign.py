@@ -17,12 +17,10 @@ from run_files import PYTHON, changed, command, contents, prepared
 from test_cli import write_csv
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import hand
-from pilfr_casadi.cli import main
-from pilfr_casadi.interrupts import Clock, time_limit
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.runs.execute import RunInterrupted
-from pilfr_casadi.runs.manifest import Manifest
+from pilfr_casadi._base import Clock, InputError, time_limit, worker_process as hand
+from pilfr_casadi.cli.app import main
+from pilfr_casadi.studies import RunInterrupted
+from pilfr_casadi.studies.manifest import Manifest
 
 SLOW = """
 import os, pathlib, time, tomllib
@@ -192,7 +190,7 @@ def test_ctrl_c_after_the_jobs_says_that_they_are_done(folder, monkeypatch, caps
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(importlib.import_module("pilfr_casadi.runs.execute"), "summarised", interrupted)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.execute"), "summarised", interrupted)
     assert main(["campaign", str(folder / "rig.toml")]) == 130
     assert "8 of 8 jobs are done" in capsys.readouterr().err
     assert len({r["job"] for r in rows(folder / "rig-campaign")}) == 8
@@ -212,7 +210,7 @@ def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
 
     close = hand.close_hands
     monkeypatch.setattr(hand.Hand, "__init__", late)
-    monkeypatch.setattr(importlib.import_module("pilfr_casadi.runs.campaign"), "close_hands", ends)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.campaigns"), "close_hands", ends)
     (folder / "mine.py").write_text(SLOW.replace("TROUBLE", "time.sleep(600)").replace("FOLDER", str(folder)))
     with pytest.raises(RunInterrupted), time_limit(0.5, Clock()):
         pilfr.campaign(folder / "mine.py")

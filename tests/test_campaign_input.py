@@ -10,15 +10,12 @@ from run_files import changed, prepared
 from test_cli import refused
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import hand
-from pilfr_casadi.cli import main
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.runs import cluster, side_by_side
-from pilfr_casadi.runs.command import _alike
-from pilfr_casadi.runs.grid import Cell
-from pilfr_casadi.runs.manifest import Manifest
-from pilfr_casadi.runs.results import reasons
-from pilfr_casadi.structures import named_structure
+from pilfr_casadi._base import InputError, worker_process as hand
+from pilfr_casadi.cli.app import main
+from pilfr_casadi.cli.run_command import _alike
+from pilfr_casadi.models import named_structure
+from pilfr_casadi.studies import Cell, cluster, reasons, side_by_side
+from pilfr_casadi.studies.manifest import Manifest
 
 
 @pytest.fixture

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from test_missing_flows import axis, moved
 
-from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.data import Recording
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.choice import choose
 from pilfr_casadi.diagnose.first_effect import wrongly_held
 from pilfr_casadi.diagnose.floor import Floor
@@ -18,24 +19,24 @@ from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.second_effect import only_drifts
 from pilfr_casadi.diagnose.timing import timing
 from pilfr_casadi.diagnose.verdict import strained
-from pilfr_casadi.diagnose.workbench import Workbench
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.laws import CubicStiffness, LinearStiffness
-from pilfr_casadi.laws.dynamic import (
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.laws import (
     Creep,
+    CubicStiffness,
     Delay,
     Drift,
+    HarmonicForce,
+    LinearStiffness,
+    PeriodicForce,
     Relaxation,
     Resonance,
     Settling,
     TwoStageCreep,
     TwoStageRelaxation,
 )
-from pilfr_casadi.laws.periodic import HarmonicForce, PeriodicForce
-from pilfr_casadi.parameters import Parameter
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.simulator import Port, Simulator
-from pilfr_casadi.solution import Status
+from pilfr_casadi.models import Parameter
+from pilfr_casadi.optimise import GaussNewton, Status
+from pilfr_casadi.simulators import Port, Simulator
 
 
 def searching(bench, said=True):

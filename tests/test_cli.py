@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from test_export import signed
 
-from pilfr_casadi.cli import in_options, main
+from pilfr_casadi.cli.app import in_options, main
 
 
 def write_csv(path, seed=0, m=600, **columns):
@@ -221,7 +221,7 @@ def test_messages_name_options_of_the_command_line(capsys, tmp_path, train, monk
     assert run(capsys, *fit_arguments(path, tmp_path, "--time-tolerance", 0.1))[0] == 0
     periodic = [a if a != "zero" else "periodic" for a in fit_arguments(train, tmp_path, "--overwrite")]
     refused(capsys, *periodic, says="--period SAMPLES")
-    monkeypatch.setattr("pilfr_casadi.compiled.compiler", lambda: None)
+    monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: None)
     refused(capsys, *fit_arguments(train, tmp_path, "--overwrite", "--engine", "c"), says="--engine vm")
 
 
@@ -264,8 +264,8 @@ def test_fit_says_what_it_works_with(capsys, tmp_path, train, monkeypatch):
     assert "order: 1, as given" in out
     arguments = list(fit_arguments(train, tmp_path, "--overwrite", "--operators", 0))
     del arguments[arguments.index("--nx") : arguments.index("--nx") + 2]
-    monkeypatch.setattr("pilfr_casadi.compiled.compiler", lambda: None)
-    monkeypatch.setattr("pilfr_casadi.commands.compiler", lambda: None)
+    monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: None)
+    monkeypatch.setattr("pilfr_casadi.cli.commands.compiler", lambda: None)
     status, out, err = run(capsys, *arguments)
     assert status == 0 and err == ""
     assert ", chosen on the training data\n" in out
@@ -273,7 +273,7 @@ def test_fit_says_what_it_works_with(capsys, tmp_path, train, monkeypatch):
 
 
 def test_a_compiler_that_fails_is_named(capsys, tmp_path, train, monkeypatch):
-    monkeypatch.setattr("pilfr_casadi.compiled.compiler", lambda: "/bin/false")
+    monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: "/bin/false")
     status, out, err = run(capsys, *fit_arguments(train, tmp_path, "--operators", 2))
     assert status == 0 and err == ""
     assert out.count("virtual machine") == 1 and "/bin/false could not build the model" in out

@@ -5,24 +5,31 @@ import json
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pilfr_casadi import load
-from pilfr_casadi.combined import Combined, Part, element_bound
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.envelope import Envelope
+from pilfr_casadi._base import InputError
+from pilfr_casadi.control import response_bound
+from pilfr_casadi.data import Recording
+from pilfr_casadi.engine import VirtualMachine
 from pilfr_casadi.export.digests import ordered_digest
-from pilfr_casadi.fit import fit
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.model import close_loop, open_model
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
-from pilfr_casadi.parameters import ParameterSet
-from pilfr_casadi.products import Products
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.response_bound import response_bound
-from pilfr_casadi.sensitivities import VirtualMachine
+from pilfr_casadi.identify import fit
+from pilfr_casadi.models import (
+    PILFR,
+    Combined,
+    Envelope,
+    GeneralizedPlay,
+    ParameterSet,
+    Part,
+    Play,
+    PrandtlIshlinskii,
+    Products,
+    Stop,
+    close_loop,
+    element_bound,
+    open_model,
+)
+from pilfr_casadi.optimise import GaussNewton
 
 EVERY = Combined(
     (

@@ -6,8 +6,7 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     CoulombFriction,
     CubicStiffness,
@@ -18,6 +17,7 @@ from pilfr_casadi.laws import (
     behind_gap,
     scaled,
 )
+from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 2e-3, 3000
 

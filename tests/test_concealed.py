@@ -6,13 +6,10 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.integration import discretise
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.readers import read_csv
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.substeps import choose_substeps
+from pilfr_casadi.data import Recording, read_csv
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.optimise import GaussNewton, Problem
+from pilfr_casadi.simulators import choose_substeps, discretise
 from problems import concealed
 from problems.concealed import KINDS, Score, case, export, run_one, score
 from problems.concealed_case import _Draw

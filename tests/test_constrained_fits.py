@@ -8,17 +8,24 @@ import pytest
 from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.constraints import BeyondRadius, Constraint, stable
-from pilfr_casadi.exactness import beyond, exactly
-from pilfr_casadi.known import Gain, dc_gain, ordered
-from pilfr_casadi.known_blocks import changed_basis, nearest_basis
-from pilfr_casadi.limits import limits_of
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.solution import Status
-from pilfr_casadi.stability import stability_limits
-from pilfr_casadi.thinning import WAYS, thinned
-from pilfr_casadi.tightening import _unsolved
+from pilfr_casadi._base import InputError
+from pilfr_casadi.identify.known_blocks import changed_basis, nearest_basis
+from pilfr_casadi.identify.thinning import WAYS, thinned
+from pilfr_casadi.optimise import (
+    Constraint,
+    Gain,
+    Problem,
+    Status,
+    beyond,
+    dc_gain,
+    exactly,
+    limits_of,
+    ordered,
+    stability_limits,
+    stable,
+)
+from pilfr_casadi.optimise.constraints import BeyondRadius
+from pilfr_casadi.optimise.tightening import _unsolved
 from problems.constrained import infeasible_sentences, radius, slowest_pole, sparse_plays, stability_table, three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)

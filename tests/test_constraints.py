@@ -3,15 +3,14 @@
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pilfr_casadi.constraints import SLACK, Constraint, compile_constraints, log_norm_of_power, stable
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.parameters import Parameter, ParameterSet
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.models import PILFR, Parameter, ParameterSet
+from pilfr_casadi.optimise import Constraint, Problem, stable
+from pilfr_casadi.optimise.constraints import SLACK, compile_constraints, log_norm_of_power
 
 matrices = st.integers(1, 5).flatmap(lambda n: hnp.arrays(float, (n, n), elements=st.floats(-2, 2, width=32)))
 

@@ -6,10 +6,9 @@ import pytest
 from random_models import random_input, random_lfr
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.constraints import Constraint
-from pilfr_casadi.costless import costless
-from pilfr_casadi.operators import Play, Stop
-from pilfr_casadi.problem import Problem
+from pilfr_casadi.identify import costless
+from pilfr_casadi.models import Play, Stop
+from pilfr_casadi.optimise import Constraint, Problem
 from problems.constrained import three_plays
 
 

@@ -9,11 +9,7 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
-from pilfr_casadi.laws import CATALOGUE
-from pilfr_casadi.laws.dynamic import Delay
-from pilfr_casadi.laws.friction import CoulombFriction, DirectionalDamping
-from pilfr_casadi.laws.hysteresis import Backlash
-from pilfr_casadi.laws.stiffness import CubicStiffness
+from pilfr_casadi.laws import CATALOGUE, Backlash, CoulombFriction, CubicStiffness, Delay, DirectionalDamping
 
 IDS = {
     "cubic_stiffness",

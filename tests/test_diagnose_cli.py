@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from pilfr_casadi import multisine
-from pilfr_casadi.cli import main
+from pilfr_casadi.cli.app import main
 
 RIG = """
 from pilfr_casadi import Parameter, Port, Simulator
@@ -312,7 +312,7 @@ def test_a_saved_model_is_diagnosed_like_a_simulator(capsys, files, monkeypatch)
 def test_the_demonstration_finds_what_its_rig_hides(tmp_path):
     from rich.console import Console
 
-    from pilfr_casadi.demo import diagnose_rig
+    from pilfr_casadi.cli.demo import diagnose_rig
 
     with (tmp_path / "out.txt").open("w") as file:
         assert diagnose_rig(tmp_path, 1, Console(file=file, width=120)) == 0

@@ -13,19 +13,18 @@ import pytest
 from browser import CHROMIUM, in_a_browser
 from test_report import EVIL, Reader
 
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.diagnose import Diagnosis, Effect
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.diagnose import Diagnosis, Effect, Workbench
 from pilfr_casadi.diagnose.gates import Gate
-from pilfr_casadi.diagnose.workbench import Workbench
+from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import BoucWen, CubicStiffness, Saturation
-from pilfr_casadi.parameters import Parameter
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.report import diagnosis_report
-from pilfr_casadi.report.diagnosis_files import diagnosis_report as same
+from pilfr_casadi.models import Parameter
+from pilfr_casadi.report import diagnosis_report, diagnosis_report as same
 from pilfr_casadi.report.diagnosis_force import hidden_force
 from pilfr_casadi.report.diagnosis_runs import comparisons, replay
 from pilfr_casadi.report.diagnosis_tables import usage
-from pilfr_casadi.simulator import Port, Simulator
+from pilfr_casadi.simulators import Port, Simulator
 
 SCHEMA = json.loads((Path(__file__).parent / "diagnosis.schema.json").read_text())
 DT, NOISE = 0.01, 1e-3

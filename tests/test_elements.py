@@ -3,14 +3,11 @@
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from random_models import OPERATORS, reference_step
 
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
-from pilfr_casadi.parameters import Parameter, ParameterSet
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.models import GeneralizedPlay, Parameter, ParameterSet, Play, PrandtlIshlinskii, Stop
 
 
 def values_of(element, seed):

@@ -3,14 +3,20 @@
 import numpy as np
 import pytest
 
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.envelopes import enveloped, inputs_behind, network, outline, reach
-from pilfr_casadi.fit import fit
-from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop, generalized_play
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.signals import multisine
-from pilfr_casadi.start import grid_start, unit_states
+from pilfr_casadi.data import Recording, multisine
+from pilfr_casadi.identify import fit
+from pilfr_casadi.identify.envelopes import enveloped, inputs_behind, network, outline, reach
+from pilfr_casadi.identify.start import grid_start, unit_states
+from pilfr_casadi.models import (
+    PILFR,
+    GeneralizedPlay,
+    Play,
+    PrandtlIshlinskii,
+    Stop,
+    generalized_play,
+    hammerstein,
+    wiener,
+)
 from problems import shape_memory
 
 PERIOD = 1000

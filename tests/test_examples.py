@@ -25,7 +25,7 @@ def test_example(path, tmp_path):
 
 
 def copy_demo_data(folder):
-    for path in (ROOT / "pilfr_casadi" / "demo_data").iterdir():
+    for path in (ROOT / "pilfr_casadi" / "cli" / "demo_data").iterdir():
         if path.is_file():
             shutil.copy(path, folder)
 
@@ -53,8 +53,8 @@ def test_run_files_of_the_readme(tmp_path, command, text, files):
 
 
 def test_the_run_file_with_every_key_has_every_key_and_runs(tmp_path, monkeypatch):
-    from pilfr_casadi.runs.described import read_run
-    from pilfr_casadi.runs.tables import Table
+    from pilfr_casadi.studies import read_run
+    from pilfr_casadi.studies.tables import Table
 
     copy_demo_data(tmp_path)
     path = tmp_path / "every_key.toml"
@@ -79,12 +79,12 @@ def test_the_run_file_with_every_key_has_every_key_and_runs(tmp_path, monkeypatc
 
 @pytest.mark.parametrize("command", ["run", "campaign"])
 def test_the_help_names_the_run_file_with_every_key(capsys, command):
-    from pilfr_casadi.cli import main
+    from pilfr_casadi.cli.app import main
 
     with pytest.raises(SystemExit):
         main([command, "--help"])
     shown = "".join(capsys.readouterr().out.partition("Every key")[2].partition(":")[2].split())
-    assert Path(shown).samefile(ROOT / "pilfr_casadi" / "demo_data" / "every_key.toml")
+    assert Path(shown).samefile(ROOT / "pilfr_casadi" / "cli" / "demo_data" / "every_key.toml")
 
 
 def test_snippets_of_the_readme(tmp_path):

@@ -5,8 +5,8 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Simulator, laws
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 4e-3, 3000
 

@@ -8,20 +8,26 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from pilfr_casadi import export
-from pilfr_casadi.compiled import compiler
-from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.engine import compiler
 from pilfr_casadi.export import load, save, to_casadi, write_atomically
 from pilfr_casadi.export.digests import ordered_digest
-from pilfr_casadi.fit import Fit, fit
-from pilfr_casadi.lfr import PILFR, hammerstein
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
-from pilfr_casadi.parameters import Parameter, ParameterSet
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.solution import Iteration, Solution, Status
+from pilfr_casadi.identify import Fit, fit
+from pilfr_casadi.models import (
+    PILFR,
+    GeneralizedPlay,
+    Parameter,
+    ParameterSet,
+    Play,
+    PrandtlIshlinskii,
+    Stop,
+    hammerstein,
+)
+from pilfr_casadi.optimise import Iteration, Solution, Status
 
 CASES = {
     "play": (PILFR(3, PrandtlIshlinskii(Play, 4)), 1, 1),
@@ -403,7 +409,7 @@ def test_a_tampered_file_loads_or_is_one_sentence(tmp_path, data):
 
 def own_model(n=3):
     """A model of the user's own equations, with units."""
-    from pilfr_casadi.model import close_loop, open_model
+    from pilfr_casadi.models import close_loop, open_model
 
     p = ParameterSet({"k": Parameter(2.0, unit="N/m", bounds=(0, 5)), "d": Parameter([0.1, 0.2])})
     model = open_model(

@@ -12,8 +12,8 @@ from test_export import one_sentence, some_fit
 from test_exported_models import mass_on_spring
 
 from pilfr_casadi import exported, load
-from pilfr_casadi.compiled import compiler
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.engine import compiler
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 NOT_PATHS = [None, 3, b"x", "", "a\0b", ["a"], "x" * 5000]

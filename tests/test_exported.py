@@ -18,15 +18,13 @@ from test_export import one_sentence, own_model, recording_for, signed, some_fit
 from test_exported_models import lfr, mass_on_spring, wave
 
 from pilfr_casadi import InputError, Parameter, Play, PrandtlIshlinskii, Recording, Simulator, exported, to_casadi
-from pilfr_casadi.compiled import compiler
-from pilfr_casadi.diagnose import diagnose
-from pilfr_casadi.diagnose.result import Diagnosis
+from pilfr_casadi.data import nrmse, read_csv
+from pilfr_casadi.diagnose import Diagnosis, diagnose
+from pilfr_casadi.engine import compiler
 from pilfr_casadi.export import load
 from pilfr_casadi.laws import Backlash, Drift, PreslidingFriction, Relaxation, StopHysteresis
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.load_simulator import load_simulator
-from pilfr_casadi.metrics import nrmse
-from pilfr_casadi.readers import read_csv
+from pilfr_casadi.models import PILFR
+from pilfr_casadi.simulators import load_simulator
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -115,9 +113,9 @@ def test_a_diagnosis_exports_what_it_fitted():
 
 
 def test_a_real_diagnosis_exports_what_it_judged():
-    simulator = load_simulator("pilfr_casadi/demo_data/rig.py")
+    simulator = load_simulator("pilfr_casadi/cli/demo_data/rig.py")
     known = {"inputs": "force", "outputs": "x2", "initial": "zero", "hold": "zero"}
-    train, test = (read_csv(f"pilfr_casadi/demo_data/rig_{name}.csv", **known) for name in ("train", "test"))
+    train, test = (read_csv(f"pilfr_casadi/cli/demo_data/rig_{name}.csv", **known) for name in ("train", "test"))
     diagnosis = diagnose(simulator, train, test=test, laws=(PreslidingFriction,))
     found = diagnosis.export(name="rig")
     assert found.sampled.substeps == diagnosis.substeps > 1 and "ground-m2.memory1" in found.states
@@ -340,8 +338,7 @@ def test_the_package_runs_no_text_but_the_users_own_program():
 
 
 def test_an_open_port_is_refused():
-    from pilfr_casadi.model import open_model
-    from pilfr_casadi.parameters import ParameterSet
+    from pilfr_casadi.models import ParameterSet, open_model
 
     p = ParameterSet({"k": Parameter(1.0)})
     model = open_model(lambda x, u, w, p: (x + w, x), lambda x, u, p: x, p, n_x=1, n_u=1, n_w=1)
@@ -358,7 +355,7 @@ def test_the_command(tmp_path, capsys):
     assert (ca.Function.load(str(out)).name(), names["smooth"]) == ("rig", 0.01)
     status, text, _ = run(capsys, "export", model, "--c", "--out", tmp_path / "c", "--name", "rig")
     assert status == 0 and (tmp_path / "c" / "rig.h").exists() and str(tmp_path / "c" / "rig.c") in text
-    rig = "pilfr_casadi/demo_data/rig.py"
+    rig = "pilfr_casadi/cli/demo_data/rig.py"
     assert run(capsys, "export", rig, "--dt", "0.01", "--hold", "zero", "--out", tmp_path / "simulator")[0] == 0
     assert list(json.loads((tmp_path / "simulator.names.json").read_text())["states"]) == ["x1", "v1", "x2", "v2"]
     refused(capsys, "export", rig, "--out", out, says="--dt")

@@ -9,19 +9,13 @@ import pytest
 from test_baselines import STRUCTURES, truth
 from test_combined import machine
 from test_export import some_fit
-from test_laws import EVERY, dose
-from test_laws import simulator as mass_on_spring
+from test_laws import EVERY, dose, simulator as mass_on_spring
 
 from pilfr_casadi import GeneralizedPlay, Play, PrandtlIshlinskii, Recording, Stop, close_loop, exported
-from pilfr_casadi.compiled import compiler
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.engine import VirtualMachine, compiler
 from pilfr_casadi.laws import CubicStiffness, StopHysteresis
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.load_simulator import load_simulator
-from pilfr_casadi.modal import modal
-from pilfr_casadi.parameters import ParameterSet
-from pilfr_casadi.sensitivities import VirtualMachine
-from pilfr_casadi.substeps import fastest
+from pilfr_casadi.models import PILFR, ParameterSet, modal
+from pilfr_casadi.simulators import discretise, fastest, load_simulator
 from problems import emps, masing_diagnosis, piezo_diagnosis, silverbox, tanks
 from problems.concealed_rigs_more import RIGS
 from problems.zoo import CASES
@@ -119,7 +113,7 @@ def simulators():
         "tanks": tanks.simulator(False),
         "root tanks": tanks.simulator(True),
         "piezo": piezo_diagnosis.simulator(),
-        "demo": load_simulator("pilfr_casadi/demo_data/rig.py"),
+        "demo": load_simulator("pilfr_casadi/cli/demo_data/rig.py"),
         **{f"rig {name}": from_rig(rig) for name, rig in RIGS.items()},
     }
     out |= {name: (s, pace(s), "zero", None) for name, s in named.items()}

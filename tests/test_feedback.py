@@ -5,14 +5,13 @@ import re
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, PredictiveController
-from pilfr_casadi.demo import demo_recordings
-from pilfr_casadi.feedback.kalman import ekf_step
-from pilfr_casadi.operators import play
+from pilfr_casadi.cli.demo import demo_recordings
+from pilfr_casadi.control.kalman import ekf_step
+from pilfr_casadi.models import play
 from problems import observer as observer_problem
 
 A = np.array([[0.7, 0.2], [-0.1, 0.8]])

@@ -6,13 +6,12 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from test_feedback import A, fitted, plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, PredictiveController
-from pilfr_casadi.feedback.asked import planned_with
+from pilfr_casadi.control.asked import planned_with
 
 
 def refused(call, words=None):

@@ -7,9 +7,8 @@ from diagnosis_rig import DT, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
-from pilfr_casadi.diagnose.result import Diagnosis
-from pilfr_casadi.laws.dynamic import Delay
-from pilfr_casadi.laws.hysteresis import StopHysteresis
+from pilfr_casadi.diagnose import Diagnosis
+from pilfr_casadi.laws import Delay, StopHysteresis
 
 LAW = StopHysteresis().at({"w": 80.0, "r": np.geomspace(0.001, 0.04, 6)})
 

@@ -8,8 +8,8 @@ import pytest
 from test_feedback import A, fitted
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.feedback.along import along
-from pilfr_casadi.feedback.reach import reach
+from pilfr_casadi.control.along import along
+from pilfr_casadi.control.reach import reach
 
 
 def recorded(delay, noise, smooth, seed=0, samples=1500):

@@ -8,19 +8,14 @@ import numpy as np
 import pytest
 
 import pilfr_casadi
-from pilfr_casadi.constraints import Constraint
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import Fit, fit
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.ipopt import Ipopt
-from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.linear_model import linear_model
-from pilfr_casadi.operators import Play
-from pilfr_casadi.order_selection import select_order
-from pilfr_casadi.penalty import element_alone, unit_weights
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.quadratic_program import QuadraticProgram, unconstrained
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.identify import Fit, fit
+from pilfr_casadi.identify.linear_model import linear_model
+from pilfr_casadi.identify.penalty import element_alone, unit_weights
+from pilfr_casadi.linear import select_order
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, hammerstein, wiener
+from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, unconstrained
+from pilfr_casadi.optimise.quadratic_program import QuadraticProgram
 from problems.zoo_case import excitation, noisy, plays, simulate_lfr
 
 FEEDBACK = {

@@ -9,21 +9,15 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr, reference
 
-from pilfr_casadi.constraints import Constraint
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import fit
-from pilfr_casadi.gauge import standard_errors
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.metrics import nrmse
-from pilfr_casadi.multistart import PRIOR
-from pilfr_casadi.operators import Play
-from pilfr_casadi.outcome import outcome
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.solution import Status
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording, nrmse
+from pilfr_casadi.identify import fit, standard_errors
+from pilfr_casadi.identify.multistart import PRIOR
+from pilfr_casadi.identify.outcome import outcome
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
+from pilfr_casadi.optimise import Constraint, GaussNewton, Problem, Status
 
-job_module = importlib.import_module("pilfr_casadi.job")
+job_module = importlib.import_module("pilfr_casadi.identify.job")
 X0 = np.array([3.0, -3.0, 0.0, 0.0, 0.0, 0.0])
 SHORT = GaussNewton(max_iterations=3)
 
@@ -287,7 +281,7 @@ def test_constraints_are_found_by_name(record, truth):
 
 
 def test_the_command_line_says_what_is_not_scored(of_record):
-    from pilfr_casadi.commands import _tested
+    from pilfr_casadi.cli.commands import _tested
 
     u, y = simulated(6, 400, X0)
     line = _tested(of_record, Recording(u, y, 0.01, name="test"))

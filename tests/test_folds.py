@@ -6,10 +6,11 @@ from run_files import changed, prepared
 from test_cli import refused, write_csv
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.repetition import repeats_itself, same_input
-from pilfr_casadi.runs import jobs
-from pilfr_casadi.runs.folds import fold
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import repeats_itself
+from pilfr_casadi.data.repetition import same_input
+from pilfr_casadi.studies import jobs
+from pilfr_casadi.studies.folds import fold
 
 
 @pytest.fixture

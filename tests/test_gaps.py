@@ -10,11 +10,11 @@ from test_diagnosis_report import SCHEMA, problems
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gaps import _settled, find_jump, gaps
-from pilfr_casadi.diagnose.prepare import prepare, refitted
-from pilfr_casadi.diagnose.workbench import Workbench
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.diagnose.preparation import prepare, refitted
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.simulators import discretise
 
 
 def lost(r, *places, count=25):

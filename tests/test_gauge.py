@@ -5,23 +5,29 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 from random_models import OPERATORS, envelope, random_input, random_lfr, reference
 
-from pilfr_casadi.constraints import Constraint
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.gauge import _snap_to_bounds, covariance, gauge_tangents, standard_errors, variance
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.model import open_model
-from pilfr_casadi.normal_form import normalise
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
-from pilfr_casadi.orbit import generators
-from pilfr_casadi.parameters import Parameter, ParameterSet
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.residual_noise import gradient_covariance
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.identify import covariance, standard_errors, variance
+from pilfr_casadi.identify.gauge import _snap_to_bounds, gauge_tangents
+from pilfr_casadi.identify.residual_noise import gradient_covariance
+from pilfr_casadi.models import (
+    PILFR,
+    GeneralizedPlay,
+    Parameter,
+    ParameterSet,
+    Play,
+    PrandtlIshlinskii,
+    Stop,
+    generators,
+    hammerstein,
+    normalise,
+    open_model,
+    wiener,
+)
+from pilfr_casadi.optimise import Constraint, GaussNewton, Problem
 
 
 def signals(operator, values, u, state=None):

@@ -5,19 +5,14 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr, reference
 
-from pilfr_casadi.constraints import Constraint, stable
-from pilfr_casadi.damping import without_rounding
-from pilfr_casadi.fit import fit
-from pilfr_casadi.gauss_newton import GaussNewton, _Run, _Step
-from pilfr_casadi.ipopt import Ipopt
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.linear_model import linear_model
-from pilfr_casadi.magnitude import Neighbours
-from pilfr_casadi.operators import Play
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import Recording
-from pilfr_casadi.solution import Status
-from pilfr_casadi.subspace import subspace_matrices
+from pilfr_casadi.data import Recording
+from pilfr_casadi.identify import fit
+from pilfr_casadi.identify.linear_model import linear_model
+from pilfr_casadi.linear import subspace_matrices
+from pilfr_casadi.models import PILFR, Neighbours, Play
+from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status, stable
+from pilfr_casadi.optimise.damping import without_rounding
+from pilfr_casadi.optimise.gauss_newton import _Run, _Step
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +151,7 @@ def test_a_run_that_strays_comes_back_to_what_was_feasible(start, monkeypatch):
     assert max(strays.points) > 5.0  # it has been to where the constraint cannot be met
     assert found.status is Status.CONVERGED and found.theta[0] == pytest.approx(strays.edge, abs=1e-5)
     assert found.cost == found.history[-1].cost and found.violation <= 1e-9
-    monkeypatch.setattr("pilfr_casadi.gauss_newton.RETURNS", 0)
+    monkeypatch.setattr("pilfr_casadi.optimise.gauss_newton.RETURNS", 0)
     ended = GaussNewton().solve(strays)
     assert ended.status is Status.SOLVER_FAILED and ended.theta[0] == start == strays.start[0]
     assert ended.cost == strays.cost(ended.theta) == ended.history[-1].cost

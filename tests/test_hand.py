@@ -4,7 +4,7 @@ import os
 import pickle
 import time
 
-from pilfr_casadi import hand
+from pilfr_casadi._base import worker_process as hand
 
 
 def test_a_hand_keeps_its_function_and_its_end_is_told():

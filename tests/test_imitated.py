@@ -7,12 +7,11 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
-from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.candidate import attempt
 from pilfr_casadi.diagnose.imitated import felt, imitated
 from pilfr_casadi.diagnose.screen import Scored
-from pilfr_casadi.diagnose.workbench import Workbench
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     Backlash,
     CoulombFriction,
@@ -23,6 +22,7 @@ from pilfr_casadi.laws import (
     Saturation,
     StopHysteresis,
 )
+from pilfr_casadi.simulators import discretise
 
 DT, M = 0.02, 1500
 

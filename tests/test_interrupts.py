@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 import pilfr_casadi
-from pilfr_casadi.interrupts import Clock, deferred_interrupt, insistent, time_limit, worker_pool
+from pilfr_casadi._base import Clock, deferred_interrupt, insistent, time_limit, worker_pool
 
-TRAIN = Path(pilfr_casadi.__file__).parent / "demo_data" / "train.csv"
+TRAIN = Path(pilfr_casadi.__file__).parent / "cli" / "demo_data" / "train.csv"
 PILFR = [sys.executable, "-c", "import sys; from pilfr_casadi.cli import main; sys.exit(main(sys.argv[1:]))"]
 linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are counted in /proc")
 

@@ -7,18 +7,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pilfr_casadi.callback import Callback, handled_interrupt
-from pilfr_casadi.constraints import Constraint
-from pilfr_casadi.damping import Damping, Point
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.ipopt import Ipopt
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.operators import Play
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.scaling import Scaled
-from pilfr_casadi.solution import Status
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
+from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status
+from pilfr_casadi.optimise.callback import Callback, handled_interrupt
+from pilfr_casadi.optimise.damping import Damping, Point
+from pilfr_casadi.optimise.scaling import Scaled
 from problems.zoo import CASES
 
 

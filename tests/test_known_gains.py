@@ -6,13 +6,10 @@ import pytest
 from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.exact_penalty import ExactPenalty
-from pilfr_casadi.known import Gain, dc_gain
-from pilfr_casadi.limits import limits_of
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.reached_gain import reached_gain_sentence
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.solution import Solution, Status
+from pilfr_casadi._base import InputError
+from pilfr_casadi.identify.reached_gain import reached_gain_sentence
+from pilfr_casadi.optimise import Gain, Problem, Solution, Status, dc_gain, limits_of
+from pilfr_casadi.optimise.exact_penalty import ExactPenalty
 from problems.constrained import three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)

@@ -9,8 +9,7 @@ from scipy.optimize import approx_fprime
 
 import pilfr_casadi.laws as laws
 from pilfr_casadi import Parameter, Port, Recording, Simulator
-from pilfr_casadi.compiled import compiler, make_engine
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.engine import VirtualMachine, compiler, make_engine
 from pilfr_casadi.laws import (
     CATALOGUE,
     FINER,
@@ -18,16 +17,16 @@ from pilfr_casadi.laws import (
     CubicStiffness,
     Delay,
     GeneralizedHysteresis,
+    Local,
     Mode,
     PreslidingStribeckFriction,
     StopHysteresis,
     StribeckFriction,
+    columns,
     readable_unit,
+    trace,
 )
-from pilfr_casadi.laws.base import Local
-from pilfr_casadi.laws.trace import columns, trace
-from pilfr_casadi.observer import led
-from pilfr_casadi.sensitivities import VirtualMachine
+from pilfr_casadi.simulators import discretise, led
 
 DT, M = 0.01, 240
 EVERY = (*CATALOGUE, *(finer for kinds in FINER.values() for finer in kinds))

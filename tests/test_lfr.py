@@ -4,14 +4,22 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr, reference
 
-from pilfr_casadi.baselines import ssnn
-from pilfr_casadi.combined import Combined, Part
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.envelope import Envelope
-from pilfr_casadi.lfr import PILFR, block_shapes, hammerstein, wiener
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.models import (
+    PILFR,
+    Combined,
+    Envelope,
+    GeneralizedPlay,
+    Part,
+    Play,
+    PrandtlIshlinskii,
+    Stop,
+    block_shapes,
+    hammerstein,
+    ssnn,
+    wiener,
+)
 
 
 def simulate(structure, values, u, n_y=1):
@@ -76,7 +84,7 @@ def test_eq_16_the_sum_is_w_not_the_noise_v():
 
 def test_eq_18_the_sample_index_makes_one_period():
     """2π k n / N_s repeats after N_s samples; 2π k (f_s/N_s) n with k in samples is another signal."""
-    from pilfr_casadi.multisines import multisine
+    from pilfr_casadi.data import multisine
 
     n_s, f_s = 64, 24.0
     k, lines = np.arange(n_s)[:, None], np.arange(1, 9)

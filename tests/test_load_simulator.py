@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from pilfr_casadi import InputError, Simulator
-from pilfr_casadi.load_simulator import load_simulator
+from pilfr_casadi.simulators import load_simulator
 
 RIG = '''"""A mass on a spring."""
 from pilfr_casadi import Parameter, Port, Simulator

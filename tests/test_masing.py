@@ -5,11 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from pilfr_casadi.metrics import nrmse
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import nrmse
 from problems.masing import MasingRig, simulate
 from problems.masing_data import FS, benchmark, records
 from problems.masing_spring import MasingSpring

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from pilfr_casadi.metrics import nrmse, rmse, rmse_per_output
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import nrmse, rmse, rmse_per_output
 
 Y = np.random.default_rng(1).normal(size=(50, 2)) * [1.0, 100.0]
 ERROR = np.random.default_rng(2).normal(size=(50, 2))

@@ -4,11 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from pilfr_casadi.diagnose.mismatch import mismatch
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.data import Recording
+from pilfr_casadi.diagnose import mismatch
 
 DT, M = 0.005, 4000
 T = np.arange(M) * DT

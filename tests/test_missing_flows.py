@@ -9,16 +9,23 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.candidate import Candidate, simpler
 from pilfr_casadi.diagnose.linearise import Probe, locals_of, run
 from pilfr_casadi.diagnose.screen import _gain
 from pilfr_casadi.diagnose.second_effect import not_named
 from pilfr_casadi.diagnose.verdict import _gone, judge
-from pilfr_casadi.diagnose.workbench import Workbench
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.laws.base import Local
-from pilfr_casadi.laws.friction import DirectionalFriction, PreslidingFriction, PreslidingStribeckFriction
-from pilfr_casadi.laws.stiffness import CubicStiffness, HertzContact, PiecewiseStiffness, QuinticStiffness
+from pilfr_casadi.laws import (
+    CubicStiffness,
+    DirectionalFriction,
+    HertzContact,
+    Local,
+    PiecewiseStiffness,
+    PreslidingFriction,
+    PreslidingStribeckFriction,
+    QuinticStiffness,
+)
+from pilfr_casadi.optimise import GaussNewton
 
 SHARE = 0.6
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from pilfr_casadi import InputError, PrandtlIshlinskii, Recording, fit, hammerstein, load, modal, multisine, play
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.modal import in_modal_coordinates, is_modal, modal_basis
-from pilfr_casadi.operators import Play
+from pilfr_casadi.linear.modal_form import modal_basis
+from pilfr_casadi.models import PILFR, Play, in_modal_coordinates, is_modal
 
 
 def system(poles, seed=0):

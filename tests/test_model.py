@@ -3,17 +3,26 @@
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from random_models import OPERATORS, random_input, random_lfr, reference
 
-from pilfr_casadi.conversion import complement, to_plays, to_stops
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.model import close_loop, open_model
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
-from pilfr_casadi.parameters import Parameter, ParameterSet
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.models import (
+    PILFR,
+    GeneralizedPlay,
+    Parameter,
+    ParameterSet,
+    Play,
+    PrandtlIshlinskii,
+    Stop,
+    close_loop,
+    hammerstein,
+    open_model,
+    to_plays,
+    to_stops,
+    wiener,
+)
+from pilfr_casadi.models.conversion import complement
 
 
 def run(model, u, state, p=None):

@@ -4,14 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from test_export import changed, leaves, one_sentence, signed, some_fit
 
-from pilfr_casadi.cli import main
+from pilfr_casadi._base import InputError
+from pilfr_casadi.cli.app import main
 from pilfr_casadi.export import load, save
-from pilfr_casadi.limits import Limit
-from pilfr_casadi.recording import InputError
+from pilfr_casadi.optimise import Limit
 
 CHANGED = "was changed after it was written .*; restore it, or save the model again"
 CASES = ("play", "generalized play", "linear")

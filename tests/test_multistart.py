@@ -7,18 +7,15 @@ import numpy as np
 import pytest
 from random_models import random_lfr
 
-from pilfr_casadi import multistart
-from pilfr_casadi.demo import demo_recordings, structure
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.linear_model import linear_model
-from pilfr_casadi.multistart import POLISH, explore, polish, search_starts
-from pilfr_casadi.operators import Play
-from pilfr_casadi.search import Candidate, Search
-from pilfr_casadi.solution import Solution, Status
-from pilfr_casadi.stability import stability
-from pilfr_casadi.start import grid_start, paper_start, unit_states
+from pilfr_casadi.cli.demo import demo_recordings, structure
+from pilfr_casadi.identify import POLISH, Candidate, multistart
+from pilfr_casadi.identify.linear_model import linear_model
+from pilfr_casadi.identify.multistart import explore, polish, search_starts
+from pilfr_casadi.identify.search import Search
+from pilfr_casadi.identify.start import grid_start, paper_start, unit_states
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
+from pilfr_casadi.optimise import GaussNewton, Solution, Status
+from pilfr_casadi.optimise.stability import stability
 
 
 @dataclass

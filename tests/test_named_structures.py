@@ -7,10 +7,10 @@ from run_files import DATA
 from test_cli import fit_arguments, refused, run, write_csv
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.cli import main
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.runs.described import read_run
-from pilfr_casadi.structures import ANY, STRUCTURES, TAKES, named_structure
+from pilfr_casadi._base import InputError
+from pilfr_casadi.cli.app import main
+from pilfr_casadi.models import ANY, STRUCTURES, TAKES, named_structure
+from pilfr_casadi.studies import read_run
 
 TEXT = f"""
 report = false

@@ -5,12 +5,9 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr
 
-from pilfr_casadi.constraints import Constraint, stable
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.operators import Play, Stop
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.data import Recording
+from pilfr_casadi.models import PILFR, Play, Stop
+from pilfr_casadi.optimise import Constraint, GaussNewton, Problem, stable
 
 LENGTH = 40
 

@@ -9,7 +9,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose import conclusion
 from pilfr_casadi.diagnose.clipping import clipped, clipped_input
-from pilfr_casadi.diagnose.prepare import prepare
+from pilfr_casadi.diagnose.preparation import prepare
 
 DT = 0.02
 

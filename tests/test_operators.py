@@ -6,12 +6,11 @@ import itertools
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 
-from pilfr_casadi import operators as op
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop, fmax, fmin, generalized_play, play, stop
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.models import GeneralizedPlay, Play, Stop, generalized_play, operators as op, play, stop
+from pilfr_casadi.models.operators import fmax, fmin
 
 numbers = st.floats(-5.0, 5.0, allow_subnormal=False)
 thresholds = st.floats(0.0, 3.0, allow_subnormal=False)

@@ -6,9 +6,9 @@ import pytest
 
 from pilfr_casadi.diagnose import other_hold
 from pilfr_casadi.diagnose.candidate import Candidate
-from pilfr_casadi.diagnose.prepared_search import Asked
-from pilfr_casadi.laws.dynamic import Delay, Mode, Relaxation
-from pilfr_casadi.simulator import Placed
+from pilfr_casadi.diagnose.search_start import Asked
+from pilfr_casadi.laws import Delay, Mode, Relaxation
+from pilfr_casadi.simulators import Placed
 
 DT = 2e-3
 

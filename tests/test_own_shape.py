@@ -9,10 +9,10 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
-from pilfr_casadi.compiled import make_engine
 from pilfr_casadi.diagnose.own_shape import own_shape
-from pilfr_casadi.integration import discretise
-from pilfr_casadi.laws.base import Law
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.laws import Law
+from pilfr_casadi.simulators import discretise
 
 DT, M = 0.02, 2000
 

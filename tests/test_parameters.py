@@ -5,12 +5,11 @@ import pickle
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pilfr_casadi.parameters import Parameter, ParameterSet
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.models import Parameter, ParameterSet
 
 shapes = st.one_of(st.just(()), st.tuples(st.integers(1, 4)), st.tuples(st.integers(0, 3), st.integers(1, 3)))
 values = shapes.flatmap(lambda s: hnp.arrays(float, s, elements=st.floats(-5, 5)))

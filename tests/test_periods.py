@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr
 
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import fit
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.open_memory import open_memory
-from pilfr_casadi.operators import Play, Stop
-from pilfr_casadi.periods import mean_period, noise_weights, period_noise
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.slopes import steady_slope
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording, mean_period, noise_weights, period_noise
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.identify import fit
+from pilfr_casadi.identify.open_memory import open_memory
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, Stop
+from pilfr_casadi.optimise import Problem
+from pilfr_casadi.optimise.slopes import steady_slope
 
 
 def noisy(size=0.1, periods=4, level=1.0, seed=0, **options):

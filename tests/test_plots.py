@@ -8,21 +8,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from pilfr_casadi import plots
-from pilfr_casadi.bla import BLA, robust_bla
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import Fit
-from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.operators import Play, Stop
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.identify import Candidate, Fit
+from pilfr_casadi.linear import BLA, robust_bla
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, Stop, hammerstein, wiener
+from pilfr_casadi.optimise import Iteration, Solution, Status
 from pilfr_casadi.plots import canvas
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.search import Candidate
-from pilfr_casadi.solution import Iteration, Solution, Status
 
 BLOCKS = {
     "A": [[0.6, 0.3], [-0.3, 0.6]],
@@ -184,7 +181,7 @@ def test_scaling_by_thousands(value, size, unit):
 
 
 def test_legends_are_honest(fitted, data):
-    from pilfr_casadi.metrics import nrmse
+    from pilfr_casadi.data import nrmse
 
     shown = legend_of(plots.time(fitted, data))
     linear = nrmse(data.y, plots.linear_simulation(fitted, data))

@@ -73,7 +73,7 @@ def test_first_plans_are_optima_nearby():
 
 
 def test_a_plan_that_was_cut_short_is_not_called_converged(monkeypatch):
-    monkeypatch.setattr("pilfr_casadi.feedback.mpc_sqp.ENTERED", 1)
+    monkeypatch.setattr("pilfr_casadi.control.mpc_sqp.ENTERED", 1)
     options, worse = {"inputs": (-3, 3), "y_scale": 0.1, "rate": 0.5}, 0
     short = PredictiveController(sluggish(), N, iterations=1, **options)
     for x, wanted, before in drawn(20):  # each begins with the plan of another

@@ -5,13 +5,10 @@ import numpy as np
 import pytest
 from random_models import OPERATORS, random_input, random_lfr, reference
 
-from pilfr_casadi import problem as module
-from pilfr_casadi.constraints import Constraint, stable
-from pilfr_casadi.model import open_model
-from pilfr_casadi.operators import Play
-from pilfr_casadi.parameters import Parameter, ParameterSet
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import InputError, Recording
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.models import Parameter, ParameterSet, Play, open_model
+from pilfr_casadi.optimise import Constraint, Problem, problem as module, stable
 
 
 def recording(seed=0, length=80, n_u=1, n_y=1, **options):

@@ -4,12 +4,11 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pilfr_casadi import InputError, read, read_csv, read_mat, read_npz
-from pilfr_casadi.readers import column_names, written_times
-from pilfr_casadi.timebase import step_of
+from pilfr_casadi.data import column_names, written_times
+from pilfr_casadi.data.timebase import step_of
 
 GOOD = "t,force,x2\n0,1,10\n0.1,2,20\n0.2,3,30\n0.3,4,40\n"
 MATRIX = np.array([[0.0, 1, 10], [0.1, 2, 20], [0.2, 3, 30], [0.3, 4, 40]])

@@ -4,10 +4,10 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from pilfr_casadi.recording import InputError, Recording, as_recordings, check_for_identification
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording, as_recordings, check_for_identification
 
 
 def recording(m=20, n_u=1, n_y=1, **options):

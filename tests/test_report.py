@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, in_a_browser
 
-from pilfr_casadi.elements import PrandtlIshlinskii
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
 from pilfr_casadi.export import load
-from pilfr_casadi.fit import Fit
-from pilfr_casadi.lfr import PILFR, block_shapes
-from pilfr_casadi.operators import Play
+from pilfr_casadi.identify import Fit
+from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, block_shapes
+from pilfr_casadi.optimise import Iteration, Solution, Status
 from pilfr_casadi.plots import new_figure
-from pilfr_casadi.recording import InputError, Recording
 from pilfr_casadi.report import Code, Page, Picture, Section, Table, Text, fit_report, write_report
 from pilfr_casadi.report.fit_tables import _cell
 from pilfr_casadi.report.page import number_text
-from pilfr_casadi.solution import Iteration, Solution, Status
 
 EVIL = "<script>alert(1)</script>\" onload='x' & $\\frac"
 
@@ -170,9 +169,9 @@ def test_the_page_of_a_fit(tmp_path):
 
 
 def test_the_table_of_errors_is_that_of_the_fit():
-    from pilfr_casadi.metrics import rmse
+    from pilfr_casadi.data import rmse
     from pilfr_casadi.plots import linear_simulation
-    from pilfr_casadi.report.fit_page import fit_page
+    from pilfr_casadi.report import fit_page
 
     fitted = example(n_u=2, n_y=2, channels=2)
     test = record(fitted, "t", seed=5)

@@ -7,26 +7,27 @@ import pytest
 from diagnosis_rig import DT, recordings, rig
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.diagnose import prepare, prepared_search, review
+from pilfr_casadi.diagnose import Workbench, prepare, prepared_search, review
 from pilfr_casadi.diagnose.choice import Choice
 from pilfr_casadi.diagnose.first_effect import led_out
 from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.prepared_search import Asked
 from pilfr_casadi.diagnose.proof import deviations, shown
 from pilfr_casadi.diagnose.rivals import WIDER, rivals_beside
 from pilfr_casadi.diagnose.screen import Scored
 from pilfr_casadi.diagnose.search import Pass, Search
-from pilfr_casadi.diagnose.workbench import Workbench
-from pilfr_casadi.gauss_newton import GaussNewton
+from pilfr_casadi.diagnose.search_start import Asked
 from pilfr_casadi.laws import (
     CATALOGUE,
+    Attached,
     CoulombFriction,
     CubicStiffness,
     Local,
+    Mode,
     PreslidingStribeckFriction,
+    Relaxation,
     StribeckFriction,
 )
-from pilfr_casadi.laws.dynamic import Attached, Mode, Relaxation
+from pilfr_casadi.optimise import GaussNewton
 
 
 @pytest.fixture(scope="module")

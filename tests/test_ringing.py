@@ -7,8 +7,8 @@ from scipy.signal import lfilter
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.simulators import discretise
 
 
 def disturbed(size, seed=5):

@@ -14,11 +14,11 @@ from run_files import PYTHON, RUN, command, contents
 from test_cli import refused, write_csv
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.cli import main
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.runs.described import read_run
-from pilfr_casadi.runs.jobs import input_digests, jobs_of
-from pilfr_casadi.solution import Status
+from pilfr_casadi._base import InputError
+from pilfr_casadi.cli.app import main
+from pilfr_casadi.optimise import Status
+from pilfr_casadi.studies import jobs_of, read_run
+from pilfr_casadi.studies.jobs import input_digests
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(folder, kind):
 
 
 def test_ending_between_a_file_and_its_manifest_is_no_tampering(folder, monkeypatch):
-    from pilfr_casadi.runs import manifest as module
+    from pilfr_casadi.studies import manifest as module
 
     changed(folder, "[0, 1, 2]", "[0]")
     out, real, calls = folder / "rig-run", module.Manifest.write, []
@@ -314,7 +314,7 @@ def test_times_that_are_damaged_do_not_matter(folder):
 
 
 def test_two_runs_do_not_share_a_folder(capsys, folder):
-    from pilfr_casadi.runs.manifest import alone
+    from pilfr_casadi.studies.manifest import alone
 
     (folder / "rig-run").mkdir()
     with alone(folder / "rig-run"):

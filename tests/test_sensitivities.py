@@ -10,15 +10,21 @@ import numpy as np
 import pytest
 from random_models import OPERATORS, random_input, random_lfr
 
-from pilfr_casadi.compiled import Compiled, cache_directory, compiler, source_code
-from pilfr_casadi.compiled import make_engine as engine_of
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.model import open_model
-from pilfr_casadi.operators import GeneralizedPlay, Play, Stop
-from pilfr_casadi.parameters import Parameter, ParameterSet
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.sensitivities import VirtualMachine, linearize
+from pilfr_casadi._base import InputError
+from pilfr_casadi.engine import VirtualMachine, compiler, make_engine as engine_of
+from pilfr_casadi.engine.compiled import Compiled, cache_directory
+from pilfr_casadi.engine.generated import source_code
+from pilfr_casadi.engine.sensitivities import linearize
+from pilfr_casadi.models import (
+    PILFR,
+    GeneralizedPlay,
+    Parameter,
+    ParameterSet,
+    Play,
+    PrandtlIshlinskii,
+    Stop,
+    open_model,
+)
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
@@ -99,7 +105,7 @@ def test_both_engines_give_the_same_numbers(name):
 
 @needs_compiler
 def test_both_engines_on_a_nonlinear_model():
-    from pilfr_casadi.model import close_loop
+    from pilfr_casadi.models import close_loop
 
     model = close_loop(grey_box(), PrandtlIshlinskii(Stop, 3))
     u, p = random_input(0, 100), model.parameters.start

@@ -40,8 +40,8 @@ def test_a_diagnosis_of_recordings_that_have_not_settled_finds_nothing_missing()
     """From rest, the rig takes some periods to settle; said to be periodic, it is not yet."""
     (one,) = recordings(count=1, seed=3)
     force = np.tile(one.u[:625], (4, 1))
-    from pilfr_casadi.compiled import make_engine
-    from pilfr_casadi.integration import discretise
+    from pilfr_casadi.engine import make_engine
+    from pilfr_casadi.simulators import discretise
 
     model = discretise(rig(), one.dt, "zero", 8)
     r = one.with_(u=force, y=np.zeros((2500, 1)))

@@ -8,17 +8,17 @@ import pytest
 from diagnosis_rig import DT, recordings, rig
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.candidate import Candidate
 from pilfr_casadi.diagnose.choice import Choice
 from pilfr_casadi.diagnose.finer_steps import on_steps_as_fine
 from pilfr_casadi.diagnose.first_effect import let_idle_offsets_go
 from pilfr_casadi.diagnose.offset import Offset
 from pilfr_casadi.diagnose.search import Pass
-from pilfr_casadi.diagnose.workbench import FINER, THOROUGH, Workbench
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.diagnose.workbench import FINER, THOROUGH
+from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import AsymmetricFriction, CoulombFriction, Delay, Polynomial
-from pilfr_casadi.simulator import Simulator
+from pilfr_casadi.simulators import Simulator, discretise
 
 F_C = 6.0
 

@@ -2,10 +2,9 @@
 
 import casadi as ca
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from pilfr_casadi.export.sides import with_sides
+from pilfr_casadi.export import with_sides
 
 seeds = st.integers(0, 2**32 - 1)
 

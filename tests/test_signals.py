@@ -2,19 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.signals import (
-    excited_bins,
-    multisine,
-    orthogonal_multisine,
-    prbs,
-    sine_sweep,
-    steady_periods,
-    tukey_realizations,
-)
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import multisine, orthogonal_multisine, prbs, sine_sweep, tukey_realizations
+from pilfr_casadi.data.multisines import excited_bins
+from pilfr_casadi.data.signals import steady_periods
 
 GRIDS = st.sampled_from(["full", "odd", "odd-random"])
 

@@ -9,9 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from pilfr_casadi import InputError, Parameter, Port, PrandtlIshlinskii, Recording, Simulator, Stop, multisine, play
-from pilfr_casadi.compiled import compiler, make_engine
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.engine import VirtualMachine, compiler, make_engine
 from pilfr_casadi.laws import (
     Backlash,
     BoucWen,
@@ -22,11 +20,9 @@ from pilfr_casadi.laws import (
     Saturation,
     StopHysteresis,
 )
-from pilfr_casadi.model import close_loop
-from pilfr_casadi.parameters import ParameterSet
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.sensitivities import VirtualMachine
-from pilfr_casadi.substeps import MOST, REACH, choose_substeps
+from pilfr_casadi.models import ParameterSet, close_loop
+from pilfr_casadi.optimise import GaussNewton, Problem
+from pilfr_casadi.simulators import MOST, REACH, choose_substeps, discretise
 
 DT, M = 0.02, 250
 VALUES = {"m": 1.3, "k": 90.0, "d": 1.1}

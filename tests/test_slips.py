@@ -5,9 +5,9 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.diagnose.prepare import prepare
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.diagnose.preparation import prepare
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.simulators import discretise
 from problems.concealed import case
 
 DT, M = 0.05, 1200

@@ -3,16 +3,17 @@
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from test_export import one_sentence
 from test_exported_models import lfr, mass_on_spring, wave, with_law
 from test_laws import EVERY
 
 from pilfr_casadi import GeneralizedPlay, InputError, Play, Stop, exported
-from pilfr_casadi.export.smoothing import enclosed, smoothed
+from pilfr_casadi.export import smoothed
+from pilfr_casadi.export.smoothing import enclosed
 from pilfr_casadi.laws import StopHysteresis
-from pilfr_casadi.operators import fmin, generalized_play, play, stop
+from pilfr_casadi.models import generalized_play, play, stop
+from pilfr_casadi.models.operators import fmin
 
 KINKS = ("FMAX", "FMIN", "FABS", "SIGN", "LT", "LE", "IF_ELSE_ZERO", "NOT", "FLOOR", "CEIL")
 number = st.floats(-3, 3)

@@ -6,12 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pilfr_casadi.constraints import Constraint, stable
-from pilfr_casadi.fit import fit
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.ipopt import Ipopt
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.solution import Status
+from pilfr_casadi.identify import fit
+from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status, stable
 from problems.zoo import CASES, main
 
 SOLVERS = {

@@ -7,15 +7,12 @@ import time
 import numpy as np
 import pytest
 
-from pilfr_casadi import compiled
-from pilfr_casadi.baselines import NARX, reading_output
-from pilfr_casadi.compiled import Compiled, cache_directory, compiler, make_engine
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.generated import source_code
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.operators import Play
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.sensitivities import VirtualMachine, linearize
+from pilfr_casadi._base import InputError
+from pilfr_casadi.engine import VirtualMachine, compiled, compiler, make_engine
+from pilfr_casadi.engine.compiled import Compiled, cache_directory
+from pilfr_casadi.engine.generated import source_code
+from pilfr_casadi.engine.sensitivities import linearize
+from pilfr_casadi.models import NARX, PILFR, Play, PrandtlIshlinskii, reading_output
 from problems import speed
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")

@@ -5,13 +5,13 @@ import pickle
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.recording import InputError
-from pilfr_casadi.stability import least_radius, stability, unbounded_sentence
+from pilfr_casadi._base import InputError
+from pilfr_casadi.optimise import unbounded_sentence
+from pilfr_casadi.optimise.stability import least_radius, stability
 from problems.constrained import three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)

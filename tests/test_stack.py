@@ -5,11 +5,11 @@ import re
 import numpy as np
 import pytest
 
-from pilfr_casadi import cli
-from pilfr_casadi.fit import fit
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.recording import Recording
+from pilfr_casadi.cli import app as cli
+from pilfr_casadi.data import Recording
+from pilfr_casadi.identify import fit
+from pilfr_casadi.models import PILFR
+from pilfr_casadi.optimise import GaussNewton
 
 N = 60
 

@@ -5,14 +5,12 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
-from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.offset import Offset
 from pilfr_casadi.diagnose.standing import standing
-from pilfr_casadi.diagnose.workbench import Workbench
-from pilfr_casadi.integration import discretise
-from pilfr_casadi.laws import CATALOGUE, Creep, Delay, Lag, Magnitude, Quadratic, Resonance, TwoStageCreep
-from pilfr_casadi.laws.base import Local
-from pilfr_casadi.laws.trace import trace
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.laws import CATALOGUE, Creep, Delay, Lag, Local, Magnitude, Quadratic, Resonance, TwoStageCreep, trace
+from pilfr_casadi.simulators import discretise
 
 DT, M = 0.05, 1500
 

@@ -6,19 +6,15 @@ import numpy as np
 import pytest
 from random_models import random_input, random_lfr
 
-from pilfr_casadi.baselines import NARX, network_lfr, ssnn
-from pilfr_casadi.bla import robust_bla
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.elements import PrandtlIshlinskii
-from pilfr_casadi.fit import fit
-from pilfr_casadi.gauss_newton import GaussNewton
-from pilfr_casadi.lfr import PILFR, hammerstein, wiener
-from pilfr_casadi.operators import Play
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.stability import stability
-from pilfr_casadi.start import grid_start, network_start, paper_start, regrid, unit_states
-from pilfr_casadi.subspace import frequency_subspace, time_subspace
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.identify import fit
+from pilfr_casadi.identify.start import grid_start, network_start, paper_start, regrid, unit_states
+from pilfr_casadi.linear import frequency_subspace, robust_bla, time_subspace
+from pilfr_casadi.models import NARX, PILFR, Play, PrandtlIshlinskii, hammerstein, network_lfr, ssnn, wiener
+from pilfr_casadi.optimise import GaussNewton, Problem
+from pilfr_casadi.optimise.stability import stability
 
 NX, N = 2, 5
 LINEAR = {

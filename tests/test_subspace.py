@@ -3,21 +3,23 @@
 import control
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from random_models import simulate_lti
 
-from pilfr_casadi.bla import BLA, robust_bla
-from pilfr_casadi.local_polynomial import plain_bla
-from pilfr_casadi.lti import frequency_response, propagate
-from pilfr_casadi.order_selection import select_order
-from pilfr_casadi.recording import InputError, Recording
-from pilfr_casadi.subspace import (
+from pilfr_casadi._base import InputError
+from pilfr_casadi.data import Recording
+from pilfr_casadi.linear import (
+    BLA,
     frequency_subspace,
-    singular_values,
+    plain_bla,
+    propagate,
+    robust_bla,
+    select_order,
     subspace_matrices,
     time_subspace,
 )
+from pilfr_casadi.linear.statespace import frequency_response
+from pilfr_casadi.linear.subspace import singular_values
 
 DT = 0.1
 SIZES = dict(nx=st.integers(1, 8), n_u=st.integers(1, 3), n_y=st.integers(1, 3), seed=st.integers(0, 10_000))

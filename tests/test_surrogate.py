@@ -3,18 +3,17 @@
 import control
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.signal import cont2discrete
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Recording, multisine
-from pilfr_casadi.accepted import as_simulator
+from pilfr_casadi.diagnose import POOR, surrogate
 from pilfr_casadi.diagnose.modes import modes, to_continuous
-from pilfr_casadi.diagnose.surrogate import POOR, modal_simulator, surrogate
-from pilfr_casadi.fit import fit
-from pilfr_casadi.integration import discretise
-from pilfr_casadi.sensitivities import VirtualMachine
+from pilfr_casadi.diagnose.surrogates import modal_simulator
+from pilfr_casadi.engine import VirtualMachine
+from pilfr_casadi.identify import fit
+from pilfr_casadi.simulators import as_simulator, discretise
 
 DT = 0.01
 

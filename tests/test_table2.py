@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pilfr_casadi.lfr import PILFR
+from pilfr_casadi.models import PILFR
 from problems import table2
 from problems.masing_figures import draw, loop_width
 

@@ -5,9 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from pilfr_casadi.baselines import NOE
-from pilfr_casadi.lfr import PILFR
-from pilfr_casadi.modal import is_modal
+from pilfr_casadi.linear import is_modal
+from pilfr_casadi.models import NOE, PILFR
 from problems.measured_data import measured
 from problems.piezo_platform import PERIODS, Platform, measure
 from problems.piezo_stack import recordings

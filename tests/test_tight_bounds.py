@@ -5,23 +5,19 @@ import time
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from random_models import coupled_plays
 from scipy.optimize import minimize
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.constraints import stable
-from pilfr_casadi.lifted import Lifted, rotated
-from pilfr_casadi.problem import Problem
-from pilfr_casadi.schur import below_blocks, bounded_rows, paired_schur
-from pilfr_casadi.solution import Status
-from pilfr_casadi.tightening import within_bounds
+from pilfr_casadi.optimise import Problem, Status, stable, within_bounds
+from pilfr_casadi.optimise.lifted import Lifted, rotated
+from pilfr_casadi.optimise.schur import below_blocks, bounded_rows, paired_schur
 from problems.constrained import radius, three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
 FINE = pilfr.GaussNewton(tolerance=1e-9, max_iterations=500)
-DEMO = "pilfr_casadi/demo_data/train.csv"
+DEMO = "pilfr_casadi/cli/demo_data/train.csv"
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from pilfr_casadi import Parameter, Recording, Simulator
-from pilfr_casadi.compiled import make_engine
-from pilfr_casadi.diagnose.prepare import prepare
-from pilfr_casadi.diagnose.workbench import Workbench
-from pilfr_casadi.integration import discretise
-from pilfr_casadi.recording import InputError
+from pilfr_casadi._base import InputError
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.preparation import prepare
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 0.02, 600
 

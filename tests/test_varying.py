@@ -5,12 +5,12 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
-from pilfr_casadi.compiled import make_engine
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.varying import varying
-from pilfr_casadi.diagnose.workbench import Workbench
-from pilfr_casadi.integration import discretise
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.simulators import discretise
 
 DT, M = 0.05, 1200
 

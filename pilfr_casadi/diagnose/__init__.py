@@ -1,6 +1,89 @@
 """Find the physics that a simulator leaves out: where, what, how sure, and the proof."""
 
-from .result import Diagnosis, Effect
-from .run import diagnose
+from __future__ import annotations
 
-__all__ = ["Diagnosis", "Effect", "diagnose"]
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from .._base.lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .._base import Progress
+    from ..data import Recording
+    from ..laws import Law
+    from .explain import prepare as prepare
+    from .linearise import Constant as Constant, over_samples as over_samples
+    from .mismatch_map import mismatch as mismatch
+    from .result import Diagnosis as Diagnosis, Effect as Effect, plain as plain
+    from .search_start import prepared_search as prepared_search
+    from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate
+    from .workbench import Fitted as Fitted, Workbench as Workbench
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+__all__.append("diagnose")
+
+
+def diagnose(
+    simulator: Any,
+    train: Recording | Sequence[Recording],
+    *,
+    test: Recording | Sequence[Recording] | None = None,
+    hold: str | None = None,
+    laws: Sequence[type[Law]] | None = None,
+    effects: int = 2,
+    limits: Mapping[str, float] | None = None,
+    workers: int | None = None,
+    engine: str = "auto",
+    stand_in_error: float = 0.0,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Find what a simulator leaves out, from recordings of the machine.
+
+    Parameters
+    ----------
+    simulator : Simulator, control.StateSpace, or a fitted PI-LFR
+        The simulator, with nominal parameters, bounds and ports.
+    train : Recording or sequence of Recording
+        What is fitted and chosen on.
+    test : Recording or sequence of Recording, optional
+        Reported on; never used to fit or to choose.
+    hold : {"zero", "linear"}, optional
+        What inputs do between samples, where neither recordings nor simulator say.
+    laws : sequence of Law classes, optional
+        By default the whole catalogue. Inputs that the simulator's equations do not
+        read are tried as scales of some of its laws.
+    effects : int
+        Most effects looked for.
+    limits : mapping, optional
+        Largest amplitude of each input that a next experiment may have; by default what was recorded.
+    workers : int, optional
+        Fits run side by side, by default one a processor, at most four.
+    stand_in_error : float
+        NRMSE by which the simulator misses what it stands for (a surrogate: another simulation); it counts as noise.
+    progress : callable
+        Called with (stage, done, total, smallest error so far).
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    InputError
+        If simulator and recordings do not fit each other.
+    """
+    from .run import run_diagnosis
+
+    return run_diagnosis(
+        simulator,
+        train,
+        test=test,
+        hold=hold,
+        laws=laws,
+        effects=effects,
+        limits=limits,
+        workers=workers,
+        engine=engine,
+        stand_in_error=stand_in_error,
+        progress=progress,
+    )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..recording import InputError, Recording
-from ..simulator import Simulator
+from .._base import InputError
+from ..data import Recording
+from ..simulators import Simulator
 
 
 def arranged(simulator: Simulator, recording: Recording) -> Recording:

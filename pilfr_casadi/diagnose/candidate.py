@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import make_engine
+from .._base import InputError
+from ..data import Recording
+from ..engine import make_engine
 from ..laws import Law
-from ..recording import InputError, Recording
-from ..simulator import Placed, Simulator, in_series
+from ..simulators import Placed, Simulator, in_series
 from .arranged import opened_at_the_start
 from .knees import knees, moved, on_finer_steps
 from .proof import deviations, shown

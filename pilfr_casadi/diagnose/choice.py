@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..simulator import in_series
+from ..simulators import in_series
 from .candidate import Candidate
 from .kinship import CONTAINS, handicap, imitates
 

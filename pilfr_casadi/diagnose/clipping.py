@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..laws.limits import AsymmetricSaturation
-from ..recording import Recording
+from ..data import Recording
+from ..laws import AsymmetricSaturation
 from .gates import Gate, refit
 from .linearise import linearised
 from .remainder import folds, followed, held_out, moved

@@ -11,7 +11,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ..simulator import Simulator
+from ..simulators import Simulator
 from .candidate import Candidate, attempt
 from .choice import LIKE
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ..simulator import Simulator
-from ..threads import side_by_side
+from .._base import side_by_side
+from ..simulators import Simulator
 from .candidate import Candidate, attempt
 from .choice import LIKE
 from .explain import BRIEF, closed

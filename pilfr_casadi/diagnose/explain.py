@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import make_engine
-from ..gauss_newton import GaussNewton
+from ..engine import make_engine
 from ..laws import Law
-from ..simulator import Simulator
+from ..optimise import GaussNewton
+from ..simulators import Simulator
 from .candidate import Candidate, attempt, heads
 from .screen import Scored
 from .workbench import Fitted, Workbench, started

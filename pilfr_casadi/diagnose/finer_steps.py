@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..recording import InputError
-from ..substeps import MOST
+from .._base import InputError
+from ..simulators import MOST
 from .floor import white_part
 from .knees import FINEST
 from .workbench import FINER, THOROUGH, Fitted, Workbench

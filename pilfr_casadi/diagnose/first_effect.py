@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..recording import InputError
+from .._base import InputError
 from .candidate import polish
 from .offset import offsets, without_idle_offsets
 from .workbench import THOROUGH, Fitted

@@ -13,10 +13,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..laws.base import Law, Local
-from ..laws.dynamic import Creep, Relaxation
-from ..laws.hysteresis import PlayHysteresis, StopHysteresis
-from ..parameters import Parameter
+from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis
+from ..models import Parameter
 from .linearise import linearised
 from .remainder import Remainder, held_out
 from .workbench import Fitted, Workbench

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..recording import Recording
+from ..data import Recording
 
 ALIKE, CHANCE = 0.5, 1e-4  # rank correlation, and its chance in noise, of a residual that swells with a signal
 LONGEST = 400  # samples over which a residual may be correlated

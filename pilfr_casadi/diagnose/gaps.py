@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from ..integration import states_along
-from ..recording import InputError, Recording
+from .._base import InputError
+from ..data import Recording
+from ..simulators import states_along
 from .gates import Gate
 from .linearise import Run, linearised
 from .timing import ALONE, DROP, nominal_directions

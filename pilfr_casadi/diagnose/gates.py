@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import make_engine
-from ..gauss_newton import GaussNewton
-from ..recording import InputError, Recording
-from ..threads import side_by_side
+from .._base import InputError, side_by_side
+from ..data import Recording
+from ..engine import make_engine
+from ..optimise import GaussNewton
 from .workbench import QUICK, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..recording import InputError
+from .._base import InputError
 from .choice import LIKE
 from .verdict import AT_FLOOR, WELL_ABOVE
 from .workbench import THOROUGH, Fitted

@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import mapped
-from ..integration import signals, states_along
-from ..laws import Law
-from ..laws.base import Local
-from ..laws.trace import trace
+from ..laws import Law, Local, trace
+from ..models import mapped
+from ..simulators import signals, states_along
 from .candidate import Candidate
 from .kinship import FLEXIBLE
 from .screen import Scored, start_values

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..recording import InputError
+from .._base import InputError
 from .workbench import FINER, THOROUGH, Fitted, Workbench
 
 if TYPE_CHECKING:

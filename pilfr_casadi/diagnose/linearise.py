@@ -19,13 +19,10 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ..arrays import mapped
-from ..integration import discretise, signals, states_along
-from ..laws.base import Law, Local
-from ..model import Model
-from ..observer import kalman_gain, led
-from ..simulator import Simulator
-from ..threads import one_at_a_time
+from .._base import one_at_a_time
+from ..laws import Law, Local
+from ..models import Model, mapped
+from ..simulators import Simulator, discretise, kalman_gain, led, signals, states_along
 from .workbench import FINER, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps

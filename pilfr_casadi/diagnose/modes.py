@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..recording import InputError
+from .._base import InputError
 
 FAST = 0.9  # eigenvalues closer to the Nyquist frequency than this share have no continuous counterpart to trust
 POOR = 1e5  # condition of a pair's eigenvectors

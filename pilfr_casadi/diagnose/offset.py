@@ -14,8 +14,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..laws.base import Law
-from ..recording import InputError
+from .._base import InputError
+from ..laws import Law
 from .floor import effective_size
 from .gates import CURED, STRAINED, Gate, slips
 from .linearise import linearised

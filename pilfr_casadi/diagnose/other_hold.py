@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..recording import InputError
+from .._base import InputError
 from .first_effect import MISHELD
 from .gates import hold_note
-from .prepare import Prepared
-from .prepared_search import Asked, prepared_search
+from .preparation import Prepared
 from .search import Search
+from .search_start import Asked, prepared_search
 
 
 def doubted(search: Search) -> bool:

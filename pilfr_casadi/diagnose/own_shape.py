@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ..laws.base import Law, Local
-from ..parameters import Parameter
+from ..laws import Law, Local
+from ..models import Parameter
 from .candidate import Candidate, attempt
 from .flexible import chebyshev
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..compiled import make_engine
-from ..threads import side_by_side
+from .._base import side_by_side
+from ..engine import make_engine
 from .candidate import Candidate, attempt
 from .explain import BRIEF, closed
 from .kinship import handicap

@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..laws.dynamic import Attached, Delay, Lag, Resonance
-from ..simulator import in_series
+from ..laws import Attached, Delay, Lag, Resonance
+from ..simulators import in_series
 from .candidate import Candidate
 from .kinship import CONTAINS
 from .screen import Scored

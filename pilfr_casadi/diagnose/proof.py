@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import make_engine
-from ..fitted import first_state, samples_for_state
-from ..metrics import nrmse
-from ..model import Model
-from ..parameters import ParameterSet
-from ..recording import Recording
-from ..simulator import Simulator
+from ..data import Recording, nrmse
+from ..engine import make_engine
+from ..identify import first_state, samples_for_state
+from ..models import Model, ParameterSet
+from ..simulators import Simulator
 from .floor import effective_size
 from .gates import Gate
 from .workbench import Fitted, Workbench

@@ -16,10 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from ..laws import Law
-from ..laws.base import Local
-from ..laws.trace import columns, trace
-from ..simulator import Port
+from ..laws import Law, Local, columns, trace
+from ..simulators import Port
 from .linearise import Probe, Run, locals_of, propagate
 from .workbench import Workbench
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..recording import Recording
-from ..simulator import Simulator
+from ..data import Recording
+from ..simulators import Simulator
 from .gates import Gate
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..compiled import make_engine
+from .._base import InputError, side_by_side
+from ..engine import make_engine
 from ..laws import FINER
-from ..recording import InputError
-from ..simulator import Simulator
-from ..threads import side_by_side
+from ..simulators import Simulator
 from .candidate import Candidate, attempt, judged
 from .choice import LIKE, choose, dry_instead
 from .explain import by_cost

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-from ..laws.dynamic import Attached
-from ..simulator import Placed, Simulator, in_series
+from ..laws import Attached
+from ..simulators import Placed, Simulator, in_series
 from .explain import closed
 from .kinship import CONTAINS, complements
 

@@ -8,80 +8,46 @@ from typing import Any
 
 import numpy as np
 
-from ..accepted import as_simulator
-from ..interrupts import Progress
+from .._base import InputError, Progress, listed, one_blas_thread, processors
+from ..data import Recording, as_recordings, check_for_identification
 from ..laws import CATALOGUE, SCALABLE, Law, readable_unit, scaled
-from ..recording import InputError, Recording, as_recordings, check_for_identification, listed
-from ..threads import one_blas_thread, processors
+from ..simulators import as_simulator
 from .arranged import arranged
 from .candidate import Candidate
 from .choice import Choice
 from .conclusion import Conclusion, concluded
 from .experiment import next_experiment, placebo
 from .first_effect import let_idle_offsets_go
-from .mismatch import mismatch
+from .mismatch_map import mismatch
 from .offset import as_it_came_out
 from .other_hold import doubted, otherwise_held
-from .prepare import Prepared
-from .prepared_search import Asked, prepared_search
+from .preparation import Prepared
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import Pass, Search
-from .surrogate import told_of_surrogate
+from .search_start import Asked, prepared_search
+from .surrogates import told_of_surrogate
 from .tones import tones
 from .verdict import UNSURE, confidence
 from .workbench import Fitted
 
 
 @one_blas_thread
-def diagnose(
+def run_diagnosis(
     simulator: Any,
     train: Recording | Sequence[Recording],
     *,
-    test: Recording | Sequence[Recording] | None = None,
-    hold: str | None = None,
-    laws: Sequence[type[Law]] = CATALOGUE,
-    effects: int = 2,
-    limits: Mapping[str, float] | None = None,
-    workers: int | None = None,
-    engine: str = "auto",
-    stand_in_error: float = 0.0,
-    progress: Progress | None = None,
+    test: Recording | Sequence[Recording] | None,
+    hold: str | None,
+    laws: Sequence[type[Law]] | None,
+    effects: int,
+    limits: Mapping[str, float] | None,
+    workers: int | None,
+    engine: str,
+    stand_in_error: float,
+    progress: Progress | None,
 ) -> Diagnosis:
-    """Find what a simulator leaves out, from recordings of the machine.
-
-    Parameters
-    ----------
-    simulator : Simulator, control.StateSpace, or a fitted PI-LFR
-        The simulator, with nominal parameters, bounds and ports.
-    train : Recording or sequence of Recording
-        What is fitted and chosen on.
-    test : Recording or sequence of Recording, optional
-        Reported on; never used to fit or to choose.
-    hold : {"zero", "linear"}, optional
-        What inputs do between samples, where neither recordings nor simulator say.
-    laws : sequence of Law classes
-        The catalogue. Inputs that the simulator's equations do not read are tried as scales of some of its laws.
-    effects : int
-        Most effects looked for.
-    limits : mapping, optional
-        Largest amplitude of each input that a next experiment may have; by default what was recorded.
-    workers : int, optional
-        Fits run side by side, by default one a processor, at most four.
-    stand_in_error : float
-        NRMSE by which the simulator misses what it stands for (a surrogate: another simulation); it counts as noise.
-    progress : callable
-        Called with (stage, done, total, smallest error so far).
-
-    Returns
-    -------
-    Diagnosis
-
-    Raises
-    ------
-    InputError
-        If simulator and recordings do not fit each other.
-    """
+    """Carry out `diagnose`, whose parameters these are."""
     began = time.perf_counter()
     workers = workers or min(processors(), 4)
     say = progress or (lambda stage, done, total, best: None)
@@ -101,6 +67,7 @@ def diagnose(
             )
         if not most > 0:
             raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")
+    laws = CATALOGUE if laws is None else laws
     laws = (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
     say("refit", 0, 1, np.inf)
     asked = Asked(simulator, recordings, laws, hold, engine, workers, effects, stand_in_error, say)

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ..laws import Law
-from ..laws.base import Local
-from ..threads import side_by_side
+from .._base import side_by_side
+from ..laws import Law, Local
 from .linearise import Run, linearised, observer_gain, run
 from .remainder import HUGE, Remainder, Task, held_out
 from .workbench import Fitted, Workbench

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..interrupts import Progress
+from .._base import Progress
 from ..laws import Law
-from ..simulator import Placed
+from ..simulators import Placed
 from .candidate import Candidate, heads, judged, polish
 from .choice import Choice, choose
 from .every_sensor import every_sensor

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..recording import Recording
+from ..data import Recording
 from .arranged import opened_at_the_start
 from .gates import Gate
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..recording import Recording
+from ..data import Recording
 from .gates import Gate
 
 SHARE, DISTINCT, LONGEST = 0.01, 0.5, 5  # of the samples that repeat, values that differ, and samples of one repeat

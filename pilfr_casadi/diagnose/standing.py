@@ -11,11 +11,9 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 
-from ..arrays import mapped
-from ..integration import Equations, Instant, on_grid
-from ..parameters import ParameterSet
-from ..simulator import Simulator
-from ..threads import one_at_a_time
+from .._base import one_at_a_time
+from ..models import ParameterSet, mapped
+from ..simulators import Equations, Instant, Simulator, on_grid
 
 
 def stands(simulator: Simulator) -> list[int]:

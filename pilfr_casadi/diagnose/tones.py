@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..recording import Recording
+from ..data import Recording
 from .gates import Gate
 from .workbench import Fitted, Workbench
 

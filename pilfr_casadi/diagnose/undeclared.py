@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ..recording import InputError
+from .._base import InputError
 from .gates import Gate
 from .search import Search
 from .verdict import UNSURE

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..integration import states_along
-from ..recording import InputError, Recording
+from .._base import InputError
+from ..data import Recording
+from ..simulators import states_along
 from .arranged import opened_at_the_start
 from .floor import effective_size
 from .gates import Gate

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..simulator import in_series
+from ..simulators import in_series
 from .choice import Choice
 from .floor import swells_with
 from .gates import Gate

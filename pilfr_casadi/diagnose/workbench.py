@@ -8,19 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from ..compiled import make_engine
-from ..gauss_newton import GaussNewton
-from ..integration import discretise
-from ..model import Model
-from ..observer import GAMMA, led
-from ..parameters import ParameterSet
-from ..problem import Problem
-from ..recording import InputError, Recording
-from ..sensitivities import Engine
-from ..simulator import Simulator
-from ..solution import Status
-from ..substeps import MOST, REACH, at_begin, choose_substeps, fastest, growth, wanted_substeps
-from ..threads import one_at_a_time
+from .._base import InputError, one_at_a_time
+from ..data import Recording
+from ..engine import Engine, make_engine
+from ..models import Model, ParameterSet
+from ..optimise import GaussNewton, Problem, Status
+from ..simulators import (
+    GAMMA,
+    MOST,
+    REACH,
+    Simulator,
+    at_begin,
+    choose_substeps,
+    discretise,
+    fastest,
+    growth,
+    led,
+    wanted_substeps,
+)
 from .arranged import arranged
 from .standing import standing, stands
 

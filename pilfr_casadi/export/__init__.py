@@ -1,22 +1,17 @@
-"""Models on disk, and models as CasADi functions."""
+"""Models that leave the package: step functions, C code, `control` systems, and model files."""
 
-from .digests import digest
-from .exported_model import NAMES, Exported
-from .files import made, write_atomically
-from .functions import exported, to_casadi
-from .loading import load
-from .saving import FORMAT, VERSION, save
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "FORMAT",
-    "NAMES",
-    "VERSION",
-    "Exported",
-    "digest",
-    "exported",
-    "load",
-    "made",
-    "save",
-    "to_casadi",
-    "write_atomically",
-]
+from .._base.lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .digests import digest as digest
+    from .exported_model import NAMES as NAMES, Exported as Exported
+    from .files import made as made, write_atomically as write_atomically
+    from .functions import exported as exported, to_casadi as to_casadi
+    from .loading import load as load
+    from .saving import model_text as model_text, save as save
+    from .sides import with_sides as with_sides
+    from .smoothing import smoothed as smoothed
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -13,7 +13,7 @@ from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
-from ..recording import InputError
+from .._base import InputError
 from .digests import ordered_digest
 from .files import path_text, short
 from .saving import FORMAT, VERSION

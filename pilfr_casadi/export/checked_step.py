@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..recording import InputError
+from .._base import InputError
 
 
 class CheckedStep(ca.Function):

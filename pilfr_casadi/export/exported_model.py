@@ -13,8 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..checks import numbers
-from ..recording import InputError
+from .._base import InputError, numbers
 from .c_code import write_c
 from .files import path_text, write_atomically
 from .sampled import Sampled

@@ -9,7 +9,7 @@ import secrets
 from pathlib import Path
 from typing import Any
 
-from ..recording import InputError
+from .._base import InputError
 
 
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:

@@ -8,14 +8,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..checks import LARGEST, is_number, numbers
-from ..compiled import make_engine
-from ..fitted import Fit, first_state
-from ..integration import discretise
-from ..model import Model
-from ..recording import InputError, Recording
-from ..simulator import Simulator
-from ..substeps import choose_substeps
+from .._base import LARGEST, InputError, is_number, numbers
+from ..data import Recording
+from ..engine import make_engine
+from ..identify import Fit, first_state
+from ..models import Model
+from ..simulators import Simulator, choose_substeps, discretise
 from .checked_step import CheckedStep
 from .exported_model import Exported
 from .names import check_name

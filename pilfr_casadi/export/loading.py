@@ -15,18 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..asked import Asked, asked_by
-from ..lfr import PILFR, block_shapes
-from ..limits import Limit
-from ..model import Model
-from ..solution import Iteration, Solution, Status
+from ..identify import Asked, asked_by
+from ..models import PILFR, Model, block_shapes
+from ..optimise import Iteration, Limit, Solution, Status
 from .checked_json import ModelFile
 from .loading_elements import element_of
 from .model_keys import check_keys
 from .saving import HISTORY
 
 if TYPE_CHECKING:
-    from ..fit import Fit
+    from ..identify import Fit
 
 
 def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fit:
@@ -57,7 +55,7 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     UserWarning
         If the file is of the first version of the format, which has no digest to tell changes by.
     """
-    from ..fit import Fit
+    from ..identify import Fit
 
     file = ModelFile(path, given=model is not None)
     check_keys(file)
@@ -84,7 +82,7 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
 
 def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[str, Any]:
     """What is kept of the way to the fit, as fields of `Fit`."""
-    from ..search import Candidate
+    from ..identify import Candidate
 
     variables = file.table(training, "variables")
     theta = file.array(list(variables.values()), (len(variables),), "a variable")

@@ -6,11 +6,18 @@ from collections.abc import Mapping
 from math import comb
 from typing import Any
 
-from ..combined import Combined, Part
-from ..elements import Element, PrandtlIshlinskii, StaticNetwork
-from ..envelope import Envelope
-from ..operators import GeneralizedPlay, Play, Stop
-from ..products import Products
+from ..models import (
+    Combined,
+    Element,
+    Envelope,
+    GeneralizedPlay,
+    Part,
+    Play,
+    PrandtlIshlinskii,
+    Products,
+    StaticNetwork,
+    Stop,
+)
 from .checked_json import ModelFile
 
 OPERATORS = {"play": Play, "stop": Stop, "generalized_play": GeneralizedPlay}

@@ -6,7 +6,7 @@ from typing import Any
 
 import casadi as ca
 
-from ..recording import InputError
+from .._base import InputError
 
 LONGEST = 50  # C tells names apart by their first 63 characters, and the longest ending is "_casadi"
 KEYWORDS = frozenset(  # of C and C++

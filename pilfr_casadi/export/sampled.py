@@ -15,12 +15,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..elements import PrandtlIshlinskii
-from ..integration import Equations, Instant, on_grid
-from ..model import Model
-from ..parameters import ParameterSet
-from ..recording import InputError
-from ..simulator import Simulator
+from .._base import InputError
+from ..models import Model, ParameterSet, PrandtlIshlinskii
+from ..simulators import Equations, Instant, Simulator, on_grid
 
 INLINE = 4  # sub-steps that are written out one after the other; more become a loop
 TIME, NEXT = "time", "_next"

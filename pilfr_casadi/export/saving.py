@@ -17,17 +17,13 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from ..combined import Combined
-from ..elements import PrandtlIshlinskii, StaticNetwork
-from ..envelope import Envelope
-from ..operators import GeneralizedPlay
-from ..products import Products
+from ..models import Combined, Envelope, GeneralizedPlay, PrandtlIshlinskii, Products, StaticNetwork
 from .digests import ordered_digest
 from .files import write_atomically
 
 if TYPE_CHECKING:
-    from ..fit import Fit
-    from ..lfr import PILFR
+    from ..identify import Fit
+    from ..models import PILFR
 
 FORMAT = "pilfr_casadi model"
 VERSION = 2  # version 1 had no digest; it is still read
@@ -59,7 +55,7 @@ def model_text(fit: Fit) -> str:
 
 
 def _document(fit: Fit) -> dict[str, Any]:
-    from .. import __version__
+    from .._base import __version__
 
     model, solution = fit.model, fit.solution
     limited = len(solution.theta) + sum(limit.kind == "constraint" for limit in fit.limits)

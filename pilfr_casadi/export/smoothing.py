@@ -25,7 +25,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..recording import InputError
+from .._base import InputError
 
 Interval = tuple[float, float]
 EVERYTHING = (-math.inf, math.inf)

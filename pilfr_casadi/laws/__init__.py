@@ -1,158 +1,88 @@
-"""The catalogue of laws that may be missing from a simulator."""
+"""The catalogue of physical laws that may be missing from a simulator; one hypothesis a class."""
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-from typing import Any
+from .._base.lazy import lazy_face
 
-from .base import Law, Local, readable_unit
-from .composed import behind_gap, scaled
-from .curves import Cubic, Magnitude, Orifice, Polynomial, Power, PowerWithGain, Quadratic, Root
-from .density import SmoothHysteresis
-from .dynamic import (
-    Attached,
-    Creep,
-    Delay,
-    Drift,
-    Lag,
-    Mode,
-    Relaxation,
-    Resonance,
-    Settling,
-    Swing,
-    TwoStageCreep,
-    TwoStageRelaxation,
-)
-from .friction import (
-    AsymmetricFriction,
-    CoulombFriction,
-    CubicDamping,
-    DirectionalDamping,
-    DirectionalDrag,
-    DirectionalFriction,
-    PreslidingFriction,
-    PreslidingStribeckFriction,
-    QuadraticDrag,
-    StribeckFriction,
-    ViscousDamping,
-)
-from .hysteresis import (
-    Backlash,
-    BoucWen,
-    BoucWenActuator,
-    FineGeneralized,
-    FinePlays,
-    GeneralizedHysteresis,
-    PlayHysteresis,
-    StopHysteresis,
-)
-from .limits import (
-    AsymmetricDeadZone,
-    AsymmetricSaturation,
-    DeadZone,
-    GradualSaturation,
-    Saturation,
-    SkewSaturation,
-    SoftSaturation,
-)
-from .periodic import HarmonicForce, PeriodicForce, Ripple
-from .stiffness import (
-    Clearance,
-    CubicStiffness,
-    GeometricStiffness,
-    HertzContact,
-    LinearStiffness,
-    OffCentreClearance,
-    PiecewiseStiffness,
-    PiecewiseStiffnessBelow,
-    PowerStiffness,
-    ProgressiveStiffness,
-    QuadraticStiffness,
-    QuinticStiffness,
-    SlackCoupling,
-    SlackSpring,
-    SoftClearance,
-)
+if TYPE_CHECKING:
+    from .base import Law as Law, Local as Local, readable_unit as readable_unit
+    from .catalogue import CATALOGUE as CATALOGUE, FINER as FINER, SCALABLE as SCALABLE
+    from .composed import behind_gap as behind_gap, scaled as scaled
+    from .curves import (
+        Cubic as Cubic,
+        Magnitude as Magnitude,
+        Orifice as Orifice,
+        Polynomial as Polynomial,
+        Power as Power,
+        PowerWithGain as PowerWithGain,
+        Quadratic as Quadratic,
+        Root as Root,
+    )
+    from .density import SmoothHysteresis as SmoothHysteresis
+    from .dynamic import (
+        Attached as Attached,
+        Creep as Creep,
+        Delay as Delay,
+        Drift as Drift,
+        Lag as Lag,
+        Mode as Mode,
+        Relaxation as Relaxation,
+        Resonance as Resonance,
+        Settling as Settling,
+        Swing as Swing,
+        TwoStageCreep as TwoStageCreep,
+        TwoStageRelaxation as TwoStageRelaxation,
+    )
+    from .force_fit import columns as columns, trace as trace
+    from .friction import (
+        AsymmetricFriction as AsymmetricFriction,
+        CoulombFriction as CoulombFriction,
+        CubicDamping as CubicDamping,
+        DirectionalDamping as DirectionalDamping,
+        DirectionalDrag as DirectionalDrag,
+        DirectionalFriction as DirectionalFriction,
+        PreslidingFriction as PreslidingFriction,
+        PreslidingStribeckFriction as PreslidingStribeckFriction,
+        QuadraticDrag as QuadraticDrag,
+        StribeckFriction as StribeckFriction,
+        ViscousDamping as ViscousDamping,
+    )
+    from .hysteresis import (
+        Backlash as Backlash,
+        BoucWen as BoucWen,
+        BoucWenActuator as BoucWenActuator,
+        FineGeneralized as FineGeneralized,
+        FinePlays as FinePlays,
+        GeneralizedHysteresis as GeneralizedHysteresis,
+        PlayHysteresis as PlayHysteresis,
+        StopHysteresis as StopHysteresis,
+    )
+    from .limits import (
+        AsymmetricDeadZone as AsymmetricDeadZone,
+        AsymmetricSaturation as AsymmetricSaturation,
+        DeadZone as DeadZone,
+        GradualSaturation as GradualSaturation,
+        Saturation as Saturation,
+        SkewSaturation as SkewSaturation,
+        SoftSaturation as SoftSaturation,
+    )
+    from .periodic import HarmonicForce as HarmonicForce, PeriodicForce as PeriodicForce, Ripple as Ripple
+    from .stiffness import (
+        Clearance as Clearance,
+        CubicStiffness as CubicStiffness,
+        GeometricStiffness as GeometricStiffness,
+        HertzContact as HertzContact,
+        LinearStiffness as LinearStiffness,
+        OffCentreClearance as OffCentreClearance,
+        PiecewiseStiffness as PiecewiseStiffness,
+        PiecewiseStiffnessBelow as PiecewiseStiffnessBelow,
+        PowerStiffness as PowerStiffness,
+        ProgressiveStiffness as ProgressiveStiffness,
+        QuadraticStiffness as QuadraticStiffness,
+        QuinticStiffness as QuinticStiffness,
+        SlackCoupling as SlackCoupling,
+        SlackSpring as SlackSpring,
+        SoftClearance as SoftClearance,
+    )
 
-CATALOGUE: tuple[type[Law], ...] = (
-    LinearStiffness,
-    CubicStiffness,
-    PowerStiffness,
-    GeometricStiffness,
-    QuinticStiffness,
-    QuadraticStiffness,
-    ProgressiveStiffness,
-    PiecewiseStiffness,
-    PiecewiseStiffnessBelow,
-    HertzContact,
-    Clearance,
-    SlackSpring,
-    SlackCoupling,
-    SoftClearance,
-    OffCentreClearance,
-    CoulombFriction,
-    AsymmetricFriction,
-    DirectionalFriction,
-    behind_gap(CoulombFriction),
-    PreslidingFriction,
-    StribeckFriction,
-    PreslidingStribeckFriction,
-    ViscousDamping,
-    DirectionalDamping,
-    QuadraticDrag,
-    DirectionalDrag,
-    CubicDamping,
-    StopHysteresis,
-    PlayHysteresis,
-    GeneralizedHysteresis,
-    BoucWen,
-    BoucWenActuator,
-    Backlash,
-    Saturation,
-    AsymmetricSaturation,
-    SoftSaturation,
-    SkewSaturation,
-    GradualSaturation,
-    DeadZone,
-    AsymmetricDeadZone,
-    Quadratic,
-    Cubic,
-    Polynomial,
-    Magnitude,
-    Power,
-    PowerWithGain,
-    Root,
-    Orifice,
-    Delay,
-    Relaxation,
-    TwoStageRelaxation,
-    Creep,
-    TwoStageCreep,
-    Drift,
-    Settling,
-    Swing,
-    PeriodicForce,
-    HarmonicForce,
-    Ripple,
-    Lag,
-    Resonance,
-    Mode,
-    Attached,
-)
-
-# what a named law is put more finely by, once it is named: it costs more to fit
-FINER: dict[type[Law], tuple[Any, ...]] = {
-    StopHysteresis: (SmoothHysteresis,),
-    PlayHysteresis: (FinePlays,),
-    GeneralizedHysteresis: (FineGeneralized,),
-}
-
-# what an input that the simulator's equations do not read may scale
-SCALABLE: tuple[type[Law], ...] = (
-    LinearStiffness,
-    ViscousDamping,
-    CoulombFriction,
-    PreslidingFriction,
-    StopHysteresis,
-)
-
-__all__ = ["CATALOGUE", "FINER", "SCALABLE", "Law", "Local", "behind_gap", "readable_unit", "scaled"]
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

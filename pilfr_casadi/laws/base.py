@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ..parameters import Parameter
+from ..models import Parameter
 
 EDGE = 0.05  # share of a gap over which contact sets in
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import casadi as ca
 
-from ..recording import InputError
+from .._base import InputError
 from .base import Law, Local, beyond
 
 GAPS = (0.1, 0.3, 0.6)  # of the largest |z|

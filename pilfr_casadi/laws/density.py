@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ..operators import play
+from ..models import play
 from .base import Law, Local, grid
 
 NODES = 24

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ..parameters import Parameter
+from ..models import Parameter
 from .base import Law, Local, grid
 
 SCREENED = 24  # steps of a delay in the screen, which tries none that is longer

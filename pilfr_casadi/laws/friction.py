@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ..operators import play
+from ..models import play
 from .base import Law, Local, grid
 
 KNEE = 0.15  # of the speed at which friction has fallen, that its reversal may take

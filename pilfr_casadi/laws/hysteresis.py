@@ -8,8 +8,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from ..operators import play
-from ..parameters import Parameter
+from ..models import Parameter, play
 from .base import Law, Local, grid
 
 PARTS = 4  # of a step of a held signal

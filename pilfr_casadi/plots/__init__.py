@@ -1,35 +1,34 @@
-"""Every figure of the package; the only place that knows matplotlib, so import it where a figure is made.
+"""Every figure of the package; the only folder that imports matplotlib.
 
 Functions that draw one picture take an optional `ax` and return the axes (`axes.figure` is the figure); those that
 compose several return the `matplotlib.figure.Figure`.
 """
 
-from .canvas import new_figure
-from .law import loading_curve, loop, virgin_curve, weights
-from .measured import best_linear_approximation, compared_spread, frequency_response, loops, operators_demo, spread
-from .overview import convergence, plot_fit
-from .signals import amplitude_density, as_scored, linear_simulation, output_over_input, remains, spectrum, time, traces
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "amplitude_density",
-    "as_scored",
-    "best_linear_approximation",
-    "compared_spread",
-    "convergence",
-    "frequency_response",
-    "linear_simulation",
-    "loading_curve",
-    "loop",
-    "loops",
-    "new_figure",
-    "operators_demo",
-    "output_over_input",
-    "plot_fit",
-    "remains",
-    "spectrum",
-    "spread",
-    "time",
-    "traces",
-    "virgin_curve",
-    "weights",
-]
+from .._base.lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .canvas import new_figure as new_figure
+    from .law import loading_curve as loading_curve, loop as loop, virgin_curve as virgin_curve, weights as weights
+    from .measured import (
+        best_linear_approximation as best_linear_approximation,
+        compared_spread as compared_spread,
+        frequency_response as frequency_response,
+        loops as loops,
+        operators_demo as operators_demo,
+        spread as spread,
+    )
+    from .overview import convergence as convergence, plot_fit as plot_fit
+    from .signals import (
+        amplitude_density as amplitude_density,
+        as_scored as as_scored,
+        linear_simulation as linear_simulation,
+        output_over_input as output_over_input,
+        remains as remains,
+        spectrum as spectrum,
+        time as time,
+        traces as traces,
+    )
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

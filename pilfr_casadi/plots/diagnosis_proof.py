@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..recording import Recording
+from ..data import Recording
 from .canvas import (
     BLUE,
     GREEN,

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..recording import InputError, Recording, as_recordings
-from ..start import density
+from .._base import InputError
+from ..data import Recording, as_recordings
+from ..identify import density
 from .canvas import BLUE, INK, SKY, VERMILLION, axes_or_new, finish, with_unit
 from .signals import as_scored
 
 if TYPE_CHECKING:
-    from ..fit import Fit
+    from ..identify import Fit
 
 Curve = Callable[[np.ndarray], np.ndarray]
 FEWEST = 4  # operators whose weights make up a density

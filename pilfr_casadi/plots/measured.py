@@ -12,10 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..bla import BLA
-from ..model import Model
-from ..operators import generalized_play, play, stop
-from ..recording import InputError
+from .._base import InputError
+from ..linear import BLA
+from ..models import Model, generalized_play, play, stop
 from .canvas import (
     BLUE,
     FONT,

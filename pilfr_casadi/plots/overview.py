@@ -9,14 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..recording import Recording, as_recordings
-from ..solution import Iteration
+from ..data import Recording, as_recordings
+from ..optimise import Iteration
 from .canvas import GREY, VERMILLION, axes_or_new, finish, new_figure
 from .law import loading_curve, loop, weights
 from .signals import spectrum, time
 
 if TYPE_CHECKING:
-    from ..fit import Fit
+    from ..identify import Fit
 
 
 def plot_fit(

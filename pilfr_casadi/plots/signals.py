@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..bla import output_spectra
-from ..metrics import nrmse
-from ..recording import InputError, Recording
+from .._base import InputError
+from ..data import Recording, nrmse
+from ..linear import output_spectra
 from .canvas import (
     BLUE,
     GREEN,
@@ -33,7 +33,7 @@ from .canvas import (
 )
 
 if TYPE_CHECKING:
-    from ..fit import Fit
+    from ..identify import Fit
 
 
 def time(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:

@@ -12,13 +12,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..arrays import mapped
-from ..diagnose.linearise import Constant
-from ..diagnose.workbench import Fitted, Workbench
-from ..integration import Equations, Instant, discretise, on_grid, signals, states_along
-from ..parameters import ParameterSet
-from ..recording import Recording
-from ..simulator import Simulator
+from ..data import Recording
+from ..diagnose import Constant, Fitted, Workbench
+from ..models import ParameterSet, mapped
+from ..simulators import Equations, Instant, Simulator, discretise, on_grid, signals, states_along
 from .smoother import UnknownForce
 
 MOST = 4000  # samples smoothed

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnose.workbench import Fitted, Workbench
+from .._base import InputError
+from ..diagnose import Fitted, Workbench
 from ..plots import diagnosis_proof as proof
-from ..recording import InputError
 from .diagnosis_force import Hidden, hidden_force
 from .page import Block, Picture, Text
 

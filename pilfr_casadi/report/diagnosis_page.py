@@ -7,11 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnose import Diagnosis
-from ..diagnose.mismatch import mismatch
-from ..diagnose.workbench import Fitted, Workbench
-from ..plots import diagnosis as pictures
-from ..plots import diagnosis_proof as proof
+from ..diagnose import Diagnosis, Fitted, Workbench, mismatch
+from ..plots import diagnosis as pictures, diagnosis_proof as proof
 from . import diagnosis_tables as tables
 from .diagnosis_hidden import force_blocks
 from .diagnosis_runs import Comparison, comparisons, replay, steps

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..compiled import make_engine
-from ..diagnose import Diagnosis
-from ..diagnose.workbench import Fitted, Workbench
-from ..gauss_newton import GaussNewton
-from ..integration import discretise
-from ..recording import InputError, Recording
-from ..simulator import Simulator
+from .._base import InputError
+from ..data import Recording
+from ..diagnose import Diagnosis, Fitted, Workbench
+from ..engine import make_engine
+from ..optimise import GaussNewton
+from ..simulators import Simulator, discretise
 
 
 def steps(diagnosis: Diagnosis, name: str) -> int | None:

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnose import Diagnosis
-from ..diagnose.result import plain
-from ..parameters import ParameterSet
+from ..diagnose import Diagnosis, plain
+from ..models import ParameterSet
 from .fit_tables import _cell
 from .page import Block, Code, Table, Text, number_text
 

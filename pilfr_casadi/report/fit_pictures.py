@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from .. import plots
-from ..bla import robust_bla
-from ..fit import Fit
-from ..local_polynomial import plain_bla
-from ..recording import InputError, Recording
+from .._base import InputError
+from ..data import Recording
+from ..identify import Fit
+from ..linear import plain_bla, robust_bla
 from .fit_tables import mode_tables
 from .page import Block, Picture, Text
 

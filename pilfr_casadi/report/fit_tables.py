@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ..fit import Fit
-from ..lfr import BLOCKS
-from ..operators import Play, Stop
-from ..parameters import ParameterSet
+from ..identify import Fit
+from ..models import BLOCKS, ParameterSet, Play, Stop
 from .page import Block, Table, Text, number_text
 
 

@@ -17,8 +17,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from .._base import InputError
 from ..export import write_atomically
-from ..recording import InputError
 
 TONES = ("plain", "good", "warning", "bad")
 DPI = 160  # of pictures; twice what a screen shows
@@ -201,7 +201,7 @@ class Page:
 
     def html(self) -> str:
         """The page as one HTML document."""
-        from .. import __version__
+        from .._base import __version__
 
         return str(_template().render(page=self, version=__version__))
 

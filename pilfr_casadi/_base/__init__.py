@@ -1,0 +1,38 @@
+"""What every other folder stands on: errors with a sentence for the user, worker processes, interrupts and progress."""
+
+from typing import TYPE_CHECKING
+
+from .lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .errors import (
+        LARGEST as LARGEST,
+        InputError as InputError,
+        filled as filled,
+        is_number as is_number,
+        listed as listed,
+        numbers as numbers,
+        signal as signal,
+        usable as usable,
+        whole as whole,
+    )
+    from .interrupts import (
+        Clock as Clock,
+        Progress as Progress,
+        deferred_interrupt as deferred_interrupt,
+        insistent as insistent,
+        terminable as terminable,
+        time_limit as time_limit,
+        worker_pool as worker_pool,
+    )
+    from .progress import progress_bar as progress_bar
+    from .threads import (
+        one_at_a_time as one_at_a_time,
+        one_blas_thread as one_blas_thread,
+        processors as processors,
+        side_by_side as side_by_side,
+    )
+    from .version import __version__ as __version__
+    from .worker_process import Reply as Reply, close_hands as close_hands, do as do
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

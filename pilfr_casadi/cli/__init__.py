@@ -1,0 +1,10 @@
+"""The command line `pilfr`, a thin skin over the Python API."""
+
+from typing import TYPE_CHECKING
+
+from .._base.lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .app import main as main
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

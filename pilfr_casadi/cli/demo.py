@@ -1,0 +1,149 @@
+"""The demonstration, on recordings that come with the package: a rig identified, and a simulator diagnosed.
+
+The first recordings are the benchmark of Krikelis et al. (2024), Sec. 6, simulated exactly: a training multisine, a
+multisine test and a sine-sweep test, 50 dB signal-to-noise ratio. `python -m problems.masing_data` writes
+them. The others are of a rig of which the simulator `demo_data/rig.py` leaves something out; what it is stands in
+`python -m problems.demo_rig`, which writes them, and nowhere in the package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .._base import deferred_interrupt, insistent, progress_bar, worker_pool
+from ..data import Recording, read_csv
+from ..identify import Fit, fit
+from ..models import PILFR, Play, PrandtlIshlinskii
+from ..optimise import Status
+from ..simulators import load_simulator
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+INTERRUPTED = 130
+SETS = ("train", "multisine", "sweep")
+FLOOR = 0.0032
+# Krikelis et al. (2024), Table 2: NRMSE on training, multisine test and sweep test (25th percentiles of 100 starts)
+PUBLISHED: Mapping[str, tuple[float, float, float]] = {
+    "LTI": (0.3026, 0.2910, 0.4799),
+    "PI-LFR N=5": (0.0275, 0.0441, 0.0331),
+    "PI-LFR N=10": (0.0090, 0.0153, 0.0154),
+    "PI-LFR N=15": (0.0078, 0.0143, 0.0144),
+    "PI-LFR N=20": (0.0073, 0.0134, 0.0153),
+}
+SHOWN = ("LTI", "PI-LFR N=20")
+
+
+def demo_recordings() -> dict[str, Recording]:
+    """The recordings `train`, `multisine` and `sweep`: force u in N, displacement x2 in m, 120 Hz."""
+    out = {}
+    for name in SETS:
+        with as_file(files(__package__) / "demo_data" / f"{name}.csv") as path:
+            out[name] = read_csv(path, "u", "x2", units={"u": "N", "x2": "m"}, initial="zero", hold="zero", name=name)
+    return out
+
+
+def rig_recordings() -> dict[str, Recording]:
+    """The recordings `train` and `test` of the rig to diagnose: force in N, displacement x2 in m, 100 Hz."""
+    out = {}
+    for name in ("train", "test"):
+        with as_file(files(__package__) / "demo_data" / f"rig_{name}.csv") as path:
+            out[name] = read_csv(path, "force", "x2", initial="zero", hold="zero", name=name)
+    return out
+
+
+def structure(n: int) -> PILFR:
+    """The paper's model: five states and N plays, or none (n = 0)."""
+    return PILFR(5, PrandtlIshlinskii(Play, n) if n else None)
+
+
+def run_demo(folder: Path, workers: int) -> int:
+    """Identify one rig, diagnose the simulator of another; returns the exit status."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    status = identify_rig(folder, workers, console)
+    if status == INTERRUPTED:
+        return status
+    console.print()
+    return max(status, diagnose_rig(folder / "diagnosis", workers, console))
+
+
+def diagnose_rig(folder: Path, workers: int, console: Console) -> int:
+    """Find what a simulator leaves out, say where, what and how sure, write the report; returns the exit status."""
+    from ..diagnose import diagnose
+    from ..report import diagnosis_report
+
+    with as_file(files(__package__) / "demo_data" / "rig.py") as path:
+        simulator = load_simulator(path)
+    recordings = rig_recordings()
+    console.print("Another rig, with a simulator: two masses, linear springs and dampers. What does it leave out?")
+    try:
+        with progress_bar() as bar, insistent(bar) as progress:
+            found = diagnose(
+                simulator, recordings["train"], test=recordings["test"], effects=1, workers=workers, progress=progress
+            )
+        page = diagnosis_report(found, folder)
+    except KeyboardInterrupt:
+        console.print("Interrupted; the diagnosis was not written.")
+        return INTERRUPTED
+    console.print(found.sentence, soft_wrap=True, style="bold")
+    for effect in found.effects:
+        console.print(f"where     {effect.port}")
+        console.print(f"what      {effect.law.replace('_', ' ')}: {effect.sentence}", soft_wrap=True)
+        console.print(f"how sure  {effect.confidence:.2f}")
+    errors = found.errors["test"]
+    assert errors is not None
+    shown = f"{errors['before']:.4f} -> {errors['after']:.4f} -> noise floor {found.floor['nrmse']:.4f}"
+    console.print(f"NRMSE on the test recording, refitted without -> with: {shown}", soft_wrap=True)
+    console.print(f"{found.seconds:.1f} s. For the pictures open {page} in a browser.", soft_wrap=True)
+    return 0 if found.effects else 1
+
+
+def identify_rig(folder: Path, workers: int, console: Console) -> int:
+    """Identify, print the table beside the published one, write the report; returns the exit status."""
+    from rich.table import Table
+
+    from ..report import fit_report
+
+    recordings = demo_recordings()
+    console.print("A force drives one mass, its displacement is measured; a second mass hangs on a hysteretic spring.")
+    table = Table("model", *SETS, "time", title="NRMSE in simulation, in brackets Krikelis et al. (2024), Table 2")
+    found: list[Fit] = []
+    interrupted, target = False, folder / "model.json"
+    try:
+        with worker_pool(workers) as pool:
+            for row in SHOWN:
+                published = PUBLISHED[row]
+                n = 0 if row == "LTI" else int(row.partition("=")[2])
+                with progress_bar() as bar, insistent(bar) as progress:
+                    result = fit(structure(n), recordings["train"], executor=pool, progress=progress)
+                interrupted = result.status is Status.INTERRUPTED
+                errors = [result.nrmse(recordings[s]) for s in SETS]
+                cells = [f"{e:.4f} ({p:.4f})" for e, p in zip(errors, published, strict=True)]
+                table.add_row(f"{row}, interrupted" if interrupted else row, *cells, f"{result.seconds:.1f} s")
+                found.append(result)
+                if interrupted:
+                    break
+    except KeyboardInterrupt:
+        if not found:
+            raise
+        interrupted = True
+    table.add_row("noise floor", *(f"{FLOOR:.4f}" for _ in SETS), "")
+    console.print(table)
+    best = min(found, key=lambda f: f.train_nrmse[0]) if interrupted else found[-1]
+    try:
+        with deferred_interrupt():
+            best.save(target)
+        page = fit_report(best, [recordings["train"]], [recordings["multisine"], recordings["sweep"]], folder)
+    except KeyboardInterrupt:
+        console.print(f"Interrupted; the model is in {target}, a report was not written.", soft_wrap=True)
+        return INTERRUPTED
+    console.print("Interrupted; the best model so far was written." if interrupted else best.status.value)
+    console.print(f"The model is in {target}; for the pictures open {page} in a browser.", soft_wrap=True)
+    if interrupted:
+        return INTERRUPTED
+    return 0 if best.status.converged else 1

@@ -1,0 +1,144 @@
+"""A fitted model in do-mpc (Fiedler et al. 2023, Control Engineering Practice 140), which is an optional extra.
+
+The same problem as `PredictiveController`, states in, multiple shooting by IPOPT; where no output limit has to be given
+up the problem is the same. IPOPT is handed the model with its kinks, and may stop at one.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError, numbers
+from .asked import ENORMOUS, asked, planned_with
+from .mpc_cost import price_of
+
+Array = np.ndarray
+MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
+
+
+def imported() -> Any:
+    """The package do_mpc.
+
+    Raises
+    ------
+    InputError
+        If it is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it warns about each of its own optional parts
+            import do_mpc
+    except ImportError:
+        raise InputError(MISSING) from None
+    return do_mpc
+
+
+def do_mpc_model(function: Any) -> Any:
+    """A discrete `do_mpc.model.Model` of `F(x, u) -> (x_next, y)`: state x, input u, expression y, reference r.
+
+    Parameters
+    ----------
+    function : casadi.Function, Fit, KalmanFilter or Exported
+        What `PredictiveController` takes.
+
+    Returns
+    -------
+    do_mpc.model.Model
+        Set up; r is a time-varying parameter of as many entries as y.
+
+    Raises
+    ------
+    InputError
+        If do-mpc is not installed, or there is no such function.
+    """
+    function = planned_with(function)
+    model = imported().model.Model("discrete", "SX")
+    x = model.set_variable("_x", "x", (function.size1_in(0), 1))
+    u = model.set_variable("_u", "u", (function.size1_in(1), 1))
+    model.set_variable("_tvp", "r", (function.size1_out(1), 1))
+    following, y = function(x, u)
+    model.set_rhs("x", following)
+    model.set_expression("y", y)
+    model.setup()
+    return model
+
+
+def do_mpc_controller(
+    function: Any,
+    horizon: int,
+    reference: Array,
+    *,
+    inputs: tuple[Any, Any],
+    outputs: tuple[Any, Any] | None = None,
+    move: float = 1e-3,
+    y_scale: Any = None,
+    u_scale: Any = None,
+) -> Any:
+    """A `do_mpc.controller.MPC` that follows a reference; the arguments are those of `PredictiveController`.
+
+    Limits and scales are numbers or one for each signal.
+
+    Parameters
+    ----------
+    reference : array, shape (M, n_y)
+        The whole path, a row a sample; behind its end the last row is wanted.
+
+    Returns
+    -------
+    do_mpc.controller.MPC
+        Set up; set `x0` and `u0`, call `set_initial_guess()`, then `make_step(x)` at each sample. The sample number is
+        do-mpc's own time.
+
+    Raises
+    ------
+    InputError
+        If do-mpc is not installed, or an argument is unfit.
+    """
+    task = asked(function, horizon, inputs, outputs, None, move, y_scale, u_scale)
+    function, n_y = task.function, task.function.size1_out(1)
+    path = numbers(reference, "The reference")
+    path = path[:, None] if path.ndim == 1 else path
+    if path.ndim != 2 or not len(path) or path.shape[1] != n_y:
+        raise InputError(f"The reference has the shape {path.shape}; give (samples, {n_y}), a row a sample.")
+    low, high, u_size = (_constant(v, horizon) for v in (task.low, task.high, task.u_scale))
+    low_y, high_y, y_size = (_constant(v, horizon) for v in (task.low_y, task.high_y, task.y_scale))
+    do_mpc = imported()
+    model = do_mpc_model(function)
+    mpc = do_mpc.controller.MPC(model)
+    quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.tol": 1e-9}
+    mpc.set_param(n_horizon=horizon, t_step=1.0, store_full_solution=False, nlpsol_opts=quiet)
+    error = (model.aux["y"] - model.tvp["r"]) / y_size
+    mpc.set_objective(lterm=ca.sumsqr(error), mterm=ca.SX(0))
+    mpc.set_rterm(u=task.move / u_size**2)
+    mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = low, high
+    price = price_of(np.maximum(low_y - path, path - high_y) / y_size)
+    soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": price}
+    for name, side, limit in (("above", 1, high_y), ("below", -1, low_y)):
+        held = np.flatnonzero(np.abs(limit) < ENORMOUS)
+        if len(held):
+            mpc.set_nl_cons(name, side * (model.aux["y"] - limit)[held] / y_size[held], **soft)
+    template = mpc.get_tvp_template()
+
+    def wanted(now: float) -> Any:
+        for k in range(horizon + 1):
+            template["_tvp", k, "r"] = path[min(round(np.asarray(now).item()) + k, len(path) - 1)]
+        return template
+
+    mpc.set_tvp_fun(wanted)
+    mpc.setup()
+    return mpc
+
+
+def _constant(values: Array, samples: int) -> Array:
+    """One value for each signal, of values over the horizon."""
+    each = values.reshape(samples, -1)
+    if np.any(each != each[0]):
+        raise InputError(
+            "A limit or a scale changes over the horizon, which do-mpc cannot take here; give one for each signal, or "
+            "use PredictiveController."
+        )
+    return np.asarray(each[0])

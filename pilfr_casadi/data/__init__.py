@@ -1,0 +1,37 @@
+"""Recordings and what is done with them before any model: reading files, excitation signals, metrics, periods."""
+
+from typing import TYPE_CHECKING
+
+from .._base.lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .metrics import (
+        NOTHING_SENTENCE as NOTHING_SENTENCE,
+        explains_nothing as explains_nothing,
+        nrmse as nrmse,
+        rmse as rmse,
+        rmse_per_output as rmse_per_output,
+    )
+    from .multisines import multisine as multisine, orthogonal_multisine as orthogonal_multisine
+    from .periods import mean_period as mean_period, noise_weights as noise_weights, period_noise as period_noise
+    from .readers import (
+        column_names as column_names,
+        read as read,
+        read_csv as read_csv,
+        read_mat as read_mat,
+        read_npz as read_npz,
+        written_times as written_times,
+    )
+    from .recording import (
+        SAME_STEP as SAME_STEP,
+        Recording as Recording,
+        as_recordings as as_recordings,
+        check_for_identification as check_for_identification,
+        fingerprint as fingerprint,
+    )
+    from .repetition import by_input as by_input, keeps_its_period as keeps_its_period, repeats_itself as repeats_itself
+    from .signals import prbs as prbs, sine_sweep as sine_sweep, tukey_realizations as tukey_realizations
+    from .stack import read_stack as read_stack
+    from .timebase import TIME_NAMES as TIME_NAMES
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

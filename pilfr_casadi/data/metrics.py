@@ -1,0 +1,101 @@
+"""Errors of a simulated output against a measured one.
+
+The normalised error is that of Krikelis et al. (2024), Eq. 27, for each output by its own standard deviation,
+
+    e_i = sqrt( 1/M Σ_k ((y_i(k) − ŷ_i(k)) / σ_yi)² ),
+
+averaged over the outputs. A simulation that ran away (infinite or not a number) has an infinite error.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .._base import InputError
+
+NOTHING = 0.99  # NRMSE from which on a simulation is no better than a constant
+NOTHING_SENTENCE = "The model explains nothing of the training recordings: it is no better than a constant."
+
+
+def rmse_per_output(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> np.ndarray:
+    """Root mean square error of each output, in the unit of that output.
+
+    Parameters
+    ----------
+    y : array, (M, n_y) or (M,)
+        Measured outputs.
+    y_hat : array, of the shape of `y`
+        Simulated outputs.
+    skip : int
+        Leading samples that are not scored.
+
+    Returns
+    -------
+    errors : array, (n_y,)
+        Infinite where the simulation is not finite.
+
+    Raises
+    ------
+    InputError
+        When shapes differ, no sample is left after `skip`, or `y` is not finite.
+    """
+    measured, simulated = _scored(y, y_hat, skip)
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.sqrt(np.mean((measured - simulated) ** 2, axis=0))
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def rmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
+    """Root mean square error, averaged over the outputs; see :func:`rmse_per_output`."""
+    return float(np.mean(rmse_per_output(y, y_hat, skip)))
+
+
+def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
+    """Error relative to the standard deviation of the output, averaged over outputs.
+
+    Krikelis et al. (2024), Eq. 27; 0 is perfect, 1 is as good as the mean of the output.
+
+    Parameters
+    ----------
+    y : array, (M, n_y) or (M,)
+        Measured outputs.
+    y_hat : array, of the shape of `y`
+        Simulated outputs.
+    skip : int
+        Leading samples that are not scored.
+
+    Raises
+    ------
+    InputError
+        As :func:`rmse_per_output`, and when an output is constant.
+    """
+    errors = rmse_per_output(y, y_hat, skip)
+    measured, _ = _scored(y, y_hat, skip)
+    sigma = measured.std(axis=0)
+    still = np.flatnonzero(sigma <= 1e-14 * np.abs(measured).max(axis=0))
+    if still.size:
+        raise InputError(
+            f"output {still[0] + 1} of {len(sigma)} never changes, so an error relative to its standard deviation does "
+            "not exist; leave it out or use rmse."
+        )
+    return float(np.mean(errors / sigma))
+
+
+def explains_nothing(errors: Sequence[float]) -> bool:
+    """Whether NRMSEs on several recordings are all those of a constant, `NOTHING` or more."""
+    return bool(errors) and min(errors) >= NOTHING
+
+
+def _scored(y: np.ndarray, y_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np.ndarray]:
+    y, y_hat = np.asarray(y, dtype=float), np.asarray(y_hat, dtype=float)
+    if y.shape != y_hat.shape or y.ndim not in (1, 2):
+        raise InputError(
+            f"measured outputs have the shape {y.shape} and simulated ones {y_hat.shape}; give both as "
+            "(samples, outputs)."
+        )
+    if not 0 <= skip < len(y):
+        raise InputError(f"skip is {skip} of {len(y)} samples; at least one sample must be scored.")
+    measured, simulated = (a[skip:].reshape(len(y) - skip, -1) for a in (y, y_hat))
+    if not np.isfinite(measured).all():
+        raise InputError("the measured outputs hold values that are not finite; repair or cut out that piece.")
+    return measured, simulated

@@ -1,0 +1,223 @@
+r"""A linear stand-in for a simulation of which only inputs and outputs are known, in modes with names.
+
+A discrete model identified from the simulation's own record is taken to continuous time and split into real modes (see
+`modes`). A pair of eigenvalues `-ζ ω ± j ω √(1 - ζ²)` becomes a displacement `q` and its rate `v`,
+
+.. math:: \dot q = v + b_q u, \qquad \dot v = -\omega^2 q - 2 ζ ω v + b_v u, \qquad y = c_q q + c_v v,
+
+a real eigenvalue `-r` the equation `q' = -r q + b u`. Frequencies, dampings and gains are parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError
+from ..data import Recording, as_recordings, check_for_identification, nrmse
+from ..identify import fit
+from ..models import PILFR, Parameter
+from ..simulators import Named, Port, Simulator
+from .gates import Gate
+from .modes import Mode, modes, to_continuous
+
+POOR = 0.02  # NRMSE above which a simulation is not linear enough for a surrogate to stand for it
+TOO_POOR = (
+    "The linear model is poor: the simulation is not linear there, and what the model misses may show up as missing "
+    "physics. Give the simulator itself where it can be had."
+)
+FREE = 0.3  # share by which parameters may move
+EXACT = 1e-3  # NRMSE at which no higher order is looked for
+HIGHEST = 8
+SMALL = 1e-3  # share of an output below which a coefficient is held
+# how inputs drive a mode's displacement and its rate, and how outputs see them
+GAINS, SEEN = ("gain on the displacement of", "gain of"), ("seen in", "rate seen in")
+Array = np.ndarray
+
+
+def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = None) -> tuple[Simulator, float]:
+    """Identify a linear simulator from what a simulation was given and what it answered.
+
+    Parameters
+    ----------
+    recordings : Recording or sequence of Recording
+        Inputs and outputs of the simulation.
+    nx : int, optional
+        States; chosen on the recordings where left out.
+
+    Returns
+    -------
+    Simulator
+        In modes, with the ports `mode:<frequency> Hz`; its parameters may move by 30 %.
+    float
+        Its NRMSE on the recordings, in free-run simulation from the fitted initial state.
+
+    Raises
+    ------
+    InputError
+        If nothing can be identified from the recordings.
+    """
+    records = check_for_identification(as_recordings(recordings), 40)
+    hold = next((r.hold for r in records if r.hold), None)
+    # the states of the sampled model are not those of the simulation: with interpolated inputs rest is not zero there
+    records = tuple(r if r.period else r.with_(initial="estimate") for r in records)
+    found: list[tuple[float, Simulator]] = []
+    for n in range(HIGHEST + 1) if nx is None else (nx,):  # a simulation has no noise: its order shows by itself
+        one = _identified(records, n, hold)
+        found += [one] if one is not None else []
+        if found and found[-1][0] < EXACT:
+            break
+    if not found:
+        raise InputError(
+            "No linear model in continuous time follows the simulation; give the simulator itself, or a simulation "
+            "at a shorter step."
+        )
+    least = min(error for error, _ in found)
+    error, simulator = next(f for f in found if f[0] <= max(1.1 * least, EXACT))
+    return simulator, error
+
+
+def told_of_surrogate(error: float) -> tuple[Gate, ...]:
+    """A note on what misses its simulation by an NRMSE of `error`; none where that is zero."""
+    if not error:
+        return ()
+    words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
+    words += f" {TOO_POOR}" if error > POOR else ""
+    return (Gate("simulation", "surrogate", error, words, False),)
+
+
+def _identified(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:
+    try:
+        found = fit(PILFR(n), records)
+    except InputError:
+        return None
+    p = found.parameters
+    a, b, c, d = (p[k] for k in ("A", "B_u", "C_y", "D_yu"))
+    options = []
+    for between in (hold,) if hold else ("zero", "linear"):
+        try:
+            continuous = to_continuous(a, b, c, d, records[0].dt, between)
+        except InputError:
+            continue
+        direct = np.max(np.abs(continuous[3]) / np.maximum(np.abs(d).max(), 1e-300), initial=0.0)
+        options.append((float(direct), between, continuous))
+    if not options:
+        return None
+    # a simulation without direct feed-through tells by it how its inputs went between the samples
+    _, between, matrices = min(options, key=lambda o: o[0]) if not hold else options[0]
+    simulator = replace(modal_simulator(matrices, np.ravel(p["y_0"]), records[0]), hold=between)
+    errors = [nrmse(r.y, found.simulate(r), skip=r.skip) for r in records]
+    return float(np.mean(errors)), simulator
+
+
+def _free(mode: Mode, slow: float) -> Mode:
+    """A mode, one too slow to swing in a recording as a mass with next to no spring."""
+    if not mode.second_order or mode.spring or abs(mode.value) > slow:
+        return mode
+    return replace(mode, spring=(abs(mode.value) ** 2, -2 * mode.value.real))
+
+
+def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, like: Recording) -> Simulator:
+    """A simulator in modes, with the names of a recording.
+
+    Parameters
+    ----------
+    matrices : A, B, C, D
+        In continuous time.
+    offset : array, shape (n_y,)
+        Constants of the outputs.
+    """
+    slow = 0.05 / (len(like) * like.dt)
+    found = [_free(mode, slow) for mode in modes(*matrices[:3])]
+    names = _distinct([mode.label(slow) for mode in found])
+    parameters: dict[str, Parameter] = {}
+    states: list[str] = []
+    inputs, outputs = like.inputs, like.outputs
+
+    def free(name: str, value: float, unit: str = "", size: float = 0.0) -> None:
+        reach = FREE * max(abs(value), 0.1 * size)
+        held = abs(value) <= SMALL * size
+        parameters[name] = Parameter(value, unit=unit, bounds=(value - reach, value + reach), fixed=held)
+
+    for i, (name, mode) in enumerate(zip(names, found, strict=True), 1):
+        of = f"mode {name}: "
+        # v is this much larger than q
+        speed = np.array([1.0, max(abs(mode.value), 1 / (len(like) * like.dt))])[: len(mode.into)]
+        entering = float(np.max(np.abs(mode.into) * (speed[::-1])[:, None]))
+        leaving = float(np.max(np.abs(mode.out) * speed))
+        if mode.spring:
+            rate = max(abs(mode.value), 1 / (len(like) * like.dt))
+            free(f"{of}stiffness", mode.spring[0], "1/s^2", rate**2)
+            free(f"{of}drag", mode.spring[1], "1/s", rate)
+            states += [f"q{i}", f"v{i}"]
+        elif mode.second_order:
+            w = abs(mode.value)
+            free(f"{of}frequency", w / (2 * np.pi), "Hz")
+            free(f"{of}damping", -mode.value.real / w)
+            states += [f"q{i}", f"v{i}"]
+        else:
+            free(f"{of}rate", -mode.value.real, "1/s")
+            states.append(f"q{i}")
+        for row, kind, faster in zip(mode.into, GAINS[-len(speed) :], speed[::-1], strict=True):
+            for other, value in zip(inputs, row, strict=True):
+                if value == 1.0:  # the gain of the strongest input is one; what is seen of the mode has its size
+                    parameters[f"{of}{kind} {other}"] = Parameter(1.0, fixed=True)
+                else:
+                    free(f"{of}{kind} {other}", float(value), size=entering / faster)
+        for column, kind, faster in zip(mode.out.T, SEEN, speed, strict=False):
+            for other, value in zip(outputs, column, strict=True):
+                free(f"{of}{kind} {other}", float(value), like.units.get(other, ""), leaving / faster)
+    spreads, moved = np.std(like.y[like.skip :], axis=0), np.std(like.u, axis=0)
+    for name, row, spread in zip(outputs, matrices[3], spreads, strict=True):
+        for other, value, push in zip(inputs, row, moved, strict=True):
+            free(f"direct: {other} in {name}", float(value), size=float(spread / max(push, 1e-300)))
+    for name, value, spread in zip(outputs, offset, spreads, strict=True):
+        parameters[f"offset: {name}"] = Parameter(value, bounds=(value - spread, value + spread))
+
+    def driven(u: Named, p: Named, of: str, kind: str) -> Any:
+        return sum((p[f"{of}{kind} {n}"] * u[n] for n in inputs), start=ca.SX(0))
+
+    def dynamics(x: Named, u: Named, p: Named) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for i, (name, mode) in enumerate(zip(names, found, strict=True), 1):
+            of = f"mode {name}: "
+            if mode.second_order:
+                q, v = x[f"q{i}"], x[f"v{i}"]
+                if mode.spring:
+                    pull = p[f"{of}stiffness"] * q + p[f"{of}drag"] * v
+                else:
+                    w = 2 * np.pi * p[f"{of}frequency"]
+                    pull = w**2 * q + 2 * p[f"{of}damping"] * w * v
+                out[f"q{i}"] = v + driven(u, p, of, GAINS[0])
+                out[f"v{i}"] = driven(u, p, of, GAINS[1]) - pull
+            else:
+                out[f"q{i}"] = -p[f"{of}rate"] * x[f"q{i}"] + driven(u, p, of, GAINS[1])
+        return out
+
+    def seen(x: Named, u: Named, p: Named) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for name in outputs:
+            y = p[f"offset: {name}"] + sum((p[f"direct: {n} in {name}"] * u[n] for n in inputs), start=ca.SX(0))
+            for i, (label, mode) in enumerate(zip(names, found, strict=True), 1):
+                for state, kind in zip("qv", SEEN[: len(mode.into)], strict=False):
+                    y = y + p[f"mode {label}: {kind} {name}"] * x[f"{state}{i}"]
+            out[name] = y
+        return out
+
+    ports = tuple(_port(f"mode:{name}", i, mode) for i, (name, mode) in enumerate(zip(names, found, strict=True), 1))
+    return Simulator(dynamics, seen, tuple(states), inputs, parameters, ports, units=dict(like.units))
+
+
+def _port(name: str, i: int, mode: Mode) -> Port:
+    if not mode.second_order:
+        return Port(name, {f"q{i}": -1.0}, lambda x: x[f"q{i}"])
+    return Port(name, {f"v{i}": -1.0}, lambda x: x[f"q{i}"], lambda x: x[f"v{i}"])
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Equal names with a number behind."""
+    return [n if names.count(n) == 1 else f"{n} ({names[:k].count(n) + 1})" for k, n in enumerate(names)]

@@ -1,0 +1,11 @@
+"""How a model is run: sensitivities by a matrix recursion, as generated C or in CasADi's virtual machine."""
+
+from typing import TYPE_CHECKING
+
+from .._base.lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .compiled import compiler as compiler, make_engine as make_engine
+    from .sensitivities import Engine as Engine, VirtualMachine as VirtualMachine
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

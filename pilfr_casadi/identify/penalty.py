@@ -1,0 +1,148 @@
+r"""An L1 penalty on an element's weights that means something: the scales it could hide in are held.
+
+    minimise  1/2 mean(e²) + l1 Σ w_ij
+
+The outputs of a PI-LFR do not change under `w_i -> w_i / μ, (B_w, D_yw)_i -> μ (...)`, nor under a scaling of z with
+its thresholds and of the states, in every combination (`orbit`): with all blocks free the penalty would be driven to
+zero by units alone. Nor is it enough to hold a product such as `C_z B_w`, which no change of the states moves: it is
+the first sample of the response from w to z, next to nothing in a mechanical system, and costs next to nothing to mend.
+So
+
+1. the problem is solved without the penalty;
+2. the weights of each channel are scaled to a sum of one, which `B_w` and `D_yw` take up, unless something fixed,
+   bounded or given a prior stands against it: `l1` then is in units of the cost, for all of a channel's weights;
+3. plays or stops of a channel with nearly the same threshold are merged into one, as long as the objective grows by
+   no more than `SLACK` in all: to the penalty one large weight and two halves of it are the same;
+4. the problem is solved with the penalty from there, with every linear block, every parameter of the operators and all
+   that is zero already held at its value; weights, thresholds, `y_0` and the initial states are free.
+
+What is fixed in the result is what the user fixed. Tibshirani (1996) is the penalty's source; the simulation error is
+that of Krikelis et al. (2024), Eq. 20.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, is_number
+from ..models import LAYER, Model, Parameter, ParameterSet, Play, PrandtlIshlinskii, Stop
+from ..optimise import Problem, Solution
+
+SLACK = 0.02  # share of the objective that merging operators may cost before the last solve
+
+
+def check_penalty(l1: dict[str, float], parameters: ParameterSet, linear: bool) -> None:
+    """Refuse a penalty that cannot be used, before any long work.
+
+    Raises
+    ------
+    InputError
+        If the model is linear, a name is unknown, a weight is no number of 0 or more, or a parameter may be negative.
+    """
+    if linear:
+        raise InputError("An L1 penalty was asked for on a linear model; it acts on an element's weights, give one.")
+    for name, weight in l1.items():
+        lower = parameters.lower[parameters.position(name)]
+        if not is_number(weight) or not 0 <= weight < np.inf:
+            raise InputError(f"The L1 weight of {name!r} is {weight!r}; give a number, 0 or more.")
+        if np.any(lower < 0):
+            raise InputError(f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior.")
+
+
+def unit_weights(model: Model) -> Model:
+    """The same outputs with the weights of each channel at a sum of one, where nothing stands against it."""
+    parameters = model.parameters
+    if not isinstance(model.element, PrandtlIshlinskii):
+        return model
+    values = {name: p.value.copy() for name, p in parameters.items()}
+    for i, total in enumerate(values["w"].sum(axis=1)):
+        entries = (("w", np.s_[i], 0.0), ("B_w", np.s_[:, i], -np.inf), ("D_yw", np.s_[:, i], -np.inf))
+        if total > 0 and all(_scales(parameters[name], part, low) for name, part, low in entries):
+            values["w"][i] /= total
+            values["B_w"][:, i] *= total
+            values["D_yw"][:, i] *= total
+    return model.with_parameters(parameters.at(parameters.pack(values)))
+
+
+def _scales(p: Parameter, part: Any, low: float) -> bool:
+    """Whether entries may be scaled: free and not bounded but by `low`, or fixed at zero; no prior."""
+    fixed = p.fixed[part]
+    free = ~fixed & (p.bounds[0][part] == low) & np.isinf(p.bounds[1][part])
+    return p.prior is None and bool(np.all(free | (fixed & (p.value[part] == 0))))
+
+
+def element_alone(model: Model, penalised: Iterable[str]) -> Model:
+    """The model with everything held but `y_0`, what is penalised and, with weights or thresholds, both of them."""
+    loose = {"y_0", *penalised} | (set(LAYER) if set(LAYER) & set(penalised) else set())
+    held = {name: {"fixed": True, "prior": None} for name in model.parameters if name not in loose}
+    return model.with_parameters(model.parameters.change(**held))
+
+
+def without_idle(model: Model) -> Model:
+    """The model with operators of no weight held, so that they do not split from another one again."""
+    p = model.parameters
+    if not isinstance(model.element, PrandtlIshlinskii):
+        return model
+    idle = p["w"].value == 0
+    return model.with_parameters(p.change(**{name: {"fixed": p[name].fixed | idle} for name in LAYER}))
+
+
+def merged(held: Problem, theta: np.ndarray) -> np.ndarray:
+    """Variables with operators of like thresholds merged, the nearest first; see above."""
+    element, parameters = held.model.element, held.model.parameters
+    if not (isinstance(element, PrandtlIshlinskii) and isinstance(element.operator, Play | Stop)):
+        return theta
+    at = np.where(held.free, np.cumsum(held.free) - 1, -1)
+    shape = (element.channels, element.n)
+    w_at, r_at = (at[parameters.position(name)].reshape(shape, order="F") for name in LAYER)
+    size, n_x = held.model.n_x + held.model.n_s, held.model.n_x
+    first = range(int(held.free.sum()), held.size, size)
+    limit = (1 + SLACK) * held.cost(theta)
+
+    def trial(i: int, a: int, b: int) -> np.ndarray:
+        """One operator of channel i in the place of two."""
+        out, w, r = theta.copy(), theta[w_at[i]], theta[r_at[i]]
+        share = w[b] / (w[a] + w[b])
+        out[w_at[i, a]], out[w_at[i, b]] = w[a] + w[b], 0.0
+        out[r_at[i, a]] = (1 - share) * r[a] + share * r[b]
+        for start in first:
+            memory = theta[start + n_x + i * element.n :][: element.n]
+            out[start + n_x + i * element.n + a] = (1 - share) * memory[a] + share * memory[b]
+        return out
+
+    for i in range(element.channels):
+        if np.any(w_at[i] < 0) or np.any(r_at[i] < 0):
+            continue
+        better = True
+        while better:
+            better = False
+            used = sorted(np.flatnonzero(theta[w_at[i]] > 0), key=lambda j: theta[r_at[i, j]])
+            pairs = sorted(pairwise(used), key=lambda ab: theta[r_at[i, ab[1]]] - theta[r_at[i, ab[0]]])
+            for a, b in pairs:
+                there = trial(i, int(a), int(b))
+                if np.all((there >= held.lower) & (there <= held.upper)) and held.cost(there) <= limit:
+                    theta, better = there, True
+                    break
+    return theta
+
+
+def restored(solution: Solution, held: Problem, problem: Problem) -> Solution:
+    """The solution of a problem with parameters held, in the variables of the problem without."""
+    n_held, n = int(held.free.sum()), int(problem.free.sum())
+    theta = np.concatenate([held.parameters(solution.theta)[problem.free], solution.theta[n_held:]])
+    multipliers = np.zeros(problem.size + len(problem.g_lower))
+    if len(solution.multipliers) == held.size + len(held.g_lower):
+        where = np.flatnonzero(held.free[problem.free])
+        multipliers[where], multipliers[n:] = solution.multipliers[:n_held], solution.multipliers[n_held:]
+    return replace(solution, theta=theta, multipliers=multipliers)
+
+
+def sentence(model: Model, l1: dict[str, float]) -> str:
+    """How many entries the penalty has brought to zero."""
+    counts = [f"{np.sum(model.parameters[k].value == 0)} of {model.parameters[k].size} entries of {k}" for k in l1]
+    return f"L1 penalty: {', '.join(counts)} are exactly zero; the linear blocks were held while it acted"

@@ -1,0 +1,286 @@
+r"""Fewer operators, stronger priors: a path of fits over the strength of a regularization, chosen by validation.
+
+Along the path the objective is that of Krikelis et al. (2024), Eq. 20, with
+
+    l1 Σ_j w_ij        (what is not needed gets exactly no weight, is taken out, and the rest is fitted again), or
+    s ((θ - m) / σ)²   (a prior of mean m and standard deviation σ, s times as strong).
+
+Every fit is judged by its free-run simulation of a validation recording, which none of them has seen; recommended is
+the strongest regularization whose validation error is within a margin of the smallest. No test recording comes in.
+Penalised estimates are biased towards zero, hence the second fit (relaxed lasso, Meinshausen 2007). It is done with the
+operators that are left, and with as many spread in several ways over the density that the first fit has found, which
+holds their weights; validation chooses here too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, Progress, is_number
+from ..data import Recording, as_recordings, fingerprint
+from ..models import LAYER, PILFR, PrandtlIshlinskii
+from ..optimise import Status
+from .fitting import fit as identify
+from .job import following
+from .multistart import POLISH, polish
+from .result import Fit
+from .search import Candidate
+from .thinning import thinned
+
+FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # of priors
+STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of L1, in units of the objective that is reached without
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RegularizationPath:
+    """Fits over the strength of a regularization.
+
+    Attributes
+    ----------
+    strengths : tuple of float
+        Weakest first; 0 is the fit without.
+    fits : tuple of Fit
+        One a strength.
+    operators : tuple of int
+        Operators that each of them has.
+    train, validation : tuple of float
+        Their NRMSE (Eq. 27) on both.
+    recommended : int
+        Index of the strongest regularization whose validation error is within `margin` of the smallest.
+    margin : float
+        That margin, as a share.
+    """
+
+    strengths: tuple[float, ...]
+    fits: tuple[Fit, ...]
+    operators: tuple[int, ...]
+    train: tuple[float, ...]
+    validation: tuple[float, ...]
+    recommended: int
+    margin: float
+
+    @property
+    def fit(self) -> Fit:
+        """The fit that is recommended."""
+        return self.fits[self.recommended]
+
+    def __repr__(self) -> str:
+        rows = [f"{'strength':>10}  {'operators':>9}  {'train':>9}  {'validation':>10}"]
+        columns = zip(self.strengths, self.operators, self.train, self.validation, strict=True)
+        for i, (s, n, a, b) in enumerate(columns):
+            mark = "  <- recommended" if i == self.recommended else ""
+            rows.append(f"{s:>10.3g}  {n:>9}  {a:>9.5f}  {b:>10.5f}{mark}")
+        return "\n".join([*rows, f"the strongest within {100 * self.margin:g} % of the smallest validation error"])
+
+
+def operators_used(fit: Fit) -> int:
+    """Operators of some weight, over all channels; 0 without an element of operators."""
+    return int(np.sum(fit.parameters["w"] > 0)) if "w" in fit.parameters else 0
+
+
+def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> Fit:
+    """Take the operators without weight out of a fit, and fit the rest again without a penalty.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of a PI-LFR with a Prandtl-Ishlinskii element, usually with an L1 penalty on `w`.
+    train : Recording or sequence of Recording
+        What it was fitted to.
+    options
+        As for `fit`: `solver`, `engine`, and `stable`, `constraints`, `noise`, `weights`, which are as the fit has them
+        where they are left out.
+
+    Returns
+    -------
+    Fit
+        With as many operators a channel as the fullest channel needs, at least one.
+
+    Raises
+    ------
+    InputError
+        If the model has no such element.
+    """
+    structure = getattr(fit, "structure", None)
+    if structure is None or not isinstance(structure.element, PrandtlIshlinskii):
+        raise InputError(
+            "Only a PI-LFR with a Prandtl-Ishlinskii element has operators to take out; give a fit of one."
+        )
+    element, weights = structure.element, fit.parameters["w"]
+    n = max(1, int(np.max(np.sum(weights > 0, axis=1))))
+    # the operators that stay, a row of indices a channel in their order; those without weight come last
+    kept = np.sort(np.argsort(weights <= 0, axis=1, kind="stable")[:, :n], axis=1)
+    full = weights.shape
+
+    def some(value: Any) -> Any:
+        array = np.asarray(value, dtype=float)
+        return np.take_along_axis(np.broadcast_to(array, full), kept, axis=1) if array.ndim else array
+
+    smaller = replace(
+        structure,
+        element=replace(element, n=n),
+        fixed={k: some(v) if k in LAYER else v for k, v in structure.fixed.items()},
+        bounds={k: (some(v[0]), some(v[1])) if k in LAYER else v for k, v in structure.bounds.items()},
+        priors={k: (some(v[0]), some(v[1])) if k in LAYER else v for k, v in structure.priors.items()},
+    )
+    old = fit.model
+    values = {k: some(v) if k in LAYER else v for k, v in fit.parameters.items()}
+    model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
+    memory = (np.arange(element.channels)[:, None] * element.n + kept).ravel()
+    initial = {key: np.concatenate([s[: old.n_x], s[old.n_x :][memory]]) for key, s in fit.initial.items()}
+    again = identify(replace(fit, model=model, structure=smaller, initial=initial), train, **options)
+    return again if again.status is Status.INTERRUPTED else polished(again, train, **options)
+
+
+def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
+    error = fit.nrmse(recordings)
+    return error if np.isfinite(error) else np.inf
+
+
+def polished(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = None, **options: Any) -> Fit:
+    """A fit with its thresholds placed anew, as the search does with its best starts, where that is no worse.
+
+    The weights are then held near a smooth density by a weak prior (`multistart.polish`).
+    """
+    structure, job = fit.structure, following(fit, train, solver=solver or POLISH, **options)
+    assert structure is not None
+    search = job.search(structure, {}, level=float(np.mean(fit.train_nrmse)))
+    problem = search.problem(fit.model)
+    states = [fit.initial_state(r) for r in job.recordings if r.begins == "estimate"]
+    theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
+    error = float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
+    best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))
+    if best.model is fit.model and best.error >= error:
+        return fit
+    problem = job.problem(best.model, best.error)
+    solution = job.solve(problem, "solve", best.theta)
+    found = job.result(best.model, structure, problem, solution, note=best.note)
+    return replace(found, seconds=found.seconds + fit.seconds, linear=fit.linear, linear_nrmse=fit.linear_nrmse)
+
+
+def regularization_path(
+    fit: Fit,
+    train: Recording | Sequence[Recording],
+    validation: Recording | Sequence[Recording],
+    *,
+    strengths: Sequence[float] | None = None,
+    priors: Mapping[str, tuple[Any, Any]] | None = None,
+    margin: float = 0.05,
+    progress: Progress | None = None,
+    **options: Any,
+) -> RegularizationPath:
+    """Fit with a regularization of growing strength, and choose by validation.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fit without regularization, of a PI-LFR; every fit of the path begins there.
+    train : Recording or sequence of Recording
+        What it was fitted to.
+    validation : Recording or sequence of Recording
+        What is judged on: no training recording, and none that is to be a test afterwards.
+    strengths : sequence of float
+        L1 weights on `w` (default: 1 to 1000 times the objective of the fit), or with `priors` factors on their
+        weight (default: 0.01 to 100).
+    priors : mapping
+        `(mean, std)` by parameter name, in place of the L1 penalty on `w`.
+    margin : float
+        Share of the smallest validation error that a stronger regularization may cost.
+    progress : callable
+        Gets ("path", done, total, smallest validation error so far).
+    options
+        As for `fit`: `solver`, `engine`, and `stable`, `constraints`, `noise`, `weights`, which are as the fit has them
+        where they are left out.
+
+    Returns
+    -------
+    RegularizationPath
+
+    Raises
+    ------
+    InputError
+        If the fit is not one of a PI-LFR, a strength or the margin is unfit, or validation is training.
+    """
+    structure, seen, judged = _checked(fit, train, validation, priors is None)
+    given = _strengths(fit.solution.cost if priors is None else None, strengths, margin)
+    fits, errors = [fit], [fit.nrmse(judged)]
+    thin: dict[int, tuple[Fit, ...]] = {}
+    for i, strength in enumerate(given):
+        if priors is None:
+            found = _sparser(fit, seen, judged, strength, thin, options)
+        else:
+            scaled = {k: (m, np.asarray(s, dtype=float) / np.sqrt(strength)) for k, (m, s) in priors.items()}
+            held = replace(structure, priors={**structure.priors, **scaled})
+            model = fit.model.with_parameters(
+                fit.model.parameters.change(**{k: {"prior": held.priors[k]} for k in scaled})
+            )
+            found = _whole(identify(replace(fit, structure=held, model=model), seen, **options))
+        fits.append(found)
+        errors.append(found.nrmse(judged))
+        if progress:
+            progress("path", i + 1, len(given), float(np.nanmin(errors)))
+    usable = np.where(np.isfinite(errors), errors, np.inf)
+    recommended = int(np.max(np.flatnonzero(usable <= (1 + margin) * np.min(usable))))
+    return RegularizationPath(
+        strengths=(0.0, *map(float, given)),
+        fits=tuple(fits),
+        operators=tuple(operators_used(f) for f in fits),
+        train=tuple(f.nrmse(seen) for f in fits),
+        validation=tuple(map(float, errors)),
+        recommended=recommended,
+        margin=float(margin),
+    )
+
+
+def _checked(
+    fit: Any, train: Any, validation: Any, sparse: bool
+) -> tuple[PILFR, tuple[Recording, ...], tuple[Recording, ...]]:
+    """Structure, training and validation recordings of a path, which for a sparse one needs operators."""
+    if not isinstance(fit, Fit):
+        raise InputError(f"A regularization path was asked for of a {type(fit).__name__}; give a Fit.")
+    structure, seen, judged = fit.structure, as_recordings(train), as_recordings(validation)
+    if structure is None or (sparse and not isinstance(structure.element, PrandtlIshlinskii)):
+        raise InputError("A regularization path needs a fit of a PI-LFR with an element; give one.")
+    if {fingerprint(r) for r in seen} & {fingerprint(r) for r in judged}:
+        raise InputError("A validation recording is a training recording too; give one that was not fitted.")
+    return structure, seen, judged
+
+
+def _strengths(unit: float | None, strengths: Any, margin: Any) -> list[float]:
+    """Strengths in ascending order: those given, else those of a penalty in units of an objective, else of priors."""
+    usual = FACTORS if unit is None else [unit * s for s in STRENGTHS]
+    asked: Any = usual if strengths is None else strengths
+    listed = isinstance(asked, Sequence | np.ndarray) and all(is_number(s) and 0 < s < np.inf for s in asked)
+    if not (listed and len(asked) and is_number(margin) and 0 <= margin < np.inf):
+        raise InputError(
+            f"strengths = {asked!r} and margin = {margin!r} were given; give one strength or more, all above zero, and "
+            "a margin of zero or more."
+        )
+    return sorted({float(s) for s in asked})
+
+
+def _sparser(
+    fit: Fit,
+    seen: tuple[Recording, ...],
+    judged: tuple[Recording, ...],
+    strength: float,
+    thin: dict[int, tuple[Fit, ...]],
+    options: Mapping[str, Any],
+) -> Fit:
+    """The better on validation of what a penalty leaves and of as many operators spread anew (kept in `thin`)."""
+    pruned = _whole(prune(_whole(identify(fit, seen, l1={"w": strength}, **options)), seen, **options))
+    n = max(1, pruned.structure.element.n)  # type: ignore[union-attr]
+    if n not in thin:
+        thin[n] = tuple(_whole(f) for f in thinned(fit, seen, n, **options))
+    return min((pruned, *thin[n]), key=lambda f: _error(f, judged))
+
+
+def _whole(fit: Fit) -> Fit:
+    """The fit, which was not interrupted; else the interrupt goes on."""
+    if fit.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    return fit

@@ -1,0 +1,141 @@
+"""Force of a law along given local signals, for every shape at once: what the screen looks at."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import one_at_a_time
+from ..models import accumulated, mapped
+from .base import Law, Local
+
+
+class _Values:
+    """Parameters by name, `p.k` or `p["k"]`."""
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        self.__dict__.update(values)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.__dict__[name]
+
+
+def columns(law: Law) -> int:
+    """Columns a shape has: one a strength, or one for a law without."""
+    p = law.parameters()
+    return max(1, sum(p[name].size for name in law.strength))
+
+
+def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarray:
+    """Force at unit strength for each shape, shape (M, len(shapes), columns).
+
+    Laws with states or memory start each recording from rest: at zero, or where z stands; see `Local.from_zero`.
+    """
+    if not shapes:
+        return np.zeros((len(local.z), 0, columns(law)))
+    kind: Any = type(law)
+    if law.scaled_by:
+        bare = trace(kind.__base__(law.values, law.limits), local, shapes)
+        return np.asarray(bare * local.inputs[law.scaled_by][:, None, None])
+    step = _step(kind, len(shapes), local.dt if law.shifts else 0.0)
+    p = law.at(shapes[0]).parameters()
+    names = [name for name in p if name not in law.strength]
+    table = [np.ravel(shape.get(n, p[n].value)) for shape in shapes for n in names]
+    vector = np.concatenate([*table, [local.dt]])
+    found, at = [], 0
+    for i, m in enumerate(local.lengths):
+        zs, dzs = local.z[at : at + m], local.dz[at : at + m]
+        following = (np.append(values[1:], values[-1]) for values in (zs, dzs))
+        rows = np.column_stack([zs, dzs, local.dt * np.arange(m), *following])
+        at += m
+        if step.size1_in(0):
+            same = np.broadcast_to(vector, (m, len(vector)))
+            first = kind().standing(0.0 if any(local.from_zero[i : i + 1]) else zs[0])
+            found.append(accumulated(step, np.tile(first, len(shapes)), rows, same)[1])
+        else:
+            found.append(mapped(step, np.zeros((m, 0)), rows, vector)[1][:, :, 0])
+    forces = np.concatenate(found) if len(found) > 1 else found[0]
+    return forces.reshape(len(local.z), len(shapes), -1)
+
+
+@one_at_a_time
+@functools.lru_cache(maxsize=256)
+def _step(kind: Any, lanes: int, grid: float) -> ca.Function:
+    """`(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`."""
+    lane = _lane(kind, grid)
+    n, sizes = lane.size1_in(0), lane.size1_in(2)
+    memory, signals = ca.SX.sym("memory", n * lanes), ca.SX.sym("signals", 5)
+    vector = ca.SX.sym("shapes", sizes * lanes + 1)
+    spans = [(slice(i * n, (i + 1) * n), slice(i * sizes, (i + 1) * sizes)) for i in range(lanes)]
+    found = [lane(memory[own], signals, vector[shape], vector[-1]) for own, shape in spans]
+    after, forces = zip(*found, strict=True)
+    return ca.Function("trace", [memory, signals, vector], [ca.vertcat(*after), ca.vertcat(*forces)])
+
+
+@one_at_a_time
+@functools.lru_cache(maxsize=256)
+def _lane(kind: Any, grid: float) -> ca.Function:
+    """`(memory, [z, dz, t, z_next, dz_next], shape, dt) -> (next memory, forces)` of one shape."""
+    law = kind()
+    law = law.on_grid(grid) if law.shifts else law
+    p = law.parameters()
+    names = [name for name in p if name not in law.strength]
+    sizes = [p[n].size for n in names]
+    vector, signals, h = ca.SX.sym("shape", sum(sizes)), ca.SX.sym("signals", 5), ca.SX.sym("h")
+    z, dz, t, following, dz_next = ca.vertsplit(signals)
+    n_q, n_s = law.order, int(getattr(law, "memory", 0)) if hasattr(law, "step") else 0
+    own = ca.SX.sym("memory", n_q + n_s)
+    edges = np.cumsum([0, *sizes])
+    shape = {n: vector[int(a) : int(b)] for n, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
+    forces = []
+    for strength in _units(law):
+        values = _Values({**shape, **strength})
+        if n_s:
+            rate = {"dz": dz} if "dz" in law.reads() else {}
+            w, end = law.step(z, own, values, **rate)
+        else:
+            w = _call(law.force, z=z, dz=dz, q=own, t=t, p=values)
+            end = _advance(law, own, (z, following), (dz, dz_next), t, values, h) if n_q else own
+        forces.append(w)
+    return ca.Function("lane", [own, signals, vector, h], [ca.densify(end), ca.densify(ca.vertcat(*forces))])
+
+
+def _units(law: Law) -> list[dict[str, Any]]:
+    """Strengths with one entry at one and the others at zero, in turn."""
+    p = law.parameters()
+    zero = {name: ca.DM(np.zeros(p[name].value.shape)) for name in law.strength}
+    out = []
+    for name in law.strength:
+        for j in range(p[name].size):
+            one = np.zeros(p[name].size)
+            one[j] = 1.0
+            out.append({**zero, name: ca.DM(one)})
+    return out or [{}]
+
+
+@functools.cache
+def _names(function: Any) -> tuple[str, ...]:
+    return tuple(inspect.signature(function).parameters)
+
+
+def _call(function: Any, **available: Any) -> Any:
+    return function(**{k: available[k] for k in _names(function)})
+
+
+def _advance(law: Law, q: Any, z: tuple[Any, Any], dz: tuple[Any, Any], t: Any, p: Any, h: Any) -> Any:
+    """One Runge-Kutta step of a law's own states along the chord of z."""
+
+    def flow(state: Any, share: float) -> Any:
+        at = {k: a + share * (b - a) for k, (a, b) in {"z": z, "dz": dz}.items()}
+        return _call(law.flow, **at, q=state, t=t + share * h, p=p)  # type: ignore[attr-defined]
+
+    k1 = flow(q, 0.0)
+    k2 = flow(q + h / 2 * k1, 0.5)
+    k3 = flow(q + h / 2 * k2, 0.5)
+    k4 = flow(q + h * k3, 1.0)
+    return q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)

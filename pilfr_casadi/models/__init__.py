@@ -1,0 +1,82 @@
+"""Models: parameters, hysteresis operators, elements, `Model` with `close_loop`, PI-LFR structures and baselines.
+
+A model is a symbolic step with open ports; an element is a law with memory from a local signal `z` to an internal
+signal `w`; closing the loop puts the element into the port.
+"""
+
+from typing import TYPE_CHECKING
+
+from .._base.lazy import lazy_face
+
+if TYPE_CHECKING:
+    from .arrays import Buffered as Buffered, accumulated as accumulated, mapped as mapped
+    from .baselines import (
+        NARX as NARX,
+        NOE as NOE,
+        Lagged as Lagged,
+        lagged_start as lagged_start,
+        network_lfr as network_lfr,
+        neurons_over as neurons_over,
+        reading_output as reading_output,
+        ssnn as ssnn,
+    )
+    from .combined import (
+        Combined as Combined,
+        Part as Part,
+        element_bound as element_bound,
+        element_slopes as element_slopes,
+        unknown_slope as unknown_slope,
+    )
+    from .conversion import to_plays as to_plays, to_stops as to_stops
+    from .elements import (
+        LAYER as LAYER,
+        Element as Element,
+        PrandtlIshlinskii as PrandtlIshlinskii,
+        StaticNetwork as StaticNetwork,
+    )
+    from .envelope import Envelope as Envelope
+    from .gauge_orbit import generators as generators
+    from .magnitude import Neighbours as Neighbours, or_one as or_one
+    from .model import (
+        Model as Model,
+        close_loop as close_loop,
+        from_expressions as from_expressions,
+        open_model as open_model,
+    )
+    from .normal_form import normalise as normalise
+    from .operators import (
+        GeneralizedPlay as GeneralizedPlay,
+        Play as Play,
+        Stop as Stop,
+        generalized_play as generalized_play,
+        play as play,
+        stop as stop,
+    )
+    from .parameters import Parameter as Parameter, ParameterSet as ParameterSet
+    from .pilfr import (
+        BLOCKS as BLOCKS,
+        PILFR as PILFR,
+        block_shapes as block_shapes,
+        hammerstein as hammerstein,
+        wiener as wiener,
+    )
+    from .placement import (
+        direction_fixed as direction_fixed,
+        driven_through as driven_through,
+        fixed_whole as fixed_whole,
+        is_zero as is_zero,
+        places as places,
+        read_through as read_through,
+    )
+    from .products import Products as Products
+    from .structures import (
+        ANY as ANY,
+        HYSTERETIC as HYSTERETIC,
+        LAGGED as LAGGED,
+        OPERATORS as OPERATORS,
+        STRUCTURES as STRUCTURES,
+        TAKES as TAKES,
+        named_structure as named_structure,
+    )
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -1,0 +1,104 @@
+"""Plays into stops and back: a whole PI-LFR in its other form, with the same outputs.
+
+`P_r[z] + S_r[z] = z`, Krikelis et al. (2024), Eq. 8, so with the sums of weights `s_i = Σ_j w_ij` of the channels
+
+    w_play = diag(s) z - w_stop,   z = C_z x + D_zu u,
+
+and the part `diag(s) z` joins the linear blocks (Sec. 4.1 states the equivalence):
+
+    A  += B_w diag(s) C_z,     B_u  += B_w diag(s) D_zu,    B_w  -> -B_w,
+    C_y += D_yw diag(s) C_z,   D_yu += D_yw diag(s) D_zu,   D_yw -> -D_yw.
+
+The same formulas lead back: they are an involution. Weights and thresholds stay, and so do all initial states: the stop
+of `operators` remembers its play state `z - v`, the very number that the play remembers. Rounded operators (`eps > 0`)
+convert exactly too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError
+from .elements import PrandtlIshlinskii
+from .operators import Play, Stop
+from .pilfr import PILFR
+
+Array = np.ndarray
+# a block that takes up the slope, and the two blocks whose product it takes up
+SLOPES = {"A": ("B_w", "C_z"), "B_u": ("B_w", "D_zu"), "C_y": ("D_yw", "C_z"), "D_yu": ("D_yw", "D_zu")}
+MIRRORED = ("B_w", "D_yw")
+
+
+def complement(values: Mapping[str, Any]) -> dict[str, Array]:
+    """Blocks of the PI-LFR with stops that equals one with plays, and the other way round.
+
+    Parameters
+    ----------
+    values : mapping
+        The blocks of `lfr.BLOCKS` and `w`, `r` (n_w, N) by name; further names are passed on.
+
+    Returns
+    -------
+    dict
+        All values in the other form; applied twice, the ones given.
+    """
+    out = {name: np.array(value, dtype=float) for name, value in values.items()}
+    total = out["w"].sum(axis=1)
+    for name, (into, out_of) in SLOPES.items():
+        out[name] = out[name] + (values[into] * total) @ values[out_of]
+    for name in MIRRORED:
+        out[name] = -out[name]
+    return out
+
+
+def to_stops(structure: PILFR, values: Mapping[str, Any]) -> tuple[PILFR, dict[str, Array]]:
+    """Structure and values with stops for plays; unchanged where there are stops already.
+
+    What is fixed, bounded or held by a prior stays so where the conversion does not touch it, and is mirrored for
+    `B_w` and `D_yw`. A block that takes up the slope (`A, B_u, C_y, D_yu`) becomes free: its restriction would be
+    another one in the new form. Thus a Hammerstein model with plays has a free `B_u` when written with stops.
+
+    Raises
+    ------
+    InputError
+        If the element is not a Prandtl-Ishlinskii layer of plays or stops.
+    """
+    return _convert(structure, values, Stop())
+
+
+def to_plays(structure: PILFR, values: Mapping[str, Any]) -> tuple[PILFR, dict[str, Array]]:
+    """Structure and values with plays for stops; see `to_stops`."""
+    return _convert(structure, values, Play())
+
+
+def _layer(structure: PILFR) -> PrandtlIshlinskii:
+    element = structure.element
+    if not isinstance(element, PrandtlIshlinskii) or not isinstance(element.operator, Play | Stop):
+        raise InputError("Only a Prandtl-Ishlinskii element of plays or stops has a complement; convert one of those.")
+    return element
+
+
+def _convert(structure: PILFR, values: Mapping[str, Any], operator: Play | Stop) -> tuple[PILFR, dict[str, Array]]:
+    element = _layer(structure)
+    if type(element.operator) is type(operator):
+        return structure, {name: np.array(value, dtype=float) for name, value in values.items()}
+    touched = {block for block, factors in SLOPES.items() if not any(_is_zero(structure, f) for f in factors)}
+    fixed = {k: -np.asarray(v) if k in MIRRORED else v for k, v in structure.fixed.items() if k not in touched}
+    bounds = {k: _mirror(v) if k in MIRRORED else v for k, v in structure.bounds.items() if k not in touched}
+    priors = {
+        k: (-np.asarray(v[0]), v[1]) if k in MIRRORED else v for k, v in structure.priors.items() if k not in touched
+    }
+    layer = replace(element, operator=operator)
+    return replace(structure, element=layer, fixed=fixed, bounds=bounds, priors=priors), complement(values)
+
+
+def _is_zero(structure: PILFR, name: str) -> bool:
+    return name in structure.fixed and not np.any(structure.fixed[name])
+
+
+def _mirror(bounds: tuple[Any, Any]) -> tuple[Any, Any]:
+    return -np.asarray(bounds[1], dtype=float), -np.asarray(bounds[0], dtype=float)

@@ -1,0 +1,277 @@
+"""The model: one symbolic step with a port, and closing the loop around an element.
+
+An open model is `z = h(x, u, p)`, `(x⁺, y) = f(x, u, w, p)`; an element is `(w, s⁺) = e(z, s, p)`. `z` does not
+depend on `w` (`D_zw = 0` in Krikelis et al. (2024), Eq. 15), so a step is explicit. `close_loop` joins the two; the
+state of the closed model is `[x; s]`, the element's memory included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError
+from ..data import Recording
+from .elements import Element
+from .parameters import ParameterSet
+
+StepExpression = Callable[[Any, Any, Any, dict[str, Any]], tuple[Any, Any]]
+PortExpression = Callable[[Any, Any, dict[str, Any]], Any]
+
+
+def _default_names(names: tuple[str, ...], n: int, letter: str) -> tuple[str, ...]:
+    if not names:
+        return (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
+    if len(names) != n:
+        raise InputError(f"{len(names)} names were given for {n} signals ({', '.join(names)}); give one name each.")
+    return tuple(names)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A discrete-time model, open (`element is None` and `n_w > 0`) or closed.
+
+    Attributes
+    ----------
+    step : casadi.Function
+        `(x, u, w, p) -> (x_next, y)`; shapes (n_x,), (n_u,), (n_w,), (n_p,) -> (n_x,), (n_y,).
+    port : casadi.Function
+        `(x, u, p) -> z`, shape (n_w,).
+    memory : casadi.Function
+        `(z, s, p) -> (w, s_next)`, the element; without one it has no memory and `w = 0`.
+    parameters : ParameterSet
+        All parameters, the element's included.
+    reads : tuple of {"u", "next", "t", "y"}
+        What the columns of the step's u are; see `drive`.
+    substeps : int
+        Steps within a sample; outputs are those at the first of them.
+    stages : casadi.Function, optional
+        `(x, u, w, p, c) -> (values of c, c by c, x_next by c)`: the step by way of intermediate values c (n_c,), each
+        of which depends on those before it alone. Its derivatives are sparse where those of `step` are dense.
+    """
+
+    step: ca.Function
+    port: ca.Function
+    memory: ca.Function
+    parameters: ParameterSet
+    element: Element | None
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    reads: tuple[str, ...] = ("u",)
+    substeps: int = 1
+    stages: ca.Function | None = None
+
+    def drive(self, recording: Recording) -> np.ndarray:
+        """What the step reads while a recording is run, shape (M * substeps, n_u): the columns named in `reads`.
+
+        `u` is the input at the start of a sub-step and `next` at its end (both interpolated between samples; `u` alone
+        is held over the sample), `t` the time in s since the recording's first sample, `y` the measured output.
+        """
+        n, m = self.substeps, len(recording)
+        share = np.tile(np.arange(n) / n, m)
+        columns = []
+        for what in self.reads:
+            if what == "t":
+                columns.append((np.repeat(np.arange(m), n) + share)[:, None] * recording.dt)
+            elif what == "u" and "next" not in self.reads:
+                columns.append(np.repeat(recording.u, n, axis=0))
+            else:
+                values = recording.y if what == "y" else recording.u
+                whole = recording.period if recording.period and m % recording.period == 0 else None
+                after = values[m - whole] if whole else values[-1]
+                a, b = np.repeat(values, n, axis=0), np.repeat(np.vstack([values[1:], after]), n, axis=0)
+                columns.append(a + (b - a) * (share + (1 / n if what == "next" else 0.0))[:, None])
+        return np.ascontiguousarray(np.hstack(columns)) if len(columns) != 1 else columns[0]
+
+    @property
+    def n_x(self) -> int:
+        """States without memory; see `n_state`."""
+        return int(self.step.size1_in(0))
+
+    @property
+    def n_u(self) -> int:
+        """Columns that the step reads: the inputs, unless `reads` says otherwise."""
+        return int(self.step.size1_in(1))
+
+    @property
+    def n_w(self) -> int:
+        """Channels of the port."""
+        return int(self.step.size1_in(2))
+
+    @property
+    def n_y(self) -> int:
+        """Outputs."""
+        return int(self.step.size1_out(1))
+
+    @property
+    def n_s(self) -> int:
+        """Memory states of the element."""
+        return int(self.memory.size1_in(1))
+
+    @property
+    def n_state(self) -> int:
+        """Entries of the whole state [x; s]."""
+        return self.n_x + self.n_s
+
+    def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Fresh symbols x, s, u, p of this model's sizes."""
+        sizes = (("x", self.n_x), ("s", self.n_s), ("u", self.n_u), ("p", self.parameters.size))
+        x, s, u, p = (ca.SX.sym(name, n) for name, n in sizes)
+        return x, s, u, p
+
+    @cached_property
+    def closed(self) -> ca.Function:
+        """`(x, u, p) -> (x_next, y)` with `x = [x; s]`: the whole step as one Function."""
+        x, s, u, p = self.symbols()
+        z = self.port(x, u, p)
+        w, s_next = self.memory(z, s, p)
+        x_next, y = self.step(x, u, w, p)
+        state = ca.vertcat(x, s)
+        return ca.Function("closed", [state, u, p], [ca.vertcat(x_next, s_next), y], ["x", "u", "p"], ["x_next", "y"])
+
+    def with_parameters(self, parameters: ParameterSet) -> Model:
+        """The same equations with other start values, bounds or fixed flags."""
+        if tuple(parameters) != tuple(self.parameters) or parameters.size != self.parameters.size:
+            raise InputError("The parameters given do not match the model's; change values with `parameters.change`.")
+        return replace(self, parameters=parameters)
+
+
+def open_model(
+    step: StepExpression,
+    port: PortExpression,
+    parameters: ParameterSet,
+    *,
+    n_x: int,
+    n_u: int,
+    n_w: int,
+    states: tuple[str, ...] = (),
+    inputs: tuple[str, ...] = (),
+    outputs: tuple[str, ...] = (),
+) -> Model:
+    """An open model from Python expressions `step(x, u, w, p) -> (x_next, y)` and `port(x, u, p) -> z`.
+
+    Parameters
+    ----------
+    step, port : callable
+        Expressions of CasADi symbols x (n_x, 1), u (n_u, 1), w (n_w, 1) and p, which maps names to matrices.
+    parameters : ParameterSet
+        Parameters that the expressions read.
+    n_x, n_u, n_w : int
+        States, inputs, and channels of the port (0: no port, `port` is not called).
+    states, inputs, outputs : tuple of str
+        Names; numbered where left out.
+
+    Raises
+    ------
+    InputError
+        If an expression has another number of rows than there are states or channels, or names are too few or too many.
+    """
+    x, u, w = ca.SX.sym("x", n_x), ca.SX.sym("u", n_u), ca.SX.sym("w", n_w)
+    vector = ca.SX.sym("p", parameters.size)
+    named = parameters.symbols(vector)
+    x_next, y = (ca.SX(e) for e in step(x, u, w, named))
+    z = ca.SX(port(x, u, named)) if n_w else ca.SX(0, 1)
+    for name, expression, rows in (("next state", x_next, n_x), ("port's signal z", z, n_w)):
+        if expression.shape != (rows, 1):
+            raise InputError(f"The {name} has the shape {expression.shape}; expected ({rows}, 1).")
+    z_in, s = ca.SX.sym("z", n_w), ca.SX(0, 1)
+    return Model(
+        step=ca.Function("step", [x, u, w, vector], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),
+        port=ca.Function("port", [x, u, vector], [z], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [z_in, s, vector], [ca.SX(n_w, 1), s], ["z", "s", "p"], ["w", "s_next"]),
+        parameters=parameters,
+        element=None,
+        states=_default_names(states, n_x, "x"),
+        inputs=_default_names(inputs, n_u, "u"),
+        outputs=_default_names(outputs, int(y.shape[0]), "y"),
+    )
+
+
+def from_expressions(
+    state: tuple[Any, Any],
+    u: Any,
+    p: Any,
+    following: tuple[Any, Any],
+    y: Any,
+    parameters: ParameterSet,
+    *,
+    port: tuple[Any, Any, Any] | None = None,
+    states: tuple[str, ...],
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    reads: tuple[str, ...] = ("u",),
+    substeps: int = 1,
+    stages: tuple[Any, Any, Any, Any] | None = None,
+) -> Model:
+    """A closed model from expressions of symbols; the other fields are as in `Model`.
+
+    Parameters
+    ----------
+    state, following : (x, s), (x_next, s_next)
+        States and memory (symbols), and those of the next step.
+    u, p, y
+        Inputs and parameters (symbols), and the outputs.
+    port : (z, channels, moved), optional
+        The signals that move the memory (expressions of x, u and p), the symbols by which `s_next` reads them, and
+        those by which `x_next` and `y` read the memory once moved; each as long as s. Without it, s is empty.
+    stages : (c, values, by_c, x_next), optional
+        Symbols of intermediate values, and what `Model.stages` gives.
+    """
+    (x, s), (x_next, s_next) = state, following
+    z, channels, moved = port or (ca.SX(0, 1),) * 3
+    w = s_next if port else ca.SX(0, 1)
+    c, *staged = stages or (ca.SX(0, 1),)
+    return Model(
+        step=ca.Function("step", [x, u, moved, p], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),
+        port=ca.Function("port", [x, u, p], [z], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [channels, s, p], [w, s_next], ["z", "s", "p"], ["w", "s_next"]),
+        parameters=parameters,
+        element=None,
+        states=states,
+        inputs=inputs,
+        outputs=outputs,
+        reads=reads,
+        substeps=substeps,
+        stages=ca.Function("stages", [x, u, moved, p, c], staged) if stages else None,
+    )
+
+
+def close_loop(model: Any, element: Element, port: str | None = None) -> Any:
+    """Put an element into a model's port, or into a port of a simulator by its name; the result is of the same kind.
+
+    Raises
+    ------
+    InputError
+        If the port is already closed or unknown, or the element has another number of channels.
+    """
+    if not isinstance(model, Model):
+        if port is None or not hasattr(model, "with_element"):
+            raise InputError("An element is put into an open Model, or into a Simulator with `port=` its port's name.")
+        return model.with_element(port, element)
+    if model.element is not None:
+        raise InputError("The model's port is closed already; close an open model.")
+    if element.channels != model.n_w:
+        raise InputError(
+            f"The element has {element.channels} channels, the model's port has {model.n_w}; give as many."
+        )
+    parameters = model.parameters | element.parameters()
+    vector = ca.SX.sym("p", parameters.size)
+    own = vector[: model.parameters.size]
+    x, _, u, _ = model.symbols()
+    z, w, s = ca.SX.sym("z", model.n_w), ca.SX.sym("w", model.n_w), ca.SX.sym("s", element.memory)
+    w_out, s_next = element.step(z, s, parameters.symbols(vector))
+    return replace(
+        model,
+        step=ca.Function("step", [x, u, w, vector], model.step(x, u, w, own), ["x", "u", "w", "p"], ["x_next", "y"]),
+        port=ca.Function("port", [x, u, vector], [model.port(x, u, own)], ["x", "u", "p"], ["z"]),
+        memory=ca.Function("memory", [z, s, vector], [w_out, s_next], ["z", "s", "p"], ["w", "s_next"]),
+        parameters=parameters,
+        element=element,
+        stages=None,
+    )

@@ -1,0 +1,193 @@
+"""Stop, play and generalized play: exact one-step hysteresis operators.
+
+Each operator has one number of memory `q`, the play state, and maps `(z, q, r)` to `(v, q_next)`:
+
+- play, Krikelis et al. (2024), Eq. 5 and 11: `v = q_next = max(z - r, min(z + r, q))`;
+- stop, Eq. 3 and 9 in the clip form `v = min(r, max(-r, z - q))`, `q_next = z - v`. The memory is the play state
+  `q = z(k-1) - v(k-1)`, which makes `play + stop = z` (Eq. 8) an identity of one line and needs no division by r;
+- generalized play, Eq. 7 and 13: `v = q_next = max(gl - r, min(hi, q))`, `gl = γ_l(z)`, `gr = γ_r(z)`.
+
+The generalized play is a play only where `γ_l(z) - r <= γ_r(z) + r`. This is met by construction: the upper curve is
+`hi = max(gr + r, gl - r)`, which is `γ_r + r` wherever the condition holds and closes the loop (no width) where it
+does not.
+
+All work on numbers, NumPy arrays and CasADi symbols alike. The derivative at a kink is the one of the sticking side.
+`eps > 0` rounds min and max over a band of half-width eps (compact support: outside the band nothing changes, so no
+memory leaks; softplus would lose memory at every step). One rounded min, max or step of an operator is off by at most
+eps/4. In the band a rounded play creeps, sample by sample, so over a record it is off by at most eps, and rate
+independence holds outside the band only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError
+from .parameters import Parameter, ParameterSet
+
+_TINY = 1e-300
+_SYMBOLIC = (ca.SX, ca.MX, ca.DM)
+
+
+def fmax(a: Any, b: Any, eps: Any = 0.0) -> Any:
+    """max(a, b), rounded over |a - b| < eps by `(eps - |a - b|)₊² / 4 eps`; numbers, arrays or symbols.
+
+    In the exact form the derivative at a tie is that of `b`.
+    """
+    symbolic = isinstance(a, _SYMBOLIC) or isinstance(b, _SYMBOLIC)
+    # casadi's own fmax halves the derivative at a tie, which is wrong for a threshold resting on its bound r = 0
+    top = ca.if_else(a > b, a, b) if symbolic else np.maximum(a, b)
+    if not isinstance(eps, _SYMBOLIC) and np.all(np.asarray(eps) == 0):
+        return top
+    if symbolic or isinstance(eps, _SYMBOLIC):
+        return top + ca.fmax(0, eps - ca.fabs(a - b)) ** 2 / (4 * ca.fmax(eps, _TINY))
+    return top + np.maximum(0, eps - np.abs(a - b)) ** 2 / (4 * np.maximum(eps, _TINY))
+
+
+def fmin(a: Any, b: Any, eps: Any = 0.0) -> Any:
+    """min(a, b), the mirror of `fmax`; in the exact form the derivative at a tie is that of `b`."""
+    return -fmax(-a, -b, eps)
+
+
+def play(z: Any, q: Any, r: Any, eps: Any = 0.0) -> Any:
+    """Play (backlash) of half-width r: the new play state `max(z - r, min(z + r, q))`, Eq. 5."""
+    return fmax(z - r, fmin(z + r, q, eps), eps)
+
+
+def stop(z: Any, q: Any, r: Any, eps: Any = 0.0) -> Any:
+    """Stop of threshold r, `z - play(z, q, r)`: the clip `min(r, max(-r, z - q))` of Eq. 3 and 9."""
+    if isinstance(eps, _SYMBOLIC) or np.any(np.asarray(eps) != 0):
+        return z - play(z, q, r, eps)
+    return fmin(r, fmax(-r, z - q))
+
+
+def generalized_play(
+    z: Any, q: Any, r: Any, gamma_l: Callable[[Any], Any], gamma_r: Callable[[Any], Any], eps: Any = 0.0
+) -> Any:
+    """Generalized play between `γ_l(z) - r` (below) and `γ_r(z) + r` (above), Eq. 7, well posed by construction."""
+    low = gamma_l(z) - r
+    high = fmax(gamma_r(z) + r, low)
+    return fmax(low, fmin(high, q, eps), eps)
+
+
+@dataclass(frozen=True)
+class Play:
+    """The play operator, Eq. 5; `v = q_next`."""
+
+    name = "play"
+
+    def parameters(self, channels: int) -> ParameterSet:
+        """No parameters beyond the thresholds."""
+        return ParameterSet()
+
+    def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0) -> tuple[Any, Any]:
+        """One step: (output, next memory); z scalar or like q and r."""
+        v = play(z, q, r, eps)
+        return v, v
+
+
+@dataclass(frozen=True)
+class Stop:
+    """The stop operator, Eq. 3 and 9; the memory is the play state `z - v`."""
+
+    name = "stop"
+
+    def parameters(self, channels: int) -> ParameterSet:
+        """No parameters beyond the thresholds."""
+        return ParameterSet()
+
+    def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0) -> tuple[Any, Any]:
+        """One step: (output, next memory)."""
+        v = stop(z, q, r, eps)
+        return v, z - v
+
+
+@dataclass(frozen=True)
+class GeneralizedPlay:
+    """The generalized play, Eq. 7 and 13, with envelopes that are small networks (Eq. 14) or any user expression.
+
+    Parameters
+    ----------
+    neurons : int
+        Neurons of each envelope network `γ(z) = c + a_0 z + Σ a_j tanh(b_j z + d_j)`. `a_0, a, b ≥ 0` are bounds of the
+        fit, so the envelopes are non-decreasing by construction.
+    gamma_l, gamma_r : callables, optional
+        Expressions `γ(z, p)` of the signal and the parameters by name, in place of the networks; non-decreasing in z.
+    extra : ParameterSet, optional
+        Parameters that the user's expressions read.
+
+    Raises
+    ------
+    InputError
+        If the number of neurons is negative or not whole.
+    """
+
+    neurons: int = 3
+    gamma_l: Callable[[Any, Any], Any] | None = None
+    gamma_r: Callable[[Any, Any], Any] | None = None
+    extra: ParameterSet | None = None
+    name = "generalized_play"
+
+    def __post_init__(self) -> None:
+        if self.neurons != int(self.neurons) or self.neurons < 0:
+            raise InputError(f"An envelope with {self.neurons} neurons was asked for; give a whole number, 0 or more.")
+
+    @property
+    def networks(self) -> bool:
+        """Whether both envelopes are networks."""
+        return self.gamma_l is None and self.gamma_r is None
+
+    def parameters(self, channels: int) -> ParameterSet:
+        """Envelope parameters, one row a channel; start: nearly the identity, with a little of every neuron."""
+        entries: dict[str, Parameter] = dict(self.extra or {})
+        for side, own in (("l", self.gamma_l), ("r", self.gamma_r)):
+            if own is not None:
+                continue
+            spread = np.tile(np.linspace(-1.0, 1.0, self.neurons), (channels, 1))
+            positive = (0.0, np.inf)
+            entries[f"gamma_{side}_c"] = Parameter(np.zeros((channels, 1)))
+            entries[f"gamma_{side}_a0"] = Parameter(np.ones((channels, 1)), bounds=positive)
+            entries[f"gamma_{side}_a"] = Parameter(np.full((channels, self.neurons), 0.01), bounds=positive)
+            entries[f"gamma_{side}_b"] = Parameter(np.ones((channels, self.neurons)), bounds=positive)
+            entries[f"gamma_{side}_d"] = Parameter(-spread)
+        return ParameterSet(entries)
+
+    def envelope(self, side: str, z: Any, p: Any, channel: int = 0) -> Any:
+        """γ_l or γ_r at z; `side` is "l" or "r", p maps names to values or symbols."""
+        own = self.gamma_l if side == "l" else self.gamma_r
+        if own is not None:
+            return own(z, p)
+        c, a0, a, b, d = (p[f"gamma_{side}_{k}"] for k in ("c", "a0", "a", "b", "d"))
+        out = c[channel, 0] + a0[channel, 0] * z
+        tanh = ca.tanh if isinstance(z, _SYMBOLIC) or isinstance(a, _SYMBOLIC) else np.tanh
+        for j in range(self.neurons):
+            out = out + a[channel, j] * tanh(b[channel, j] * z + d[channel, j])
+        return out
+
+    def far_slope(self, side: str, p: Any) -> Any:
+        """Slope of the network γ_l or γ_r where its neurons are saturated, `a_0` of each channel: (channels, 1)."""
+        return p[f"gamma_{side}_a0"]
+
+    def steepest(self, side: str, p: Any) -> np.ndarray:
+        """Largest slope of the network γ_l or γ_r of named numbers p, each channel: (channels,)."""
+        a0, a, b, d = (np.asarray(p[f"gamma_{side}_{k}"], dtype=float) for k in ("a0", "a", "b", "d"))
+        out = []
+        for i in range(len(a0)):
+            at = [(np.linspace(-2, 2, 81) - shift) / rate for rate, shift in zip(b[i], d[i], strict=True) if rate > 0]
+            z = np.concatenate([np.zeros(1), *at])[:, None]
+            out.append(
+                a0[i, 0] + np.max(np.sum(a[i] * b[i] / np.cosh(np.clip(b[i] * z + d[i], -300, 300)) ** 2, axis=1))
+            )
+        return np.array(out)
+
+    def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0, channel: int = 0) -> tuple[Any, Any]:
+        """One step: (output, next memory)."""
+        v = generalized_play(
+            z, q, r, lambda s: self.envelope("l", s, p, channel), lambda s: self.envelope("r", s, p, channel), eps
+        )
+        return v, v

@@ -1,0 +1,305 @@
+"""Constraints on a model's named parameters, as CasADi expressions that every solver takes the same way.
+
+`stable` bounds the spectral radius. For every matrix norm and every m, `ρ(A) <= ‖A^m‖^(1/m)`, with equality as m grows,
+so
+
+    (1/m) log ‖A^m‖_F <= log ρ_max,   m = 2^squarings,
+
+is one smooth inequality that guarantees the bound, at any point where it holds. Repeated squaring with the norm taken
+out after each step keeps the numbers in range. Where eigenvalues coincide (a double integrator) the powers grow as
+m^(n-1) and the left-hand side exceeds `log ρ(A)` by up to `(n - 1) log(m) / m`, 1.3e-5 (n - 1) here, with slopes of the
+size of m. `stable` therefore has a slack, and a violation as small as that slack is no failure of a solver.
+
+Asked for as `exact`, a constraint has no slack and no tolerance: it is checked on the numbers of the result, the
+spectral radius by its eigenvalues. Where a check fails the result is moved (`exactness`); a radius is bounded by other
+rows than this one, which are smooth where eigenvalues meet (`tightening`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError
+from ..models import ParameterSet
+from ..simulators import numbers_or_nan
+
+TOLERATED = 1e-6  # violation, in units of a constraint, that is no failure
+AT_MOST, AT_LEAST = 100.0, 1e-6  # limits that a unit comes to at most; share of the largest change, at least
+UNIT = 100.0  # unit of log ρ: a violation of 1e-4 is tolerated
+SLACK = 1e-4  # share by which `stable` lets the radius exceed its limit
+INSIDE = 2e-7  # how far inside the logarithm of a radius an exact limit is solved: beyond what solvers tolerate
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """`lower <= expression(p) <= upper`, p mapping parameter names to CasADi matrices.
+
+    Parameters
+    ----------
+    expression : callable
+        Takes the mapping of named parameters, returns a CasADi expression (column).
+    lower, upper : float or array
+        Bounds of the expression; equal for an equation.
+    name : str
+        How the constraint is called in results.
+    unit : float, optional
+        A change of the expression that counts: violations are judged next to it. By default the largest change that one
+        of its variables brings about when it changes by its own size, so that units do not matter, and a hundred times
+        the limit at most, so that a small one is met to 1e-4 of itself.
+    exact : bool
+        The limits hold at the numbers of the result, not up to a solver's tolerance; for inequalities.
+    check : callable, optional
+        Of an exact constraint: how far named numbers lie beyond the limit in another measure than the expression's,
+        0 or less inside; `stable` looks at the eigenvalues.
+    """
+
+    expression: Callable[[Mapping[str, Any]], Any]
+    lower: Any = -np.inf
+    upper: Any = np.inf
+    name: str = "constraint"
+    unit: float | None = None
+    exact: bool = False
+    check: Callable[[Mapping[str, Any]], float] | None = None
+
+
+def log_norm_of_power(matrix: Any, squarings: int = 20) -> Any:
+    """`(1/m) log ‖A^m‖_F` with `m = 2^squarings`: an upper bound of `log ρ(A)`, smooth in A."""
+    log_scale, power = 0.0, matrix
+    for k in range(squarings + 1):
+        if k:
+            power = ca.mtimes(power, power)
+        norm = ca.sqrt(ca.sumsqr(power) + 1e-300)
+        log_scale = log_scale + ca.log(norm) / 2**k
+        power = power / norm
+    return log_scale
+
+
+def linear_part(p: Mapping[str, Any]) -> Any:
+    """The matrix `A`."""
+    return p["A"]
+
+
+@dataclass(frozen=True)
+class LogRadius:
+    """`log_norm_of_power` of a square matrix picked from the named parameters; a class, so that it can be pickled."""
+
+    matrix: Callable[[Mapping[str, Any]], Any] = linear_part
+    squarings: int = 20
+
+    def __call__(self, p: Mapping[str, Any]) -> Any:
+        """The expression for named parameters p."""
+        return log_norm_of_power(self.matrix(p), self.squarings)
+
+
+@dataclass(frozen=True)
+class BeyondRadius:
+    """How far the largest eigenvalue of a square matrix of named numbers exceeds a radius."""
+
+    radius: float
+    matrix: Callable[[Mapping[str, Any]], Any] = linear_part
+
+    def __call__(self, p: Mapping[str, Any]) -> float:
+        """0 or less where the bound holds."""
+        numbers = np.asarray(ca.DM(self.matrix({name: ca.DM(value) for name, value in p.items()})))
+        return float(np.max(np.abs(np.linalg.eigvals(numbers)), initial=0.0)) - self.radius
+
+
+def stable(
+    radius: float = 1.0,
+    matrix: Callable[[Mapping[str, Any]], Any] = linear_part,
+    name: str = "spectral radius",
+    slack: float = SLACK,
+    exact: bool = False,
+) -> Constraint:
+    """Spectral radius of `A` (or of another square expression of the parameters) at most `radius`.
+
+    What holds is `radius (1 + slack)`, and with `exact` the radius itself, to the last digit of the eigenvalues.
+    Without slack no solver could meet a limit of 1 at a double integrator.
+
+    Raises
+    ------
+    InputError
+        If the radius is not positive, or the slack negative.
+    """
+    if not (radius > 0 and slack >= 0):
+        raise InputError(
+            f"A bound of {radius} on the spectral radius was given; give a number above zero."
+            if slack >= 0
+            else f"The bound on the spectral radius has a slack of {slack}; give zero or more."
+        )
+    limit = float(np.log(radius) + (-INSIDE if exact else np.log1p(slack)))
+    check = BeyondRadius(radius, matrix) if exact else None
+    return Constraint(
+        LogRadius(matrix), upper=limit, name=f"{name} <= {radius:.12g}", unit=UNIT, exact=exact, check=check
+    )
+
+
+def loosened(constraints: Sequence[Constraint], least: float = 0.0) -> tuple[Constraint, ...]:
+    """The constraints with exact bounds on spectral radii, of `least` or more, at 1 or more and up to the slack."""
+    return tuple(
+        stable(max(c.check.radius, 1.0), c.check.matrix, c.name.partition(" <=")[0])
+        if c.exact and isinstance(c.check, BeyondRadius) and c.check.radius >= least
+        else c
+        for c in constraints
+    )
+
+
+class Rows:
+    """The constraints of a problem as one Function of the full parameter vector p, shape (n_p,).
+
+    Attributes
+    ----------
+    function : casadi.Function
+        `p -> g`.
+    lower, upper, units : array, shape (n_g,)
+        Limits, and the units as given, nan where not.
+    labels : tuple of str
+        One an entry.
+    sizes : tuple of int
+        Number of entries of each constraint.
+
+    Raises
+    ------
+    InputError
+        As `compile_constraints` and `check_free`.
+    """
+
+    def __init__(self, constraints: tuple[Constraint, ...], parameters: ParameterSet) -> None:
+        compiled = compile_constraints(constraints, parameters)
+        self.function, self._slope, self.lower, self.upper, self.labels, self.units = compiled
+        self.sizes = constraint_sizes(constraints, parameters)
+        p = parameters.start
+        named = parameters.unpack(p)
+        held = np.repeat([c.check is not None and c.check(named) <= 0 for c in constraints], self.sizes).astype(bool)
+        logs = np.repeat([isinstance(c.expression, LogRadius) for c in constraints], self.sizes).astype(bool)
+        check_free(self.function, self._slope, parameters.free, p, self.lower, self.upper, self.labels, held, logs)
+
+    def units_from(self, change: np.ndarray) -> np.ndarray:
+        """Units as given, or from the largest change of each entry (n_g,), no larger than its limits warrant."""
+        limits = np.abs([np.where(np.isfinite(b), b, 0.0) for b in (self.lower, self.upper)])
+        largest = AT_MOST * np.max(limits, axis=0, initial=0.0)
+        own = np.where(largest > 0, np.clip(largest, AT_LEAST * change, change), change)
+        return np.where(np.isnan(self.units), own, self.units)
+
+    def values(self, p: np.ndarray) -> np.ndarray:
+        """Shape (n_g,); nan where they cannot be computed, such as a gain where a pole is 1 to the last digit."""
+        return numbers_or_nan(self.function, p).ravel()
+
+    def slope(self, p: np.ndarray) -> np.ndarray:
+        """Shape (n_g, n_p)."""
+        return numbers_or_nan(self._slope, p)
+
+
+def compile_constraints(
+    constraints: tuple[Constraint, ...], parameters: ParameterSet
+) -> tuple[ca.Function, ca.Function, np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:
+    """One Function `p -> g`, its Jacobian, the bounds, a label and a unit an entry (nan: not given).
+
+    Raises
+    ------
+    InputError
+        If an expression fails, names an unknown parameter, its bounds are infeasible, or its unit is not positive.
+    """
+    vector = ca.MX.sym("p", parameters.size)
+    named = parameters.symbols(vector)
+    parts, lower, upper, labels, units = [], [np.zeros(0)], [np.zeros(0)], [], [np.zeros(0)]
+    for c in constraints:
+        g = _expression(c, named, parameters)
+        size = int(g.shape[0])
+        try:
+            low, high = (np.broadcast_to(np.asarray(b, dtype=float).ravel(), (size,)) for b in (c.lower, c.upper))
+        except ValueError:
+            raise InputError(
+                f"The bounds of the constraint {c.name!r} do not fit its {size} entries; give one or {size} of each."
+            ) from None
+        if not np.all(low <= high):
+            raise InputError(f"The constraint {c.name!r} is infeasible: its lower bound exceeds its upper bound.")
+        if c.exact and np.any(low == high):
+            raise InputError(
+                f"The constraint {c.name!r} is an equation and asked for as exact, which rounding does not allow; "
+                "leave exact out, or give a lower and an upper limit."
+            )
+        if c.unit is not None and not 0 < c.unit < np.inf:
+            raise InputError(f"The unit of the constraint {c.name!r} is {c.unit!r}; give a positive number, or none.")
+        units.append(np.full(size, np.nan if c.unit is None else float(c.unit)))
+        parts.append(g)
+        lower.append(low)
+        upper.append(high)
+        labels += [c.name if size == 1 else f"{c.name}[{i}]" for i in range(size)]
+    g = ca.densify(ca.vertcat(*parts)) if parts else ca.MX(0, 1)
+    value = ca.Function("g", [vector], [g], ["p"], ["g"])
+    slope = ca.Function("g_slope", [vector], [ca.densify(ca.jacobian(g, vector))], ["p"], ["jac"])
+    return value, slope, np.concatenate(lower), np.concatenate(upper), tuple(labels), np.concatenate(units)
+
+
+def _expression(c: Constraint, named: Mapping[str, Any], parameters: ParameterSet) -> Any:
+    """The constraint's expression as a column; an `InputError` if it fails or names an unknown parameter."""
+    try:
+        g = ca.vec(c.expression(named))
+        if not isinstance(g, ca.MX):
+            g = ca.MX(ca.DM(g))
+    except InputError:
+        raise
+    except KeyError as e:
+        raise InputError(
+            f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(parameters)}."
+        ) from e
+    except Exception as e:
+        why = str(e).strip().splitlines()[-1].strip() if str(e).strip() else type(e).__name__
+        if "__bool__" in str(e) or "truth value" in str(e).lower():
+            why = "it asks whether a symbol is true, as `if`, `and`, `min` and `max` of Python do"
+        raise InputError(
+            f"The expression of the constraint {c.name!r} cannot be formed ({why}); use CasADi functions of the named "
+            "parameters, such as casadi.if_else, fmin and fmax."
+        ) from e
+    return g
+
+
+def constraint_sizes(constraints: tuple[Constraint, ...], parameters: ParameterSet) -> tuple[int, ...]:
+    """Number of entries of each constraint."""
+    named = parameters.symbols(ca.MX.sym("p", parameters.size))
+    return tuple(int(_expression(c, named, parameters).shape[0]) for c in constraints)
+
+
+def check_free(
+    g: ca.Function,
+    slope: ca.Function,
+    free: np.ndarray,
+    p: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    labels: tuple[str, ...],
+    held: np.ndarray,
+    logs: np.ndarray,
+) -> None:
+    """Refuse a constraint that is no number at the start, or that does not hold and that no free parameter enters.
+
+    `held` says of which entries a check of their own says that they hold, `logs` which are logarithms of what is told.
+
+    Raises
+    ------
+    InputError
+        With its name, its value and its limits.
+    """
+    reach = np.asarray(ca.DM(g.jac_sparsity(0, 0), 1).full(), dtype=bool).reshape(len(labels), len(p))
+    value = numbers_or_nan(g, p).ravel()
+    steep = numbers_or_nan(slope, p).reshape(len(labels), len(p))[:, free]
+    for i in np.flatnonzero(~np.isfinite(value) | ~np.all(np.isfinite(steep), axis=1)):
+        what, shown = ("value", value[i]) if not np.isfinite(value[i]) else ("slope", np.nan)
+        raise InputError(
+            f"The constraint {labels[i]!r} has no finite {what} at the start values of the parameters (it is {shown}); "
+            "give an expression that is finite there, or other start values."
+        )
+    for i in np.flatnonzero(~np.any(reach[:, free], axis=1) & ~held):
+        room = TOLERATED * max(abs(value[i]), 1.0)
+        if not lower[i] - room <= value[i] <= upper[i] + room:
+            found, low, high = (np.exp(v) if logs[i] else v for v in (value[i], lower[i], upper[i]))
+            raise InputError(
+                f"The constraint {labels[i]!r} is infeasible: all that enters it is fixed and gives {found:g}, "
+                f"limits {low:g} and {high:g}; free a parameter or loosen it."
+            )

@@ -1,0 +1,268 @@
+"""The simulation-error problem through IPOPT, by single shooting with the package's own derivatives.
+
+IPOPT is given the problem in the units of `scaling`, with bounds and constraints as they are, and the damped
+Gauss-Newton Hessian of `damping`: an interior-point iteration turned Levenberg-Marquardt method, with a barrier for
+bounds and a filter for constraints (Wächter & Biegler 2006). With an undamped or the exact Hessian, trials diverged.
+Only where IPOPT restores feasibility, and the cost is out of its sight, is the curvature of the constraints used.
+
+An interior-point method pushes away from bounds, and thresholds start on theirs (r = 0): push and barrier are kept
+small next to the first cost, which is 1. Bounds are never relaxed. At the end, variables whose multiplier outweighs
+their distance to a bound are put onto it, where that costs nothing. A diverging simulation is an evaluation error, from
+which the line search backs off.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError
+from .callback import Callback, handled_interrupt
+from .damping import Damping, Point
+from .ipopt_settings import ENDINGS, SETTINGS, check_settings
+from .problem import Problem
+from .scaling import Scaled
+from .solution import Iteration, Progress, Solution, Status
+
+Sparsities = dict[str, ca.Sparsity]
+FEASIBLE = 1e-8  # violation of a constraint, in units of the change that one scaled variable makes
+ROUNDS = 4  # solves: where IPOPT's line search fails, the next one starts from the best point with more damping
+
+
+@dataclass(frozen=True)
+class Ipopt:
+    """Options of the solver through `casadi.nlpsol("ipopt")`.
+
+    Parameters
+    ----------
+    hessian : {"gauss-newton", "limited-memory"}
+        Damped Gauss-Newton Hessian, or IPOPT's own quasi-Newton approximation (many more iterations).
+    max_iterations : int
+        Iterations in all.
+    tolerance : float
+        Stop when the cost changed by less than this share over `patience` iterations.
+    damping : float
+        First λ.
+    time_limit : float
+        Seconds of a solve; see `GaussNewton`.
+    options : mapping
+        Further options of IPOPT by name, for example `{"print_level": 5}`.
+
+    Raises
+    ------
+    InputError
+        If the Hessian is unknown.
+    """
+
+    hessian: str = "gauss-newton"
+    max_iterations: int = 500
+    tolerance: float = 1e-5
+    patience: int = 5
+    damping: float = 0.1
+    time_limit: float = np.inf
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.hessian not in ("gauss-newton", "limited-memory"):
+            raise InputError(f"The Hessian {self.hessian!r} is unknown; use 'gauss-newton' or 'limited-memory'.")
+        check_settings(self.options)
+
+    def solve(self, problem: Problem, start: np.ndarray | None = None, progress: Progress | None = None) -> Solution:
+        """Minimise from `start` (n,), by default the problem's own."""
+        return _Run(self, problem, problem.start if start is None else start, progress).run()
+
+
+class _Run:
+    """One solve: the last point evaluated, and the best one."""
+
+    def __init__(self, options: Ipopt, problem: Problem, start: np.ndarray, progress: Progress | None) -> None:
+        self.options, self.problem, self.progress = options, problem, progress
+        self.theta = np.clip(np.asarray(start, dtype=float), problem.lower, problem.upper)
+        self.cost, self.violation = np.inf, np.inf
+        self.multipliers = np.zeros(problem.size + len(problem.g_lower))
+        self.history: list[Iteration] = []
+        self.stopped: Status | None = None
+        self.error: BaseException | None = None
+        self.x, self.at, self.slope_at = self.theta, b"", b""
+        self.began = time.perf_counter()
+
+    def run(self) -> Solution:
+        """Solve, again with more damping where IPOPT gives up, and return the best point."""
+        status: Status | None = None
+        message = ""
+        try:
+            start, self.cost = self.theta, self.problem.cost(self.theta)
+            if not np.isfinite(self.cost):
+                return self._solution(Status.DIVERGED_START, message)
+            try:
+                with np.errstate(all="ignore"):
+                    self.scaled = Scaled(self.problem, start, self.options.damping)
+            except FloatingPointError:
+                return self._solution(Status.DIVERGED_START, message)
+            self._keep(start, self.cost)
+            damping = self.scaled.damping
+            for _ in range(ROUNDS):
+                before = (self.violation, self.cost)
+                with handled_interrupt(lambda: self._failed(KeyboardInterrupt())):
+                    message = self._nlpsol(damping)
+                status = self._ending(message, *before)
+                if status is not None:
+                    break
+                damping = 100.0 * max(self.damping.value, 1e-2)
+            if self.error is None:
+                self._onto_bounds()
+        except KeyboardInterrupt as interrupt:
+            self.error = interrupt
+        if isinstance(self.error, KeyboardInterrupt):
+            status = Status.INTERRUPTED
+        elif self.error is not None:
+            raise self.error
+        stopped = status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
+        if self.violation > 1e-6 and not stopped:
+            status = Status.INFEASIBLE
+        return self._solution(status or Status.SOLVER_FAILED, message)
+
+    def _ending(self, message: str, violation: float, cost: float) -> Status | None:
+        """What IPOPT's last word means, given what there was before; None to try again."""
+        status = self.stopped or ENDINGS.get(message)
+        if status is Status.INFEASIBLE and self.violation <= FEASIBLE:
+            return None
+        if status is None and violation <= FEASIBLE and cost - self.cost < self.options.tolerance * self.cost:
+            return Status.SMALL_STEP
+        return status
+
+    def _nlpsol(self, damping: float) -> str:
+        """One run of IPOPT from the best point; returns its own word for how it ended."""
+        scaled, n, n_g, dense = self.scaled, self.problem.size, len(self.problem.g_lower), ca.Sparsity.dense
+        self.damping, self.trials = Damping(damping, n), 0
+        x, g, one = dense(n, 1), dense(n_g, 1), dense(1, 1)
+        first, last = {"x": x, "p": ca.Sparsity(0, 0)}, {"lam_f": one, "lam_g": g}
+        iterate = {"x": x, "f": one, "g": g, "lam_x": x, "lam_g": g, "lam_p": dense(0, 1)}
+        triangle = {"triu_hess_gamma_x_x": ca.Sparsity.upper(n)}
+        parts: dict[str, tuple[str, Sparsities, Sparsities, Callable[..., Sequence[Any]]]] = {
+            "oracle": ("nlp", first, {"f": one, "g": g}, self._value),
+            "grad_f": ("nlp_grad_f", first, {"f": one, "grad_f_x": x}, self._gradient),
+            "jac_g": ("nlp_jac_g", first, {"g": g, "jac_g_x": dense(n_g, n)}, self._slope),
+            "hess_lag": ("nlp_hess_l", first | last, triangle, self._hessian),
+            "iteration_callback": ("iteration", iterate, {"ret": one}, self._iteration),
+        }
+        settings = {**SETTINGS, "max_iter": max(self.options.max_iterations - len(self.history), 0)}
+        if self.options.hessian == "limited-memory":
+            settings |= {"hessian_approximation": "limited-memory", "limited_memory_max_history": 30}
+            del parts["hess_lag"]
+        if not n_g:
+            del parts["jac_g"]
+        made = {key: Callback(*part, self._failed) for key, part in parts.items()}
+        oracle, ipopt = made.pop("oracle"), {**settings, **self.options.options}
+        quiet = {"print_time": False, "show_eval_warnings": False, "calc_lam_p": False, "no_nlp_grad": True}
+        solver = ca.nlpsol("ipopt", "ipopt", oracle, {**made, **quiet, "ipopt": ipopt})
+        limits = {"lbg": scaled.g_lower, "ubg": scaled.g_upper}
+        out = solver(x0=self.theta * scaled.s, lbx=scaled.lower, ubx=scaled.upper, **limits)
+        self.multipliers = scaled.multipliers(*(np.asarray(out[key]).ravel() for key in ("lam_x", "lam_g")))
+        return str(solver.stats()["return_status"])
+
+    def _failed(self, error: BaseException) -> None:
+        self.error, self.stopped = self.error or error, Status.SOLVER_FAILED
+
+    def _keep(self, theta: np.ndarray, cost: float, margin: float = 0.0) -> np.ndarray:
+        """Keep θ if it is the best so far: feasible with the lowest cost, else least violated; returns G there."""
+        g = self.scaled.constraints(theta)
+        violation = max(float(np.max(np.abs(self.scaled.excess(g)), initial=0.0)), FEASIBLE)
+        if np.isfinite(cost) and (violation, cost) < (self.violation, self.cost * (1.0 + margin)):
+            self.theta, self.cost, self.violation = theta, cost, violation
+        return g
+
+    def _value(self, x: np.ndarray, _: Any) -> Sequence[Any]:
+        """F and G; infinite where the simulation diverges, from which IPOPT backs off."""
+        if self.stopped:
+            return [np.nan, np.full(len(self.problem.g_lower), np.nan)]
+        if x.tobytes() != self.at:
+            if time.perf_counter() - self.began > self.options.time_limit:
+                self.stopped = Status.TIME_LIMIT
+            theta = self.scaled.theta(x)
+            cost = self.problem.cost(theta)
+            self.values = [cost / self.scaled.unit, self._keep(theta, cost)]
+            self.at, self.trials = x.tobytes(), self.trials + 1
+        return self.values
+
+    def _point(self, x: np.ndarray) -> Point:
+        if x.tobytes() != self.slope_at:
+            self.point, self.slope_at = self.scaled.point(x), x.tobytes()
+        return self.point
+
+    def _gradient(self, x: np.ndarray, _: Any) -> Sequence[Any]:
+        point = self._point(x)
+        return [point.value, point.gradient]
+
+    def _slope(self, x: np.ndarray, _: Any) -> Sequence[Any]:
+        return [self.scaled.constraints(self.scaled.theta(x)), self.scaled.slope(x)]
+
+    def _hessian(self, x: np.ndarray, _: Any, weight: np.ndarray, multipliers: np.ndarray) -> Sequence[Any]:
+        if weight[0]:
+            h = weight[0] * self.damping.hessian(self._point(x), multipliers / weight[0], self.trials)
+            self.trials = 0
+        else:  # IPOPT restores feasibility
+            h = self.scaled.curvature(x, multipliers)
+        return [ca.triu(ca.DM(h))]
+
+    def _iteration(self, *iterate: np.ndarray) -> Sequence[Any]:
+        """History, progress, and the test for convergence at an accepted iterate; 1 tells IPOPT to stop."""
+        x, f, g, lam_x, lam_g, _ = iterate
+        scaled, options, cost = self.scaled, self.options, float(f[0]) * self.scaled.unit
+        step = float(np.max(np.abs(x - self.x)) * np.sqrt(scaled.unit)) if self.history else 0.0
+        self.x = x
+        seconds = time.perf_counter() - self.began
+        self.history.append(Iteration(len(self.history), cost, seconds, step, self.damping.value))
+        if self.progress:
+            self.progress(self.history[-1])
+        value, multipliers = np.concatenate([x, g]), np.concatenate([lam_x, lam_g])
+        low, high = np.concatenate([scaled.lower, scaled.g_lower]), np.concatenate([scaled.upper, scaled.g_upper])
+        gap = np.where(multipliers < 0, value - low, high - value)
+        barrier = float(np.sum(np.abs(multipliers * np.where(np.isfinite(gap), gap, 0.0)))) * scaled.unit
+        span = options.patience * (1 if options.hessian == "gauss-newton" else 4)
+        recent = [entry.cost for entry in self.history[-1 - span :]]
+        calm = len(recent) > span and max(recent) - min(recent) < options.tolerance * cost
+        feasible = np.max(np.abs(scaled.excess(g)), initial=0.0) <= FEASIBLE
+        if calm and feasible and barrier < 10 * options.tolerance * cost:
+            self.stopped = self.stopped or Status.CONVERGED
+        return [int(self.stopped is not None)]
+
+    def _onto_bounds(self) -> None:
+        """Put variables onto the bounds that hold them, mending the constraints, where that costs nothing."""
+        problem, scaled = self.problem, self.scaled
+        theta, force = self.theta.copy(), self.multipliers[: problem.size] / scaled.s / scaled.unit
+        for bound, pull in ((problem.lower, -force), (problem.upper, force)):
+            near = np.abs(theta - bound) * scaled.s <= np.maximum(pull, 0.0)
+            theta[near] = bound[near]
+        loose = (theta > problem.lower) & (theta < problem.upper)
+        for _ in range(3):
+            excess = scaled.excess(scaled.constraints(theta))
+            rows = np.abs(excess) > 0.1 * FEASIBLE
+            if not np.any(rows):
+                break
+            slope = scaled.slope(theta * scaled.s)[np.ix_(rows, loose)]
+            theta[loose] -= np.linalg.lstsq(slope, excess[rows], rcond=None)[0] / scaled.s[loose]
+            theta = np.clip(theta, problem.lower, problem.upper)
+        self._keep(theta, problem.cost(theta), margin=self.options.tolerance)
+        inside = (self.theta > problem.lower) & (self.theta < problem.upper)
+        self.multipliers[: problem.size][inside] = 0.0  # what the barrier has left there
+
+    def _solution(self, status: Status, message: str) -> Solution:
+        g = self.problem.constraint(self.theta) if len(self.problem.g_lower) else np.zeros(0)
+        violation = np.maximum(self.problem.g_lower - g, g - self.problem.g_upper)
+        return Solution(
+            theta=self.theta,
+            cost=self.cost,
+            status=status,
+            iterations=max(len(self.history) - 1, 0),
+            seconds=time.perf_counter() - self.began,
+            violation=float(np.max(violation, initial=0.0)),
+            multipliers=self.multipliers,
+            history=tuple(self.history),
+            message=message,
+        )

@@ -1,0 +1,208 @@
+"""The page of a fit: how good it is on what data, the hysteresis it found, its modes and parameters, and how to use it.
+
+Errors are those of Krikelis et al. (2024), Eq. 27.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .. import plots
+from ..data import Recording, as_recordings, rmse_per_output
+from ..identify import Fit
+from ..models import StaticNetwork
+from .fit_pictures import curve, hysteresis, linear_part, output_pictures
+from .fit_tables import limit_blocks, parameter_blocks, usage
+from .page import Block, Code, Page, Picture, Section, Table, Text
+
+RUNAWAY = 1e3  # NRMSE beyond which a simulation is not called a simulation
+
+
+def fit_page(
+    fit: Fit,
+    train: Recording | Sequence[Recording],
+    tests: Recording | Sequence[Recording],
+    *,
+    model_file: str = "model.json",
+) -> Page:
+    """Fill a page; see `fit_report`."""
+    used, judged = as_recordings(train), as_recordings(tests) if isinstance(tests, Recording) or len(tests) else ()
+    named = [(r.with_(name=r.name or _numbered("training", i, used)), "training") for i, r in enumerate(used)]
+    named += [(r.with_(name=r.name or _numbered("test", i, judged)), "test") for i, r in enumerate(judged)]
+    rows = [row for recording, role in named for row in _errors(fit, recording, role)]
+    shown = [recording for recording, role in named if role == "test"] or [named[0][0]]
+    sections = [
+        Section("How well it fits", [Text(_verdict(rows)), _error_table(rows), *output_pictures(fit, shown)]),
+        *([Section("The hysteresis it found", hysteresis(fit, shown))] if fit.model.n_s else []),
+        *([Section("The curve it found", curve(fit, shown[0]))] if fit.model.n_w == 1 and not fit.model.n_s else []),
+        Section("The linear part", linear_part(fit, used)),
+        Section("What holds it", limit_blocks(fit)),
+        Section("How it was found", _search(fit)),
+        Section("Parameters", parameter_blocks(fit)),
+        Section("How to use it", [Code(usage(fit, model_file))]),
+    ]
+    status = fit.status
+    return Page(
+        f"Identified model: {', '.join(fit.model.inputs)} → {', '.join(fit.model.outputs)}",
+        [s for s in sections if s.blocks],
+        subtitle=_subtitle(fit),
+        status=f"{status.value} {status.advice}".strip(),
+        tone="good" if status.converged else "bad" if status.value.startswith("Failed") else "warning",
+        facts=_facts(fit, rows),
+    )
+
+
+def _numbered(word: str, i: int, recordings: Sequence[Recording]) -> str:
+    return word if len(recordings) == 1 else f"{word} {i + 1}"
+
+
+def _errors(fit: Fit, recording: Recording, role: str) -> list[dict[str, Any]]:
+    """Errors of one recording, output by output, over the samples that are scored (`Fit.scored_from`)."""
+    recording = plots.as_scored(fit, recording)
+    y, y_hat = recording.y, fit.simulate(recording)
+    scored = y[recording.skip :]
+    rms, sigma, extent = rmse_per_output(y, y_hat, recording.skip), np.std(scored, axis=0), np.ptp(scored, axis=0)
+    compared = fit.linear is not None and fit.model.n_w > 0
+    linear = (
+        rmse_per_output(y, plots.linear_simulation(fit, recording), recording.skip)
+        if compared
+        else np.full(len(rms), np.nan)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return [
+            {
+                "recording": recording.name,
+                "role": role,
+                "output": name,
+                "unit": recording.units.get(name, fit.units.get(name, "")),
+                "seconds": len(scored) * recording.dt,
+                "linear": float(linear[i] / sigma[i]),
+                "nrmse": float(rms[i] / sigma[i]),
+                "rms": float(rms[i]),
+                "range": float(100 * rms[i] / extent[i]),
+            }
+            for i, name in enumerate(recording.outputs)
+        ]
+
+
+def _error_table(rows: list[dict[str, Any]]) -> Table:
+    outputs, compared = len({r["output"] for r in rows}) > 1, any(np.isfinite(r["linear"]) for r in rows)
+    columns = [
+        "recording",
+        *(["output"] if outputs else []),
+        "NRMSE, this model",
+        *(["NRMSE, linear model"] if compared else []),
+    ]
+    units = {r["unit"] for r in rows}
+    unit = f" [{units.pop()}]" if len(units) == 1 and "" not in units else ""
+    cells = [
+        [
+            r["recording"],
+            *([r["output"]] if outputs else []),
+            r["nrmse"],
+            *([r["linear"]] if compared else []),
+            r["rms"],
+            r["range"],
+            r["seconds"],
+            r["role"],
+        ]
+        for r in rows
+    ]
+    note = (
+        "NRMSE: rms error of the free-run simulation over the standard deviation of the measured output "
+        "(0 is perfect, 1 is no better than its mean)."
+    )
+    if any(r["role"] == "test" for r in rows):
+        note += " Test recordings were not used to fit or to choose; samples that a state was fitted to are left out."
+    emphasis = [i for i, r in enumerate(rows) if r["role"] == "test"]
+    return Table(
+        [*columns, f"rms error{unit}", "rms error, % of range", "length [s]", "used for"],
+        cells,
+        note=note,
+        emphasis=emphasis,
+        digits=3,
+    )
+
+
+def _verdict(rows: list[dict[str, Any]]) -> str:
+    tests = [r for r in rows if r["role"] == "test"] or rows
+    seen = "on recordings it has never seen" if tests[0]["role"] == "test" else "on its training recordings"
+    worst = max(tests, key=lambda r: r["nrmse"])
+    place = (
+        f"{worst['output']} in {worst['recording']}" if len({r["output"] for r in tests}) > 1 else worst["recording"]
+    )
+    at_worst = f" at worst ({place})" if len(tests) > 1 else ""
+    if not worst["nrmse"] < RUNAWAY:
+        return f"Simulated from its inputs alone, {seen}, the model runs away{at_worst.replace(' at worst', '')}."
+    text = f"Simulated from its inputs alone, {seen}, the model is off by {100 * worst['nrmse']:.2g}\u00a0%"
+    text += f" of the output's standard deviation{at_worst}"
+    linear = (
+        f"; a linear model of the same order by {100 * worst['linear']:.2g}\u00a0%"
+        if np.isfinite(worst["linear"])
+        else ""
+    )
+    return f"{text}{linear}."
+
+
+def _facts(fit: Fit, rows: list[dict[str, Any]]) -> dict[str, str]:
+    facts: dict[str, str] = {}
+    for role in ("training", "test"):
+        values = [r["nrmse"] for r in rows if r["role"] == role]
+        if values:
+            facts[f"NRMSE, {role}" + (" (worst)" if len(values) > 1 else "")] = f"{max(values):.4f}"
+    judged = [r for r in rows if r["role"] == "test"] or rows
+    gain = np.min([r["linear"] / r["nrmse"] if 0 < r["nrmse"] < np.inf else np.nan for r in judged])
+    if gain >= 1:
+        facts["smaller error than a linear model"] = f"{gain:.2g} ×"
+    facts["free parameters"] = str(int(fit.model.parameters.free.sum()))
+    if fit.seconds:
+        facts["time of the fit"] = f"{fit.seconds:.1f} s"
+    return facts
+
+
+def _subtitle(fit: Fit) -> str:
+    element, n_x = fit.model.element, fit.model.n_x
+    parts = [f"{n_x} state{'s' * (n_x != 1)}"]
+    operator = getattr(element, "operator", None)
+    if element is not None and operator is not None:
+        channels = f", {element.channels} channels" if element.channels > 1 else ""
+        parts.append(f"{getattr(element, 'n', '')} {operator.name.replace('_', ' ')} operators{channels}")
+    elif isinstance(element, StaticNetwork):
+        parts.append(f"{element.hidden * element.channels} neurons")
+    elif element is not None:
+        parts.append(type(element).__name__)
+    return ", ".join([*parts, f"step {fit.dt:.4g} s ({1 / fit.dt:.4g} Hz)"])
+
+
+def _search(fit: Fit) -> list[Block]:
+    lines = [line for line in str(fit).splitlines()[1:] if line]
+    out: list[Block] = [Text(". ".join(line[0].upper() + line[1:] for line in lines) + ".")]
+    if fit.solution.history or any(c.solution.history for c in fit.candidates):
+        out.append(
+            Picture(
+                plots.convergence(fit).figure,
+                "Training error over iterations, for every start and for the last solve of the best.",
+                "Convergence of the starts.",
+            )
+        )
+    if fit.candidates:
+        timed = any(c.solution.seconds for c in fit.candidates)
+        rows = [
+            [str(c.seed), c.error, c.solution.iterations, *[c.solution.seconds] * timed, c.solution.status.value]
+            for c in sorted(fit.candidates, key=lambda c: c.error)
+        ]
+        note = "Errors at the end of the exploration, before the best ones are polished."
+        out.append(
+            Table(
+                ["start", "training error", "iterations", *["time [s]"] * timed, "status"],
+                rows,
+                caption="All starts, best first",
+                note=note,
+                folded=True,
+                digits=3,
+            )
+        )
+    return out

@@ -1,0 +1,180 @@
+"""What `diagnose` accepts in place of a `Simulator`: a `control.StateSpace`, and a fitted PI-LFR.
+
+A state space becomes equations whose matrix entries are parameters: entries that are exactly 0, 1 or -1 are structure
+and stay, the others may move within a factor of two. A fitted model runs in discrete time as it is, with its memory
+among the states and its parameters held: it has been fitted already, what is asked is what it lacks. Only a gain near
+one and an offset of each output are free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError
+from ..data import Recording
+from ..models import Model, Parameter
+from .expressions import Named
+from .simulator import Simulator
+
+FACTOR = 2.0
+GAIN = (0.7, 1.3)
+SAME_STEP = 1e-3
+
+
+def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
+    """A simulator from what stands for one.
+
+    Parameters
+    ----------
+    thing : Simulator, control.StateSpace, control.TransferFunction, Fit or Model
+        Signals that were given no names there get the recordings'.
+    recordings : sequence of Recording
+        Their step is compared with that of a discrete-time system.
+
+    Returns
+    -------
+    Simulator
+
+    Raises
+    ------
+    InputError
+        If it is something else, or its step or number of signals is not the recordings'.
+    """
+    if isinstance(thing, Simulator):
+        return thing
+    if isinstance(thing, Model):
+        return _of_model(thing, recordings)
+    if isinstance(getattr(thing, "model", None), Model):  # a Fit
+        _check_step(float(thing.dt), recordings)
+        return _of_model(thing.model, recordings, getattr(thing, "units", {}))
+    if type(thing).__module__.partition(".")[0] == "control" and hasattr(thing, "ninputs"):
+        return _of_system(thing, recordings)
+    what = "a class" if isinstance(thing, type) else f"a {type(thing).__name__}"
+    raise InputError(f"{what} was given; give a Simulator, a control.StateSpace, or a fitted PI-LFR.")
+
+
+def _check_step(dt: float, recordings: Sequence[Recording]) -> None:
+    for r in recordings:
+        if abs(r.dt / dt - 1) > SAME_STEP:
+            raise InputError(f"The model's step is {dt:g} s, that of {r.label} {r.dt:g} s; resample the recording.")
+
+
+def _of_model(model: Model, recordings: Sequence[Recording] = (), units: Mapping[str, str] | None = None) -> Simulator:
+    if model.n_w and model.element is None:
+        raise InputError("The model has an open port; close it with close_loop first.")
+    if model.reads != ("u",) or model.substeps != 1:
+        raise InputError("The model was made from a simulator; give the simulator itself.")
+    own, parameters = model.parameters, {k: Parameter(p.value, p.unit, fixed=True) for k, p in model.parameters.items()}
+    for name in model.outputs:
+        seen = [np.std(r.y[:, r.outputs.index(name)]) for r in recordings if name in r.outputs]
+        reach = float(max(seen, default=np.inf))
+        parameters[f"gain_{name}"] = Parameter(1.0, bounds=GAIN)
+        parameters[f"offset_{name}"] = Parameter(0.0, bounds=(-reach, reach))
+    states = tuple(model.states)
+    states += tuple(f"memory{i + 1}" for i in range(model.n_x + model.n_s - len(states)))
+
+    def step(x: Named, u: Named, p: Named) -> Any:
+        state = ca.vertcat(ca.SX(0, 1), *(x[n] for n in states))
+        vector = ca.vertcat(ca.SX(0, 1), *(ca.vec(p[n]) for n in own))
+        return model.closed(state, ca.vertcat(*(u[n] for n in model.inputs)), vector)
+
+    def dynamics(x: Named, u: Named, p: Named) -> dict[str, Any]:
+        return {n: step(x, u, p)[0][i] for i, n in enumerate(states)}
+
+    def outputs(x: Named, u: Named, p: Named) -> dict[str, Any]:
+        y = step(x, u, p)[1]
+        return {n: p[f"gain_{n}"] * y[i] + p[f"offset_{n}"] for i, n in enumerate(model.outputs)}
+
+    units = dict(units or {})
+    return Simulator(dynamics, outputs, states, model.inputs, parameters, discrete=True, hold="zero", units=units)
+
+
+def _of_system(system: Any, recordings: Sequence[Recording]) -> Simulator:
+    import control
+
+    try:
+        system = control.ss(system)
+    except Exception as error:
+        raise InputError(
+            f"The system cannot be written as a state space ({' '.join(str(error).split())[:120]}); give one."
+        ) from error
+    matrices = {"A": system.A, "B": system.B, "C": system.C, "D": system.D}
+    if not all(np.all(np.isfinite(m)) for m in matrices.values()):
+        raise InputError("The state space has entries that are not finite; give numbers.")
+    discrete = bool(system.isdtime(strict=True))
+    if discrete and system.dt is not True:
+        _check_step(float(system.dt), recordings)
+    first = recordings[0] if recordings else None
+    inputs = _names(system.input_labels, "u", first.inputs if first else ())
+    outputs = _names(system.output_labels, "y", first.outputs if first else ())
+    states = _names(system.state_labels, "x", ())
+    return linear_simulator(matrices, states, inputs, outputs, discrete)
+
+
+def linear_simulator(
+    matrices: Mapping[str, np.ndarray],
+    states: tuple[str, ...],
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    discrete: bool = False,
+) -> Simulator:
+    """`ẋ = A x + B u, y = C x + D u` (or `x⁺`) with a parameter for every entry that is not 0, 1 or -1.
+
+    Parameters
+    ----------
+    matrices : mapping
+        A (n_x, n_x), B (n_x, n_u), C (n_y, n_x), D (n_y, n_u).
+    """
+    parameters: dict[str, Parameter] = {}
+    entries: dict[str, list[list[Any]]] = {}
+    for letter, matrix in matrices.items():
+        entries[letter] = []
+        for i, row in enumerate(np.asarray(matrix, dtype=float)):
+            entries[letter].append([])
+            for j, value in enumerate(row):
+                if value in (0.0, 1.0, -1.0):
+                    entries[letter][i].append(float(value))
+                    continue
+                name = f"{letter}{i + 1}{j + 1}" if max(matrix.shape) < 10 else f"{letter}{i + 1}_{j + 1}"
+                parameters[name] = Parameter(value, bounds=_around(float(value), letter == "A" and discrete))
+                entries[letter][i].append(name)
+
+    def product(letter: str, i: int, symbols: list[Any], p: Named) -> Any:
+        total: Any = 0
+        for entry, symbol in zip(entries[letter][i], symbols, strict=True):
+            total = total + (p[entry] if isinstance(entry, str) else entry) * symbol
+        return total
+
+    def dynamics(x: Named, u: Named, p: Named) -> dict[str, Any]:
+        xs, us = [x[n] for n in states], [u[n] for n in inputs]
+        return {n: product("A", i, xs, p) + product("B", i, us, p) for i, n in enumerate(states)}
+
+    def outputs_of(x: Named, u: Named, p: Named) -> dict[str, Any]:
+        xs, us = [x[n] for n in states], [u[n] for n in inputs]
+        return {n: product("C", i, xs, p) + product("D", i, us, p) for i, n in enumerate(outputs)}
+
+    hold = "zero" if discrete else None
+    return Simulator(dynamics, outputs_of, states, inputs, parameters, discrete=discrete, hold=hold)
+
+
+def _around(value: float, pole: bool) -> tuple[float, float]:
+    """Within a factor of two; entries of a discrete A, where a pole sits near one, within half their distance to it."""
+    if pole and abs(value) < 1:
+        reach = min(abs(value) * (FACTOR - 1), max(0.5 * (1 - abs(value)), 1e-3))
+        return value - reach, value + reach
+    ends = (value / FACTOR, value * FACTOR)
+    return min(ends), max(ends)
+
+
+def _names(labels: Sequence[str], letter: str, recorded: tuple[str, ...]) -> tuple[str, ...]:
+    """The system's own names; where it has only u[0], u[1], ... those of the recordings, else u or u1, u2, ..."""
+    own = tuple(str(label) for label in labels)
+    if own != tuple(f"{letter}[{i}]" for i in range(len(own))):
+        return own
+    if len(recorded) == len(own) and recorded:
+        return recorded
+    return (letter,) if len(own) == 1 else tuple(f"{letter}{i + 1}" for i in range(len(own)))

@@ -1,0 +1,151 @@
+"""Jobs side by side over an executor: in the order in which they end, again where a worker has died.
+
+Every job runs in a process of its own (`hand`), whatever the executor is made of. What a job's result is does not
+depend on where, when or how often it ran.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from typing import Any
+
+from .._base import InputError, Reply, do
+from .jobs import LOST, TIMED_OUT, Batch, Outcome, RunJob, attempt, unfinished
+from .manifest import versions
+
+AHEAD = 64  # jobs that an executor is given at a time
+
+
+def check_executor(executor: Any) -> None:
+    """Refuse what no job can be given to.
+
+    Raises
+    ------
+    InputError
+        That says what was given.
+    """
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")
+
+
+def side_by_side(
+    function: Callable[[RunJob], Outcome],
+    jobs: Sequence[RunJob],
+    executor: Executor,
+    *,
+    time_limit: float | None = None,
+    retries: int = 2,
+    ahead: int = AHEAD,
+) -> Iterator[Batch]:
+    """Outcomes as they arrive.
+
+    Parameters
+    ----------
+    function : callable
+        What to do with a job; it is pickled.
+    executor : concurrent.futures.Executor
+        Threads, processes, or a Dask cluster's.
+    time_limit : float, optional
+        Seconds a job may take before it is ended.
+    retries : int
+        How often a job whose worker has died is tried again.
+    ahead : int
+        Jobs that the executor is given at a time.
+
+    Raises
+    ------
+    InputError
+        If the jobs cannot be sent, the executor stops, its workers cannot begin, or have other versions.
+    """
+    shared = _pickled(function)
+    waiting, running = deque((job, 1) for job in jobs), dict[Future[Reply], tuple[RunJob, int]]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < ahead:
+                job, trial = waiting.popleft()
+                running[executor.submit(do, shared, _pickled(job), time_limit)] = job, trial
+            batch: Batch = []
+            stop: Exception | None = None
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                job, trial = running.pop(future)
+                try:
+                    reply = _reply(future)
+                    if not reply.lost:
+                        batch.append((job, _outcome(reply, time_limit)))
+                    elif trial <= retries:
+                        waiting.appendleft((job, trial + 1))
+                    elif not reply.begun:
+                        raise InputError(
+                            f"The workers cannot begin a job ({reply.lost}); see that they run this package."
+                        )
+                    else:
+                        text = f"Failed: its worker was lost {trial} times, lastly {reply.lost}."
+                        batch.append((job, unfinished(LOST, text)))
+                except (InputError, BrokenExecutor, CancelledError) as error:
+                    stop = error
+            if batch:
+                yield batch  # whatever stops a campaign, what has arrived is kept
+            if stop is not None:
+                raise stop
+    except (BrokenExecutor, CancelledError, RuntimeError, OSError) as error:
+        reason = str(error) or type(error).__name__
+        raise InputError(
+            f"The executor has stopped ({reason}); what is done stays, the same command goes on from there."
+        ) from None
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def _reply(future: Future[Reply]) -> Reply:
+    """A future's reply; an error of the executor's own counts as a worker lost."""
+    try:
+        return future.result()
+    except (BrokenExecutor, CancelledError):
+        raise
+    except Exception as error:  # a Dask worker was killed, or has not got the package
+        name = type(error).__name__
+        return Reply(lost=f"{name}: {error}".splitlines()[0], begun=name == "KilledWorker")
+
+
+def _outcome(reply: Reply, time_limit: float | None) -> Outcome:
+    if reply.timed_out:
+        return unfinished(TIMED_OUT, f"Failed: ended after its time limit of {time_limit:g} s.", time_limit=time_limit)
+    outcome, used = reply.result
+    for name, version in versions().items():
+        if used.get(name) != version:
+            raise InputError(
+                f"A worker has {name} {used.get(name)} and this process {version}; give both the same, results of "
+                "different versions are not mixed."
+            )
+    return outcome
+
+
+class Sent:
+    """`attempt` on a run and its recordings, with the versions that it used."""
+
+    def __init__(self, run: Any, recordings: Any) -> None:
+        self.run, self.recordings = run, recordings
+
+    def __call__(self, job: RunJob) -> tuple[Outcome, dict[str, str]]:
+        """The outcome of a job, and what it was computed with."""
+        return attempt(self.run, self.recordings, job), versions()
+
+
+def _pickled(thing: Any) -> bytes:
+    try:
+        return pickle.dumps(thing)
+    except Exception as error:
+        reason = error
+    try:  # what a run file in Python defines has no module that workers could import: cloudpickle sends the code
+        import cloudpickle
+
+        return bytes(cloudpickle.dumps(thing))
+    except Exception:
+        raise InputError(
+            f"The model or a constraint cannot be sent to other processes ({reason}); install "
+            "pilfr-casadi[dask], which can send code, or use workers=1 without a time limit."
+        ) from None

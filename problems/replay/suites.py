@@ -1,0 +1,215 @@
+"""The suites of the replay: their keys, how each key is answered, and how two answers are compared."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pilfr_casadi as pilfr
+
+from .. import accuracy, concealed, emps, masing_diagnosis, piezo_diagnosis, silverbox, speed, table2, tanks, zoo
+from ..masing_data import benchmark
+from ..measured_data import measured
+
+DIGITS = 10  # of exported steps
+SHORT_TABLE = ["--rows", "LTI", "N=5, paper", "nx=5, n=5", "--starts", "2", "--network-starts", "1", "--workers", "1"]
+ACCURACY = [(operators, seed) for operators in (20, 10) for seed in (0, 1)]
+EXPORTS = ("casadi", "smooth", "control", "diagnosis")
+Answer = dict[str, Any]
+# Concealed cases whose answers have been looked at before, balanced over kinds, rigs and laws.
+SEEDS = tuple(
+    map(
+        int,
+        """
+        4330 4331 4332 4333 4334 4335 4336 4337 4338 4339 4340 4341 4342 4343 4344 4345 4346 4347 4349 4350
+        4351 4352 4353 4354 4355 4356 4357 4358 4359 4360 4361 4362 4363 4364 4366 4369 4371 4372 4373 4374
+        4375 4376 4377 4378 4380 4381 4383 4384 4385 4386 4388 4390 4392 4395 4396 4400 4401 4402 4403 4405
+        4408 4409 4411 4412 4415 4416 4417 4418 4419 4420 4421 4423 4426 4429 4431 4433 4437 4438 4441 4443
+        4444 4445 4448 4449 4450 4451 4455 4462 4464 4466 4468 4469 4471 4472 4474 4478 4480 4481 4482 4483
+        4485 4488 4490 4491 4500 4501 4504 4511 4519 4524 4532 4538 4539 4558 4562 4568 4571 4575 4579 4589
+        """.split(),
+    )
+)
+
+
+def diagnosed(diagnosis: Any) -> Answer:
+    """Verdict, effects, gates and errors of a diagnosis."""
+    found = diagnosis.to_dict()
+    return {
+        "verdict": found["verdict"],
+        "effects": [[e["port"], e["law"], round(e["confidence"], 4)] for e in found["effects"]],
+        "gates": sorted([g["channel"], g["finding"]] for g in found["gates"]),
+        "train": found["fit"]["train"],
+        "test": found["fit"]["test"],
+        "floor": found["fit"]["noise_floor"]["nrmse"],
+    }
+
+
+def _case(key: str) -> Answer:
+    hidden = concealed.case(int(key))
+    try:
+        diagnosis = pilfr.diagnose(hidden.simulator, hidden.train, test=hidden.test, workers=1)
+    except Exception as error:  # a crash is an answer too
+        return {"verdict": f"crash: {type(error).__name__}", "effects": [], "gates": []}
+    score = concealed.score(hidden, diagnosis.to_dict())
+    marks = {k: getattr(score, k) for k in ("verdict_right", "port", "law", "both", "channel", "ratio")}
+    return {"name": hidden.name, **diagnosed(diagnosis), "score": marks}
+
+
+def from_files(folder: Path) -> Any:
+    """Diagnose a folder with simulator.py, train_*.csv and test.csv, as `pilfr diagnose` does."""
+    simulator = load_simulator(folder / "simulator.py")
+    names: dict[str, Any] = {"inputs": simulator.inputs, "outputs": simulator.outputs}
+    train = [pilfr.read_csv(path, **names) for path in sorted(folder.glob("train_*.csv"))]
+    return pilfr.diagnose(simulator, train, test=pilfr.read_csv(folder / "test.csv", **names), workers=1)
+
+
+def load_simulator(path: Path) -> Any:
+    """The simulator that a file defines."""
+    from pilfr_casadi.simulators import load_simulator as load
+
+    return load(path)
+
+
+MACHINES: dict[str, tuple[str, Callable[[Path], Any]]] = {
+    "emps": ("emps", lambda folder: emps.run(folder, workers=1)[0]),
+    "silverbox": ("silverbox", lambda folder: silverbox.run(folder, workers=1)[0]),
+    "tanks-linear": ("cascaded_tanks", lambda folder: tanks.run(folder, False, workers=1)[0]),
+    "tanks-root": ("cascaded_tanks", lambda folder: tanks.run(folder, True, workers=1)[0]),
+    "piezo": ("piezo_dbo", lambda folder: piezo_diagnosis.run(folder, workers=1)[0]),
+    "ced": ("ced", from_files),
+    "mr_damper": ("mr_damper", from_files),
+    "pendulum": ("dfki_pendulum", from_files),
+    "seal": ("pneumatic_seal", from_files),
+}
+
+
+def _machine(key: str) -> Answer | None:
+    if key == "masing":
+        return diagnosed(masing_diagnosis.run(0, workers=1)[0])
+    name, run = MACHINES[key]
+    folder = measured(name)
+    return None if folder is None else diagnosed(run(folder))
+
+
+def _table(key: str) -> Answer:
+    text = printed(lambda: table2.main([*SHORT_TABLE, "--seed", key]))
+    return {"lines": [re.sub(r" +[\d.]+ s$", "", line) for line in text.splitlines() if "minutes" not in line]}
+
+
+def printed(action: Callable[[], Any]) -> str:
+    """Standard output of an action."""
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        action()
+    return said.getvalue()
+
+
+def _accuracy(key: str) -> Answer:
+    operators, seed = map(int, key.split("-"))
+    return {"nrmse": [f"{e:.4f}" for e in accuracy.default_run(100, operators, seed)[0]]}
+
+
+def _zoo(key: str) -> Answer:
+    problem = zoo.CASES[key]().problem()
+    out: Answer = {}
+    for solver in (pilfr.GaussNewton(), pilfr.Ipopt()):
+        found = solver.solve(problem)
+        out[type(solver).__name__] = [f"{found.cost:.4e}", found.iterations]
+    return out
+
+
+def _export(key: str) -> Answer:
+    if key == "diagnosis":
+        simulator = masing_diagnosis.simulator()
+        from pilfr_casadi.export import exported
+
+        step, state = exported(simulator, dt=1 / 120, hold="zero").step, np.zeros(4)
+        records = benchmark(0).records
+    else:
+        records = benchmark(0).records
+        fit = pilfr.fit(accuracy.structure(5), records["train"], starts=2, seed=0)
+        with tempfile.TemporaryDirectory() as folder:
+            fit.save(Path(folder) / "model.json")
+            loaded = pilfr.load(Path(folder) / "model.json")
+        if key == "control":
+            system = loaded.export().to_control()
+            state = np.zeros(system.nstates)
+            out = []
+            for u in records["multisine"].u[:40]:
+                out.append(float(np.ravel(system.output(0, state, u))[0]))
+                state = np.ravel(system.dynamics(0, state, u))
+            return {"y": [f"{v:.{DIGITS}e}" for v in out]}
+        step = loaded.to_casadi() if key == "casadi" else loaded.export(smooth=1e-4).step
+        state = np.zeros(step.size1_in(0))
+    out = []
+    for u in records["multisine"].u[:40]:
+        state, y = step(state, u)
+        out.append(float(np.ravel(y)[0]))
+    return {"y": [f"{v:.{DIGITS}e}" for v in out]}
+
+
+def _speed(key: str) -> Answer:
+    return {"lines": printed(lambda: speed.main(["--quick"])).splitlines()}
+
+
+SUITES: dict[str, tuple[tuple[str, ...], Callable[[str], Answer | None]]] = {
+    "zoo": (tuple(zoo.CASES), _zoo),
+    "table2": (("101",), _table),
+    "accuracy": (tuple(f"{n}-{seed}" for n, seed in ACCURACY), _accuracy),
+    "exports": (EXPORTS, _export),
+    "machines": (("masing", *MACHINES), _machine),
+    "cases": (tuple(map(str, SEEDS)), _case),
+    "speed": (("quick",), _speed),
+}
+
+
+def keys(suite: str) -> tuple[str, ...]:
+    """Keys of a suite."""
+    return SUITES[suite][0]
+
+
+def answer(suite: str, key: str) -> Answer | None:
+    """Answer of one key; None where third-party recordings are missing."""
+    return SUITES[suite][1](key)
+
+
+def timed(suite: str, key: str) -> Answer | None:
+    """Answer of one key with its seconds; None where third-party recordings are missing."""
+    began = time.perf_counter()
+    found = answer(suite, key)
+    return None if found is None else {"key": key, "seconds": round(time.perf_counter() - began, 2), **found}
+
+
+def differences(suite: str, old: Answer, new: Answer) -> list[str]:
+    """Differences that fail a replay."""
+    if suite == "speed":
+        return []
+    if suite in ("cases", "machines"):
+        before, now = ({"verdict": a["verdict"], "effects": [e[:2] for e in a["effects"]]} for a in (old, new))
+    else:
+        before, now = ({k: v for k, v in a.items() if k not in ("key", "seconds")} for a in (old, new))
+    return [f"{k} was {v}, is {now.get(k)}" for k, v in before.items() if now.get(k) != v]
+
+
+def drifts(suite: str, old: Answer, new: Answer) -> list[str]:
+    """Differences of a diagnosis that are reported only."""
+    if suite not in ("cases", "machines") or "train" not in old or "train" not in new:
+        return []
+    out = []
+    for kind in ("train", "test"):
+        for name, value in (old[kind] or {}).items():
+            now = (new[kind] or {}).get(name)
+            if value is not None and now is not None and abs(now - value) > 1e-3 * abs(value):
+                out.append(f"{kind} {name} {value:.4g} -> {now:.4g}")
+    for (port, law, was), (_, _, sure) in zip(old["effects"], new["effects"], strict=False):
+        if abs(was - sure) > 0.005:
+            out.append(f"{law} at {port} {was:.2f} -> {sure:.2f}")
+    return out
