@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from diagnosis_contract import SCHEMA, problems
 from diagnosis_rig import OFF, recordings, rig
-from test_diagnosis_report import SCHEMA, problems
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
