@@ -1,0 +1,1 @@
+"""Answers banked from an earlier commit, and the command that replays and compares them."""
