@@ -15,7 +15,7 @@ from pilfr_casadi.identify.penalty import element_alone, unit_weights
 from pilfr_casadi.linear import select_order
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, hammerstein, wiener
 from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, unconstrained
-from pilfr_casadi.optimise.quadratic_program import QuadraticProgram
+from pilfr_casadi.optimise.gauss_newton import QuadraticProgram
 from problems.zoo_case import excitation, noisy, plays, simulate_lfr
 
 FEEDBACK = {

@@ -11,8 +11,7 @@ from pilfr_casadi.identify.linear_model import linear_model
 from pilfr_casadi.linear import subspace_matrices
 from pilfr_casadi.models import PILFR, Neighbours, Play
 from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status, stable
-from pilfr_casadi.optimise.damping import without_rounding
-from pilfr_casadi.optimise.gauss_newton import _Run, _Step
+from pilfr_casadi.optimise.gauss_newton import _Run, _Step, without_rounding
 
 
 @pytest.fixture(scope="module")

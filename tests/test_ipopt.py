@@ -11,9 +11,7 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status
-from pilfr_casadi.optimise.callback import Callback, handled_interrupt
-from pilfr_casadi.optimise.damping import Damping, Point
-from pilfr_casadi.optimise.scaling import Scaled
+from pilfr_casadi.optimise.ipopt import Callback, Damping, Point, Scaled, handled_interrupt
 from problems.zoo import CASES
 
 

@@ -9,7 +9,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.identify.reached_gain import reached_gain_sentence
 from pilfr_casadi.optimise import Gain, Problem, Solution, Status, dc_gain, limits_of
-from pilfr_casadi.optimise.exact_penalty import ExactPenalty
+from pilfr_casadi.optimise.gauss_newton import ExactPenalty
 from problems.constrained import three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)

@@ -11,7 +11,7 @@ from pilfr_casadi.identify import fit
 from pilfr_casadi.identify.open_memory import open_memory
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, Stop
 from pilfr_casadi.optimise import Problem
-from pilfr_casadi.optimise.slopes import steady_slope
+from pilfr_casadi.optimise.problem import steady_slope
 
 
 def noisy(size=0.1, periods=4, level=1.0, seed=0, **options):

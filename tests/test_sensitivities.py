@@ -12,8 +12,7 @@ from random_models import OPERATORS, random_input, random_lfr
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.engine import VirtualMachine, compiler, make_engine as engine_of
-from pilfr_casadi.engine.compiled import Compiled, cache_directory
-from pilfr_casadi.engine.generated import source_code
+from pilfr_casadi.engine.compiled import Compiled, cache_directory, source_code
 from pilfr_casadi.engine.sensitivities import linearize
 from pilfr_casadi.models import (
     PILFR,

@@ -5,17 +5,32 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .constraints import Constraint as Constraint, loosened as loosened, stable as stable
+    from .constraints import (
+        Constraint as Constraint,
+        Gain as Gain,
+        check_gain as check_gain,
+        dc_gain as dc_gain,
+        loosened as loosened,
+        ordered as ordered,
+        stable as stable,
+    )
     from .exactness import beyond as beyond, exactly as exactly, missed as missed
-    from .gauss_newton import GaussNewton as GaussNewton
+    from .gauss_newton import (
+        GaussNewton as GaussNewton,
+        QuadraticProgram as QuadraticProgram,
+        unconstrained as unconstrained,
+    )
     from .ipopt import Ipopt as Ipopt
-    from .known import Gain as Gain, check_gain as check_gain, dc_gain as dc_gain, ordered as ordered
-    from .layout import checked_weights as checked_weights
-    from .limits import Limit as Limit, limits_of as limits_of, unknown_multipliers as unknown_multipliers
-    from .problem import Problem as Problem
-    from .quadratic_program import QuadraticProgram as QuadraticProgram, unconstrained as unconstrained
-    from .slopes import settled as settled
-    from .solution import Iteration as Iteration, Progress as Progress, Solution as Solution, Status as Status
+    from .problem import Problem as Problem, checked_weights as checked_weights, settled as settled
+    from .solution import (
+        Iteration as Iteration,
+        Limit as Limit,
+        Progress as Progress,
+        Solution as Solution,
+        Status as Status,
+        limits_of as limits_of,
+        unknown_multipliers as unknown_multipliers,
+    )
     from .stability import (
         check_room as check_room,
         stability_limits as stability_limits,

@@ -17,9 +17,8 @@ import numpy as np
 
 from ..models import Neighbours
 from .constraints import TOLERATED
-from .damping import without_rounding
+from .gauss_newton import QuadraticProgram, without_rounding
 from .problem import Problem
-from .quadratic_program import QuadraticProgram
 from .solution import Solution, Status
 
 ROUNDS = 40

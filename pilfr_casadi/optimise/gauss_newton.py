@@ -17,24 +17,225 @@ cheapest feasible point goes on from there, with more damping and under a larger
 
 from __future__ import annotations
 
+import contextlib
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from .._base import InputError
 from ..models import Neighbours
-from .callback import handled_interrupt
 from .constraints import TOLERATED
-from .damping import without_rounding
-from .exact_penalty import ExactPenalty
-from .feasible import Feasible
 from .lifted import Lifted
 from .problem import Problem
-from .quadratic_program import QuadraticProgram
 from .solution import Iteration, Progress, Solution, Status
+
+
+class QuadraticProgram:
+    """Dense QP; solves for a step inside limits.
+
+    Where the unconstrained step lies inside all of them it is the solution, for the price of a Cholesky factorisation.
+    Else `ca.conic`, built when it is first needed, finds out which limits hold it.
+    """
+
+    def __init__(self, n: int, n_g: int, plugin: str) -> None:
+        self._size, self._plugin = (n, n_g), plugin
+
+    @cached_property
+    def _solve(self) -> ca.Function:
+        (n, n_g), plugin = self._size, self._plugin
+        structure = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(n_g, n)}
+        quiet = {"daqp": {}, "qrqp": {"print_iter": False, "print_header": False, "print_info": False}}.get(plugin, {})
+        return ca.conic("qp", plugin, structure, {**quiet, "error_on_fail": False})
+
+    def __call__(
+        self,
+        h: np.ndarray,
+        g: np.ndarray,
+        lbx: np.ndarray,
+        ubx: np.ndarray,
+        a: np.ndarray,
+        lba: np.ndarray,
+        uba: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Minimise `1/2 d'h d + g'd` over `lbx <= d <= ubx, lba <= a d <= uba`: d, multipliers, whether found.
+
+        h has a positive diagonal. A solver's tolerances are absolute: it gets unit diagonal and rows, and the step in
+        units of the steepest slope or, where there is none, of what the rows lack at d = 0.
+        """
+        unit = 1.0 / np.sqrt(np.diag(h))
+        a, g = a * unit, g * unit
+        row = np.max(np.abs(a), axis=1, initial=0.0)
+        row = np.where(row > 0, row, 1.0)
+        low, high = lba / row, uba / row
+        size = float(np.max(np.abs(g))) or float(np.max(np.maximum(low, -high), initial=0.0))
+        size = max(size, 1e-300)
+        rows = a / row[:, None], low / size, high / size
+        d, multipliers, good = self._solved(
+            h * unit * unit[:, None], g / size, lbx / unit / size, ubx / unit / size, *rows
+        )
+        return d * size * unit, size * multipliers / np.concatenate([unit, row]), good
+
+    def _solved(self, h: np.ndarray, g: np.ndarray, *limits: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        """The same as it stands."""
+        lbx, ubx, a, lba, uba = limits
+        d = unconstrained(h, g)
+        if d is not None and np.all((lbx <= d) & (d <= ubx)):
+            slack = a @ d
+            if np.all((lba <= slack) & (slack <= uba)):
+                return d, np.zeros(len(d) + len(slack)), True
+        low, high = np.concatenate([lbx, lba]), np.concatenate([ubx, uba])
+        if not np.all((low < np.inf) & (high > -np.inf)):  # too far away for numbers, or none: a plugin would raise
+            return np.zeros(len(g)), np.zeros(len(g) + len(a)), False
+        out = self._solve(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
+        d = np.asarray(out["x"]).ravel()
+        multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])
+        return d, multipliers, bool(self._solve.stats()["success"]) and bool(np.all(np.isfinite(d)))
+
+
+def unconstrained(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
+    """`-h⁻¹ g` for a positive definite h, else None."""
+    from scipy.linalg import cho_factor, cho_solve
+
+    try:
+        d = -cho_solve(cho_factor(h, lower=True, check_finite=False), g, check_finite=False)
+    except np.linalg.LinAlgError:
+        return None
+    return d if np.all(np.isfinite(d)) else None
+
+
+ROUNDING = 1e-20  # squares of columns that are rounding
+NONE = 1e-100  # size of a variable that is none: what is left of one that was driven to zero
+
+
+def without_rounding(squares: np.ndarray, theta: np.ndarray, neighbours: Neighbours) -> np.ndarray:
+    """Squared column norms (n,) in which those that are zero or rounding are replaced.
+
+    A column is rounding where it is so next to the others of its matrix, and a change of its variable by the variable's
+    size changes the outputs by nothing: a state that nothing excites. It gets the norm with which that change would
+    change the outputs by their own size; what rounding says about the variable is then damped away.
+    """
+    size = neighbours.sizes(theta)
+    idle = (squares <= ROUNDING * neighbours.largest(squares)) & (squares * size**2 <= ROUNDING)
+    return np.asarray(np.where(idle, 1.0 / np.where(size > NONE, size, 1.0) ** 2, squares))
+
+
+@contextlib.contextmanager
+def handled_interrupt(handle: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C calls `handle` in place of raising KeyboardInterrupt; in the main thread, where nobody else handles it."""
+    ours = threading.current_thread() is threading.main_thread()
+    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if ours:
+        signal.signal(signal.SIGINT, lambda *_: handle())
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+SHRUNK = 1e-2  # share of its first unit below which a constraint's unit is taken anew
+
+
+class ExactPenalty:
+    """The constraints of a problem, measured where each first has a slope, and where a run ends (`shrink`).
+
+    Attributes
+    ----------
+    unit : numpy.ndarray
+        Shape (n_g,), see `Problem.constraint_units`.
+    weight, least : float
+        μ, and what it never falls below.
+    """
+
+    def __init__(self, problem: Problem | Lifted) -> None:
+        self.problem, n_g = problem, len(problem.g_lower)
+        self.unit, self._known = np.ones(n_g), np.zeros(n_g, dtype=bool)
+        self.weight, self.least = 0.0, 0.0
+
+    def measure(self, theta: np.ndarray, squares: np.ndarray) -> None:
+        """Take the units of what has a slope at θ and had none before."""
+        if not np.all(self._known):
+            unit = self.problem.constraint_units(theta, squares)
+            first = ~self._known & (unit > 0)
+            self.unit[first], self._known[first] = unit[first], True
+
+    def shrink(self, theta: np.ndarray) -> bool:
+        """Take units at θ that are far smaller than they were; whether these alone tell of a violation.
+
+        Where a constraint has a pole nearby, such as a gain beside an integrator, its first unit may be immense.
+        """
+        if not len(self.unit):
+            return False
+        unit, before = self.problem.constraint_units(theta), self.violations(theta)
+        smaller = self._known & (unit > 0) & (unit < SHRUNK * self.unit)
+        self.unit = np.where(smaller, unit, self.unit)
+        return bool(np.any((before <= TOLERATED) & (self.violations(theta) > TOLERATED)))
+
+    def values(self, theta: np.ndarray) -> np.ndarray:
+        """The constraints in their units, shape (n_g,)."""
+        return self.problem.constraint(theta) / self.unit if len(self.unit) else np.zeros(0)
+
+    def slope(self, theta: np.ndarray) -> np.ndarray:
+        """Their Jacobian, shape (n_g, n)."""
+        return self.problem.constraint_jacobian(theta) / self.unit[:, None]
+
+    def room(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far it is from values to the lower limits and to the upper ones, (n_g,) each."""
+        return self.problem.g_lower / self.unit - values, self.problem.g_upper / self.unit - values
+
+    def violations(self, theta: np.ndarray) -> np.ndarray:
+        """Violation of each constraint in its unit, shape (n_g,); infinite where it has no value."""
+        if not len(self.unit):
+            return np.zeros(0)
+        low, high = self.room(self.values(theta))
+        over = np.maximum(np.maximum(low, -high), 0.0)
+        return np.where(np.isnan(over), np.inf, over)
+
+    def violation(self, theta: np.ndarray) -> float:
+        """Their sum."""
+        return float(self.violations(theta).sum())
+
+    def follow(self, multipliers: np.ndarray) -> None:
+        """Let the weight follow the constraints' multipliers (n_g,)."""
+        if len(multipliers):
+            needed = 1.5 * float(np.max(np.abs(multipliers)))
+            self.weight = max(needed, 0.5 * (self.weight + needed), self.least)
+
+    def raise_to(self, weight: float) -> None:
+        """Set the weight, and let it never fall below; at least twice what that was."""
+        self.weight = self.least = max(weight, 2.0 * self.least)
+
+
+class Feasible:
+    """Remembers the feasible point of the smallest cost, and how much straying would pay.
+
+    Parameters
+    ----------
+    tolerance : float
+        Share of its cost by which another feasible point has to be dearer to be worse.
+    """
+
+    def __init__(self, tolerance: float) -> None:
+        self.tolerance, self.cost, self.tempting = tolerance, np.inf, 0.0
+        self.theta = self.multipliers = np.zeros(0)
+
+    def see(self, cost: float, violation: float, theta: np.ndarray, multipliers: np.ndarray) -> None:
+        """Remember a point, its summed violation in units of the constraints."""
+        if violation > TOLERATED:
+            self.tempting = max(self.tempting, (self.cost - cost) / violation if np.isfinite(self.cost) else 0.0)
+        elif cost < self.cost:
+            self.cost, self.theta, self.multipliers = cost, theta, multipliers
+
+    def better(self, cost: float, violation: float) -> bool:
+        """Whether the best feasible point beats one of this cost and violation."""
+        return bool(np.isfinite(self.cost)) and (violation > TOLERATED or cost > self.cost * (1.0 + self.tolerance))
+
 
 FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
 RETURNS = 4  # times that a run which has strayed goes on from the best feasible point

@@ -16,18 +16,275 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from .._base import InputError
-from .callback import Callback, handled_interrupt
-from .damping import Damping, Point
-from .ipopt_settings import ENDINGS, SETTINGS, check_settings
+from .gauss_newton import ROUNDING, handled_interrupt
 from .problem import Problem
-from .scaling import Scaled
 from .solution import Iteration, Progress, Solution, Status
+
+SETTINGS = {
+    "print_level": 0,
+    "sb": "yes",
+    "tol": 1e-9,
+    "nlp_scaling_method": "none",
+    "bound_relax_factor": 0.0,
+    "mu_strategy": "adaptive",
+    "adaptive_mu_globalization": "never-monotone-mode",
+    "mu_max": 1e-3,
+    "mu_init": 1e-3,
+    "watchdog_shortened_iter_trigger": 0,
+    "bound_push": 1e-4,
+    "bound_frac": 1e-4,
+    "slack_bound_push": 1e-4,
+    "slack_bound_frac": 1e-4,
+}
+ENDINGS = {
+    "Solve_Succeeded": Status.CONVERGED,
+    "Solved_To_Acceptable_Level": Status.CONVERGED,
+    "Maximum_Iterations_Exceeded": Status.MAX_ITERATIONS,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+}
+
+
+def check_settings(options: Any) -> None:
+    """Let IPOPT itself judge its options, on a problem of one variable.
+
+    Raises
+    ------
+    InputError
+        If it does not take one.
+    """
+    if not isinstance(options, Mapping):
+        raise InputError(f'IPOPT\'s options were given as {options!r}; give them by name, like {{"print_level": 5}}.')
+    x = ca.MX.sym("x")
+    for name, value in options.items():
+        try:
+            ca.nlpsol("check", "ipopt", {"x": x, "f": x**2}, {"ipopt": {name: value, "sb": "yes"}, "print_time": False})
+        except (RuntimeError, TypeError, NotImplementedError):
+            raise InputError(
+                f"IPOPT does not take the option {name!r} with the value {value!r}; see its own list of options."
+            ) from None
+
+
+class Callback(ca.Callback):
+    """A CasADi Function around a Python function.
+
+    Parameters
+    ----------
+    name : str
+        Name of the Function.
+    inputs, outputs : mapping of str to casadi.Sparsity
+        Names and shapes; the order counts.
+    function : callable
+        Takes one flat array an input, returns one value an output.
+    failed : callable
+        Takes what `function` raised.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        inputs: Mapping[str, ca.Sparsity],
+        outputs: Mapping[str, ca.Sparsity],
+        function: Callable[..., Sequence[Any]],
+        failed: Callable[[BaseException], None],
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._inputs, self._outputs = list(inputs.items()), list(outputs.items())
+        self._function, self._failed = function, failed
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        """Number of inputs."""
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        """Number of outputs."""
+        return len(self._outputs)
+
+    def get_name_in(self, i: int) -> str:
+        """Name of input i."""
+        return self._inputs[i][0]
+
+    def get_name_out(self, i: int) -> str:
+        """Name of output i."""
+        return self._outputs[i][0]
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Shape of input i."""
+        return self._inputs[i][1]
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Shape of output i."""
+        return self._outputs[i][1]
+
+    def eval(self, arguments: Sequence[Any]) -> Sequence[Any]:
+        """Values of the outputs, NaN where the function raised."""
+        try:
+            return self._function(*(np.asarray(a).ravel() for a in arguments))
+        except BaseException as error:
+            self._failed(error)
+            return [ca.DM(sparsity, np.nan) for _, sparsity in self._outputs]
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A point x (n,): objective, its gradient (n,) and Gauss-Newton Hessian (n, n), constraints (n_g,) and Jacobian."""
+
+    x: np.ndarray
+    value: float
+    gradient: np.ndarray
+    hessian: np.ndarray
+    constraints: np.ndarray
+    slope: np.ndarray
+
+
+class Damping:
+    """λ, and what is needed to judge the next step.
+
+    Parameters
+    ----------
+    first : float
+        λ of the first Hessian.
+    size : int
+        Number of variables n.
+    """
+
+    def __init__(self, first: float, size: int) -> None:
+        self.value, self.growth, self.largest = first, 2.0, np.zeros(size)
+        self.before: Point | None = None
+        self.damped = np.zeros((size, size))
+
+    def hessian(self, point: Point, multipliers: np.ndarray, trials: int) -> np.ndarray:
+        """`H + λ D` at a new iterate, reached after `trials` evaluations; multipliers (n_g,) of the constraints."""
+        if self.before is not None and np.any(point.x != self.before.x):
+            if trials > 1:
+                self.value *= min(4.0 ** (trials - 1), 100.0)
+            else:
+                self._follow(self._ratio(self.before, point, multipliers))
+            self.value = min(max(self.value, 1e-12), 1e12)
+        self.largest = np.maximum(self.largest, np.diag(point.hessian))
+        # the variables are scaled: next to 1, what is less has been zero or rounding so far
+        self.damped = point.hessian + self.value * np.diag(np.where(self.largest > ROUNDING, self.largest, 1.0))
+        self.before = point
+        return self.damped
+
+    def _ratio(self, before: Point, after: Point, multipliers: np.ndarray) -> float:
+        """1 + (gain - foretold gain) / scale; the gain ratio, where bounds and constraints do not bend the step."""
+        d = after.x - before.x
+        curvature = 0.5 * float(d @ before.hessian @ d)
+        foretold = float((before.gradient + multipliers @ before.slope) @ d) + curvature
+        change = after.value - before.value + float(multipliers @ (after.constraints - before.constraints))
+        return 1.0 + (foretold - change) / max(float(d @ self.damped @ d) - curvature, 1e-300)
+
+    def _follow(self, ratio: float) -> None:
+        if ratio < 1e-4:
+            self.value, self.growth = self.value * self.growth, 2.0 * self.growth
+        else:
+            self.value, self.growth = self.value * max(1 / 3, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3), 2.0
+
+
+class Scaled:
+    """The scaled problem.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is scaled.
+    start : array, shape (n,)
+        Where, inside the bounds and with a finite cost.
+    damping : float
+        λ of the step; raised until the step lowers the cost.
+
+    Raises
+    ------
+    FloatingPointError
+        If the derivatives at the start are not finite.
+    """
+
+    def __init__(self, problem: Problem, start: np.ndarray, damping: float) -> None:
+        self.problem, self.damping = problem, damping
+        cost, g, h = problem.normal(start)
+        squares = np.diag(h).copy()
+        if not (np.all(np.isfinite(h)) and np.all(np.isfinite(g))):
+            raise FloatingPointError("the derivatives at the start are not finite")
+        unit, trial = 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0)), start
+        for _ in range(20):
+            step = -unit * np.linalg.solve(h * unit * unit[:, None] + self.damping * np.eye(len(g)), g * unit)
+            trial = np.clip(start + step, problem.lower, problem.upper)
+            there = np.diag(problem.normal(trial)[2]) if problem.cost(trial) <= cost else np.full(len(g), np.nan)
+            if np.all(np.isfinite(there)):
+                squares = np.maximum(squares, there)
+                break
+            self.damping *= 4.0
+        self.unit = cost if cost > 0 else 1.0
+        self.s = np.sqrt(_filled(squares, problem.labels, start, self.unit) / self.unit)
+        rows = np.max(np.abs(problem.constraint_jacobian(trial) / self.s), axis=1, initial=0.0)
+        self.g_unit = np.where(rows > 0, rows, 1.0)
+        self.lower, self.upper = problem.lower * self.s, problem.upper * self.s
+        self.g_lower, self.g_upper = problem.g_lower / self.g_unit, problem.g_upper / self.g_unit
+
+    def theta(self, x: np.ndarray) -> np.ndarray:
+        """θ at x, rounding taken back into the bounds."""
+        return np.asarray(np.clip(x / self.s, self.problem.lower, self.problem.upper))
+
+    def constraints(self, theta: np.ndarray) -> np.ndarray:
+        """Scaled constraints G, shape (n_g,)."""
+        return self.problem.constraint(theta) / self.g_unit if len(self.g_unit) else np.zeros(0)
+
+    def slope(self, x: np.ndarray) -> np.ndarray:
+        """Jacobian of G, shape (n_g, n)."""
+        return self.problem.constraint_jacobian(self.theta(x)) / self.s / self.g_unit[:, None]
+
+    def excess(self, g: np.ndarray) -> np.ndarray:
+        """By how much G lies above (positive) or below (negative) its limits, shape (n_g,)."""
+        return np.maximum(g - self.g_upper, 0.0) - np.maximum(self.g_lower - g, 0.0)
+
+    def point(self, x: np.ndarray) -> Point:
+        """Everything at x, with derivatives."""
+        with np.errstate(all="ignore"):
+            f, g, h = self.problem.normal(self.theta(x))
+            scale = self.s * self.unit
+            gradient, hessian = g / scale, h / scale / self.s[:, None]
+        return Point(x, f / self.unit, gradient, hessian, self.constraints(self.theta(x)), self.slope(x))
+
+    @cached_property
+    def _weighted_curvature(self) -> ca.Function | None:
+        """`(p, λ) -> ∇²(λ'g)` over the model's full parameter vector; None where the constraints are linear."""
+        p, lam = ca.MX.sym("p", len(self.problem.free)), ca.MX.sym("lam", len(self.g_unit))
+        h = ca.hessian(ca.dot(lam, self.problem.rows.function(p)), p)[0]
+        return ca.Function("curvature", [p, lam], [ca.densify(h)], ["p", "lam"], ["hessian"]) if h.nnz() else None
+
+    def curvature(self, x: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+        """Hessian of the constraints weighted by their multipliers (n_g,), shape (n, n)."""
+        h, free = np.zeros((len(x), len(x))), np.flatnonzero(self.problem.free)
+        if self._weighted_curvature is not None:
+            dense = np.asarray(
+                self._weighted_curvature(self.problem.parameters(self.theta(x)), multipliers / self.g_unit)
+            )
+            s = self.s[: len(free)]
+            h[: len(free), : len(free)] = dense[np.ix_(free, free)] / s / s[:, None]
+        return h
+
+    def multipliers(self, lam_x: np.ndarray, lam_g: np.ndarray) -> np.ndarray:
+        """Multipliers of the bounds and constraints of the problem itself, shape (n + n_g,)."""
+        return self.unit * np.concatenate([lam_x * self.s, lam_g / self.g_unit])
+
+
+def _filled(squares: np.ndarray, labels: tuple[str, ...], start: np.ndarray, unit: float) -> np.ndarray:
+    """Columns that vanish at both points get the norm of their like (idle thresholds), else one to fit their value."""
+    names, out = np.array([label.split("[")[0] for label in labels]), squares.copy()
+    for name in set(names[~(squares > 0)]):
+        alike = names == name
+        known, size = squares[alike & (squares > 0)], float(np.max(np.abs(start[alike])))
+        out[alike & ~(squares > 0)] = np.median(known) if len(known) else unit / (size or 1.0) ** 2
+    return out
+
 
 Sparsities = dict[str, ca.Sparsity]
 FEASIBLE = 1e-8  # violation of a constraint, in units of the change that one scaled variable makes

@@ -11,22 +11,277 @@ of the record, so memory does not grow with its length.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, numbers
 from ..data import Recording, as_recordings
 from ..engine import Engine, VirtualMachine, make_engine
-from ..models import Model, Neighbours
-from .constraints import Constraint, Rows
-from .known import check_gain
-from .layout import Part, checked_weights, lay_out, output_scale
-from .nlp import Horizon, to_nlp
-from .penalties import Penalties
-from .slopes import Pass, settled, steady_slope, steady_sums, sums
+from ..models import Model, Neighbours, ParameterSet
+from .constraints import Constraint, Rows, check_gain
+
+
+@dataclass(frozen=True)
+class Part:
+    """One recording inside the problem.
+
+    Attributes
+    ----------
+    recording : Recording
+        Its data.
+    first : int or None
+        The first of its variables, where its initial state is estimated.
+    state : array, (n_state,)
+        State at its first sample, before any periods that are run before.
+    drive, warm_up : array
+        What drives it, and the periods before it.
+    scale : array, (n_y,)
+        What residuals are divided by.
+    steady : bool
+        Whether it begins at the fixed point of its period, where periods from rest lead.
+    """
+
+    recording: Recording
+    first: int | None
+    state: np.ndarray
+    drive: np.ndarray
+    warm_up: np.ndarray
+    scale: np.ndarray
+    steady: bool = False
+
+
+def lay_out(
+    model: Model,
+    recordings: Sequence[Recording],
+    engine: Engine,
+    at: int,
+    periods: int | None,
+    scales: Sequence[np.ndarray],
+) -> Iterator[Part]:
+    """Each recording with its first state, which is a variable from index `at` on where it is to be estimated."""
+    n_state = model.n_x + model.n_s
+    for r, scale in zip(recordings, scales, strict=True):
+        zero, drive = np.zeros(n_state), model.drive(r)
+        nothing = drive[:0]
+        if isinstance(r.initial, str):
+            if r.begins == "zero":
+                yield Part(r, None, zero, drive, nothing, scale)
+            elif r.begins == "estimate":
+                yield Part(r, at, zero, drive, nothing, scale)
+                at += n_state
+            else:
+                if r.period is None:
+                    raise InputError(
+                        "A recording in periodic steady state needs its period in samples; give `period=`."
+                    )
+                one = drive[: r.period * model.substeps]
+                warm_up = _periods_before(model, engine, one, periods)
+                yield Part(r, None, zero, drive, warm_up, scale, periods is None)
+        else:
+            given = np.asarray(r.initial, dtype=float).ravel()
+            if given.size not in (len(model.states), n_state):
+                raise InputError(
+                    f"An initial state of {given.size} numbers was given; expected {len(model.states)} or {n_state}."
+                )
+            yield Part(r, None, np.concatenate([given, zero[given.size :]]), drive, nothing, scale)
+
+
+def _periods_before(model: Model, engine: Engine, one: np.ndarray, periods: int | None) -> np.ndarray:
+    """What drives the periods before a periodic recording: as many as the start model takes to settle, 2 to 50."""
+    state = np.zeros(model.n_x + model.n_s)
+    for count in range(1, 51 if periods is None else 1):
+        before, state = state, engine.simulate(one, model.parameters.start, state)[1]
+        if not np.all(np.isfinite(state)):
+            break
+        periods = max(count, 2)
+        if np.max(np.abs(state - before), initial=0.0) <= 1e-6 * np.max(np.abs(state), initial=0.0):
+            break
+    return np.tile(one, (periods or 2, 1))
+
+
+def checked_weights(given: Sequence[float] | np.ndarray | None, count: int) -> np.ndarray:
+    """One weight above zero for each recording, ones where none are given."""
+    weights = numbers(np.ones(count) if given is None else given, "A weight of a recording").ravel()
+    if len(weights) != count or not np.all(weights > 0):
+        raise InputError(
+            f"{len(weights)} weights from {weights.min(initial=np.inf):g} were given for {count} recordings; give one "
+            "above zero for each."
+        )
+    return weights
+
+
+def output_scale(recordings: Sequence[Recording]) -> np.ndarray:
+    """Standard deviation of each output over all recordings, (n_y,)."""
+    return np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
+
+
+class Penalties:
+    """What is added to the simulation error.
+
+    Parameters
+    ----------
+    parameters : ParameterSet
+        With their priors.
+    l1 : mapping
+        Weight of an L1 penalty by name.
+    noise : float
+        Standard deviation of the noise relative to the output's.
+    residuals, size : int
+        Number of residuals, and of variables: the free parameters come first, no others are penalised.
+
+    Raises
+    ------
+    InputError
+        If what an L1 penalty is on may be negative.
+    """
+
+    def __init__(
+        self, parameters: ParameterSet, l1: Mapping[str, float], noise: float, residuals: int, size: int
+    ) -> None:
+        weight, mean, slope = (np.zeros(parameters.size) for _ in range(3))
+        for name, strength in l1.items():
+            where = parameters.position(name)
+            if np.any(parameters.lower[where] < 0):
+                raise InputError(
+                    f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior."
+                )
+            slope[where] = strength
+        for name, p in parameters.items():
+            if p.prior is not None:
+                where = parameters.position(name)
+                mean[where] = np.broadcast_to(np.asarray(p.prior[0], dtype=float), p.value.shape).ravel(order="F")
+                std = np.broadcast_to(np.asarray(p.prior[1], dtype=float), p.value.shape).ravel(order="F")
+                weight[where] = noise**2 / std**2 / residuals
+        pad = np.zeros(size - int(parameters.free.sum()))
+        self.weight, self.mean, self.slope = (np.concatenate([a[parameters.free], pad]) for a in (weight, mean, slope))
+
+    def value(self, theta: np.ndarray) -> float:
+        """Both terms."""
+        return float(0.5 * self.weight @ (theta - self.mean) ** 2 + self.slope @ theta)
+
+    def gradient(self, theta: np.ndarray) -> np.ndarray:
+        """Their gradient, shape (n,); the Hessian is diagonal, `weight`."""
+        return np.asarray(self.weight * (theta - self.mean) + self.slope)
+
+
+Array = np.ndarray
+SETTLED = 1e-10  # change over a period, next to the largest entry of the state, that is none
+NEARLY = 1e-6  # the same where it has to do
+MOST, WAIT = 200, 10  # periods, and periods before each leap
+CHUNK = 512  # samples of a period whose slopes are held at a time
+
+
+def settled(engine: Engine, period: Array, p: Array, state: Array, tolerance: float = SETTLED) -> Array:
+    """State at the beginning of a steady period, not finite where none is reached.
+
+    Memory of operators that never slip in a period is not decided by it: it stays as the periods leave it that are run
+    from the state given, which is zero for a recording (`open_memory` finds it). Periods are run from there; where that
+    takes long, for slow poles, Newton's rule on `x = Φ(x)` leaps ahead.
+    """
+    change, size = np.inf, 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(1, MOST + 1):
+            before, state = state, engine.simulate(period, p, state)[1]
+            change, size = np.max(np.abs(state - before), initial=0.0), np.max(np.abs(state), initial=1e-300)
+            if not np.isfinite(change) or change <= tolerance * size:
+                return state
+            if k % WAIT == 0:
+                state = _leap(engine, period, p, state)
+    return state if change <= NEARLY * size else np.full_like(state, np.nan)
+
+
+def _leap(engine: Engine, period: Array, p: Array, state: Array) -> Array:
+    """One step of Newton's rule towards the fixed point of a period, where it brings it nearer; else one period."""
+    after, slope = state, np.eye(len(state))
+    rows = CHUNK * engine.linear.substeps
+    for a in range(0, len(period), rows):
+        _, _, after, slope = engine.sensitivity(period[a : a + rows], p, after, slope, np.full(len(p), -1))
+    if not np.all(np.isfinite(slope)):
+        return after
+    try:
+        there = state + steady_slope(np.hstack([(after - state)[:, None], slope]), 1)[:, 0]
+    except np.linalg.LinAlgError:
+        return after
+    behind = engine.simulate(period, p, there)[1]
+    return there if np.max(np.abs(behind - there)) < np.max(np.abs(after - state)) else after
+
+
+def steady_slope(after: Array, n: int) -> Array:
+    """`(I - Φ_x)^-1 Φ_θ` from the slope behind one period, columns of θ (n) first: shape (n_state, n).
+
+    Memory that nothing moves in a whole period stays where it is: it has no slope.
+    """
+    size = len(after)
+    matrix, right = np.eye(size) - after[:, n:], after[:, :n].copy()
+    still = np.max(np.abs(matrix), axis=1, initial=0.0) <= 1e-12
+    matrix[still, still], right[still] = 1.0, 0.0
+    return np.linalg.solve(matrix, right) if size else right
+
+
+@dataclass
+class Pass:
+    """One run of a recording with derivatives.
+
+    Parameters
+    ----------
+    seed : array, (n_state, n_c)
+        Slope of the first state.
+    """
+
+    engine: Engine
+    part: Part
+    p: Array
+    columns: Array
+    state: Array
+    seed: Array
+    length: int
+    after_period: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def stretches(self, substeps: int) -> Iterator[tuple[Array, Array]]:
+        """Residuals (R_b,) and their Jacobian (R_b, n_c), behind the periods that are run before the recording."""
+        part, r, n = self.part, self.part.recording, substeps
+        state, seed = self.state, self.seed
+        if not part.steady:
+            for a in range(0, len(part.warm_up), self.length * n):
+                rows = part.warm_up[a : a + self.length * n]
+                _, _, state, seed = self.engine.sensitivity(rows, self.p, state, seed, self.columns)
+        a, period = 0, r.period or len(r)
+        while a < len(r):
+            b = min(a + self.length, len(r), period if a < period else len(r))
+            y, jac, state, seed = self.engine.sensitivity(part.drive[a * n : b * n], self.p, state, seed, self.columns)
+            if b == period:
+                self.after_period = seed.copy()
+            cut = min(max(r.skip - a, 0), b - a)
+            e = ((y - r.y[a:b]) / part.scale)[cut:].ravel()
+            jac /= part.scale[:, None]
+            yield e, jac[cut:].reshape(e.size, jac.shape[2])
+            a = b
+
+
+def sums(run: Pass, substeps: int) -> tuple[float, Array, Array]:
+    """`e'e`, `J'e` and `J'J` over a recording, for the columns of the seed."""
+    n_c = run.seed.shape[1]
+    value, gradient, hessian = 0.0, np.zeros(n_c), np.zeros((n_c, n_c))
+    for e, jac in run.stretches(substeps):
+        value += float(e @ e)
+        gradient += e @ jac
+        hessian += jac.T @ jac
+    return value, gradient, hessian
+
+
+def steady_sums(run: Pass, substeps: int, n: int) -> tuple[float, Array, Array]:
+    """`sums` over a recording in periodic steady state for the n columns of θ; the seed is `[0 I]`."""
+    value, gradient, hessian = sums(run, substeps)
+    if not np.all(np.isfinite(run.after_period)):
+        return np.inf, np.full(n, np.nan), np.full((n, n), np.nan)
+    total = np.vstack([np.eye(n), steady_slope(run.after_period, n)])
+    return value, total.T @ gradient, total.T @ hessian @ total
+
 
 STRETCH = 2_000_000  # numbers in the piece of the Jacobian that is held at a time
 
@@ -294,3 +549,80 @@ class Problem:
             size = np.where(rests, self.scale, spread)
             out.append(float(np.mean(np.sqrt(np.mean(error**2, axis=0)) / size)))
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class Horizon:
+    """A problem as CasADi expressions of its variables θ, in the words of `casadi.nlpsol`.
+
+    Attributes
+    ----------
+    x : casadi.MX
+        Variables θ, shape (n,), laid out as `Problem.labels`.
+    f : casadi.MX
+        Cost, equal to `Problem.cost`.
+    g : casadi.MX
+        General constraints, shape (n_g,).
+    x0, lbx, ubx : array, shape (n,)
+        Start and bounds of θ.
+    lbg, ubg : array, shape (n_g,)
+        Bounds of g.
+    residual : casadi.MX
+        Normalised residuals of the scored samples, shape (R,).
+    simulated : tuple of casadi.MX
+        Simulated outputs of each recording, one column a sample, shape (n_y, M), in the recording's units.
+    initial : tuple of casadi.MX
+        State with the element's memory before each recording; where it is periodic, before the periods that the start
+        model takes to settle, which are written out before it.
+    parameters : mapping of str to casadi.MX
+        The model's parameters by name, fixed ones as numbers.
+    """
+
+    x: ca.MX
+    f: ca.MX
+    g: ca.MX
+    x0: np.ndarray
+    lbx: np.ndarray
+    ubx: np.ndarray
+    lbg: np.ndarray
+    ubg: np.ndarray
+    residual: ca.MX
+    simulated: tuple[ca.MX, ...]
+    initial: tuple[ca.MX, ...]
+    parameters: Mapping[str, ca.MX]
+
+
+def to_nlp(problem: Problem) -> Horizon:
+    """Write a problem out over the horizon; see `Horizon` and `Problem.to_nlp`."""
+    model = problem.model
+    theta = ca.MX.sym("theta", problem.size)
+    n_free, n_state = int(problem.free.sum()), model.n_x + model.n_s
+    p = ca.MX(ca.DM(problem.parameters(problem.start)))
+    if n_free:
+        p[np.flatnonzero(problem.free).tolist()] = theta[:n_free]
+    simulated, residual, initial = [], [], []
+    for part in problem._parts:
+        state = ca.MX(ca.DM(part.state)) if part.first is None else theta[part.first : part.first + n_state]
+        r = part.recording
+        u = np.concatenate([part.warm_up, part.drive])
+        _, y = model.closed.mapaccum("run", len(u))(state, u.T, ca.repmat(p, 1, len(u)))
+        y = y[:, len(part.warm_up) :: model.substeps]
+        initial.append(state)
+        simulated.append(y)
+        residual.append(ca.vec(((y - r.y.T) / np.tile(part.scale[:, None], (1, len(r))))[:, r.skip :]))
+    e = ca.vertcat(*residual)
+    prior = 0.5 * ca.dot(problem.penalties.weight, (theta - problem.penalties.mean) ** 2)
+    return Horizon(
+        x=theta,
+        f=0.5 * ca.sumsqr(e) / problem.residuals + prior + ca.dot(problem.penalties.slope, theta),
+        g=problem.rows.function(p),
+        x0=problem.start,
+        lbx=problem.lower,
+        ubx=problem.upper,
+        lbg=problem.g_lower,
+        ubg=problem.g_upper,
+        residual=e,
+        simulated=tuple(simulated),
+        initial=tuple(initial),
+        parameters=model.parameters.symbols(p),
+    )

@@ -30,9 +30,8 @@ from .constraints import BeyondRadius, Constraint, loosened
 from .exactness import beyond, missed
 from .gauss_newton import GaussNewton
 from .lifted import Lifted, back, radius_limits, rotated
-from .limits import FELT
 from .problem import Problem
-from .solution import Progress, Solution, Status
+from .solution import FELT, Progress, Solution, Status
 
 Array = np.ndarray
 Solve = Callable[[Problem, "Array | None"], Solution]
