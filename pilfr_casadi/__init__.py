@@ -1,4 +1,26 @@
-"""Identify dynamic models with hysteresis from recordings, and find the physics that a simulator leaves out."""
+"""Identify dynamic models with hysteresis from recordings, and find the physics that a simulator leaves out.
+
+Find missing physics. A `Simulator` holds your equations, with `Parameter` values and a `Port` wherever a force may be
+missing; `diagnose` compares it with recordings of the machine and returns a `Diagnosis`::
+
+    import pilfr_casadi as pilfr
+
+    train = pilfr.read_csv("train.csv", inputs="force", outputs="x2")
+    diagnosis = pilfr.diagnose(simulator, train, test=pilfr.read_csv("test.csv", inputs="force", outputs="x2"))
+    print(diagnosis)  # where, what, how sure, error before and after
+    diagnosis.report("report")  # report.html, diagnosis.json, figures
+
+Identify a model. A `PILFR` is a linear model closed by hysteresis operators; `fit` returns a `Fit`::
+
+    model = pilfr.PILFR(nx=5, element=pilfr.PrandtlIshlinskii(pilfr.Play, 20))
+    fit = pilfr.fit(model, train, starts=8, seed=0)
+    fit.save("rig.json")  # pilfr.load reads it again
+    F = fit.to_casadi()  # casadi.Function (x, u) -> (x_next, y)
+
+More lives in the folders: `pilfr.laws` (the catalogue of physical laws), `pilfr.models`, `pilfr.data`, `pilfr.linear`,
+`pilfr.optimise`, `pilfr.control`, `pilfr.plots`, `pilfr.report`, `pilfr.studies`. Each says in its docstring what it
+holds.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -7,7 +29,20 @@ from ._base.version import __version__ as __version__
 from .diagnose import diagnose as diagnose
 
 if TYPE_CHECKING:
-    from . import control as control, laws as laws, plots as plots
+    from . import (
+        control as control,
+        data as data,
+        export as export,
+        identify as identify,
+        laws as laws,
+        linear as linear,
+        models as models,
+        optimise as optimise,
+        plots as plots,
+        report as report,
+        simulators as simulators,
+        studies as studies,
+    )
     from ._base import InputError as InputError
     from .control import (
         PredictiveController as PredictiveController,
@@ -103,5 +138,57 @@ if TYPE_CHECKING:
     from .simulators import Port as Port, Simulator as Simulator
     from .studies import campaign as campaign, read_run as read_run, run as run
 
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
-__all__ += ["__version__", "diagnose"]
+__getattr__, __dir__, _listed = lazy_face(__name__, __file__)
+# Reached through their folders (`pilfr.models.to_plays`); these spellings still work.
+_ELSEWHERE = {
+    "BLA",
+    "Envelope",
+    "Exported",
+    "Limit",
+    "ParameterSet",
+    "Part",
+    "Products",
+    "RegularizationPath",
+    "Solution",
+    "StaticNetwork",
+    "Status",
+    "as_recordings",
+    "dc_gain",
+    "do_mpc_controller",
+    "do_mpc_model",
+    "feedforward",
+    "fit_report",
+    "generalized_play",
+    "inverse_element",
+    "kalman_filter",
+    "mean_period",
+    "modal",
+    "network_lfr",
+    "noise_weights",
+    "normalise",
+    "one_step",
+    "open_model",
+    "ordered",
+    "orthogonal_multisine",
+    "period_noise",
+    "plain_bla",
+    "play",
+    "prbs",
+    "prune",
+    "read_run",
+    "regularization_path",
+    "response_bound",
+    "rmse",
+    "select_order",
+    "stable",
+    "standard_errors",
+    "stop",
+    "time_subspace",
+    "to_casadi",
+    "to_plays",
+    "to_stops",
+    "tukey_realizations",
+    "visibility",
+    "write_report",
+}
+__all__ = [*(name for name in _listed if name not in _ELSEWHERE), "__version__", "diagnose"]
