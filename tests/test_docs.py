@@ -1,0 +1,133 @@
+"""Every example runs and ends in an assertion; every snippet of the README and of docs/ runs as printed."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+DEMO = ROOT / "pilfr_casadi" / "cli" / "demo_data"
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
+LONG = {"combined_elements", "mpc_piezo", "baselines", "own_law", "diagnose"}  # examples of more than some seconds
+COMMAND = "import sys; from pilfr_casadi.cli import main; sys.exit(main())"
+
+
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, marks=[pytest.mark.slow] if p.stem in LONG else [], id=p.stem) for p in EXAMPLES]
+)
+def test_example(path, tmp_path):
+    done = subprocess.run([sys.executable, path], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+def test_examples_are_short_and_end_in_an_assertion(path):
+    source = path.read_text(encoding="utf-8")
+    assert source.count("\n") <= 60
+    assert isinstance(ast.parse(source).body[-1], ast.Assert)
+
+
+def snippets(language, *names):
+    """Code blocks of a language in the given documents, in their order."""
+    texts = [(ROOT / name).read_text(encoding="utf-8") for name in names]
+    return [block for text in texts for block in re.findall(rf"```{language}\n(.*?)```", text, re.S)]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for path in DEMO.iterdir():
+        if path.is_file():
+            shutil.copy(path, tmp_path)
+    return tmp_path
+
+
+def run(arguments, folder):
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
+
+
+@pytest.mark.parametrize("name", ["README.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))])
+def test_links_lead_somewhere(name):
+    text = (ROOT / name).read_text(encoding="utf-8")
+    for link in re.findall(r"\]\(([^)#]+)\)", text):
+        assert "://" in link or (ROOT / name).parent.joinpath(link).exists(), link
+
+
+def test_python_of_the_readme(folder):
+    (folder / "readme.py").write_text("\n".join(snippets("python", "README.md")), encoding="utf-8")
+    said = run(["readme.py"], folder)
+    assert "friction" in said and (folder / "report" / "report.html").exists()
+    assert (folder / "rig.json").exists()
+
+
+@pytest.mark.slow
+def test_python_of_the_documents(folder):
+    blocks = snippets("python", "docs/identify.md", "docs/control.md", "docs/diagnose.md")
+    (folder / "documents.py").write_text("\n".join(blocks), encoding="utf-8")
+    said = run(["documents.py"], folder)
+    table = said.partition("strength  operators")[2].partition("the strongest")[0]
+    operators = [int(row.split()[1]) for row in table.splitlines()[1:]]
+    assert operators[0] == 10 and operators[-1] < 9  # the path shows what it is for
+
+
+def commands(*names):
+    """The `pilfr` commands of the documents as lists of arguments, without comments."""
+    lines = [line for block in snippets("sh", *names) for line in block.splitlines() if line.startswith("pilfr ")]
+    return [line.partition("  #")[0].split()[1:] for line in lines]
+
+
+def test_commands_of_the_readme(folder):
+    assert commands("README.md")
+    for arguments in commands("README.md"):
+        run(["-c", COMMAND, *arguments], folder)
+    assert (folder / "diagnosis" / "diagnosis.json").exists()
+
+
+@pytest.mark.slow
+def test_commands_of_the_documents(folder):
+    shutil.copy(folder / "rig_train.csv", folder / "simulation.csv")  # a table of another tool has these columns
+    done = 0
+    for arguments in commands("docs/identify.md", "docs/diagnose.md"):
+        run(["-c", COMMAND, *arguments], folder)
+        done += 1
+    assert done >= 5
+    assert {"rig.c", "rig.h"} <= {p.name for p in (folder / "rig" / "c").iterdir()}
+
+
+RUN_FILES = snippets("toml", "docs/studies.md")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command, text, files",
+    [
+        ("run", RUN_FILES[0], {"report.html"}),
+        ("campaign", RUN_FILES[1].replace("count = 100", "count = 1"), {"summary.csv", "spread.png", "report.html"}),
+    ],
+    ids=["run", "campaign"],
+)
+def test_run_files_of_the_documents(folder, command, text, files):
+    assert len(RUN_FILES) == 2 and "count = 100" not in text
+    (folder / "rig.toml").write_text(text, encoding="utf-8")
+    run(["-c", COMMAND, command, "rig.toml", "--workers", "2"], folder)
+    written = {path.name for path in (folder / f"rig-{command}").iterdir()}
+    assert {"manifest.json", "results.csv", "model.json", "jobs", *files} <= written
+
+
+@pytest.mark.slow
+def test_the_run_file_with_every_key_runs(folder):
+    run(["-c", COMMAND, "run", "every_key.toml"], folder)
+    assert (folder / "every_key-run" / "report.html").exists()
