@@ -137,8 +137,8 @@ if TYPE_CHECKING:
     from .report import fit_report as fit_report, write_report as write_report
     from .simulators import Port as Port, Simulator as Simulator
     from .studies import campaign as campaign, read_run as read_run, run as run
-
-__getattr__, __dir__, _listed = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, _listed = lazy_face(__name__, __file__)
 # Reached through their folders (`pilfr.models.to_plays`); these spellings still work.
 _ELSEWHERE = {
     "BLA",
@@ -191,4 +191,5 @@ _ELSEWHERE = {
     "visibility",
     "write_report",
 }
-__all__ = [*(name for name in _listed if name not in _ELSEWHERE), "__version__", "diagnose"]
+if not TYPE_CHECKING:
+    __all__ = [*(name for name in _listed if name not in _ELSEWHERE), "__version__", "diagnose"]

@@ -34,5 +34,5 @@ if TYPE_CHECKING:
     )
     from .version import __version__ as __version__
     from .worker_process import Reply as Reply, close_hands as close_hands, do as do
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

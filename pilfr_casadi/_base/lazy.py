@@ -8,8 +8,8 @@ A face lists its names once, under ``TYPE_CHECKING``; type checkers, editors and
 
     if TYPE_CHECKING:
         from .operators import Play as Play
-
-    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+    else:
+        __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
 """
 
 from __future__ import annotations

@@ -6,5 +6,5 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .app import main as main
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

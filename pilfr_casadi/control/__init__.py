@@ -12,5 +12,5 @@ if TYPE_CHECKING:
     from .kalman import KalmanFilter as KalmanFilter, kalman_filter as kalman_filter
     from .mpc import PredictiveController as PredictiveController
     from .unseen import visibility as visibility
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

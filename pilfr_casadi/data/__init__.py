@@ -33,5 +33,5 @@ if TYPE_CHECKING:
     from .signals import prbs as prbs, sine_sweep as sine_sweep, tukey_realizations as tukey_realizations
     from .stack import read_stack as read_stack
     from .timebase import TIME_NAMES as TIME_NAMES
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

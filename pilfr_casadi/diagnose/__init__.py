@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from .search_start import prepared_search as prepared_search
     from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate
     from .workbench import Fitted as Fitted, Workbench as Workbench
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
-__all__.append("diagnose")
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+    __all__.append("diagnose")
 
 
 def diagnose(

@@ -7,5 +7,5 @@ from .._base.lazy import lazy_face
 if TYPE_CHECKING:
     from .compiled import compiler as compiler, make_engine as make_engine
     from .sensitivities import Engine as Engine, VirtualMachine as VirtualMachine
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -13,5 +13,5 @@ if TYPE_CHECKING:
     from .saving import model_text as model_text, save as save
     from .sides import with_sides as with_sides
     from .smoothing import smoothed as smoothed
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -21,5 +21,5 @@ if TYPE_CHECKING:
         regularization_path as regularization_path,
     )
     from .start import density as density
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

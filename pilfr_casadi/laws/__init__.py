@@ -84,5 +84,5 @@ if TYPE_CHECKING:
         SlackSpring as SlackSpring,
         SoftClearance as SoftClearance,
     )
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

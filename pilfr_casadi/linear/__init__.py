@@ -16,5 +16,5 @@ if TYPE_CHECKING:
         time_subspace as time_subspace,
     )
     from .subspace_frequency import FrequencyProblem as FrequencyProblem
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -78,5 +78,5 @@ if TYPE_CHECKING:
         TAKES as TAKES,
         named_structure as named_structure,
     )
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

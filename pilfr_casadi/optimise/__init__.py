@@ -37,5 +37,5 @@ if TYPE_CHECKING:
         unbounded_sentence as unbounded_sentence,
     )
     from .tightening import STEP as STEP, held_at_bounds as held_at_bounds, within_bounds as within_bounds
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -30,5 +30,5 @@ if TYPE_CHECKING:
         time as time,
         traces as traces,
     )
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

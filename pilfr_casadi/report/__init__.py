@@ -17,5 +17,5 @@ if TYPE_CHECKING:
         Text as Text,
         write_report as write_report,
     )
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -31,5 +31,5 @@ if TYPE_CHECKING:
         growth as growth,
         wanted_substeps as wanted_substeps,
     )
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

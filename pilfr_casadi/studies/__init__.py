@@ -21,5 +21,5 @@ if TYPE_CHECKING:
     from .grid import Cell as Cell, grid_keys as grid_keys
     from .jobs import jobs_of as jobs_of
     from .results import reasons as reasons
-
-__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+else:
+    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
