@@ -39,7 +39,8 @@ import numpy as np
 
 from pilfr_casadi.data import Recording
 from pilfr_casadi.identify import Fit, fit
-from pilfr_casadi.models import NOE, PILFR, Lagged, Play, PrandtlIshlinskii, hammerstein, modal, ssnn
+from pilfr_casadi.linear import modal
+from pilfr_casadi.models import NOE, PILFR, Lagged, Play, PrandtlIshlinskii, hammerstein, ssnn
 from pilfr_casadi.optimise import GaussNewton
 
 from .measured_data import measured

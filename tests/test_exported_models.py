@@ -14,7 +14,8 @@ from test_laws import EVERY, dose, simulator as mass_on_spring
 from pilfr_casadi import GeneralizedPlay, Play, PrandtlIshlinskii, Recording, Stop, close_loop, exported
 from pilfr_casadi.engine import VirtualMachine, compiler
 from pilfr_casadi.laws import CubicStiffness, StopHysteresis
-from pilfr_casadi.models import PILFR, ParameterSet, modal
+from pilfr_casadi.linear import modal
+from pilfr_casadi.models import PILFR, ParameterSet
 from pilfr_casadi.simulators import discretise, fastest, load_simulator
 from problems import emps, masing_diagnosis, piezo_diagnosis, silverbox, tanks
 from problems.concealed_rigs_more import RIGS
