@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pilfr_casadi import InputError, PrandtlIshlinskii, Recording, fit, hammerstein, load, modal, multisine, play
-from pilfr_casadi.linear.modal_form import modal_basis
 from pilfr_casadi.linear import in_modal_coordinates, is_modal
+from pilfr_casadi.linear.modal_form import modal_basis
 from pilfr_casadi.models import PILFR, Play
 
 
