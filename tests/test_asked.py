@@ -8,7 +8,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import fingerprint
-from pilfr_casadi.identify.thinning import thinned
+from pilfr_casadi.identify.sparse import thinned
 from problems.constrained import three_plays
 
 WEIGHTS = (1.0, 8.0)

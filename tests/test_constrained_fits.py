@@ -9,8 +9,8 @@ from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.identify.known_blocks import changed_basis, nearest_basis
-from pilfr_casadi.identify.thinning import WAYS, thinned
+from pilfr_casadi.identify.linear_start import changed_basis, nearest_basis
+from pilfr_casadi.identify.sparse import WAYS, thinned
 from pilfr_casadi.optimise import (
     Constraint,
     Gain,

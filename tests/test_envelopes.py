@@ -5,8 +5,7 @@ import pytest
 
 from pilfr_casadi.data import Recording, multisine
 from pilfr_casadi.identify import fit
-from pilfr_casadi.identify.envelopes import enveloped, inputs_behind, network, outline, reach
-from pilfr_casadi.identify.start import grid_start, unit_states
+from pilfr_casadi.identify.start import enveloped, grid_start, inputs_behind, network, outline, reach, unit_states
 from pilfr_casadi.models import (
     PILFR,
     GeneralizedPlay,

@@ -10,7 +10,7 @@ import pytest
 import pilfr_casadi
 from pilfr_casadi._base import InputError
 from pilfr_casadi.identify import Fit, fit
-from pilfr_casadi.identify.linear_model import linear_model
+from pilfr_casadi.identify.linear_start import linear_model
 from pilfr_casadi.identify.penalty import element_alone, unit_weights
 from pilfr_casadi.linear import select_order
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, hammerstein, wiener

@@ -13,11 +13,11 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording, nrmse
 from pilfr_casadi.identify import fit, standard_errors
 from pilfr_casadi.identify.multistart import PRIOR
-from pilfr_casadi.identify.outcome import outcome
+from pilfr_casadi.identify.result import outcome
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import Constraint, GaussNewton, Problem, Status
 
-job_module = importlib.import_module("pilfr_casadi.identify.job")
+job_module = importlib.import_module("pilfr_casadi.identify.context")
 X0 = np.array([3.0, -3.0, 0.0, 0.0, 0.0, 0.0])
 SHORT = GaussNewton(max_iterations=3)
 

@@ -11,8 +11,7 @@ from random_models import OPERATORS, envelope, random_input, random_lfr, referen
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.identify import covariance, standard_errors, variance
-from pilfr_casadi.identify.gauge import _snap_to_bounds, gauge_tangents
-from pilfr_casadi.identify.residual_noise import gradient_covariance
+from pilfr_casadi.identify.uncertainty import _snap_to_bounds, gauge_tangents, gradient_covariance
 from pilfr_casadi.models import (
     PILFR,
     GeneralizedPlay,

@@ -7,7 +7,7 @@ from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.identify.reached_gain import reached_gain_sentence
+from pilfr_casadi.identify.result import reached_gain_sentence
 from pilfr_casadi.optimise import Gain, Problem, Solution, Status, dc_gain, limits_of
 from pilfr_casadi.optimise.gauss_newton import ExactPenalty
 from problems.constrained import three_plays

@@ -8,7 +8,7 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording, mean_period, noise_weights, period_noise
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import fit
-from pilfr_casadi.identify.open_memory import open_memory
+from pilfr_casadi.identify.result import open_memory
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, Stop
 from pilfr_casadi.optimise import Problem
 from pilfr_casadi.optimise.problem import steady_slope

@@ -1,7 +1,8 @@
-"""`fit`: the verb that takes a model and recordings and returns one immutable result.
+"""`fit`: identify a model from recordings.
 
-It refuses what cannot be used, finds the linear model that a search begins with, and leaves the rest to one of the
-`ways`.
+The verb checks its arguments and chooses one of four ways: from values (an earlier fit, a closed model, or a structure
+with values by name), a linear model alone, many starts (`multistart`), or the training of NARX and NOE models
+(`lagged`). Where an L1 penalty is asked for, a last solve follows (`penalty`).
 """
 
 from __future__ import annotations
@@ -17,20 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, one_blas_thread
+from .._base import InputError, Progress, filled, one_blas_thread
 from ..data import Recording, as_recordings, check_for_identification
 from ..models import PILFR, Lagged, Model, PrandtlIshlinskii, StaticNetwork
-from ..optimise import Constraint, Problem, Status, beyond, check_gain, check_room, loosened, stability_limits
-from .job import Job
-from .known_blocks import in_known_coordinates
-from .lagged_fit import check_lagged_options, fit_lagged
-from .linear_model import linear_model
-from .multistart import POLISH, STARTS
+from ..optimise import Constraint, Problem, Solution, Status, beyond, check_gain, check_room, loosened, stability_limits
+from .context import Job, Stage, interrupted, rms_error
+from .lagged import check_lagged_options, fit_lagged
+from .linear_start import in_known_coordinates, known_entries, linear_model
+from .multistart import KEEP, POLISH, STARTS, Search, search_starts
 from .options import Asked
-from .outcome import with_solution
-from .penalty import check_penalty
-from .result import Fit
-from .ways import at_values, from_starts, from_values, linear_only
+from .penalty import check_penalty, penalised
+from .result import Candidate, Fit, with_solution
 
 __all__ = ["Fit", "Progress", "fit"]
 DEAD_WORKER = (
@@ -235,3 +233,122 @@ def _check_options(model: Any, solver: Any, starts: Any, seed: Any, workers: Any
 def _leave_interrupts() -> None:
     """In a worker: Ctrl-C is for the process that waits for the results."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def at_values(structure: PILFR, first: Recording, values: Mapping[str, Any]) -> Model:
+    """The model of a structure at values given by name, with a recording's names of inputs and outputs."""
+    model = structure.model(first.n_u, first.n_y, inputs=first.inputs, outputs=first.outputs)
+    unknown = sorted(set(values) - set(model.parameters))
+    if unknown:
+        raise InputError(
+            f"The start has a value for {unknown[0]!r}, which the model lacks; it has {', '.join(model.parameters)}."
+        )
+    changes = {}
+    for name, value in values.items():
+        p = model.parameters[name]
+        given = filled(value, f"The start of {name!r}", p.value.shape)
+        changes[name] = {"value": np.where(p.fixed & (name in structure.fixed), p.value, np.clip(given, *p.bounds))}
+    return model.with_parameters(model.parameters.change(**changes))
+
+
+def from_values(model: Model, structure: PILFR | None, job: Job, earlier: Fit | None) -> Fit:
+    """A closed model or an earlier fit, from its values, and from the initial states that the fit has or estimates."""
+    if job.l1:
+        check_penalty(job.l1, model.parameters, structure is not None and structure.element is None)
+    options: dict[str, Any] = {"l1": {} if structure else job.l1}
+    problem = job.problem(model, **options)
+    if not np.isfinite(problem.cost(problem.start)):
+        raise InputError("The simulation diverges at the start values; start from a stable model.")
+    start = problem.start
+    if earlier is not None:
+        estimated = [r for r in job.recordings if r.begins == "estimate"]
+        begin = np.concatenate([start[: int(problem.free.sum())], *(earlier.initial_state(r) for r in estimated)])
+        start = begin if problem.cost(begin) < problem.cost(start) else start
+    latest = model, problem, job.solve(problem, "solve", start), ""
+    try:
+        problem, solution = job.settled(problem, latest[2], "solve", **options)
+        latest = model, problem, solution, ""
+        if job.l1 and structure:
+            latest = penalised(model, problem, solution, job, problem.noise)
+    except KeyboardInterrupt:
+        latest = interrupted(*latest)
+    model, problem, solution, note = latest
+    return job.result(model, structure, problem, solution, note=note)
+
+
+def linear_only(structure: PILFR, fitted: Model, job: Job) -> Fit:
+    """A linear model with the structure's bounds and fixed blocks, from the one without."""
+    values = {k: p.value for k, p in fitted.parameters.items()}
+    first = job.recordings[0]
+    model = structure.model(first.n_u, first.n_y, values, inputs=fitted.inputs, outputs=fitted.outputs)
+    problem = job.problem(model)
+    latest = problem, job.solve(problem, "solve")
+    try:
+        latest = job.settled(*latest, "solve")
+    except KeyboardInterrupt:
+        latest = problem, replace(latest[1], status=Status.INTERRUPTED)
+    return job.result(model, structure, *latest)
+
+
+def from_starts(
+    structure: PILFR,
+    linear: Model,
+    problem: Problem,
+    solution: Solution,
+    job: Job,
+    starts: int,
+    seed: int,
+    start: str,
+    executor: Executor | None,
+) -> Fit:
+    """A PI-LFR from many starts; `problem` and `solution` are those of the linear model."""
+    blocks = {k: p.value for k, p in linear.parameters.items()}
+    level, coordinates = rms_error(problem, solution), not known_entries(structure)
+    told = job.progress if executor is None else None
+    search = Search.of(job, structure, blocks, start=start, level=level, coordinates=coordinates, progress=told)
+    least: list[float] = [np.inf]
+
+    def report(stage: str, found: list[Candidate], total: int) -> None:
+        least.append(min([least[-1], *(c.error for c in found)]))
+        if job.progress:
+            job.progress(stage, len(found), total, least[-1] if np.isfinite(least[-1]) else np.nan)
+
+    candidates, best, stopped = search_starts(search, starts, seed, executor, report)
+    if best is None:
+        ended = replace(solution, status=Status.INTERRUPTED)
+        return job.result(linear, structure.linear(), problem, ended)
+    compared: dict[str, Any] = {"linear": linear, "linear_nrmse": tuple(problem.nrmse(solution.theta))}
+    model, note, l1 = best.model, best.note, job.l1 and not stopped
+    if l1:  # the penalty and a prior towards a smooth density contradict each other
+        asked = {name: {"prior": structure.priors.get(name)} for name in ("w", "r")}
+        model, note = model.with_parameters(model.parameters.change(**asked)), ""
+    problem = job.problem(model, best.error)
+    latest = model, problem, best.solution, note
+    try:
+        if stopped:
+            latest = interrupted(*latest)
+        elif start == "grid" or beyond(problem, best.theta):
+            latest = model, problem, job.solve(problem, "solve", best.theta), note
+        model, problem, result, note = latest = _from_others(latest, candidates, job)
+        if structure.priors and not stopped:
+            problem, result = job.settled(problem, result, "solve")
+            latest = model, problem, result, note
+        if l1:
+            latest = penalised(model, problem, latest[2], job, problem.noise)
+    except KeyboardInterrupt:
+        latest = interrupted(*latest)
+    model, problem, result, note = latest
+    return job.result(model, structure, problem, result, candidates=tuple(candidates), note=note, **compared)
+
+
+def _from_others(latest: Stage, candidates: Sequence[Candidate], job: Job) -> Stage:
+    """The same or, where its last solve misses the constraints, that from the best start which had met them."""
+    usable = [c for c in candidates if c.solution.status is not Status.INFEASIBLE and np.isfinite(c.error)]
+    for other in sorted(usable, key=lambda c: c.error)[:KEEP]:
+        if latest[2].status is not Status.INFEASIBLE:
+            break
+        problem = job.problem(other.model, other.error)
+        found = job.solve(problem, "solve", other.theta)
+        if found.status is not Status.INFEASIBLE:
+            return other.model, problem, found, other.note
+    return latest

@@ -31,7 +31,9 @@ import numpy as np
 
 from .._base import InputError, is_number
 from ..models import LAYER, Model, Parameter, ParameterSet, Play, PrandtlIshlinskii, Stop
-from ..optimise import Problem, Solution
+from ..optimise import Problem, Solution, Status
+from .context import Job, Stage
+from .result import with_solution
 
 SLACK = 0.02  # share of the objective that merging operators may cost before the last solve
 
@@ -146,3 +148,21 @@ def sentence(model: Model, l1: dict[str, float]) -> str:
     """How many entries the penalty has brought to zero."""
     counts = [f"{np.sum(model.parameters[k].value == 0)} of {model.parameters[k].size} entries of {k}" for k in l1]
     return f"L1 penalty: {', '.join(counts)} are exactly zero; the linear blocks were held while it acted"
+
+
+def penalised(model: Model, problem: Problem, solution: Solution, job: Job, noise: float) -> Stage:
+    """The model, problem and solution with the L1 penalty, from the solution without, and a note; see `penalty`."""
+    if solution.status is Status.INTERRUPTED:
+        return model, problem, solution, "interrupted before the L1 penalty was applied"
+    found = unit_weights(with_solution(model, problem, solution))
+    states = solution.theta[int(problem.free.sum()) :]
+    options: dict[str, Any] = {"engine": problem.engine, "l1": job.l1}
+    whole, held = (job.problem(m, noise, **options) for m in (found, element_alone(found, job.l1)))
+    begin = merged(held, np.concatenate([held.start[: int(held.free.sum())], states]))
+    states = begin[int(held.free.sum()) :]
+    last = without_idle(held.model.with_parameters(held.model.parameters.at(held.parameters(begin))))
+    if np.any(last.parameters.free):
+        held = job.problem(last, noise, **options)
+    begin = np.concatenate([held.start[: int(held.free.sum())], states])
+    result = restored(job.solve(held, "L1 penalty", begin), held, whole)
+    return found, whole, result, sentence(with_solution(found, whole, result), job.l1)

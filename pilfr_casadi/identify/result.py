@@ -1,10 +1,26 @@
-"""What `fit` returns: a fitted model with how it came about, which simulates, judges, draws and saves itself."""
+"""`Fit`, the result of `fit`: a fitted model that simulates, judges, draws and saves itself.
+
+`outcome` builds it from the solution of a problem. Its note says two things that the recordings leave open.
+
+Memory in a periodic steady state: an operator that never slips in a whole period keeps whatever memory it has. Its row
+of the state's slope over a period is that of the identity, every value in an interval is a steady state, and the
+outputs differ by a constant. The memory that periods from rest lead to is taken.
+
+A known DC gain beyond the recordings: the gain of `known` belongs to motions so large that every play slips (`slope`
+1), or so small that every one sticks (0), after an infinite time. A fit may meet it where no data contradict it, by
+operators whose thresholds lie beyond all motions, or by a slow pole. So the gain is computed a second time, over the
+samples of the longest recording and without the operators that never slip (for small motions: with the operators that
+have no threshold),
+
+    gain_M = C' (Σ_{k<M} A'^k) B' + D',   with the blocks of `known` at S = diag(Σ_j w_ij), j slipping.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,11 +29,36 @@ import numpy as np
 from .._base import InputError
 from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse, rmse_per_output
 from ..engine import Engine, make_engine
-from ..models import PILFR, Model
-from ..optimise import GaussNewton, Limit, Problem, Solution, Status, settled, unknown_multipliers
-from .gauge import unknown_sentences
+from ..models import PILFR, Model, PrandtlIshlinskii, Stop
+from ..optimise import (
+    Gain,
+    GaussNewton,
+    Limit,
+    Problem,
+    Solution,
+    Status,
+    limits_of,
+    settled,
+    unbounded_sentence,
+    unknown_multipliers,
+)
 from .options import Asked
-from .search import Candidate
+from .uncertainty import standard_errors, unknown_sentences
+
+PRIOR = "weights held near a smooth density by a weak prior"
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """What one start led to; `drawn` tells whether its start depends on the seed."""
+
+    seed: int
+    model: Model
+    theta: np.ndarray
+    error: float
+    solution: Solution
+    note: str = ""
+    drawn: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,3 +319,211 @@ def first_state(model: Model, engine: Engine, recording: Recording, samples: int
 
 def _shown(error: float) -> str:
     return f"{error:.4f}" if error < 1e4 else f"{error:.3g}"
+
+
+FAR = 1e3  # times the error of no output at all, from which a model diverges
+
+
+def with_solution(model: Model, problem: Problem, solution: Solution) -> Model:
+    """The model at the values of a solution."""
+    return model.with_parameters(model.parameters.at(problem.parameters(solution.theta)))
+
+
+def outcome(
+    model: Model,
+    structure: PILFR | None,
+    problem: Problem,
+    solution: Solution,
+    began: float,
+    recordings: tuple[Recording, ...],
+    candidates: tuple[Candidate, ...] = (),
+    linear: Model | None = None,
+    note: str = "",
+    linear_nrmse: tuple[float, ...] = (),
+    engine: str = "auto",
+    minimum: bool = True,
+    asked: Asked | None = None,
+) -> Fit:
+    """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
+
+    Standard errors are those of a `minimum` of the simulation error; where it is none there are none.
+
+    Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the standard
+    errors know of them. The note also says which memory a periodic steady state leaves open (`open_memory`), and
+    which DC gain holds beyond the recordings alone (`reached_gain`).
+    """
+    fitted = with_solution(model, problem, solution)
+    judged = problem
+    if note == PRIOR:
+        priors = structure.priors if structure else {}
+        fitted = fitted.with_parameters(
+            fitted.parameters.change(**{name: {"prior": priors.get(name)} for name in ("w", "r")})
+        )
+        names = ("constraints", "noise", "scale", "weights")
+        options: dict[str, Any] = {name: getattr(problem, name) for name in names}
+        judged = Problem(fitted, recordings, engine=problem.engine, **options)
+    theta, errors = solution.theta, tuple(problem.nrmse(solution.theta))
+    if solution.status.converged and not max(errors) < FAR * _of_nothing(problem):
+        solution = replace(solution, status=Status.DIVERGES)
+    values = problem.model.parameters.unpack(problem.parameters(theta))
+    told = (
+        note,
+        open_memory_sentence(judged, theta),
+        reached_gain_sentence(problem, theta),
+        unbounded_sentence(structure, problem.constraints, values),
+    )
+    note = "; ".join(part for part in told if part)
+    at_bound = [
+        f"{label} = {value:g}"
+        for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
+        if value in (low, high)
+    ]
+    limits = limits_of(problem, solution)
+    at_bound += [limit.name for limit in limits if limit.active and limit.kind == "constraint"]
+    return Fit(
+        model=fitted,
+        structure=structure,
+        dt=recordings[0].dt,
+        solution=solution,
+        train_nrmse=errors,
+        initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
+        labels=problem.labels,
+        errors=standard_errors(judged, theta, structure) if minimum else {},
+        active=tuple(at_bound),
+        candidates=candidates,
+        linear=linear,
+        seconds=time.perf_counter() - began,
+        units=dict(recordings[0].units),
+        note=note,
+        linear_nrmse=linear_nrmse,
+        engine=engine,
+        limits=limits,
+        asked=asked or Asked(),
+    )
+
+
+def _of_nothing(problem: Problem) -> float:
+    """The largest NRMSE of any output that a model without outputs has, at least 1."""
+    return max(1.0, *(float(np.max(np.sqrt(np.mean(r.y**2, axis=0)) / problem.scale)) for r in problem.recordings))
+
+
+Array = np.ndarray
+CHUNK = 512  # samples of a period whose slopes are held at a time
+STILL = 1e-12  # difference from the identity that is none
+
+
+def open_memory(problem: Problem, theta: Array, recording: Recording, state: Array) -> Array:
+    """Which memories a period from a steady state leaves alone though outputs see them, indices (k,)."""
+    engine, p, n_x = problem.engine, problem.parameters(theta), problem.model.n_x
+    rows = CHUNK * problem.model.substeps
+    period = problem.model.drive(recording)[: (recording.period or 1) * problem.model.substeps]
+    slope, after, seen = np.eye(len(state)), state, np.zeros(len(state))
+    for a in range(0, len(period), rows):
+        _, jac, after, slope = engine.sensitivity(period[a : a + rows], p, after, slope, np.full(len(p), -1))
+        seen = np.maximum(seen, np.max(np.abs(jac / problem.scale[:, None]), axis=(0, 1), initial=0.0))
+    still = np.max(np.abs(slope - np.eye(len(state))), axis=1, initial=0.0) <= STILL
+    return np.flatnonzero(still[n_x:] & (seen[n_x:] > STILL * np.max(seen, initial=0.0)))
+
+
+def open_memory_sentence(problem: Problem, theta: Array) -> str:
+    """What it means for a result, naming the recordings; empty where every memory is decided."""
+    counts = {}
+    for k, (r, state) in enumerate(zip(problem.recordings, problem.first_states(theta), strict=True)):
+        periodic = r.begins == "periodic"
+        if periodic and problem.model.n_s and np.all(np.isfinite(state)):
+            counts[r.label if len(problem.recordings) == 1 or r.name else f"recording {k + 1}"] = len(
+                open_memory(problem, theta, r, state)
+            )
+    found = [f"{count} in {label}" for label, count in counts.items() if count]
+    if not found:
+        return ""
+    return (
+        f"operators that never slip in a steady period: {', '.join(found)}; the period does not tell their memory, "
+        "which shifts the outputs and is taken as periods from rest with zero memory leave it"
+    )
+
+
+APART = 0.05  # difference of gains, next to the largest one asked for, that is told
+
+
+def reached_gain_sentence(problem: Problem, theta: Array) -> str:
+    """What it means that a gain is met beyond the recordings alone, one for all; empty where none is."""
+    found, at = [], 0
+    values, moved = problem.model.parameters.unpack(problem.parameters(theta)), None
+    samples = max(len(r) for r in problem.recordings)
+    for c, size in zip(problem.constraints, problem.g_sizes, strict=True):
+        rows, at = slice(at, at + size), at + size
+        if not isinstance(c.expression, Gain):
+            continue
+        if moved is None:
+            moved = slipping(problem, theta, values)
+        low, high = problem.g_lower[rows], problem.g_upper[rows]
+        room = APART * float(np.max(np.abs(np.concatenate([low, high])), initial=0.0))
+
+        def far(gain: Array, low: Array = low, high: Array = high, room: float = room) -> bool:
+            return bool(np.any(~((low - room <= gain) & (gain <= high + room))))
+
+        whole, within, odd = weights(problem.model.element, values, c.expression.slope, moved)
+        if far(gain_over(values, whole, None)):
+            continue  # not met at all, which is told elsewhere
+        reached = gain_over(values, within, samples)
+        if not far(reached):
+            continue
+        range_alone, time_alone = far(gain_over(values, within, None)), far(gain_over(values, whole, samples))
+        both = not range_alone and not time_alone
+        why = [odd] if (range_alone or both) and odd else []
+        why += [f"it settles over more than their {samples} samples"] if time_alone or both else []
+        shown = ", ".join(f"{g:.3g}" for g in reached)
+        found.append(f"{c.name} holds only beyond the recordings: {' and '.join(why)}; within them it comes to {shown}")
+    return "; ".join(found)
+
+
+def slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -> Array:
+    """Which operators slip in some recording, (channels, N); none without an element."""
+    element = problem.model.element
+    if not isinstance(element, PrandtlIshlinskii):
+        return np.zeros((0, 0), dtype=bool)
+    r, n_x, p = values["r"], problem.model.n_x, problem.parameters(theta)
+    moved = np.zeros(r.shape, dtype=bool)
+    for recording, state in zip(problem.recordings, problem.first_states(theta), strict=True):
+        z = problem.engine.simulate(problem.model.drive(recording), p, state, True)[2]
+        q = state[n_x:].reshape(r.shape)
+        for row in z:
+            after = np.clip(q, row[:, None] - r, row[:, None] + r)
+            moved |= after != q
+            q = after
+    return moved
+
+
+def weights(element: object, values: Mapping[str, Array], slope: float, moved: Array) -> tuple[Array, Array, str]:
+    """Σw of each channel (n_w,) as asked for and within the recordings, and how the operators differ in them."""
+    if not isinstance(element, PrandtlIshlinskii):
+        return np.zeros(0), np.zeros(0), ""
+    w, stops = values["w"], isinstance(element.operator, Stop)
+    whole = slope * w.sum(axis=1)
+    if slope not in (0.0, 1.0):
+        return whole, whole, ""
+    if (slope == 1.0) != stops:  # large motions
+        odd, what = ~moved, "never slip in them"
+    else:
+        odd, what = values["r"] <= 0, "have no threshold below which they stick"
+    odd = odd & (w > 0)
+    active = odd if slope == 0.0 else ~odd
+    return whole, (w * active).sum(axis=1), f"{int(odd.sum())} of {w.size} operators {what}" if np.any(odd) else ""
+
+
+def gain_over(values: Mapping[str, Array], weight: Array, samples: int | None) -> Array:
+    """Gain (n_y n_u,), row by row, with Σw of each channel, after a number of samples or (None) in the end."""
+    a, b, c, d = (values[k] for k in ("A", "B_u", "C_y", "D_yu"))
+    if len(weight):
+        s = np.diag(weight)
+        a, b = a + values["B_w"] @ s @ values["C_z"], b + values["B_w"] @ s @ values["D_zu"]
+        c, d = c + values["D_yw"] @ s @ values["C_z"], d + values["D_yw"] @ s @ values["D_zu"]
+    n = len(a)
+    with np.errstate(over="ignore", invalid="ignore"):
+        if samples is None:
+            state = np.linalg.lstsq(np.eye(n) - a, b, rcond=None)[0] if n else b
+        else:
+            step = np.block([[a, b], [np.zeros((b.shape[1], n)), np.eye(b.shape[1])]])
+            state = np.linalg.matrix_power(step, samples)[:n, n:]
+        return np.asarray(c @ state + d).ravel()

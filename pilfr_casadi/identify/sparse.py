@@ -24,12 +24,11 @@ from .._base import InputError, Progress, is_number
 from ..data import Recording, as_recordings, fingerprint
 from ..models import LAYER, PILFR, PrandtlIshlinskii
 from ..optimise import Status
+from .context import following
 from .fitting import fit as identify
-from .job import following
-from .multistart import POLISH, polish
-from .result import Fit
-from .search import Candidate
-from .thinning import thinned
+from .multistart import POLISH, Search, held_near, polish
+from .result import PRIOR, Candidate, Fit
+from .start import is_density, regrid
 
 FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # of priors
 STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of L1, in units of the objective that is reached without
@@ -148,7 +147,7 @@ def polished(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = 
     """
     structure, job = fit.structure, following(fit, train, solver=solver or POLISH, **options)
     assert structure is not None
-    search = job.search(structure, {}, level=float(np.mean(fit.train_nrmse)))
+    search = Search.of(job, structure, {}, level=float(np.mean(fit.train_nrmse)))
     problem = search.problem(fit.model)
     states = [fit.initial_state(r) for r in job.recordings if r.begins == "estimate"]
     theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
@@ -284,3 +283,49 @@ def _whole(fit: Fit) -> Fit:
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return fit
+
+
+WAYS = tuple(
+    (beyond, spacing) for beyond in (1.0, 1.15, 1.3) for spacing in (0.25, 0.4)
+)  # to spread operators, `regrid`
+SPREAD = 0.02  # relative deviation of the prior on weights that are spread over a density
+
+
+def thinned(
+    fit: Fit, train: Recording | Sequence[Recording], n: int, *, solver: Any = None, **options: Any
+) -> tuple[Fit, ...]:
+    """Fits with n operators a channel, spread in several ways over the density of weights that a fit had.
+
+    What the fit was asked with holds, where nothing else is given (`job.following`).
+    None where weights or thresholds are fixed, bounded or have a prior.
+    """
+    structure, recordings = fit.structure, as_recordings(train)
+    bound = structure is None or set(LAYER) & {*structure.fixed, *structure.bounds, *structure.priors}
+    if structure is None or bound or not isinstance(structure.element, PrandtlIshlinskii):
+        return ()
+    smaller, old = replace(structure, element=replace(structure.element, n=n)), fit.model
+    z = np.concatenate([fit.signals(r)["z"] for r in recordings])
+    reach = np.max(np.abs(z), axis=0)
+    states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
+    states = [np.concatenate([s[: old.n_x], np.zeros(n * structure.element.channels)]) for s in states]
+    found: list[Fit] = []
+    for beyond, spacing in WAYS:
+        job = following(replace(fit, structure=smaller), recordings, solver=solver or POLISH, **options)
+        rows = [
+            regrid(r, w, float(top), beyond=beyond, spacing=spacing, count=n)
+            if is_density(w) and top > 0
+            else (r[:n], w[:n])
+            for r, w, top in zip(fit.parameters["r"], fit.parameters["w"], reach, strict=True)
+        ]
+        values = {**fit.parameters, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
+        model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
+        model = held_near(model, values, SPREAD)
+        problem = job.problem(model, float(np.mean(fit.train_nrmse)))
+        begin = np.concatenate([problem.start[: int(problem.free.sum())], *states])
+        if not np.isfinite(problem.cost(begin)):
+            continue
+        again = job.result(model, smaller, problem, job.solve(problem, "solve", begin), note=PRIOR)
+        found.append(replace(again, linear=fit.linear, linear_nrmse=fit.linear_nrmse))
+        if again.status is Status.INTERRUPTED:
+            break
+    return tuple(found)

@@ -1,9 +1,9 @@
-"""What the ways to a fit share: recordings, solver and options, and the stages that follow a first solution."""
+"""The context of one fit: recordings, solver and options, and the solves that every way to a fit makes."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -13,14 +13,20 @@ import numpy as np
 from .._base import Progress, deferred_interrupt
 from ..data import Recording, as_recordings
 from ..models import PILFR, Model
-from ..optimise import Constraint, GaussNewton, Ipopt, Problem, Solution, Status, exactly
+from ..optimise import (
+    STEP,
+    Constraint,
+    GaussNewton,
+    Ipopt,
+    Iteration,
+    Problem,
+    Solution,
+    Status,
+    exactly,
+    within_bounds,
+)
 from .options import Asked
-from .outcome import outcome, with_solution
-from .penalty import element_alone, merged, restored, sentence, unit_weights, without_idle
-from .result import Fit
-from .search import Search
-from .start import Blocks
-from .told import solve_inside
+from .result import Fit, outcome
 
 Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
 LAST = GaussNewton()  # at a bound on a radius, where another solver is asked for
@@ -42,19 +48,15 @@ class Job:
     began: float = field(default_factory=time.perf_counter)
 
     @cached_property
-    def _weights(self) -> np.ndarray | None:
+    def weights(self) -> np.ndarray | None:
+        """Weight of each recording, or None."""
         return self.asked.weights_of(self.recordings)
 
     def problem(self, model: Model, noise: float = 1.0, **options: Any) -> Problem:
         """The simulation-error problem of a model."""
         given: dict[str, Any] = {"constraints": self.limits, "noise": self.asked.noise or noise, "engine": self.engine}
-        given |= {"weights": self._weights, "threads": self.threads, **options}
+        given |= {"weights": self.weights, "threads": self.threads, **options}
         return Problem(model, self.recordings, **given)
-
-    def search(self, structure: PILFR, linear: Blocks, **options: Any) -> Search:
-        """What the tasks of a search for a structure share."""
-        given = {"engine": self.engine, "noise": self.asked.noise, "weights": self._weights, **options}
-        return Search(structure, self.recordings, linear, self.solver, self.limits, **given)
 
     def settled(self, problem: Problem, solution: Solution, stage: str, **options: Any) -> tuple[Problem, Solution]:
         """Problem and solution with the noise at the error that is reached, where priors are weighed against it."""
@@ -123,19 +125,37 @@ def rms_error(problem: Problem, solution: Solution) -> float:
     return float(np.sqrt(np.mean(e**2)))
 
 
-def penalised(model: Model, problem: Problem, solution: Solution, job: Job, noise: float) -> Stage:
-    """The model, problem and solution with the L1 penalty, from the solution without, and a note; see `penalty`."""
-    if solution.status is Status.INTERRUPTED:
-        return model, problem, solution, "interrupted before the L1 penalty was applied"
-    found = unit_weights(with_solution(model, problem, solution))
-    states = solution.theta[int(problem.free.sum()) :]
-    options: dict[str, Any] = {"engine": problem.engine, "l1": job.l1}
-    whole, held = (job.problem(m, noise, **options) for m in (found, element_alone(found, job.l1)))
-    begin = merged(held, np.concatenate([held.start[: int(held.free.sum())], states]))
-    states = begin[int(held.free.sum()) :]
-    last = without_idle(held.model.with_parameters(held.model.parameters.at(held.parameters(begin))))
-    if np.any(last.parameters.free):
-        held = job.problem(last, noise, **options)
-    begin = np.concatenate([held.start[: int(held.free.sum())], states])
-    result = restored(job.solve(held, "L1 penalty", begin), held, whole)
-    return found, whole, result, sentence(with_solution(found, whole, result), job.l1)
+def solve_inside(
+    problem: Problem,
+    start: np.ndarray | None,
+    solver: Any,
+    stage: str,
+    progress: Progress | None,
+    last: GaussNewton = STEP,
+    held: bool = False,
+) -> Solution:
+    """The solution of a solver, of the package or a user's, inside exact bounds on spectral radii (`tightening`).
+
+    Parameters
+    ----------
+    problem, start, last, held
+        See `within_bounds`; `last` gets the solver's limit on time.
+    solver : object
+        With `solve(problem, start)`. Those of the package take a limit on time, and tell their steps.
+    stage : str
+        What the steps are told as.
+    progress : callable
+        Gets (stage, step, largest number of steps, error).
+    """
+    start = problem.start if start is None else start
+    if not isinstance(solver, GaussNewton | Ipopt):
+        return within_bounds(problem, start, solver.solve, last, held)
+    report, last = iterations(progress, stage, solver.max_iterations), replace(last, time_limit=solver.time_limit)
+    return within_bounds(problem, start, lambda p, s: solver.solve(p, s, report), last, held, report)
+
+
+def iterations(progress: Progress | None, stage: str, most: int) -> Callable[[Iteration], None] | None:
+    """A solver's progress function that reports iterations as a stage, with the error that their cost stands for."""
+    if progress is None:
+        return None
+    return lambda i: progress(stage, min(i.number, most), most, float(np.sqrt(2 * max(i.cost, 0.0))))
