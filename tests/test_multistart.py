@@ -8,7 +8,7 @@ import pytest
 from random_models import random_lfr
 
 from pilfr_casadi.cli.demo import demo_recordings, structure
-from pilfr_casadi.identify import POLISH, multistart
+from pilfr_casadi.identify import POLISH, Candidate, multistart
 from pilfr_casadi.identify.linear_start import linear_model
 from pilfr_casadi.identify.multistart import Search, explore, polish, search_starts
 from pilfr_casadi.identify.start import grid_start, paper_start, unit_states

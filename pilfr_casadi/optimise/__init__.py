@@ -14,12 +14,8 @@ if TYPE_CHECKING:
         ordered as ordered,
         stable as stable,
     )
-    from .exactness import beyond as beyond, exactly as exactly, missed as missed
-    from .gauss_newton import (
-        GaussNewton as GaussNewton,
-        QuadraticProgram as QuadraticProgram,
-        unconstrained as unconstrained,
-    )
+    from .exactness import beyond as beyond, exactly as exactly
+    from .gauss_newton import GaussNewton as GaussNewton, unconstrained as unconstrained
     from .ipopt import Ipopt as Ipopt
     from .problem import Problem as Problem, checked_weights as checked_weights, settled as settled
     from .solution import (
