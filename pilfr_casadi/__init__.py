@@ -73,14 +73,16 @@ if TYPE_CHECKING:
         tukey_realizations as tukey_realizations,
     )
     from .diagnose import Diagnosis as Diagnosis
-    from .export import Exported as Exported, exported as exported, load as load, save as save, to_casadi as to_casadi
+    from .export import Exported as Exported, exported as exported, to_casadi as to_casadi
     from .identify import (
         Fit as Fit,
         RegularizationPath as RegularizationPath,
         fit as fit,
+        load as load,
         one_step as one_step,
         prune as prune,
         regularization_path as regularization_path,
+        save as save,
         standard_errors as standard_errors,
     )
     from .laws import Law as Law, Local as Local

@@ -14,9 +14,9 @@ from pilfr_casadi import export
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.engine import compiler
-from pilfr_casadi.export import load, save, to_casadi, write_atomically
+from pilfr_casadi.export import to_casadi, write_atomically
 from pilfr_casadi.export.digests import ordered_digest
-from pilfr_casadi.identify import Fit, fit
+from pilfr_casadi.identify import Fit, fit, load, save
 from pilfr_casadi.models import (
     PILFR,
     GeneralizedPlay,

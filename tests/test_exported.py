@@ -21,7 +21,7 @@ from pilfr_casadi import InputError, Parameter, Play, PrandtlIshlinskii, Recordi
 from pilfr_casadi.data import nrmse, read_csv
 from pilfr_casadi.diagnose import Diagnosis, diagnose
 from pilfr_casadi.engine import compiler
-from pilfr_casadi.export import load
+from pilfr_casadi.identify import load
 from pilfr_casadi.laws import Backlash, Drift, PreslidingFriction, Relaxation, StopHysteresis
 from pilfr_casadi.models import PILFR
 from pilfr_casadi.simulators import load_simulator

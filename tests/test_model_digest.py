@@ -9,7 +9,7 @@ from test_export import changed, leaves, one_sentence, signed, some_fit
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.cli.app import main
-from pilfr_casadi.export import load, save
+from pilfr_casadi.identify import load, save
 from pilfr_casadi.optimise import Limit
 
 CHANGED = "was changed after it was written .*; restore it, or save the model again"

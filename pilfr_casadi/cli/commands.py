@@ -23,8 +23,7 @@ from ..data import (
     read,
 )
 from ..engine import VirtualMachine, compiler, make_engine
-from ..export import load
-from ..identify import Fit, fit as identify
+from ..identify import Fit, fit as identify, load
 from ..linear import select_order
 from ..models import ANY, PILFR, TAKES, Lagged, named_structure
 from ..optimise import GaussNewton, Ipopt, Status

@@ -12,7 +12,8 @@ import numpy as np
 
 from .._base import InputError, deferred_interrupt, insistent, listed, progress_bar
 from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
-from ..export import load, write_atomically
+from ..export import write_atomically
+from ..identify import load
 from ..simulators import Simulator, as_simulator, simulator_variable
 from .app import DONE, INTERRUPTED, NO_RESULT, say
 from .commands import columns_of, make_folder, read_file

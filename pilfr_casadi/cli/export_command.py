@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from .._base import InputError
-from ..export import NAMES, exported, load
+from ..export import NAMES, exported
+from ..identify import load
 from ..simulators import load_simulator
 from .app import DONE
 

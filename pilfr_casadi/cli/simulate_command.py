@@ -11,8 +11,8 @@ import numpy as np
 
 from .._base import InputError, listed
 from ..data import Recording, column_names, nrmse, read_stack, written_times
-from ..export import load, write_atomically
-from ..identify import Fit
+from ..export import write_atomically
+from ..identify import Fit, load
 from .app import DONE, NO_RESULT, say
 from .commands import announced_engine, check_names, read_file
 from .option_values import name_list, pairs

@@ -9,8 +9,8 @@ import numpy as np
 
 from ..data import Recording, nrmse
 from ..engine import make_engine
-from ..identify import first_state, samples_for_state
 from ..models import Model, ParameterSet
+from ..optimise import first_state, samples_for_state
 from ..simulators import Simulator
 from .floor import effective_size
 from .gates import Gate

@@ -8,9 +8,14 @@ if TYPE_CHECKING:
     from .digests import digest as digest
     from .exported_model import NAMES as NAMES, Exported as Exported
     from .files import made as made, write_atomically as write_atomically
-    from .functions import exported as exported, to_casadi as to_casadi
-    from .loading import load as load
-    from .saving import model_text as model_text, save as save
+    from .functions import FittedModel as FittedModel, exported as exported, to_casadi as to_casadi
+    from .loading import read_model_file as read_model_file
+    from .saving import (
+        FitContent as FitContent,
+        SavedStart as SavedStart,
+        model_text as model_text,
+        write_model_file as write_model_file,
+    )
     from .sides import with_sides as with_sides
     from .smoothing import smoothed as smoothed
 else:

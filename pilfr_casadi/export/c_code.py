@@ -10,54 +10,69 @@ end a comment, or is no letter, digit or underscore, has been taken out.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import casadi as ca
 
 from .files import made, write_atomically
 
-if TYPE_CHECKING:
-    from .exported_model import Exported
+
+def write_c(
+    folder: str | os.PathLike[str], step: ca.Function, names: Mapping[str, Any], interpolated: bool
+) -> tuple[Path, Path]:
+    """Write source and header of a step `(x, u) -> (x_next, y)`; see `Exported.to_c`.
+
+    Parameters
+    ----------
+    folder : path
+        Made where it does not exist.
+    step : casadi.Function
+    names : mapping
+        `Exported.names()`.
+    interpolated : bool
+        Whether the second half of u holds the inputs of the next sample.
+
+    Returns
+    -------
+    tuple of Path
+        Source and header.
+    """
+    target, name = made(folder), names["name"]
+    header = write_atomically(target / f"{name}.h", _header(names, interpolated))
+    return write_atomically(target / f"{name}.c", _source(step, names)), header
 
 
-def write_c(exported: Exported, folder: str | os.PathLike[str]) -> tuple[Path, Path]:
-    """Write source and header of an exported model; see `Exported.to_c`."""
-    target, name = made(folder), exported.name
-    header = write_atomically(target / f"{name}.h", _header(exported))
-    return write_atomically(target / f"{name}.c", _source(exported)), header
-
-
-def _header(exported: Exported) -> str:
-    name, big = exported.name, exported.name.upper()
-    between = "next" in exported.sampled.reads
-    sizes = {"NX": len(exported.states), "NU": len(exported.inputs), "NY": len(exported.outputs)}
+def _header(names: Mapping[str, Any], interpolated: bool) -> str:
+    name, big = names["name"], names["name"].upper()
+    sizes = {"NX": len(names["states"]), "NU": len(names["inputs"]), "NY": len(names["outputs"])}
     lines = [
-        f"/* {name}: one step of an identified model, every {exported.dt:.10g} s; {_accuracy(exported)}.",
+        f"/* {name}: one step of an identified model, every {names['dt']:.10g} s; {_accuracy(names['smooth'])}.",
         " *",
         f" *   double x[{big}_NX], u[{big}_NU], y[{big}_NY];",
         f" *   {name}_x0(x);                 once, at the start",
         f" *   {name}_step(x, u, x, y);      every sample: y now, and x for the next one",
         " *",
-        *([" * Inputs are interpolated: behind those of this sample, u holds those of the next one.", " *"] * between),
+        *(
+            [" * Inputs are interpolated: behind those of this sample, u holds those of the next one.", " *"]
+            * interpolated
+        ),
         " * Nothing is allocated and nothing is kept between calls; several threads may call it at once.",
         " */",
         f"#ifndef {big}_H",
         f"#define {big}_H",
         "",
         *(f"#define {big}_{key} {size}" for key, size in sizes.items()),
-        f"#define {big}_DT {exported.dt!r} /* s */",
+        f"#define {big}_DT {names['dt']!r} /* s */",
     ]
-    for letter, title, names in (
-        ("X", "entries of x", list(exported.states)),
-        ("U", "entries of u", exported.inputs),
-        ("Y", "entries of y", exported.outputs),
-    ):
-        constants = _constants(f"{big}_{letter}_", names)
+    for letter, role in (("X", "states"), ("U", "inputs"), ("Y", "outputs")):
+        entries = list(names[role])
+        title = f"entries of {letter.lower()}"
+        constants = _constants(f"{big}_{letter}_", entries)
         rows = [
-            f"#define {constant} {i} /* {_comment(_labelled(exported, n))} */"
-            for i, (constant, n) in enumerate(zip(constants, names, strict=True))
+            f"#define {constant} {i} /* {_comment(_labelled(names, entry))} */"
+            for i, (constant, entry) in enumerate(zip(constants, entries, strict=True))
         ]
         lines += ["", f"/* {title} */", *rows]
     lines += [
@@ -81,8 +96,8 @@ def _header(exported: Exported) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _source(exported: Exported) -> str:
-    name, big, step = exported.name, exported.name.upper(), exported.step
+def _source(step: ca.Function, names: Mapping[str, Any]) -> str:
+    name, big = names["name"], names["name"].upper()
     inner = f"{name.rstrip('_')}_casadi"
     x, u = (ca.MX.sym(key, step.size1_in(key)) for key in ("x", "u"))
     # long ones hold a loop and stay as they are, called from a function of the right name
@@ -90,7 +105,7 @@ def _source(exported: Exported) -> str:
     generator = ca.CodeGenerator(inner)
     generator.add(renamed)
     sizes = {"arg": renamed.sz_arg(), "res": renamed.sz_res(), "iw": renamed.sz_iw(), "w": renamed.sz_w()}
-    start = [f"  x[{i}] = {float(v)!r};" for i, v in enumerate(exported.start)] or ["  (void)x;"]
+    start = [f"  x[{i}] = {float(v)!r};" for i, v in enumerate(names["x0"])] or ["  (void)x;"]
     lines = [
         f'#include "{name}.h"',
         "",
@@ -101,9 +116,9 @@ def _source(exported: Exported) -> str:
         "",
         f"void {name}_step(const double *x, const double *u, double *x_next, double *y) {{",
         *(f"  {kind}[{max(1, sizes[key])}];" for key, kind in _WORK.items()),
-        f"  double now[{max(1, len(exported.states))}]; /* x_next may be x */",
+        f"  double now[{max(1, len(names['states']))}]; /* x_next may be x */",
         "  int i;",
-        f"  for (i = 0; i < {big}_NX; i++) now[i] = x[i];" if exported.states else "  (void)x; i = 0; now[i] = 0;",
+        f"  for (i = 0; i < {big}_NX; i++) now[i] = x[i];" if names["states"] else "  (void)x; i = 0; now[i] = 0;",
         "  arg[0] = now;",
         "  arg[1] = u;",
         "  res[0] = x_next;",
@@ -117,14 +132,14 @@ def _source(exported: Exported) -> str:
 _WORK = {"arg": "const casadi_real *arg", "res": "casadi_real *res", "iw": "casadi_int iw", "w": "casadi_real w"}
 
 
-def _accuracy(exported: Exported) -> str:
-    return f"min and max rounded, eps = {exported.smooth:g}" if exported.smooth else "min and max exact"
+def _accuracy(smooth: float) -> str:
+    return f"min and max rounded, eps = {smooth:g}" if smooth else "min and max exact"
 
 
-def _labelled(exported: Exported, name: str) -> str:
-    unit = exported.units.get(name)
+def _labelled(names: Mapping[str, Any], name: str) -> str:
+    unit = names["units"].get(name)
     text = f"{name} [{unit}]" if unit else name
-    return f"{text}, r = {exported.thresholds[name]:.6g}" if name in exported.thresholds else text
+    return f"{text}, r = {names['thresholds'][name]:.6g}" if name in names["thresholds"] else text
 
 
 def _comment(text: str) -> str:

@@ -146,7 +146,7 @@ class Exported:
         InputError
             If the folder cannot be made or written.
         """
-        return write_c(self, folder)
+        return write_c(folder, self.step, self.names(), "next" in self.sampled.reads)
 
     def to_control(self) -> Any:
         """The model as a `control.NonlinearIOSystem` in discrete time; dots in names become underscores.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol, TypeGuard
 
 import casadi as ca
 import numpy as np
@@ -11,14 +11,29 @@ import numpy as np
 from .._base import LARGEST, InputError, is_number, numbers
 from ..data import Recording
 from ..engine import make_engine
-from ..identify import Fit, first_state
 from ..models import Model
+from ..optimise import first_state
 from ..simulators import Simulator, choose_substeps, discretise
 from .checked_step import CheckedStep
 from .exported_model import Exported
 from .names import check_name
 from .sampled import Sampled, right_hand_side, sampled
 from .smoothing import smoothed
+
+
+class FittedModel(Protocol):
+    """A model with a time step of its own, such as a `Fit`."""
+
+    @property
+    def model(self) -> Model:
+        """Closed model at its fitted values."""
+
+    @property
+    def dt(self) -> float:
+        """Duration of a step, s."""
+
+    def initial_state(self, recording: Recording) -> np.ndarray:
+        """State with memory at a recording's first sample."""
 
 
 def exported(
@@ -66,7 +81,7 @@ def exported(
             f"smooth = {smooth!r} was given; give a number, from zero to {LARGEST:g}, in the signals' units."
         )
     rhs = None
-    if isinstance(model, Fit | Model):
+    if isinstance(model, Model) or _is_fitted(model):
         if hold is not None or substeps is not None:
             raise InputError("The model has its own steps; `hold` and `substeps` are for simulators, leave them out.")
         closed, step = _of_model(model, dt)
@@ -98,7 +113,11 @@ def exported(
     )
 
 
-def _of_model(model: Fit | Model, dt: float | None) -> tuple[Model, Sampled]:
+def _is_fitted(model: Any) -> TypeGuard[FittedModel]:
+    return isinstance(getattr(model, "model", None), Model) and callable(getattr(model, "initial_state", None))
+
+
+def _of_model(model: FittedModel | Model, dt: float | None) -> tuple[Model, Sampled]:
     """A fit or a model closed, and as a step."""
     if isinstance(model, Model):
         return model, sampled(model, _duration(dt))
@@ -169,7 +188,7 @@ def _start(model: Any, closed: Model, step: Sampled, start: Any) -> np.ndarray:
     if start is None:
         return np.zeros(size)
     if isinstance(start, Recording):
-        if isinstance(model, Fit):
+        if _is_fitted(model):
             state = model.initial_state(start)
         else:
             if (start.inputs, start.outputs) != (closed.inputs, closed.outputs):

@@ -11,24 +11,20 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ..identify import Asked, asked_by
 from ..models import PILFR, Model, block_shapes
 from ..optimise import Iteration, Limit, Solution, Status
 from .checked_json import ModelFile
 from .loading_elements import element_of
 from .model_keys import check_keys
-from .saving import HISTORY
-
-if TYPE_CHECKING:
-    from ..identify import Fit
+from .saving import HISTORY, FitContent, SavedStart
 
 
-def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fit:
-    """Read a fit that `save` wrote; simulations are the same to the last digit.
+def read_model_file(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> FitContent:
+    """Read what `write_model_file` wrote; simulations are the same to the last digit.
 
     Parameters
     ----------
@@ -40,9 +36,8 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
 
     Returns
     -------
-    Fit
-        Of the starts that were tried only what they reached is kept: each candidate has its seed, error and status, an
-        empty `theta` and the fitted model.
+    FitContent
+        Solutions of the starts have an empty `theta`: only what they reached is kept.
 
     Raises
     ------
@@ -55,8 +50,6 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     UserWarning
         If the file is of the first version of the format, which has no digest to tell changes by.
     """
-    from ..identify import Fit
-
     file = ModelFile(path, given=model is not None)
     check_keys(file)
     signals, training = file.table(file.content, "model"), file.table(file.content, "training")
@@ -66,9 +59,7 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
         file.damaged(f"the step dt is {dt:g} s")
     structure, start = _equations(file, names, model)
     fitted = _with_values(file, start, structure)
-    rest = _training(file, training, fitted)
-    return Fit(
-        asked=_asked(file, training, rest["limits"], structure),
+    return FitContent(
         model=fitted,
         structure=structure,
         dt=dt,
@@ -76,31 +67,28 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
         errors=_errors(file, fitted),
         initial=_initial_states(file, fitted.n_x + fitted.n_s),
         units={channel["name"]: channel["unit"] for key in names for channel in signals[key] if channel["unit"]},
-        **rest,
+        **_training(file, training),
     )
 
 
-def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[str, Any]:
-    """What is kept of the way to the fit, as fields of `Fit`."""
-    from ..identify import Candidate
-
+def _training(file: ModelFile, training: dict[str, Any]) -> dict[str, Any]:
+    """Read what is kept of the way to the fit, as fields of `FitContent`."""
     variables = file.table(training, "variables")
     theta = file.array(list(variables.values()), (len(variables),), "a variable")
     history = file.table(training, "history")
     numbers = file.array(history.get("number"), (len(file.rows(history, "number")),), "the history")
     columns = [file.array(history.get(key), numbers.shape, "the history", np.inf).tolist() for key in HISTORY[1:]]
-    limits = tuple(_limit(file, row) for row in (file.rows(training, "limits") if "limits" in training else []))
+    known = "limits" in training
+    limits = tuple(_limit(file, row) for row in (file.rows(training, "limits") if known else []))
     solution = replace(
         _solution(file, training, file.table(training, "solve"), theta),
         multipliers=_multipliers(file, training, limits, theta),
         history=tuple(Iteration(int(k), *row) for k, *row in zip(numbers, *columns, strict=True)),
         message=file.text(training, "message"),
     )
-    candidates = [
-        Candidate(
+    starts = [
+        SavedStart(
             seed=file.count(start, "seed"),
-            model=fitted,
-            theta=np.zeros(0),
             error=file.number(start, "error", np.inf),
             solution=_solution(file, start, start, np.zeros(0)),
             note=file.text(start, "note"),
@@ -117,17 +105,18 @@ def _training(file: ModelFile, training: dict[str, Any], fitted: Model) -> dict[
         "labels": tuple(variables),
         "train_nrmse": tuple(errors.ravel().tolist()),
         "linear_nrmse": tuple(linear.ravel().tolist()),
-        "limits": limits,
+        "limits": limits if known else None,
         "active": tuple(str(name) for name in file.rows(training, "active")),
-        "candidates": tuple(candidates),
+        "starts": tuple(starts),
         "seconds": file.number(training, "seconds"),
+        **_noise_and_weights(file, training),
     }
 
 
-def _asked(file: ModelFile, training: dict[str, Any], limits: tuple[Limit, ...], structure: PILFR | None) -> Asked:
-    """What the fit was asked with, as far as the file has it; the first files did not say it."""
+def _noise_and_weights(file: ModelFile, training: dict[str, Any]) -> dict[str, Any]:
+    """Read the noise that priors are weighed against and the recordings' weights; the first files did not say them."""
     if "limits" not in training:
-        return Asked()
+        return {}
     noise = None if training.get("noise") is None else file.number(training, "noise")
     weights = None
     if training.get("weights") is not None:
@@ -135,7 +124,7 @@ def _asked(file: ModelFile, training: dict[str, Any], limits: tuple[Limit, ...],
         weights = {recording: float(file.array(weight, (), "a weight")) for recording, weight in rows.items()}
     if any(number <= 0 for number in (*(() if noise is None else (noise,)), *(weights or {}).values())):
         file.damaged("the noise or a weight of a recording is not above zero")
-    return asked_by(limits, structure, noise=noise, weights=weights)
+    return {"noise": noise, "weights": weights}
 
 
 def _limit(file: ModelFile, row: Any) -> Limit:

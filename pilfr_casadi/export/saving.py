@@ -12,53 +12,130 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..models import Combined, Envelope, GeneralizedPlay, PrandtlIshlinskii, Products, StaticNetwork
+from ..models import (
+    PILFR,
+    Combined,
+    Envelope,
+    GeneralizedPlay,
+    Model,
+    PrandtlIshlinskii,
+    Products,
+    StaticNetwork,
+)
+from ..optimise import Limit, Solution
 from .digests import ordered_digest
 from .files import write_atomically
-
-if TYPE_CHECKING:
-    from ..identify import Fit
-    from ..models import PILFR
 
 FORMAT = "pilfr_casadi model"
 VERSION = 2  # version 1 had no digest; it is still read
 HISTORY = ("number", "cost", "seconds", "step", "damping")  # columns of a solver's history
 
 
-def save(fit: Fit, path: str | os.PathLike[str]) -> None:
+@dataclass(frozen=True, eq=False)
+class FitContent:
+    """A fit as values, which is all that a model file holds of it.
+
+    Attributes
+    ----------
+    model : Model
+        Closed model at the fitted values.
+    structure : PILFR or None
+        What the model was made from; None for a model of the user's own equations.
+    dt : float
+        Duration of a step, s.
+    solution : Solution
+        The winning solve.
+    labels : tuple of str
+        Names of the variables in `solution.theta`.
+    errors : mapping
+        Standard errors by parameter name.
+    linear : Model or None
+        Linear model that the search began with.
+    initial : mapping
+        Fingerprint of a training recording -> state with memory at its first sample.
+    units : mapping
+        Unit by name of an input or output.
+    train_nrmse, linear_nrmse : tuple of float
+        NRMSE on each training recording, of the model and of the linear one.
+    seconds : float
+        Time the identification took, s.
+    active : tuple of str
+        Variables at a bound and constraints at a limit.
+    limits : tuple of Limit
+        Constraints and active bounds; None in files that were written before these were kept.
+    noise : float or None
+        Noise that priors are weighed against.
+    weights : mapping or None
+        Weight of each training recording by its fingerprint.
+    starts : tuple of SavedStart
+        Every start that was tried.
+    """
+
+    model: Model
+    structure: PILFR | None
+    dt: float
+    solution: Solution
+    labels: tuple[str, ...] = ()
+    errors: Mapping[str, np.ndarray] = field(default_factory=dict)
+    linear: Model | None = None
+    initial: Mapping[str, np.ndarray] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    train_nrmse: tuple[float, ...] = ()
+    linear_nrmse: tuple[float, ...] = ()
+    seconds: float = 0.0
+    active: tuple[str, ...] = ()
+    limits: tuple[Limit, ...] | None = ()
+    noise: float | None = None
+    weights: Mapping[str, float] | None = None
+    starts: tuple[SavedStart, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class SavedStart:
+    """A start of a multistart search: its seed, the error it reached, how its solve ended, and whether it was drawn."""
+
+    seed: int
+    error: float
+    solution: Solution
+    note: str = ""
+    drawn: bool = True
+
+
+def write_model_file(path: str | os.PathLike[str], content: FitContent) -> None:
     """Write a fit as JSON, atomically: an existing file stays as it is until the new one is complete on disk.
 
     Parameters
     ----------
-    fit : Fit
-        What to save. A model of the user's own equations is saved by its values alone; see `load`.
     path : path
         The file, usually `*.json`.
+    content : FitContent
+        The values to save. Of a model of the user's own equations only the values are kept; see `read_model_file`.
 
     Raises
     ------
     InputError
         If the file cannot be written.
     """
-    write_atomically(path, model_text(fit))
+    write_atomically(path, model_text(content))
 
 
-def model_text(fit: Fit) -> str:
-    """The text of a model file."""
-    content = _document(fit)
-    return _text({**content, "sha256": ordered_digest(content)}) + "\n"
+def model_text(content: FitContent) -> str:
+    """Return the text of a model file."""
+    tables = _document(content)
+    return _text({**tables, "sha256": ordered_digest(tables)}) + "\n"
 
 
-def _document(fit: Fit) -> dict[str, Any]:
+def _document(fit: FitContent) -> dict[str, Any]:
     from .._base import __version__
 
     model, solution = fit.model, fit.solution
-    limited = len(solution.theta) + sum(limit.kind == "constraint" for limit in fit.limits)
+    limited = len(solution.theta) + sum(limit.kind == "constraint" for limit in fit.limits or ())
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -82,12 +159,12 @@ def _document(fit: Fit) -> dict[str, Any]:
             "sentence": solution.status.value,
             "message": solution.message,
             "nrmse": _plain(fit.train_nrmse),
-            "noise": fit.asked.noise,
-            "weights": None if fit.asked.weights is None else dict(fit.asked.weights),
+            "noise": fit.noise,
+            "weights": None if fit.weights is None else dict(fit.weights),
             "linear_nrmse": _plain(fit.linear_nrmse),
             "seconds": fit.seconds,
             "active": list(fit.active),
-            "limits": [_limit(limit) for limit in fit.limits],
+            "limits": [_limit(limit) for limit in fit.limits or ()],
             "solve": _solve(solution),
             "variables": dict(zip(fit.labels, _plain(solution.theta), strict=True)),
             "multipliers": _plain(solution.multipliers if len(solution.multipliers) == limited else ()),
@@ -101,7 +178,7 @@ def _document(fit: Fit) -> dict[str, Any]:
                     "drawn": c.drawn,
                 }
                 | _solve(c.solution)
-                for c in fit.candidates
+                for c in fit.starts
             ],
         },
     }

@@ -22,10 +22,10 @@ from .._base import InputError, one_blas_thread
 from ..data import Recording, as_recordings, by_input, check_for_identification, mean_period, repeats_itself
 from ..engine import Engine, make_engine
 from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
-from ..optimise import GaussNewton, Ipopt, Problem, Progress, Solution, Status
+from ..optimise import GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
 from .context import Job, iterations
 from .multistart import EXPLORE, run_tasks
-from .result import Candidate, Fit, first_state, with_solution
+from .result import Candidate, Fit, with_solution
 
 SHARES = (1.0, 0.3, 0.1, 0.0)  # of the measured output that a NOE reads while it is trained, stage by stage
 

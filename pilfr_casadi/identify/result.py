@@ -29,16 +29,17 @@ import numpy as np
 from .._base import InputError
 from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse, rmse_per_output
 from ..engine import Engine, make_engine
+from ..export import FitContent, SavedStart, exported, write_model_file
 from ..models import PILFR, Model, PrandtlIshlinskii, Stop
 from ..optimise import (
     Gain,
-    GaussNewton,
     Limit,
     Problem,
     Solution,
     Status,
+    first_state,
     limits_of,
-    settled,
+    samples_for_state,
     unbounded_sentence,
     unknown_multipliers,
 )
@@ -223,10 +224,30 @@ class Fit:
         return plot_fit(self, recordings, **options)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model as JSON, atomically; see `export.save`."""
-        from ..export import save
+        """Write the model as JSON, atomically; see `identify.save`."""
+        write_model_file(path, self.content())
 
-        save(self, path)
+    def content(self) -> FitContent:
+        """Return the values that a model file holds of this fit."""
+        return FitContent(
+            model=self.model,
+            structure=self.structure,
+            dt=self.dt,
+            solution=self.solution,
+            labels=self.labels,
+            errors=self.errors,
+            linear=self.linear,
+            initial=self.initial,
+            units=self.units,
+            train_nrmse=self.train_nrmse,
+            linear_nrmse=self.linear_nrmse,
+            seconds=self.seconds,
+            active=self.active,
+            limits=self.limits,
+            noise=self.asked.noise,
+            weights=self.asked.weights,
+            starts=tuple(SavedStart(c.seed, c.error, c.solution, c.note, c.drawn) for c in self.candidates),
+        )
 
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
         """`casadi.Function (x, u) -> (x_next, y)`, operator memory inside x; see `export.to_casadi`."""
@@ -234,8 +255,6 @@ class Fit:
 
     def export(self, **options: Any) -> Any:
         """The step with start state, names and units, for CasADi, C and python-control; see `export.exported`."""
-        from ..export import exported
-
         return exported(self, **options)
 
     def __str__(self) -> str:
@@ -276,45 +295,6 @@ class Fit:
         return "\n".join(line for line in lines if line)
 
     __repr__ = __str__
-
-
-def samples_for_state(model: Model) -> int:
-    """Samples that an unknown initial state is fitted to: ten a state, at least 50."""
-    return max(10 * (model.n_x + model.n_s), 50)
-
-
-def first_state(model: Model, engine: Engine, recording: Recording, samples: int | None = None) -> np.ndarray:
-    """State with memory at a recording's first sample, as its `initial` says; the model's parameters are held.
-
-    Where it is to be estimated, it is fitted to the first `samples` samples; nothing later is looked at.
-
-    Raises
-    ------
-    InputError
-        If a given state has another number of entries.
-    """
-    n, initial, values = model.n_x + model.n_s, recording.initial, model.parameters.start
-    if not isinstance(initial, str):
-        given = np.asarray(initial, dtype=float).ravel()
-        states = len(model.states)
-        if given.size not in (states, n):
-            raise InputError(f"An initial state of {given.size} numbers was given; expected {states} or {n}.")
-        return np.concatenate([given, np.zeros(n - given.size)])
-    state = np.zeros(n)
-    if initial == "periodic":
-        period = model.drive(recording)[: (recording.period or 1) * model.substeps]
-        state = settled(engine, period, values, state)
-    elif initial == "estimate" and n:
-        samples = min(len(recording), samples or samples_for_state(model))
-        held = model.with_parameters(
-            model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
-        )
-        head = recording.slice(0, max(samples, 2)).with_(skip=0)
-        spread = np.std(head.y, axis=0)
-        spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
-        problem = Problem(held, head, engine=engine, scale=spread)
-        state = GaussNewton(max_iterations=50).solve(problem).theta
-    return state
 
 
 def _shown(error: float) -> str:

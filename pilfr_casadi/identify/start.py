@@ -41,6 +41,7 @@ from ..models import (
     neurons_over,
     or_one,
     read_through,
+    weight_density,
 )
 
 Blocks = dict[str, np.ndarray]
@@ -225,12 +226,6 @@ def _layer(structure: PILFR) -> PrandtlIshlinskii:
     return element
 
 
-def density(r: np.ndarray, w: np.ndarray, grid: np.ndarray, width: float) -> np.ndarray:
-    """Density of weights (N,) over thresholds (N,) on a grid (G,): Gaussian kernels, mirrored at zero."""
-    kernels = sum(np.exp(-0.5 * ((grid[:, None] - sign * r) / width) ** 2) for sign in (1, -1))
-    return np.asarray(kernels @ w) / (width * np.sqrt(2 * np.pi))
-
-
 def is_density(w: np.ndarray) -> bool:
     """Whether weights (N,) are a density: whether any of them is above zero."""
     return bool(np.sum(w) > 0)
@@ -269,7 +264,7 @@ def regrid(
         New thresholds (ascending) and the weights that the density gives them.
     """
     grid = np.linspace(0.0, beyond * reach, 600)
-    d = density(r, w, grid, smooth * reach)
+    d = weight_density(r, w, grid, smooth * reach)
     if d.max() <= 1e-200 * np.sum(w):  # all of them rest far beyond what is visited: evenly
         d = np.full_like(grid, np.sum(w) / grid[-1])
     tail = (grid >= 0.4 * reach) & (grid <= 0.85 * reach)

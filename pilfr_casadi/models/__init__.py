@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         Element as Element,
         PrandtlIshlinskii as PrandtlIshlinskii,
         StaticNetwork as StaticNetwork,
+        weight_density as weight_density,
     )
     from .envelope import Envelope as Envelope
     from .gauge_orbit import generators as generators

@@ -179,6 +179,12 @@ class StaticNetwork:
         return np.asarray(np.sum(np.abs(np.asarray(p["gain"], dtype=float)), axis=1))
 
 
+def weight_density(r: np.ndarray, w: np.ndarray, grid: np.ndarray, width: float) -> np.ndarray:
+    """Density of weights (N,) over thresholds (N,) on a grid (G,): Gaussian kernels, mirrored at zero."""
+    kernels = sum(np.exp(-0.5 * ((grid[:, None] - sign * r) / width) ** 2) for sign in (1, -1))
+    return np.asarray(kernels @ w) / (width * np.sqrt(2 * np.pi))
+
+
 def _check_counts(what: str, **counts: Any) -> None:
     for count in counts.values():
         if (

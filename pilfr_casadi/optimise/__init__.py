@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     )
     from .exactness import beyond as beyond, exactly as exactly
     from .gauss_newton import GaussNewton as GaussNewton, unconstrained as unconstrained
+    from .initial_state import first_state as first_state, samples_for_state as samples_for_state
     from .ipopt import Ipopt as Ipopt
-    from .problem import Problem as Problem, checked_weights as checked_weights, settled as settled
+    from .problem import Problem as Problem, checked_weights as checked_weights
     from .solution import (
         Iteration as Iteration,
         Limit as Limit,

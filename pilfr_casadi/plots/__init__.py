@@ -10,6 +10,23 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .canvas import new_figure as new_figure
+    from .diagnosis import (
+        mismatch_bands as mismatch_bands,
+        mismatch_growth as mismatch_growth,
+        mismatch_level as mismatch_level,
+        mismatch_map as mismatch_map,
+        mismatch_time as mismatch_time,
+        port_law_map as port_law_map,
+    )
+    from .diagnosis_proof import (
+        Simulated as Simulated,
+        compared_residuals as compared_residuals,
+        compared_spectra as compared_spectra,
+        compared_traces as compared_traces,
+        force_cloud as force_cloud,
+        force_left as force_left,
+        force_time as force_time,
+    )
     from .law import loading_curve as loading_curve, loop as loop, virgin_curve as virgin_curve, weights as weights
     from .measured import (
         best_linear_approximation as best_linear_approximation,

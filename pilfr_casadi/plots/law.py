@@ -6,25 +6,23 @@ Krikelis et al. (2024), Eq. 16 and Fig. 15.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from .._base import InputError
 from ..data import Recording, as_recordings
-from ..identify import density
+from ..models import weight_density
 from .canvas import BLUE, INK, SKY, VERMILLION, axes_or_new, finish, with_unit
-from .signals import as_scored
-
-if TYPE_CHECKING:
-    from ..identify import Fit
+from .signals import PlottedFit, as_scored
 
 Curve = Callable[[np.ndarray], np.ndarray]
 FEWEST = 4  # operators whose weights make up a density
 
 
-def loop(fit: Fit, recording: Recording, *, channel: int = 0, bare: bool = False, ax: Axes | None = None) -> Axes:
+def loop(
+    fit: PlottedFit, recording: Recording, *, channel: int = 0, bare: bool = False, ax: Axes | None = None
+) -> Axes:
     """The identified hysteresis: the element's output w over its input z along a recording, as Fig. 15.
 
     With `bare` the line through the origin that fits w best is taken off, so that the hysteresis alone is seen.
@@ -45,7 +43,7 @@ def loop(fit: Fit, recording: Recording, *, channel: int = 0, bare: bool = False
 
 
 def loading_curve(
-    fit: Fit,
+    fit: PlottedFit,
     recordings: Recording | Sequence[Recording] | None = None,
     *,
     channel: int = 0,
@@ -68,7 +66,7 @@ def loading_curve(
     return finish(ax, _label(fit, "z", channel), _label(fit, "w", channel), "loading curve")
 
 
-def virgin_curve(fit: Fit, z: np.ndarray, channel: int = 0) -> np.ndarray:
+def virgin_curve(fit: PlottedFit, z: np.ndarray, channel: int = 0) -> np.ndarray:
     """w (G,) while one channel's z runs through the values given (G,), from empty memory."""
     model, p = fit.model, fit.model.parameters.start
     memory, out = np.zeros(model.n_s), np.empty(len(z))
@@ -79,7 +77,7 @@ def virgin_curve(fit: Fit, z: np.ndarray, channel: int = 0) -> np.ndarray:
 
 
 def weights(
-    fit: Fit,
+    fit: PlottedFit,
     recordings: Recording | Sequence[Recording] | None = None,
     *,
     channel: int = 0,
@@ -112,7 +110,7 @@ def weights(
     if two:
         right = ax.twinx()
         if smooth:
-            drawn = density(r, w, grid, limit / 12)
+            drawn = weight_density(r, w, grid, limit / 12)
             right.plot(grid, drawn, color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
         if reference is not None:
             drawn = reference(grid)
@@ -127,18 +125,18 @@ def weights(
     return ax
 
 
-def _check_channel(fit: Fit, channel: int) -> None:
+def _check_channel(fit: PlottedFit, channel: int) -> None:
     if not 0 <= channel < fit.model.n_w:
         raise InputError(
             f"Channel {channel} of the element was asked for; the model has {fit.model.n_w}, counted from 0."
         )
 
 
-def _index(fit: Fit, channel: int) -> str:
+def _index(fit: PlottedFit, channel: int) -> str:
     return str(channel + 1) if fit.model.n_w > 1 else ""
 
 
-def _label(fit: Fit, signal: str, channel: int, name: str = "") -> str:
+def _label(fit: PlottedFit, signal: str, channel: int, name: str = "") -> str:
     """Axis label of an element's signal: in units where it is an input or output of the model, else in its scale."""
     index = _index(fit, channel)
     reads, writes = (("C_z", "D_zu"), fit.model.inputs), (("C_y", "D_yu", "D_yw"), fit.model.outputs)
@@ -155,12 +153,12 @@ def _label(fit: Fit, signal: str, channel: int, name: str = "") -> str:
     return f"{name} (model scale)"
 
 
-def _reach(fit: Fit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:
+def _reach(fit: PlottedFit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:
     records = () if recordings is None else as_recordings(recordings)
     return max((float(np.nanmax(np.abs(fit.signals(r)["z"][:, channel]))) for r in records), default=0.0)
 
 
-def _range(fit: Fit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:
+def _range(fit: PlottedFit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:
     """Up to where an element is drawn: what is visited, and the thresholds where they lie not far beyond."""
     reach, r = _reach(fit, recordings, channel), fit.parameters.get("r")
     far = 0.0 if r is None else float(np.max(r[channel]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,14 +12,11 @@ from ..data import Recording, as_recordings
 from ..optimise import Iteration
 from .canvas import GREY, VERMILLION, axes_or_new, finish, new_figure
 from .law import loading_curve, loop, weights
-from .signals import spectrum, time
-
-if TYPE_CHECKING:
-    from ..identify import Fit
+from .signals import PlottedFit, spectrum, time
 
 
 def plot_fit(
-    fit: Fit, recordings: Recording | Sequence[Recording], *, steady: Sequence[Recording] | None = None
+    fit: PlottedFit, recordings: Recording | Sequence[Recording], *, steady: Sequence[Recording] | None = None
 ) -> Figure:
     """One figure: time and spectrum of every output; loop and loading curve of every channel, and a layer's weights.
 
@@ -66,7 +62,7 @@ def plot_fit(
     return figure
 
 
-def convergence(fit: Fit, *, ax: Axes | None = None) -> Axes:
+def convergence(fit: PlottedFit, *, ax: Axes | None = None) -> Axes:
     """Training error over iterations, of every start and of the solve that won."""
     ax = axes_or_new(ax)
     histories = [c.solution.history for c in fit.candidates if c.solution.history]

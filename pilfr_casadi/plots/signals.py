@@ -5,16 +5,19 @@ Krikelis et al. (2024), Fig. 9, 10 and 14.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any, Protocol, cast
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from .._base import InputError
 from ..data import Recording, nrmse
+from ..export import FittedModel
 from ..linear import output_spectra
+from ..models import Model
+from ..optimise import Solution
 from .canvas import (
     BLUE,
     GREEN,
@@ -32,11 +35,53 @@ from .canvas import (
     with_unit,
 )
 
-if TYPE_CHECKING:
-    from ..identify import Fit
+
+class Start(Protocol):
+    """A start of a multistart search."""
+
+    @property
+    def solution(self) -> Solution:
+        """How its solve ended."""
 
 
-def time(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
+class PlottedFit(FittedModel, Protocol):
+    """The parts of a fit that figures show; a `Fit` is one, and so is any other object that has them."""
+
+    @property
+    def linear(self) -> Model | None:
+        """Linear model that the search began with."""
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Unit by name of an input or output."""
+
+    @property
+    def parameters(self) -> Mapping[str, np.ndarray]:
+        """Fitted values by name."""
+
+    @property
+    def errors(self) -> Mapping[str, np.ndarray]:
+        """Standard errors by parameter name."""
+
+    @property
+    def solution(self) -> Solution:
+        """The winning solve."""
+
+    @property
+    def candidates(self) -> Sequence[Start]:
+        """Every start that was tried."""
+
+    def simulate(self, recording: Recording) -> np.ndarray:
+        """Simulated outputs, (M, n_y)."""
+
+    def signals(self, recording: Recording) -> dict[str, np.ndarray]:
+        """Simulated `y` (M, n_y) with the element's `z` and `w` (M, n_w)."""
+
+    def scored_from(self, recording: Recording) -> int:
+        """First sample that is scored."""
+
+
+def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
     """Measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
     recording = as_scored(fit, recording)
     ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
@@ -52,7 +97,7 @@ def time(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = N
 
 
 def traces(
-    fit: Fit,
+    fit: PlottedFit,
     recording: Recording,
     *,
     output: int = 0,
@@ -91,7 +136,7 @@ def busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
     return begin * recording.dt, max(end, begin + 2) * recording.dt
 
 
-def remains(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
+def remains(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
     """What the fit leaves over, alone over time and in its own scale."""
     recording = as_scored(fit, recording)
     ax, y = axes_or_new(ax), _column(recording.y, output, "output")
@@ -110,7 +155,7 @@ def remains(fit: Fit, recording: Recording, *, output: int = 0, ax: Axes | None 
 
 
 def output_over_input(
-    fit: Fit, recording: Recording, *, input: int = 0, output: int = 0, ax: Axes | None = None
+    fit: PlottedFit, recording: Recording, *, input: int = 0, output: int = 0, ax: Axes | None = None
 ) -> Axes:
     """Measured and simulated output over an input, where scored: the nested loops of a quasi-static device."""
     ax, u, y = axes_or_new(ax), _column(recording.u, input, "input"), _column(recording.y, output, "output")
@@ -125,7 +170,7 @@ def output_over_input(
 
 
 def spectrum(
-    fit: Fit,
+    fit: PlottedFit,
     recording: Recording,
     *,
     output: int = 0,
@@ -206,7 +251,7 @@ def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.nd
     return out
 
 
-def linear_simulation(fit: Fit, recording: Recording) -> np.ndarray:
+def linear_simulation(fit: PlottedFit, recording: Recording) -> np.ndarray:
     """Outputs (M, n_y) of the linear model that the fit began with, from its own initial state.
 
     Raises
@@ -217,12 +262,11 @@ def linear_simulation(fit: Fit, recording: Recording) -> np.ndarray:
     if fit.linear is None:
         raise InputError("The fit holds no linear model to compare with.")
     given = not isinstance(recording.initial, str)
-    return replace(fit, model=fit.linear, linear=None, initial={}).simulate(
-        recording.with_(initial="estimate") if given else recording
-    )
+    linear: PlottedFit = replace(cast(Any, fit), model=fit.linear, linear=None, initial={})
+    return linear.simulate(recording.with_(initial="estimate") if given else recording)
 
 
-def as_scored(fit: Fit, recording: Recording) -> Recording:
+def as_scored(fit: PlottedFit, recording: Recording) -> Recording:
     """The recording with `skip` at the first sample that is scored: behind those that its state was fitted to."""
     try:
         return recording.with_(skip=fit.scored_from(recording))
@@ -252,7 +296,7 @@ def _moved(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
     return error - np.mean(known), f", less {np.mean(known):.3g} {unit}".rstrip()
 
 
-def _compares(fit: Fit) -> bool:
+def _compares(fit: PlottedFit) -> bool:
     """Whether there is a linear model beside the fit."""
     return fit.linear is not None and fit.model.n_w > 0
 
@@ -264,7 +308,7 @@ def _column(values: np.ndarray, index: int, role: str) -> np.ndarray:
     return values[:, index]
 
 
-def _residuals(fit: Fit, recording: Recording, output: int) -> list[tuple[str, np.ndarray, str]]:
+def _residuals(fit: PlottedFit, recording: Recording, output: int) -> list[tuple[str, np.ndarray, str]]:
     """(label, residual, colour) of the linear model, where the fit has one, and of the fit."""
     out = [(*_named("this model", recording, fit.simulate(recording), output), INK)]
     if _compares(fit):
@@ -281,5 +325,5 @@ def _named(model: str, recording: Recording, simulated: np.ndarray, output: int)
     return f"residual, {model}{share}", y_hat - y
 
 
-def _unit(fit: Fit, recording: Recording, name: str) -> str:
+def _unit(fit: PlottedFit, recording: Recording, name: str) -> str:
     return recording.units.get(name, fit.units.get(name, ""))

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from .. import plots
 from .._base import InputError
 from ..diagnose import Fitted, Workbench
-from ..plots import diagnosis_proof as proof
 from .diagnosis_force import Hidden, hidden_force
 from .page import Block, Picture, Text
 
@@ -53,25 +53,25 @@ def force_blocks(
         out.append(_over_rate(hidden, across, what, name, place.unit, place.across_unit, alt))
     elif place.series and len(hidden.law):
         out.append(_through(hidden, across, name, place.across_unit, alt))
-    over = proof.force_time(hidden.t, hidden.force, hidden.std, hidden.law, label=what, unit=place.unit, name=name)
+    over = plots.force_time(hidden.t, hidden.force, hidden.std, hidden.law, label=what, unit=place.unit, name=name)
     caption = "The same over time, around its largest value, with the uncertainty that noise alone leaves."
     out.append(Picture(over.figure, caption, f"{alt} over time."))
     if len(hidden.law):
         left = hidden.force - hidden.law_held
-        shown = proof.force_left(hidden.z, left, hidden.std, across=across, label="recovered − law", **units)
+        shown = plots.force_left(hidden.z, left, hidden.std, across=across, label="recovered − law", **units)
         caption = "What the law leaves of the recovered force. Where the mean bends away from zero, its form is off."
         out.append(Picture(shown.figure, caption, f"{alt} without the law."))
     return out
 
 
 def _cloud(h: Hidden, across: str, what: str, name: str, units: dict[str, Any], caption: str, alt: str) -> Picture:
-    shown = proof.force_cloud(h.z, h.force, h.law_z, h.law, across=across, label=what, title=h.port, name=name, **units)
+    shown = plots.force_cloud(h.z, h.force, h.law_z, h.law, across=across, label=what, title=h.port, name=name, **units)
     return Picture(shown.figure, caption, alt)
 
 
 def _over_rate(h: Hidden, across: str, what: str, name: str, unit: str, across_unit: str, alt: str) -> Picture:
     units: dict[str, Any] = {"unit": unit, "across_unit": f"{across_unit}/s" if across_unit else ""}
-    shown = proof.force_cloud(
+    shown = plots.force_cloud(
         h.dz, h.force, h.law_dz, h.law, across=f"rate of {across}", label=what, title=h.port, name=name, **units
     )
     return Picture(shown.figure, "The same over the rate.", f"{alt} over its rate.")
@@ -80,7 +80,7 @@ def _over_rate(h: Hidden, across: str, what: str, name: str, unit: str, across_u
 def _through(h: Hidden, across: str, name: str, unit: str, alt: str) -> Picture:
     """What comes out of a series law over what goes in."""
     units: dict[str, Any] = {"unit": unit, "across_unit": unit}
-    shown = proof.force_cloud(
+    shown = plots.force_cloud(
         h.z, h.z + h.force, h.law_z, h.law_z + h.law, across=across, label=f"{across} as it acts", title=h.port,
         name=name, **units,
     )  # fmt: skip

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from .. import plots
 from ..diagnose import Diagnosis, Fitted, Workbench, mismatch
-from ..plots import diagnosis as pictures, diagnosis_proof as proof
 from . import diagnosis_tables as tables
 from .diagnosis_hidden import force_blocks
 from .diagnosis_runs import Comparison, comparisons, replay, steps
@@ -112,33 +112,33 @@ def _where(case: _Case) -> list[Block]:
     return [
         *out,
         Picture(
-            pictures.mismatch_map(found, unit).figure,
+            plots.mismatch_map(found, unit).figure,
             f"{intro}, over frequency and the amplitude of {outputs}.",
             "Map of the residual over frequency and amplitude.",
         ),
         Picture(
-            pictures.mismatch_bands(found).figure,
+            plots.mismatch_bands(found).figure,
             "The same by band of frequency, beside the noise floor.",
             "Residual by band of frequency.",
         ),
         Picture(
-            pictures.mismatch_growth(found, unit).figure,
+            plots.mismatch_growth(found, unit).figure,
             "Growth with amplitude. The refit has bent the parameters to hide what it can: this says where the "
             "simulator fails, not why.",
             "Residual over amplitude.",
         ),
         Picture(
-            pictures.mismatch_growth(found, unit, kind="rate").figure,
+            plots.mismatch_growth(found, unit, kind="rate").figure,
             "Growth with speed.",
             "Residual over rate.",
         ),
         Picture(
-            pictures.mismatch_time(found).figure,
+            plots.mismatch_time(found).figure,
             "The same over time, beside the motion of the output.",
             "Residual over time.",
         ),
         Picture(
-            pictures.mismatch_level(found, case.unit(found["level"]["output"])).figure,
+            plots.mismatch_level(found, case.unit(found["level"]["output"])).figure,
             f"The same over the value of {found['level']['output']}.",
             "Residual over the value of the output.",
         ),
@@ -185,7 +185,7 @@ def _tried(d: Diagnosis) -> list[Block]:
         framed = [(port, words(law)) for port, law in own]
         errors = (d.errors["train"] or {}).get("before") if not k else None
         known = errors if errors is not None and np.isfinite(errors) else None
-        figure = pictures.port_law_map(cells, framed, known, d.floor["nrmse"] or None).figure
+        figure = plots.port_law_map(cells, framed, known, d.floor["nrmse"] or None).figure
         caption = f"{title}: the error that remains on data not fitted, in %, by port and law (best form). "
         caption += "Grey: left out by the quick test before the fits."
         out += [Picture(figure, caption, "Errors by port and law.", wide=len({r["port"] for r in rows}) > 6)]
@@ -209,7 +209,7 @@ def _proof(case: _Case) -> list[Block]:
 def _compared(case: _Case, c: Comparison, i: int) -> list[Block]:
     r, name = c.recording, c.recording.outputs[i]
     unit, floor = case.unit(name), float(case.noise[i])
-    simulated: proof.Simulated = [("refitted", c.before)]
+    simulated: plots.Simulated = [("refitted", c.before)]
     if what := tables.mended(case.diagnosis):
         simulated.append((what.removesuffix(" put back"), c.after))
     gone = [label for label, v in simulated if v is None]
@@ -217,22 +217,22 @@ def _compared(case: _Case, c: Comparison, i: int) -> list[Block]:
     where = f"{name} in {r.name}"
     return [
         Picture(
-            proof.compared_traces(r, simulated, i, unit).figure,
+            plots.compared_traces(r, simulated, i, unit).figure,
             f"{where}: measured and simulated, around the largest excursion.{lost}",
             f"Measured and simulated {where}.",
         ),
         Picture(
-            proof.compared_traces(r, simulated, i, unit, quiet=True).figure,
+            plots.compared_traces(r, simulated, i, unit, quiet=True).figure,
             f"{where}: the same in a stretch with little motion.",
             f"Measured and simulated {where}, little motion.",
         ),
         Picture(
-            proof.compared_residuals(r, simulated, i, unit, floor).figure,
+            plots.compared_residuals(r, simulated, i, unit, floor).figure,
             f"{where}: what is left, the whole recording.",
             f"Residuals of {where}.",
         ),
         Picture(
-            proof.compared_spectra(r, simulated, i, unit, floor).figure,
+            plots.compared_spectra(r, simulated, i, unit, floor).figure,
             f"{where}: output and what is left over frequency, beside the noise floor.",
             f"Spectra of {where}.",
         ),

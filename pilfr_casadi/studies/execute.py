@@ -20,8 +20,8 @@ import numpy as np
 
 from .._base import InputError, Progress, deferred_interrupt
 from ..data import Recording, keeps_its_period, read
-from ..export import digest, load, made
-from ..identify import Fit
+from ..export import digest, made
+from ..identify import Fit, load
 from ..models import Model
 from ..optimise import Status
 from .described import ROLES, Run, read_run

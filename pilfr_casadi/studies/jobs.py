@@ -149,7 +149,7 @@ def outcome(
         return Outcome({**about, "held": fit.nrmse(fold(recordings["train"], job.fold, run.folds)[1])}, found.seconds)
     pairs = ((name, r) for role, names in run.files.items() for name, r in zip(names, recordings[role], strict=True))
     errors = {name: error_of(fit, recording) for name, recording in pairs}
-    return Outcome(about, found.seconds, model_text(fit), errors)
+    return Outcome(about, found.seconds, model_text(fit.content()), errors)
 
 
 def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:

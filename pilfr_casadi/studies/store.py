@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError
-from ..export import digest, load
+from ..export import digest
+from ..identify import load
 from ..models import Model
 from ..optimise import Status
 from .described import Run

@@ -11,8 +11,7 @@ from browser import CHROMIUM, in_a_browser
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
-from pilfr_casadi.export import load
-from pilfr_casadi.identify import Fit
+from pilfr_casadi.identify import Fit, load
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, block_shapes
 from pilfr_casadi.optimise import Iteration, Solution, Status
 from pilfr_casadi.plots import new_figure

@@ -1,0 +1,51 @@
+"""The state with memory at the first sample of a recording, of a model whose parameters are known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .._base import InputError
+from ..data import Recording
+from ..engine import Engine
+from ..models import Model
+from .gauss_newton import GaussNewton
+from .problem import Problem, settled
+
+
+def samples_for_state(model: Model) -> int:
+    """Samples that an unknown initial state is fitted to: ten a state, at least 50."""
+    return max(10 * (model.n_x + model.n_s), 50)
+
+
+def first_state(model: Model, engine: Engine, recording: Recording, samples: int | None = None) -> np.ndarray:
+    """State with memory at a recording's first sample, as its `initial` says; the model's parameters are held.
+
+    Where it is to be estimated, it is fitted to the first `samples` samples; nothing later is looked at.
+
+    Raises
+    ------
+    InputError
+        If a given state has another number of entries.
+    """
+    n, initial, values = model.n_x + model.n_s, recording.initial, model.parameters.start
+    if not isinstance(initial, str):
+        given = np.asarray(initial, dtype=float).ravel()
+        states = len(model.states)
+        if given.size not in (states, n):
+            raise InputError(f"An initial state of {given.size} numbers was given; expected {states} or {n}.")
+        return np.concatenate([given, np.zeros(n - given.size)])
+    state = np.zeros(n)
+    if initial == "periodic":
+        period = model.drive(recording)[: (recording.period or 1) * model.substeps]
+        state = settled(engine, period, values, state)
+    elif initial == "estimate" and n:
+        samples = min(len(recording), samples or samples_for_state(model))
+        held = model.with_parameters(
+            model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
+        )
+        head = recording.slice(0, max(samples, 2)).with_(skip=0)
+        spread = np.std(head.y, axis=0)
+        spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
+        problem = Problem(held, head, engine=engine, scale=spread)
+        state = GaussNewton(max_iterations=50).solve(problem).theta
+    return state
