@@ -8,31 +8,31 @@ if TYPE_CHECKING:
     from .errors import (
         LARGEST as LARGEST,
         InputError as InputError,
+        existing_file as existing_file,
         filled as filled,
         is_number as is_number,
+        is_whole as is_whole,
         listed as listed,
         numbers as numbers,
-        signal as signal,
+        positive as positive,
         usable as usable,
         whole as whole,
     )
     from .interrupts import (
         Clock as Clock,
-        Progress as Progress,
         deferred_interrupt as deferred_interrupt,
-        insistent as insistent,
         terminable as terminable,
         time_limit as time_limit,
-        worker_pool as worker_pool,
     )
-    from .progress import progress_bar as progress_bar
-    from .threads import (
+    from .progress import Progress as Progress, progress_bar as progress_bar
+    from .version import __version__ as __version__
+    from .worker_process import Reply as Reply, close_hands as close_hands, do as do
+    from .workers import (
         one_at_a_time as one_at_a_time,
         one_blas_thread as one_blas_thread,
         processors as processors,
         side_by_side as side_by_side,
+        worker_pool as worker_pool,
     )
-    from .version import __version__ as __version__
-    from .worker_process import Reply as Reply, close_hands as close_hands, do as do
-else:
-    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -1,25 +1,31 @@
-"""What is wrong with the fields of a recording, in one plain sentence each; layer 0, knows nothing of the rest."""
+"""The package's one error for bad input, and the few checks that raise it with a plain sentence."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
 
-LARGEST = 1e100  # samples above cannot be squared and summed
+LARGEST = 1e100  # samples above cannot be squared and summed in double precision
 
 
 class InputError(ValueError):
     """Something given by the user cannot be used; the message is one plain sentence for that user."""
 
 
-def listed(names: Sequence[str], most: int = 20) -> str:
+def listed(names: Sequence[Any], most: int = 20) -> str:
     """Join names for a message; of many, the first ones."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+    return ", ".join(map(str, names[:most])) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def usable(values: np.ndarray) -> np.ndarray:
-    """Where the values are finite and small enough for their squares to be summed; a boolean array of their shape."""
+    """Tell where the values are finite and small enough for their squares to be summed; a boolean array."""
     return np.abs(values) <= LARGEST  # False for nan
+
+
+def is_whole(value: Any, least: int, most: float = np.inf) -> bool:
+    """Tell whether a value is a whole number from `least` to `most`."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(least <= value <= most)
 
 
 def whole(value: Any, what: str, least: int) -> int:
@@ -30,24 +36,36 @@ def whole(value: Any, what: str, least: int) -> int:
     InputError
         If something else is given.
     """
-    good = isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least
-    if not good:
+    if not is_whole(value, least):
         raise InputError(f"{what} is {value!r}; give a whole number, {least} or more.")
     return int(value)
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Whether a value is one real number."""
+    """Tell whether a value is one real number."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infinite: bool = False) -> np.ndarray:
-    """Return finite real numbers as an array; of a shape, to which it is broadcast, where one is given.
+def positive(value: Any, what: str, meaning: str = "a number", zero: bool = False) -> float:
+    """Return a finite number above zero, or zero where `zero` allows it.
 
     Raises
     ------
     InputError
-        If something else is given, or one of them is not finite (nan, where `infinite`).
+        If something else is given, `what` being the argument's name; the message asks for `meaning`.
+    """
+    if not is_number(value) or not np.isfinite(value) or value < 0 or (value == 0 and not zero):
+        raise InputError(f"{what}={value!r} was given; give {meaning}, {'zero or more' if zero else 'above zero'}.")
+    return float(value)
+
+
+def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infinite: bool = False) -> np.ndarray:
+    """Return finite real numbers as an array, broadcast to `shape` where that is given.
+
+    Raises
+    ------
+    InputError
+        If something else is given, or one of them is not finite (with `infinite`: is nan).
     """
     try:
         given = np.asarray(values)
@@ -66,19 +84,19 @@ def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infini
 def filled(
     values: Any, what: str, shape: tuple[int | str, ...], nan: bool = False, infinite: bool = False
 ) -> np.ndarray:
-    """Return an array of a shape from one number for all of it, or from an array of just this shape.
+    """Return an array of a shape from one number for all of it, or from an array of exactly this shape.
 
-    Nothing else is stretched: a row given for a matrix is more likely a mistake than every row of it.
+    Nothing else is broadcast: a row given for a matrix is more likely a mistake than meant for every row.
 
     Parameters
     ----------
     values : float or array
     what : str
-        Begins the sentence.
+        Begins the message.
     shape : tuple
-        A name in place of a length stands for one that is not known yet; a single number stays as it is then.
+        A name in place of a length stands for an unknown length; a single number then stays a single number.
     nan, infinite : bool
-        Whether such entries have a meaning.
+        Whether such entries are allowed.
 
     Raises
     ------
@@ -102,38 +120,20 @@ def filled(
     return np.broadcast_to(found, lengths) if len(lengths) == len(shape) else found
 
 
-def signal(
-    values: Any, names: Sequence[str], letter: str, role: str, label: str, none: bool = False
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the signal as a read-only (M, n) copy, and its names; (M, 0) only where `none` allows it."""
-    try:
-        given = np.asarray(values)
-        real = given.dtype.kind in "biuf" or given.dtype == object
-        array = np.array(given, dtype=float) if real else None
-    except (TypeError, ValueError, OverflowError):
-        array = None
-    if array is None:
-        raise InputError(f"{letter} of {label} is not an array of real numbers; give one of shape (samples, channels).")
-    if array.ndim == 1:
-        array = array[:, None]
-    if array.ndim != 2 or (array.shape[1] == 0 and not none):
-        raise InputError(
-            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels)."
-        )
-    n = array.shape[1]
-    names = (names,) if isinstance(names, str) else tuple(names)
-    if not names and n:
-        names = (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
-    if len(names) != n:
-        raise InputError(f"{label} has {n} {role} column(s) but {len(names)} name(s) {listed(names)}; give one each.")
-    if len(set(names)) != n or not all(isinstance(name, str) and name for name in names):
-        raise InputError(f"the {role} names {names} of {label} must be distinct and not empty.")
-    unusable = ~usable(array)
-    if unusable.any():
-        k, i = np.argwhere(unusable)[0]
-        raise InputError(
-            f"sample {k} of {role} {names[i]!r} in {label} is {array[k, i]}; only finite numbers up to {LARGEST:g} can "
-            "be used, so repair or cut out that piece, or give it in another unit."
-        )
-    array.setflags(write=False)
-    return array, names
+def existing_file(path: str | Path) -> Path:
+    """Return the path of a regular file; reading a pipe or a device might wait forever.
+
+    Raises
+    ------
+    InputError
+        If there is nothing, a directory, or anything else that is not a regular file.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path} is a directory; give the file inside it.")
+    if not path.exists():
+        link = ", only a link that leads nowhere" if path.is_symlink() else ""
+        raise InputError(f"there is no file {path}{link}; check the name and the folder.")
+    if not path.is_file():
+        raise InputError(f"{path} is a pipe or a device, not a regular file; write its content to a file first.")
+    return path

@@ -1,33 +1,103 @@
-"""Progress of long work on the terminal (silent where stderr is not one)."""
+"""Progress of long work on stderr: a bar on a terminal, plain lines anywhere else.
+
+Long work reports to a callable `progress(stage, done, total, best)`: the stage that runs, the parts of it that are
+done, their total (0 where it is not known), and the smallest error so far (nan where there is none).
+"""
 
 from __future__ import annotations
 
 import math
+import sys
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from typing import Any
+
+from .interrupts import repeated_interrupt
+
+Progress = Callable[[str, int, int, float], None]
+
+STAGE_LINE = 1.0  # seconds between plain lines when the stage changes; quicker work stays silent
+SAME_STAGE_LINE = 10.0  # seconds between plain lines within a stage
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, int, int, float], None]]:
-    """A callable (stage, done, total, smallest error) that moves a bar while the context lasts."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+def progress_bar() -> Iterator[Progress]:
+    """Yield a function (stage, done, total, best error) that shows the progress while the context lasts.
 
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total}"),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[best]}"),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        tasks: dict[str, TaskID] = {}
+    It shows the stage that runs, the parts done, the smallest error of all stages so far, and the time spent since the
+    context began. It raises KeyboardInterrupt if Ctrl-C was pressed and CasADi swallowed the exception.
+    """
+    shown = _Shown()
+    with repeated_interrupt() as repeat, _bar(shown) if sys.stderr.isatty() else nullcontext(_lines(shown)) as show:
 
         def report(stage: str, done: int, total: int, best: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total, best="")
-            known = f"best NRMSE {best:.4f}" if math.isfinite(best) else ""
-            bar.update(tasks[stage], completed=done, total=total, best=known)
+            shown.best = min(shown.best, best) if math.isfinite(best) else shown.best
+            show(stage, done, total)
+            repeat()
 
         yield report
+
+
+@dataclass
+class _Shown:
+    """The smallest error so far, and when the work began (seconds of the monotonic clock)."""
+
+    best: float = math.inf
+    began: float = field(default_factory=lambda: time.monotonic())
+
+    def best_text(self) -> str:
+        return f"best NRMSE {self.best:.4f}" if math.isfinite(self.best) else ""
+
+    def time_text(self) -> str:
+        seconds = int(time.monotonic() - self.began)
+        return f"{seconds} s" if seconds < 60 else f"{seconds // 60} min {seconds % 60:02d} s"
+
+
+Show = Callable[[str, int, int], None]
+
+
+def _lines(shown: _Shown) -> Show:
+    """Print a line when the stage changes and about every ten seconds, never two within a second."""
+    last_stage, last_line = "", shown.began
+
+    def show(stage: str, done: int, total: int) -> None:
+        nonlocal last_stage, last_line
+        now = time.monotonic()
+        if now - last_line < (SAME_STAGE_LINE if stage == last_stage else STAGE_LINE):
+            return
+        last_stage, last_line = stage, now
+        parts = [f"{stage} {_count(done, total)}".rstrip(), shown.best_text(), shown.time_text()]
+        print(", ".join(part for part in parts if part), file=sys.stderr, flush=True)
+
+    return show
+
+
+@contextmanager
+def _bar(shown: _Shown) -> Iterator[Show]:
+    """Draw one bar, of the stage that runs."""
+    from rich import progress as rich
+    from rich.console import Console
+    from rich.text import Text
+
+    class State(rich.ProgressColumn):
+        """The smallest error and the time, which goes on when a stage reports nothing."""
+
+        def render(self, task: rich.Task) -> Text:
+            return Text(", ".join(part for part in (shown.best_text(), shown.time_text()) if part))
+
+    columns: list[Any] = [rich.TextColumn("{task.description}"), rich.BarColumn()]
+    columns += [rich.TextColumn("{task.fields[count]}"), State()]
+    with rich.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None, count="", visible=False)
+
+        def show(stage: str, done: int, total: int) -> None:
+            count = _count(done, total)
+            bar.update(task, description=stage, completed=done, total=total or None, count=count, visible=True)
+
+        yield show
+
+
+def _count(done: int, total: int) -> str:
+    return f"{done}/{total}" if total else ""

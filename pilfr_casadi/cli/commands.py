@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._base import Clock, InputError, deferred_interrupt, insistent, listed, progress_bar, time_limit, worker_pool
+from .._base import Clock, InputError, deferred_interrupt, listed, progress_bar, time_limit, worker_pool
 from ..data import (
     NOTHING_SENTENCE,
     TIME_NAMES,
@@ -103,7 +103,7 @@ def _checked(options: argparse.Namespace) -> tuple[tuple[str, ...], tuple[str, .
         if getattr(options, name) is None:
             setattr(options, name, default)
     inputs, outputs = name_list(options.inputs, "--inputs"), name_list(options.outputs, "--outputs")
-    seen = [Path(path).resolve() for path in (*options.train, *options.test)]
+    seen = [os.path.realpath(path) for path in (*options.train, *options.test)]
     if len(set(seen)) < len(seen):
         raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
     for name, least in LEAST.items():
@@ -126,8 +126,7 @@ def _identified(
     with (
         time_limit(options.time_limit, clock),
         worker_pool(options.workers) as pool,
-        progress_bar() as bar,
-        insistent(bar) as progress,
+        progress_bar() as progress,
     ):
         task = saved if saved is not None else _structure(options, train)
         if isinstance(task, Lagged):  # too many lags are refused before they are built
@@ -188,11 +187,21 @@ def read_file(
     options: argparse.Namespace, path: str, inputs: tuple[str, ...], outputs: tuple[str, ...], glance: bool = False
 ) -> Recording:
     """A recording, as the options say; at a glance columns may be given of names that are not asked for."""
+    check_period(options)
     more = {key: getattr(options, key) for key in ("period", "hold", "skip", "dt", "time_tolerance")}
     columns = columns_of(options, path)
     if glance:
         columns = {name: column for name, column in columns.items() if name in (*inputs, *outputs, *TIME_NAMES)}
     return read(path, inputs, outputs, columns=columns, initial=options.initial or "estimate", **more)
+
+
+def check_period(options: argparse.Namespace) -> None:
+    """Refuse a period without a word on the initial state, which would be estimated as if there were no period."""
+    if options.period is not None and options.initial is None:
+        raise InputError(
+            f"--period {options.period} was given without --initial; give --initial periodic for a record in steady "
+            "state from its first sample, or --initial estimate for one that settles first."
+        )
 
 
 def columns_of(options: argparse.Namespace, path: str) -> dict[str, str]:

@@ -13,7 +13,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .._base import deferred_interrupt, insistent, progress_bar, worker_pool
+from .._base import deferred_interrupt, progress_bar, worker_pool
 from ..data import Recording, read_csv
 from ..identify import Fit, fit
 from ..models import PILFR, Play, PrandtlIshlinskii
@@ -82,7 +82,7 @@ def diagnose_rig(folder: Path, workers: int, console: Console) -> int:
     recordings = rig_recordings()
     console.print("Another rig, with a simulator: two masses, linear springs and dampers. What does it leave out?")
     try:
-        with progress_bar() as bar, insistent(bar) as progress:
+        with progress_bar() as progress:
             found = diagnose(
                 simulator, recordings["train"], test=recordings["test"], effects=1, workers=workers, progress=progress
             )
@@ -119,7 +119,7 @@ def identify_rig(folder: Path, workers: int, console: Console) -> int:
             for row in SHOWN:
                 published = PUBLISHED[row]
                 n = 0 if row == "LTI" else int(row.partition("=")[2])
-                with progress_bar() as bar, insistent(bar) as progress:
+                with progress_bar() as progress:
                     result = fit(structure(n), recordings["train"], executor=pool, progress=progress)
                 interrupted = result.status is Status.INTERRUPTED
                 errors = [result.nrmse(recordings[s]) for s in SETS]

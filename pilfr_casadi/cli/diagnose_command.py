@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError, deferred_interrupt, insistent, listed, progress_bar
+from .._base import InputError, deferred_interrupt, listed, progress_bar
 from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
 from ..export import write_atomically
 from ..identify import load
@@ -53,7 +54,7 @@ def run_diagnosis(options: argparse.Namespace) -> int:
     with deferred_interrupt():
         from ..diagnose import diagnose
     try:
-        with progress_bar() as bar, insistent(bar) as progress:
+        with progress_bar() as progress:
             diagnosis = diagnose(
                 simulator,
                 recordings,
@@ -117,7 +118,7 @@ def _check_files(options: argparse.Namespace, source: str | None, train: Sequenc
     if source is not None and (options.inputs or options.outputs):
         raise InputError("--inputs and --outputs go with --simulated; a simulator file has names of its own.")
     every = [*train, *options.test, *([options.simulated] if options.simulated else [])]
-    seen = [Path(path).resolve() for path in every]
+    seen = [os.path.realpath(path) for path in every]
     if len(set(seen)) < len(seen):
         raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
     if options.workers is not None and options.workers < 1:

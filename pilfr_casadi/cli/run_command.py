@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
-from .._base import InputError, insistent, progress_bar, worker_pool
+from .._base import InputError, progress_bar, worker_pool
 from ..data import NOTHING_SENTENCE, explains_nothing
 from ..identify import drawn
 from ..models import PILFR, places
@@ -44,7 +44,7 @@ def run_command(options: argparse.Namespace) -> int:
     count = len(given.seeds) * len(given.cells)
     print(f"run: {given.file}, {count} job{'s' * (count > 1)}, results in {given.out}", flush=True)
     try:
-        with worker_pool(given.workers) as pool, progress_bar() as bar, insistent(bar) as progress:
+        with worker_pool(given.workers) as pool, progress_bar() as progress:
             result = run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=_tell)
     except RunInterrupted as stop:
         return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
@@ -75,7 +75,7 @@ def campaign_command(options: argparse.Namespace) -> int:
 
                 executor, workers, ahead = stack.enter_context(dask_executor(options.dask))
             print(f"campaign: {given.file}, {size}, {workers} workers, results in {given.out}", flush=True)
-            progress = stack.enter_context(insistent(stack.enter_context(progress_bar())))
+            progress = stack.enter_context(progress_bar())
             result = campaign(
                 given,
                 overwrite=options.overwrite,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -14,15 +15,16 @@ from ..data import Recording, column_names, nrmse, read_stack, written_times
 from ..export import write_atomically
 from ..identify import Fit, load
 from .app import DONE, NO_RESULT, say
-from .commands import announced_engine, check_names, read_file
+from .commands import announced_engine, check_names, check_period, read_file
 from .option_values import name_list, pairs
 
 
 def run_simulation(options: argparse.Namespace) -> int:
     """Simulate a saved model on a file's inputs; judge it where the file has outputs."""
+    check_period(options)
     out = Path(options.out)
     for path, what in ((options.data, "recording"), (options.model, "model")):
-        if out.resolve() == Path(path).resolve():
+        if os.path.realpath(out) == os.path.realpath(path):
             raise InputError(f"--out {options.out} would overwrite the {what}; give another file.")
     kind = Path(options.data).suffix.lower()
     if out.suffix.lower() in (".mat", ".npz", ".npy") and kind not in (".npz", ".npy"):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     )
     from .repetition import by_input as by_input, keeps_its_period as keeps_its_period, repeats_itself as repeats_itself
     from .signals import prbs as prbs, sine_sweep as sine_sweep, tukey_realizations as tukey_realizations
-    from .stack import read_stack as read_stack
-    from .timebase import TIME_NAMES as TIME_NAMES
-else:
-    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+    from .tables import read_stack as read_stack
+    from .timebase import TIME_NAMES as TIME_NAMES, step_of as step_of
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

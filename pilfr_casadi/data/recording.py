@@ -1,12 +1,11 @@
 """The recording: sampled inputs and outputs of one experiment, checked once where data enters.
 
-A :class:`Recording` holds ``M`` samples of ``n_u`` inputs and ``n_y`` outputs on one uniform time grid, and says what a
-simulation of it has to know besides: the state it starts from, what the input does between the samples, whether it is
-periodic, and how many leading samples are not scored. It never changes once made; everything behind the door trusts it.
+A :class:`Recording` holds ``M`` samples of ``n_u`` inputs and ``n_y`` outputs on one uniform time grid, and states
+the rest that a simulation of it needs: the initial state, the input between the samples, the period, and the number of
+leading samples that are not scored. It is immutable, and all code that receives one trusts it.
 """
 
 import hashlib
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
@@ -14,14 +13,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from .._base import InputError, listed, signal
+from .._base import LARGEST, InputError, is_whole, listed, positive, usable
 
-__all__ = ["InputError", "Recording", "as_recordings", "check_for_identification", "fingerprint", "listed"]
-SAME_STEP = (
-    1e-4  # recordings fitted together may differ by this share in `dt` (a time column is written with few digits)
-)
-
-
+SAME_STEP = 1e-4  # relative difference in `dt` between recordings fitted together; written times have few digits
 HOLDS = ("zero", "linear", None)
 INITIALS = ("zero", "estimate", "periodic")
 
@@ -36,7 +30,7 @@ class Recording:
         Inputs at the samples. Copied; stored as a read-only (M, n_u) array.
     y : array, (M, n_y) or (M,)
         Outputs at the same samples. Copied; stored as a read-only (M, n_y) array. (M, 0) where none was measured:
-        such a recording serves as the input of a simulation and is refused by every fit.
+        such a recording can be simulated but not fitted.
     dt : float
         Time from one sample to the next, in seconds.
     inputs, outputs : tuple of str
@@ -46,11 +40,11 @@ class Recording:
     period : int, optional
         Samples per period, when the recording is in periodic steady state from sample `skip` on.
     initial : {"estimate", "zero", "periodic"} or array, (nx,)
-        State at the first sample: to be estimated, zero, that of the periodic steady state, or given. The memory of an
-        operator that never slips in a period is not unique in steady state: periods from rest with zero memory lead to
-        the one that is taken, and a fit says so.
+        State at the first sample: estimated, zero, periodic steady state, or given as numbers. The memory of an
+        operator that never slips in a period is not unique in steady state; the one reached from rest with zero memory
+        is used, and `fit` reports this.
     hold : {"zero", "linear"}, optional
-        What the input does between the samples: held, or interpolated. ``None`` means not said.
+        Input between the samples: held or interpolated. ``None`` leaves it open.
     skip : int
         Leading samples that are simulated but not scored.
     name : str
@@ -63,8 +57,8 @@ class Recording:
     """
 
     u: np.ndarray
-    y: np.ndarray
-    dt: float
+    y: np.ndarray = None  # type: ignore[assignment]  # needed, and missed with a sentence
+    dt: float = None  # type: ignore[assignment]  # needed too
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
@@ -75,8 +69,8 @@ class Recording:
     name: str = ""
 
     def __post_init__(self) -> None:
-        u, inputs = signal(self.u, self.inputs, "u", "input", self.label)
-        y, outputs = signal(self.y, self.outputs, "y", "output", self.label, none=True)
+        u, inputs = _channels(self.u, self.inputs, "u", "input", self.label)
+        y, outputs = _channels(self.y, self.outputs, "y", "output", self.label, none=True)
         if len(u) != len(y):
             raise InputError(
                 f"{self.label} has {len(u)} samples of u but {len(y)} of y; give arrays of shape (samples, channels) "
@@ -90,15 +84,13 @@ class Recording:
         twice = sorted(set(inputs) & set(outputs))
         if twice:
             raise InputError(f"{self.label} names {twice[0]!r} both as an input and as an output; give it one role.")
-        strange = sorted(set(self.units) - {*inputs, *outputs})
-        if strange:
-            raise InputError(
-                f"{self.label} gives a unit for {strange[0]!r}; its columns are {listed(inputs + outputs)}."
-            )
-        check_options(self, len(u))
+        _check_options(self, len(u))
+        for name in self.units:
+            if name not in inputs + outputs:
+                raise InputError(f"{self.label} gives a unit for {name!r}; its columns are {listed(inputs + outputs)}.")
         initial = self.initial
         if not isinstance(initial, str):
-            initial = initial_state(initial, self.label)
+            initial = _initial_state(initial, self.label)
         units = MappingProxyType(dict(self.units))
         clean = dict(u=u, y=y, dt=float(self.dt), inputs=inputs, outputs=outputs, units=units, initial=initial)
         for key, value in clean.items():
@@ -110,12 +102,12 @@ class Recording:
 
     @property
     def begins(self) -> str:
-        """What is known of the state at the first sample: "zero", "estimate", "periodic", or "given" as numbers."""
+        """The kind of initial state: "zero", "estimate", "periodic", or "given" where it is numbers."""
         return self.initial if isinstance(self.initial, str) else "given"
 
     @property
     def label(self) -> str:
-        """How messages call this recording."""
+        """Name of this recording in messages."""
         return f"recording {self.name!r}" if self.name else "the recording"
 
     @property
@@ -155,8 +147,8 @@ class Recording:
     def slice(self, start: int | None = None, stop: int | None = None) -> Self:
         """Return the samples from `start` up to `stop`, counted as in a Python slice.
 
-        The state at a later first sample is not the one given for the old first sample, so ``initial`` becomes
-        ``"estimate"`` there; ``"periodic"`` stays where a whole period is left.
+        A piece that begins later has another initial state, so its ``initial`` becomes ``"estimate"``; ``"periodic"``
+        stays if a whole period is left.
 
         Raises
         ------
@@ -184,40 +176,46 @@ class Recording:
 
 
 def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, ...]:
-    """Take one recording or several, return a tuple.
+    """Return one recording or several as a tuple.
 
     Raises
     ------
     InputError
-        When there is none, or something else than a recording among them.
+        If there is none, or one of them is not a recording.
     """
     if isinstance(data, Recording):
         return (data,)
-    if not isinstance(data, Iterable):
-        raise InputError(f"a Recording or a list of them is needed, not {type(data).__name__}; read_csv makes one.")
+    if isinstance(data, Mapping | np.ndarray) or not isinstance(data, Iterable):
+        raise InputError(
+            f"a Recording or a list of them is needed, not {type(data).__name__}; Recording(u, y, dt) makes one from "
+            "arrays, read_csv from a file."
+        )
     recordings = tuple(data)
     for item in recordings:
         if not isinstance(item, Recording):
-            raise InputError(f"every item must be a Recording, not {type(item).__name__}; read_csv makes one.")
+            raise InputError(
+                f"every item must be a Recording, not {type(item).__name__}; Recording(u, y, dt) makes one from "
+                "arrays, read_csv from a file."
+            )
     if not recordings:
         raise InputError("no recording was given; give at least one.")
     return recordings
 
 
 def fingerprint(recording: Recording) -> str:
-    """Short digest of a recording's numbers and of what is said about its initial state."""
+    """Return a short digest of a recording's numbers and its initial state."""
     initial = recording.initial
     kind = f"{initial} {recording.period}".encode() if isinstance(initial, str) else np.asarray(initial).tobytes()
     return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes() + kind).hexdigest()[:16]
 
 
 def check_for_identification(data: Recording | Iterable[Recording], n_min: int = 2) -> tuple[Recording, ...]:
-    """Check that recordings can be fitted together and carry something to fit; return them as a tuple.
+    """Check that recordings can be fitted together and are excited; return them as a tuple.
 
     Parameters
     ----------
     data : Recording or iterable of Recording
-        What is to be fitted.
+        The recordings to fit.
     n_min : int
         Smallest number of scored samples over all recordings, e.g. the number of free parameters.
 
@@ -269,7 +267,61 @@ def _varies(x: np.ndarray) -> bool:
     return bool(np.ptp(x) > 1e-12 * np.max(np.abs(x)))
 
 
-def initial_state(values: Any, label: str) -> np.ndarray:
+def _channels(
+    values: Any, names: Any, letter: str, role: str, label: str, none: bool = False
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return a signal as a read-only (M, n) copy, and its names; (M, 0) only where `none` allows it."""
+    array = _signal(values, letter, label)
+    n = array.shape[1]
+    if n == 0 and not none:
+        raise InputError(
+            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels)."
+        )
+    names = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else tuple(names)
+    if not names and n:
+        names = (letter,) if n == 1 else tuple(f"{letter}{i + 1}" for i in range(n))
+    if len(names) != n:
+        raise InputError(f"{label} has {n} {role} column(s) but {len(names)} name(s) {listed(names)}; give one each.")
+    if not all(isinstance(name, str) and name for name in names) or len(set(names)) != n:
+        raise InputError(f"the {role} names {names} of {label} must be texts, distinct and not empty.")
+    unusable = ~usable(array)
+    if unusable.any():
+        k, i = np.argwhere(unusable)[0]
+        raise InputError(
+            f"sample {k} of {role} {names[i]!r} in {label} is {array[k, i]}; only finite numbers up to {LARGEST:g} can "
+            "be used, so repair or cut out that piece, or give it in another unit."
+        )
+    array.setflags(write=False)
+    return array, names
+
+
+def _signal(values: Any, letter: str, label: str) -> np.ndarray:
+    """Return a copy of the samples as (M, n) floats."""
+    if values is None:
+        raise InputError(f"{label} lacks {letter}; give Recording(u, y, dt) with arrays of shape (samples, channels).")
+    if isinstance(values, Mapping):
+        raise InputError(
+            f"{letter} of {label} is a {type(values).__name__} with the keys {listed(list(values))}; give one array of "
+            "shape (samples, channels), with numpy.column_stack for several channels."
+        )
+    if hasattr(values, "toarray"):
+        raise InputError(f"{letter} of {label} is a sparse matrix; give a full array, as its toarray() makes one.")
+    try:
+        given = np.asarray(values)
+        array = np.array(given, dtype=float) if given.dtype.kind in "biufO" else None
+    except (TypeError, ValueError, OverflowError):
+        array = None
+    if array is None:
+        raise InputError(f"{letter} of {label} is not an array of real numbers; give one of shape (samples, channels).")
+    if array.ndim not in (1, 2):
+        raise InputError(
+            f"{letter} of {label} has the shape {array.shape}; give an array of shape (samples, channels), and a "
+            "recording for each experiment."
+        )
+    return array[:, None] if array.ndim == 1 else array
+
+
+def _initial_state(values: Any, label: str) -> np.ndarray:
     """Return the state at the first sample as a read-only vector."""
     try:
         state = np.array(values, dtype=float)
@@ -283,26 +335,21 @@ def initial_state(values: Any, label: str) -> np.ndarray:
     return state
 
 
-def check_options(r: Recording, m: int) -> None:
+def _check_options(r: Recording, m: int) -> None:
     """Check the step, `hold`, `initial`, `skip` and `period` of a recording of `m` samples."""
-    if not isinstance(r.dt, (int, float, np.number)) or not math.isfinite(r.dt) or r.dt <= 0:
-        raise InputError(
-            f"{r.label} has a step dt of {r.dt!r}; give the seconds from one sample to the next, above zero."
-        )
-    if r.hold not in HOLDS:
+    positive(r.dt, f"{r.label}: dt", "the seconds from one sample to the next")
+    if not (r.hold is None or isinstance(r.hold, str)) or r.hold not in HOLDS:
         raise InputError(f"hold of {r.label} is {r.hold!r}; give 'zero', 'linear' or None.")
     if isinstance(r.initial, str) and r.initial not in INITIALS:
         raise InputError(f"initial of {r.label} is {r.initial!r}; give one of {listed(INITIALS)}, or the state itself.")
-    if not _is_count(r.skip) or not 0 <= r.skip < m:
+    if not is_whole(r.skip, 0, m - 1):
         raise InputError(f"{r.label} was given skip={r.skip!r}; give a number of samples from 0 to {m - 1}.")
-    if r.period is not None and (not _is_count(r.period) or not 2 <= r.period <= m - r.skip):
+    if r.period is not None and not is_whole(r.period, 2, m - r.skip):
         raise InputError(
             f"{r.label} was given period={r.period!r}; it must be a whole number of samples from 2 to {m - r.skip}, so "
             "that one period lies after the skipped samples."
         )
     if r.begins == "periodic" and r.period is None:
         raise InputError(f"{r.label} was given initial='periodic' but no period; set period=SAMPLES.")
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not isinstance(r.units, Mapping):
+        raise InputError(f"units of {r.label} is {r.units!r}; give a mapping from column to unit, as in {{'u': 'N'}}.")

@@ -1,7 +1,7 @@
-"""The step of a time column: seconds, increasing, uniform; or one sentence saying where and how it is not.
+"""The step of a time column: seconds, increasing, uniform; or one sentence that says where it is not.
 
-A grid is uniform when no sample is further than ``tolerance`` steps from ``t(0) + k dt``, beyond what rounding to the
-digits written explains: a grid of 1/120 s written with six decimals is uniform.
+A grid is uniform if no sample is further than ``tolerance`` steps from ``t(0) + k dt``, beyond the rounding to the
+digits written: a grid of 1/120 s written with six decimals is uniform.
 """
 
 import re
@@ -12,39 +12,28 @@ import numpy as np
 from .._base import InputError, listed
 
 TIME_NAMES = ("t", "t_s", "time")
-TOLERANCE = 1e-4  # of a step
-AGREEMENT = 1e-3  # of a step: between a step that is stated and the one that is read
+TOLERANCE = 1e-4  # steps that a sample may lie off the grid; the clocks of recorders do not drift by more in a record
+AGREEMENT = 1e-3  # relative difference between a stated step and the written times; another unit differs by far more
 _UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|minutes?|hours?|days?"
 _OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
 
 
-def unit_other_than_seconds(name: str) -> str | None:
-    """Return the unit, other than seconds, that a name such as ``t_ms`` or ``Time [min]`` states for its time."""
-    match = _OTHER_UNIT.fullmatch(name.strip())
-    return match.group(1) if match else None
-
-
 def time_column(names: Sequence[str], chosen: str | None, source: str) -> str | None:
-    """Find the time column among the names.
+    """Find the time column among the names; None where there is none.
 
     Parameters
     ----------
     names : sequence of str
-        Columns there are.
+        The columns of the file.
     chosen : str, optional
-        The column that the user said holds the time.
+        The column that the user named for the time.
     source : str
         File name, for messages.
-
-    Returns
-    -------
-    name : str or None
-        None when there is none.
 
     Raises
     ------
     InputError
-        When the choice is missing, states another unit, or there are several.
+        If the choice is missing or states another unit, or there are several time columns.
     """
     found = [chosen] if chosen is not None else [name for name in TIME_NAMES if name in names]
     if not found:
@@ -61,13 +50,13 @@ def time_column(names: Sequence[str], chosen: str | None, source: str) -> str | 
 
 
 def refuse_other_unit(names: Sequence[str], source: str) -> None:
-    """Raise :class:`InputError` if a name states time in another unit than seconds."""
+    """Raise :class:`InputError` if a name such as ``t_ms`` or ``Time [min]`` states a unit other than seconds."""
     for name in names:
-        unit = unit_other_than_seconds(name)
+        unit = _OTHER_UNIT.fullmatch(name.strip())
         if unit:
             raise InputError(
-                f"{source}: column {name!r} is time in {unit} by its name, but time must be in seconds; convert it and "
-                "name it t_s, or leave it out and state the step in seconds with dt=STEP."
+                f"{source}: column {name!r} is time in {unit.group(1)} by its name, but time must be in seconds; "
+                "convert it and name it t_s, or leave it out and state the step in seconds with dt=STEP."
             )
 
 
@@ -88,16 +77,16 @@ def step_of(
     column : str
         Name of the column, with its file, for messages.
     place : callable
-        Says where sample ``k`` stands, e.g. ``"line 17"``.
+        Returns the place of sample ``k`` in the file, e.g. ``"line 17"``.
     dt : float, optional
-        Step that was stated; the one read must agree with it, and is replaced by it.
+        Stated step; it must agree with the times and is returned in their place.
     tolerance : float, optional
         Allowed deviation from the grid in steps, beyond rounding; `TOLERANCE` by default.
 
     Raises
     ------
     InputError
-        When time does not increase, is not uniform, or its step is not the one stated.
+        If time does not increase, is not uniform, or its step is not the stated one.
     """
     if len(t) < 2:
         raise InputError(f"{column} has only one sample; at least 2 are needed.")
@@ -108,9 +97,8 @@ def step_of(
         raise InputError(
             f"{column}: {place(k)} is {t[k]:.10g} s, after {t[k - 1]:.10g} s; time must increase from sample to sample."
         )
-    k_all = np.arange(len(t))
     step = (t[-1] - t[0]) / (len(t) - 1)
-    deviation = np.abs(t - t[0] - k_all * step)
+    deviation = np.abs(t - t[0] - np.arange(len(t)) * step)
     allowed = (TOLERANCE if tolerance is None else tolerance) * step
     if (deviation > allowed).any() and (deviation > allowed + _rounding(t, step)).any():
         usual = float(np.median(gaps))
@@ -133,10 +121,10 @@ def step_of(
 
 
 def _rounding(t: np.ndarray, step: float) -> np.ndarray:
-    """How far samples may lie off the grid because times were rounded when written, (M,), in seconds.
+    """Bound how far samples may lie off the grid because written times are rounded, (M,), in seconds.
 
-    Rounded to D decimals or to S significant digits, whichever is coarser at a sample; the error of the last time turns
-    the grid. Never more than a tenth of a step, so that a missing sample is never explained by it.
+    Times are rounded to D decimals or to S significant digits, whichever is coarser at a sample; the error of the last
+    time turns the grid. The bound is at most a tenth of a step, so that it never hides a missing sample.
     """
     size = np.abs(t)
     exponent = np.floor(np.log10(size, where=size > 0, out=np.full(len(t), -np.inf)))
@@ -148,10 +136,10 @@ def _rounding(t: np.ndarray, step: float) -> np.ndarray:
 
 
 def _fewest(scaled: Callable[[float], np.ndarray]) -> float:
-    """Smallest n for which all the scaled times are whole numbers; infinite where they are not rounded."""
+    """Return the smallest n for which all scaled times are whole numbers; infinite where they are not rounded."""
     for n in range(15):
-        whole = scaled(float(n))
-        near = np.abs(whole - np.rint(whole)) <= 4 * np.finfo(float).eps * np.abs(whole)
+        times = scaled(float(n))
+        near = np.abs(times - np.rint(times)) <= 4 * np.finfo(float).eps * np.abs(times)
         if near.all():
             return float(n)
     return np.inf

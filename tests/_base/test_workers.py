@@ -7,7 +7,7 @@ import sys
 
 SCRIPT = """
 import json
-from pilfr_casadi.threads import one_blas_thread
+from pilfr_casadi._base import one_blas_thread
 
 @one_blas_thread
 def limited():

@@ -23,7 +23,7 @@ def test_import_is_cheap():
         "import pilfr_casadi\n"
         "print(json.dumps([time.perf_counter() - start, sorted(set(sys.modules) - before)]))"
     )
-    assert seconds < 0.5
+    assert seconds < 0.3
     assert not {m.split(".")[0] for m in modules} & set(HEAVY)
 
 
@@ -39,28 +39,10 @@ def test_public_names_are_listed_and_there():
     assert set(pilfr_casadi.__all__) <= set(dir(pilfr_casadi))
     for name in pilfr_casadi.__all__:
         value = getattr(pilfr_casadi, name)
-        assert value.__name__ == name
+        assert getattr(value, "__name__", name).rpartition(".")[2] == name
         assert getattr(pilfr_casadi, name) is value
 
 
 def test_unknown_name():
     with pytest.raises(AttributeError, match="no attribute 'fitt'"):
         pilfr_casadi.fitt  # noqa: B018
-
-
-def test_a_verb_wins_over_the_module_it_is_named_after():
-    names = in_fresh_python(
-        "import json, sys, pilfr_casadi\n"
-        "from importlib.machinery import ModuleSpec\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        return ModuleSpec(name, self) if name == 'pilfr_casadi.verb' else None\n"
-        "    def create_module(self, spec): return None\n"
-        "    def exec_module(self, module): exec('def verb(): return 1\\ndef other(): return 2', module.__dict__)\n"
-        "sys.meta_path.insert(0, Finder())\n"
-        "pilfr_casadi._EXPORTS['verb'] = 'verb'\n"
-        "from pilfr_casadi.verb import other\n"
-        "from pilfr_casadi import verb\n"
-        "print(json.dumps([other(), pilfr_casadi.verb(), verb()]))"
-    )
-    assert names == [2, 1, 1]

@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from scipy.sparse import csc_array
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording, as_recordings, check_for_identification
@@ -71,6 +72,10 @@ NAN = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
     [
         (dict(u=np.arange(19.0)), "19 samples of u but 20 of y"),
         (dict(u=[1.0], y=[1.0]), "at least 2"),
+        (dict(u={"force": np.zeros(20), "volt": np.zeros(20)}), "u of .* is a dict with the keys force, volt"),
+        (dict(u=csc_array(np.eye(20))), "u of .* is a sparse matrix; give a full array"),
+        (dict(y=None), "lacks y; give Recording"),
+        (dict(u=np.zeros((20, 2, 3))), r"shape \(20, 2, 3\).*a recording for each experiment"),
         (dict(u=np.zeros((20, 1, 1))), r"shape \(20, 1, 1\)"),
         (dict(u=np.zeros((20, 0))), r"shape \(20, 0\)"),
         (dict(u=["a"] * 20), "real numbers"),
@@ -83,6 +88,10 @@ NAN = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
         (dict(dt=0.0), "above zero"),
         (dict(dt=np.nan), "above zero"),
         (dict(dt="fast"), "above zero"),
+        (dict(dt=None), "dt=None was given"),
+        (dict(inputs=3), "texts, distinct"),
+        (dict(u=np.zeros((20, 2)), inputs=("a", 3)), "texts, distinct"),
+        (dict(units=["u"]), "a mapping from column to unit"),
         (dict(inputs=("a", "b")), "1 input column.* 2 name"),
         (dict(u=np.zeros((20, 2)), inputs=("a", "a")), "distinct"),
         (dict(inputs=("",)), "distinct and not empty"),
@@ -107,6 +116,11 @@ def test_each_fault_has_its_sentence(change, words):
         Recording(**fields)
     assert "\n" not in str(caught.value)
     assert "'rig'" in str(caught.value)
+
+
+def test_a_dict_alone_is_answered_with_a_sentence():
+    with pytest.raises(InputError, match="is a dict with the keys u, y; give one array"):
+        Recording({"u": np.zeros(20), "y": np.zeros(20)})
 
 
 @given(start=st.integers(-25, 25), stop=st.none() | st.integers(-25, 25), skip=st.integers(0, 10))
@@ -153,7 +167,14 @@ def test_as_recordings():
     r = recording()
     assert as_recordings(r) == (r,)
     assert as_recordings(iter([r, r])) == (r, r)
-    for wrong, words in [([], "no recording"), ([r, "x"], "not str"), (3, "not int")]:
+    arrays = {"u": np.zeros(20), "y": np.zeros(20)}
+    for wrong, words in [
+        ([], "no recording"),
+        ([r, "x"], "not str"),
+        (3, "not int"),
+        (arrays, "not dict; Recording"),
+        (r.u, "not ndarray; Recording"),
+    ]:
         with pytest.raises(InputError, match=words):
             as_recordings(wrong)
 

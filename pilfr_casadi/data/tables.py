@@ -1,0 +1,372 @@
+"""Numbers by column name out of CSV, ``.mat`` and ``.npz`` files, or one sentence with file, column and line.
+
+A CSV file is read at once by NumPy, and cell by cell only if that fails, to find the bad cell. Commas, semicolons and
+tabs separate cells; a byte-order mark, Windows line ends, quoted cells and blank lines are accepted. Lines are counted
+as an editor does, so the header is line 1. No code in a ``.mat`` or ``.npz`` file is run.
+"""
+
+import csv
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._base import LARGEST, InputError, existing_file, usable
+
+Array = np.ndarray
+
+DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
+REPAIR = "only finite numbers up to {:g} can be used: repair or cut out that piece, or give it in another unit."
+KINDS = {
+    "c": "complex numbers",
+    "V": "a struct",
+    "O": "a cell array or objects",
+    "U": "text",
+    "S": "text",
+    "M": "dates",
+}
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """The text of a CSV file and its header.
+
+    Attributes
+    ----------
+    path : Path
+        The file, for messages.
+    names : tuple of str
+        Header, without surrounding blanks.
+    delimiter : str
+        The character between cells.
+    lines : list of str
+        All lines below the header, without line ends.
+    first_line : int
+        Number of the first of these lines in the file.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    delimiter: str
+    lines: list[str]
+    first_line: int
+
+    def columns(self, names: Sequence[str]) -> list[Array]:
+        """Return each named column as numbers, (M, 1).
+
+        Raises
+        ------
+        InputError
+            For a cell that is empty, not a number, not finite or too large, and for a row of the wrong length.
+        """
+        where = [self.names.index(name) for name in names]
+        numbers = self._read_at_once(where)
+        if numbers is None or not usable(numbers).all():
+            numbers = self._read_cells(where)
+        return [numbers[:, i : i + 1] for i in range(len(names))]
+
+    def texts(self, name: str) -> list[str]:
+        """Return the cells of a column as they are written."""
+        where = self.names.index(name)
+        return [_cells(text, self.delimiter, str(self.path))[where] for text in self.lines if text.strip()]
+
+    def place(self, row: int) -> str:
+        """Return the line of the data row `row`, counted from 0, in words."""
+        filled = [i for i, line in enumerate(self.lines) if line.strip()]
+        return f"line {self.first_line + filled[row]}"
+
+    def _read_at_once(self, where: Sequence[int]) -> Array | None:
+        width = len(self.names) - 1
+        if any('"' in line or line.count(self.delimiter) != width for line in self.lines if line.strip()):
+            return None
+        try:
+            return np.loadtxt(self.lines, delimiter=self.delimiter, usecols=where, ndmin=2, comments=None)
+        except ValueError:
+            return None
+
+    def _read_cells(self, where: Sequence[int]) -> Array:
+        rows = []
+        for line, text in enumerate(self.lines, self.first_line):
+            if not text.strip():
+                continue
+            cells = _cells(text, self.delimiter, f"{self.path}: line {line}")
+            if len(cells) != len(self.names):
+                raise InputError(
+                    f"{self.path}: line {line} has {len(cells)} cell(s) but the header names {len(self.names)}; "
+                    f"give every line one cell for each column, separated by {DELIMITERS[self.delimiter]}s."
+                )
+            rows.append([self._value(cells[i], self.names[i], line) for i in where])
+        return np.array(rows)
+
+    def _value(self, cell: str, column: str, line: int) -> float:
+        place = f"{self.path}: column {column!r}, line {line}"
+        value = _number(cell)
+        if value is None:
+            if not cell.strip():
+                raise InputError(f"{place} is empty; fill in a number or cut out that piece.")
+            hint = "write a number there"
+            if cell.count(",") == 1 and cell.replace(",", "").strip(" +-").isdigit():
+                hint = "write decimals with a point"
+            raise InputError(f"{place} reads {cell.strip()[:40]!r}, which is not a number; {hint}.")
+        if not usable(np.array(value)):
+            raise InputError(f"{place} is {cell.strip()}; {REPAIR.format(LARGEST)}")
+        return value
+
+
+@dataclass(frozen=True)
+class ArrayTable:
+    """The variables of a ``.mat`` or ``.npz`` file.
+
+    Attributes
+    ----------
+    path : Path
+        The file, for messages.
+    names : tuple of str
+        Names of the variables.
+    arrays : mapping of str to array
+        Each variable, or the error that reading it raised: it matters only if the variable is used.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    arrays: Mapping[str, Any]
+
+    def columns(self, names: Sequence[str]) -> list[Array]:
+        """Return each named variable as finite numbers, (M, channels); a row vector becomes a column.
+
+        Raises
+        ------
+        InputError
+            If a variable cannot be read, is no vector or matrix of finite real numbers, or their lengths differ.
+        """
+        parts = [self._samples(name) for name in names]
+        if len({len(part) for part in parts}) > 1:
+            counts = ", ".join(f"{name} {len(part)}" for name, part in zip(names, parts, strict=True))
+            raise InputError(f"{self.path} has vectors of different lengths ({counts} samples); give all the same.")
+        return parts
+
+    def texts(self, name: str) -> list[str]:
+        """Return the numbers of a vector with all their digits."""
+        return [repr(t) for t in self._samples(name)[:, 0].tolist()]
+
+    def place(self, row: int) -> str:
+        """Return the sample `row`, counted from 0, in words."""
+        return f"sample {row}"
+
+    def array(self, name: str) -> Array:
+        """Return a variable as it is in the file.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read or is no full array.
+        """
+        values = self.arrays[name]
+        if isinstance(values, Exception):
+            raise InputError(f"{self.path}: variable {name!r} cannot be read ({_reason(values)}); write it again.")
+        if hasattr(values, "toarray"):
+            raise InputError(f"{self.path}: variable {name!r} is a sparse matrix; write it as a full one.")
+        if not isinstance(values, np.ndarray):
+            raise InputError(f"{self.path}: variable {name!r} is not an array; give a vector of real numbers.")
+        return values
+
+    def _samples(self, name: str) -> Array:
+        values = self.array(name)
+        if values.dtype.kind not in "biuf" or values.ndim > 2 or values.size == 0:
+            held = KINDS.get(values.dtype.kind, f"{values.dtype} numbers")
+            raise InputError(
+                f"{self.path}: variable {name!r} holds {held} of shape {values.shape}; give a vector of real numbers, "
+                "or a matrix with a row for each sample."
+            )
+        column = values.reshape(-1, 1) if values.ndim < 2 or 1 in values.shape else values
+        column = column.astype(float)
+        bad = np.argwhere(~usable(column))
+        if bad.size:
+            k, i = bad[0]
+            raise InputError(f"{self.path}: variable {name!r}, sample {k} is {column[k, i]}; {REPAIR.format(LARGEST)}")
+        return column
+
+
+def read_csv_table(path: Path, score: Callable[[Sequence[str]], int]) -> CsvTable:
+    """Open a CSV file and read its header.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    score : callable
+        Counts how many of the wanted columns a header has; this decides the delimiter.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read as text, or has no header or no data.
+    """
+    lines = _text(path).split("\n")
+    top = next((i for i, line in enumerate(lines) if line.strip()), None)
+    if top is None:
+        raise InputError(f"{path} is empty; give a CSV file with a header row and one row for each sample.")
+    headers = {d: _cells(lines[top], d, f"{path}: line {top + 1}") for d in DELIMITERS}
+    delimiter = max(DELIMITERS, key=lambda d: (score(headers[d]), len(headers[d]), d == ","))
+    names = headers[delimiter]
+    if all(_number(name) is not None for name in names):
+        raise InputError(
+            f"{path} has no header row: line {top + 1} reads {lines[top].strip()[:60]!r}; name the columns there."
+        )
+    below = lines[top + 1 :]
+    if not any(line.strip() for line in below):
+        raise InputError(f"{path} has a header but no data below it; give one row for each sample.")
+    return CsvTable(path, names, delimiter, below, top + 2)
+
+
+def read_mat_table(path: Path) -> ArrayTable:
+    """Read the variables of a MATLAB file (up to version 7.2).
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read as one.
+    """
+    from scipy.io import loadmat
+
+    existing_file(path)
+    try:
+        content = loadmat(path)
+    except NotImplementedError:
+        raise InputError(f"{path} is a MATLAB file of version 7.3; save it with the option -v7.") from None
+    except Exception as error:  # the parser raises many kinds on damaged files
+        raise InputError(
+            f"{path} cannot be read as a MATLAB file ({_reason(error)}); save it again with the option -v7."
+        ) from None
+    arrays = {name: value for name, value in content.items() if not name.startswith("__")}
+    return ArrayTable(path, tuple(arrays), arrays)
+
+
+def read_npz_table(path: Path) -> ArrayTable:
+    """Read the variables of a NumPy archive.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read as one.
+    """
+    existing_file(path)
+    arrays: dict[str, Any] = {}
+    try:
+        with path.open("rb") as file:
+            content = np.load(file, allow_pickle=False)
+            if isinstance(content, np.ndarray):
+                raise ValueError("it holds a single array")
+            for name in content.files:
+                try:
+                    arrays[name] = content[name]
+                except Exception as error:  # damaged, encrypted or odd members raise many kinds
+                    arrays[name] = error
+    except Exception as error:
+        raise InputError(
+            f"{path} cannot be read as a NumPy archive ({_reason(error)}); write it with numpy.savez."
+        ) from None
+    return ArrayTable(path, tuple(content.files), arrays)
+
+
+def read_stack(path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[Array, Array | None] | None:
+    """Read several records in one array: samples, channels, and further axes such as realizations and periods.
+
+    Parameters
+    ----------
+    path : Path
+        An .npz file, whose arrays are found by one name for all channels, `u` for `u1, u2, u3`, outputs being optional;
+        or an .npy file, which holds the inputs alone.
+    inputs, outputs : sequence of str
+        Names of the channels, or the one name of the array.
+
+    Returns
+    -------
+    tuple or None
+        Inputs (M, n_u, ...) and outputs (M, n_y, ...) or None; None alone where the file holds a single record.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or the arrays do not fit each other or hold anything but finite numbers.
+    """
+    y: Array | None = None
+    if path.suffix.lower() == ".npy":
+        u = _read_npy(path)
+        u = u if u.ndim > 2 else u.reshape(*u.shape, *(1,) * (3 - u.ndim))
+    else:
+        table = read_npz_table(path)
+        found = [table.array(name) if name in table.arrays else None for name in map(_stem, (inputs, outputs))]
+        if found[0] is None or found[0].ndim < 3:
+            return None
+        u, y = found[0], found[1]
+    for x, names, what in ((u, inputs, "inputs"), (y, outputs, "outputs")):
+        if x is None:
+            continue
+        if x.dtype.kind not in "biuf" or x.size == 0 or not np.all(usable(x)):
+            raise InputError(f"{path}: the array of the {what} holds something else than finite numbers; repair it.")
+        if x.ndim != u.ndim or x.shape != (len(u), x.shape[1], *u.shape[2:]) or len(names) not in (1, x.shape[1]):
+            raise InputError(
+                f"{path}: the array of the {what} has the shape {x.shape}; expected (samples, {len(names)} channels, "
+                f"...) with the axes of the inputs, {u.shape}."
+            )
+    return u.astype(float), None if y is None else y.astype(float)
+
+
+def _read_npy(path: Path) -> Array:
+    existing_file(path)
+    try:
+        with path.open("rb") as file:
+            return np.asarray(np.load(file, allow_pickle=False))
+    except Exception as error:  # damaged files raise many kinds
+        raise InputError(
+            f"{path} cannot be read as a NumPy array ({_reason(error)}); write it with numpy.save."
+        ) from None
+
+
+def _stem(names: Sequence[str]) -> str:
+    """Return the one name of several channels: `u` of `u1, u2, u3`."""
+    if len(names) > 1 and all(name == f"{names[0][:-1]}{i + 1}" for i, name in enumerate(names)):
+        return names[0][:-1]
+    return names[0]
+
+
+def _reason(error: Exception) -> str:
+    """Return the first line of a parser's error as part of a sentence."""
+    text = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
+    return "it holds Python objects, which are not read because they can run code" if "pickle" in text else text
+
+
+def _text(path: Path) -> str:
+    try:
+        raw = existing_file(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise InputError(f"{path} is UTF-16 text; save it as UTF-8.")
+    odd = sum(raw[:65536].count(bytes([b])) for b in range(32) if b not in (9, 10, 12, 13))
+    if odd:
+        raise InputError(
+            f"{path} is not text (it holds binary data); give a CSV file, or name it .mat or .npz if it is one."
+        )
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = raw.decode("latin-1")  # a degree sign or a micro from an older instrument
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _cells(line: str, delimiter: str, place: str) -> tuple[str, ...]:
+    try:
+        return tuple(cell.strip() for cell in next(csv.reader([line], delimiter=delimiter)))
+    except csv.Error as error:
+        raise InputError(f"{place} is not a row of a CSV file ({error}); give one row for each sample.") from None
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return None if "_" in cell else float(cell)
+    except ValueError:
+        return None

@@ -1,0 +1,98 @@
+"""Progress shows the stage that runs, what is done of it, the smallest error so far, and the time spent."""
+
+import contextlib
+import os
+import pty
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from pilfr_casadi._base import progress_bar
+
+NAN = float("nan")
+
+
+class Clock:
+    """Seconds that a test moves on by hand."""
+
+    now = 100.0
+
+    def monotonic(self):
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("pilfr_casadi._base.progress.time", clock)
+    return clock
+
+
+def test_lines_tell_each_stage_and_every_ten_seconds(clock, capsys):
+    reports = [
+        (0.5, "linear model", 1, 1, NAN),  # too early for a line
+        (2.0, "linear model", 1, 1, 0.5),
+        (4.0, "starts", 1, 8, 0.02),
+        (6.0, "starts", 2, 8, 0.01),
+        (14.5, "starts", 7, 8, 0.03),  # worse: the best stays
+        (15.0, "polish", 0, 0, NAN),  # within a second of the last line
+        (85.0, "polish", 0, 0, float("inf")),
+    ]
+    with progress_bar() as progress:
+        for seconds, *news in reports:
+            clock.now = 100.0 + seconds
+            progress(*news)
+    assert capsys.readouterr().err.splitlines() == [
+        "linear model 1/1, best NRMSE 0.5000, 2 s",
+        "starts 1/8, best NRMSE 0.0200, 4 s",
+        "starts 7/8, best NRMSE 0.0100, 14 s",
+        "polish, best NRMSE 0.0100, 1 min 25 s",
+    ]
+
+
+def test_quick_work_prints_nothing(clock, capsys):
+    with progress_bar() as progress:
+        for k in range(5):
+            clock.now += 0.1
+            progress(f"stage {k}", 0, 1, 0.1)
+    assert capsys.readouterr().err == ""
+
+
+SCRIPT = """
+import time
+from pilfr_casadi._base import progress_bar
+with progress_bar() as progress:
+    progress("starts", 2, 8, 0.0123)
+    time.sleep(0.3)
+    progress("polish", 5, 9, 0.5)
+    time.sleep(1.3)
+"""
+
+
+def test_a_terminal_shows_one_bar_whose_time_goes_on():
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT], stderr=theirs, env={**os.environ, "COLUMNS": "90"})
+    os.close(theirs)
+    seen = b""
+    with contextlib.suppress(OSError):  # the terminal's end
+        while piece := os.read(ours, 4096):
+            seen += piece
+    os.close(ours)
+    assert process.wait() == 0
+    drawn = seen.decode()
+    for words in ("starts", "2/8", "polish", "5/9", "best NRMSE 0.0123, 0 s", "best NRMSE 0.0123, 1 s"):
+        assert words in drawn
+    assert "0.5000" not in drawn  # the smallest error, not the latest
+
+
+def test_an_interrupt_that_was_swallowed_is_raised_again():
+    with progress_bar() as progress:
+        progress("starts", 1, 2, 0.5)
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            progress("starts", 2, 2, 0.4)
+        progress("polish", 1, 1, 0.3)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
