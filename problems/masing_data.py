@@ -12,8 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from pilfr_casadi.data import Recording, sine_sweep, tukey_realizations
-from pilfr_casadi.data.signals import steady_periods
+from pilfr_casadi.data import Recording, sine_sweep, steady_periods, tukey_realizations
 
 from .masing import MasingRig, Motion, simulate
 

@@ -7,8 +7,7 @@ from test_cli import refused, write_csv
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.data import repeats_itself
-from pilfr_casadi.data.repetition import same_input
+from pilfr_casadi.data import repeats_itself, same_input
 from pilfr_casadi.studies import jobs
 from pilfr_casadi.studies.folds import fold
 

@@ -5,6 +5,15 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
+    from .excitation import (
+        excited_bins as excited_bins,
+        multisine as multisine,
+        orthogonal_multisine as orthogonal_multisine,
+        prbs as prbs,
+        sine_sweep as sine_sweep,
+        steady_periods as steady_periods,
+        tukey_realizations as tukey_realizations,
+    )
     from .metrics import (
         NOTHING_SENTENCE as NOTHING_SENTENCE,
         explains_nothing as explains_nothing,
@@ -12,8 +21,15 @@ if TYPE_CHECKING:
         rmse as rmse,
         rmse_per_output as rmse_per_output,
     )
-    from .multisines import multisine as multisine, orthogonal_multisine as orthogonal_multisine
-    from .periods import mean_period as mean_period, noise_weights as noise_weights, period_noise as period_noise
+    from .periods import (
+        group_by_input as group_by_input,
+        keeps_its_period as keeps_its_period,
+        mean_period as mean_period,
+        noise_weights as noise_weights,
+        period_noise as period_noise,
+        repeats_itself as repeats_itself,
+        same_input as same_input,
+    )
     from .readers import (
         column_names as column_names,
         read as read,
@@ -29,8 +45,6 @@ if TYPE_CHECKING:
         check_for_identification as check_for_identification,
         fingerprint as fingerprint,
     )
-    from .repetition import by_input as by_input, keeps_its_period as keeps_its_period, repeats_itself as repeats_itself
-    from .signals import prbs as prbs, sine_sweep as sine_sweep, tukey_realizations as tukey_realizations
     from .tables import read_stack as read_stack
     from .timebase import TIME_NAMES as TIME_NAMES, step_of as step_of
 

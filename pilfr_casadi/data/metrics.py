@@ -1,6 +1,6 @@
 """Errors of a simulated output against a measured one.
 
-The normalised error is that of Krikelis et al. (2024), Eq. 27, for each output by its own standard deviation,
+The normalised error is Krikelis et al. (2024), Eq. 27: each output is scaled by its own standard deviation,
 
     e_i = sqrt( 1/M Σ_k ((y_i(k) − ŷ_i(k)) / σ_yi)² ),
 
@@ -13,12 +13,12 @@ import numpy as np
 
 from .._base import InputError
 
-NOTHING = 0.99  # NRMSE from which on a simulation is no better than a constant
+NOTHING = 0.99  # NRMSE above which a simulation is no better than a constant, whose NRMSE is 1
 NOTHING_SENTENCE = "The model explains nothing of the training recordings: it is no better than a constant."
 
 
 def rmse_per_output(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Root mean square error of each output, in the unit of that output.
+    """Return the root mean square error of each output, in the unit of that output.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def rmse_per_output(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> np.ndarr
     Raises
     ------
     InputError
-        When shapes differ, no sample is left after `skip`, or `y` is not finite.
+        If shapes differ, no sample is left after `skip`, or `y` is not finite.
     """
     measured, simulated = _scored(y, y_hat, skip)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -46,12 +46,12 @@ def rmse_per_output(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> np.ndarr
 
 
 def rmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
-    """Root mean square error, averaged over the outputs; see :func:`rmse_per_output`."""
+    """Return the root mean square error, averaged over the outputs; see :func:`rmse_per_output`."""
     return float(np.mean(rmse_per_output(y, y_hat, skip)))
 
 
 def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
-    """Error relative to the standard deviation of the output, averaged over outputs.
+    """Return the error relative to the standard deviation of the output, averaged over outputs.
 
     Krikelis et al. (2024), Eq. 27; 0 is perfect, 1 is as good as the mean of the output.
 
@@ -67,7 +67,7 @@ def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
     Raises
     ------
     InputError
-        As :func:`rmse_per_output`, and when an output is constant.
+        As :func:`rmse_per_output`, and if an output is constant.
     """
     errors = rmse_per_output(y, y_hat, skip)
     measured, _ = _scored(y, y_hat, skip)
@@ -82,7 +82,7 @@ def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
 
 
 def explains_nothing(errors: Sequence[float]) -> bool:
-    """Whether NRMSEs on several recordings are all those of a constant, `NOTHING` or more."""
+    """Tell whether the NRMSEs on all recordings are those of a constant, `NOTHING` or more."""
     return bool(errors) and min(errors) >= NOTHING
 
 

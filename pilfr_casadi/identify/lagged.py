@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, one_blas_thread
-from ..data import Recording, as_recordings, by_input, check_for_identification, mean_period, repeats_itself
+from ..data import Recording, as_recordings, check_for_identification, group_by_input, mean_period, repeats_itself
 from ..engine import Engine, make_engine
 from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
 from ..optimise import GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
@@ -214,7 +214,7 @@ def hold_back(
     share : float
         Share to hold back, above 0 and below 1.
     """
-    groups = by_input(recordings)
+    groups = group_by_input(recordings)
     if len(groups) > 1:
         wanted, last = max(1, round(share * len(recordings))), set(groups[-1])
         for group in reversed(groups[1:-1]):

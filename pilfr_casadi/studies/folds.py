@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from .._base import InputError
-from ..data import Recording, by_input, repeats_itself
+from ..data import Recording, group_by_input, repeats_itself
 
 LEAST = 20  # samples of a piece of training
 
@@ -24,7 +24,7 @@ def fold(recordings: Sequence[Recording], k: int, folds: int) -> tuple[tuple[Rec
     InputError
         If the recordings are too short to be cut, or a block of one has the same input as its other blocks.
     """
-    groups = by_input(recordings)
+    groups = group_by_input(recordings)
     if len(groups) >= folds:
         out = {i for number, group in enumerate(groups) if number % folds == k for i in group}
         dealt = list(enumerate(recordings))

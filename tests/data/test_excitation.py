@@ -5,9 +5,15 @@ import pytest
 from hypothesis import given, strategies as st
 
 from pilfr_casadi._base import InputError
-from pilfr_casadi.data import multisine, orthogonal_multisine, prbs, sine_sweep, tukey_realizations
-from pilfr_casadi.data.multisines import excited_bins
-from pilfr_casadi.data.signals import steady_periods
+from pilfr_casadi.data import (
+    excited_bins,
+    multisine,
+    orthogonal_multisine,
+    prbs,
+    sine_sweep,
+    steady_periods,
+    tukey_realizations,
+)
 
 GRIDS = st.sampled_from(["full", "odd", "odd-random"])
 
@@ -187,7 +193,7 @@ def test_prbs_holds_and_scales():
         (lambda: multisine(64, 10.0, 64.0, rng(), grid="even"), "unknown"),
         (lambda: multisine(64, 10.0, 64.0, rng(), grid=np.array([0, 1])), "from 1 to 31"),
         (lambda: multisine(64, 10.0, 64.0, rng(), periods=0), "periods is 0"),
-        (lambda: multisine(64, 10.0, 64.0, rng(), rms=-1.0), "rms is -1"),
+        (lambda: multisine(64, 10.0, 64.0, rng(), rms=-1.0), "rms=-1"),
         (lambda: multisine(64, 10.0, 64.0, rng(), amplitude=np.ones(3)), r"\(3,\) for 10 excited bins"),
         (lambda: multisine(64, 10.0, 64.0, rng(), amplitude=np.zeros(10)), "not all 0"),
         (lambda: excited_bins(64, 10.0, 64.0, grid="odd-random"), "pass rng"),

@@ -1,12 +1,12 @@
-"""Random-phase multisines, for one input and orthogonal for several.
+"""Excitation signals: random-phase and orthogonal multisines, Tukey-shaped realizations, sine sweeps, binary sequences.
 
-One period is Krikelis et al. (2024), Eq. 18–19, with k the sample index,
+One period of a multisine is Krikelis et al. (2024), Eq. 18–19, with k the sample index,
 
     u(k) = 1/√N Σ_n A_n sin(2π k n / N + φ_n),  n ≤ n_max = round(f_max N / f_s),  φ_n uniform in [0, 2π),
 
 so it has exactly the chosen amplitudes at the bins n and nothing elsewhere. The bin at half the sampling frequency is
 left out: a sine there depends on its phase. Grids of odd bins, and of odd bins with one left out at random in every
-group of four, tell even from odd nonlinear distortion (Pintelon & Schoukens, System Identification, 2nd ed., 2012,
+group of four, separate even from odd nonlinear distortion (Pintelon & Schoukens, System Identification, 2nd ed., 2012,
 Ch. 4). Several inputs are excited by orthogonal multisines (Dobrowiecki, Schoukens & Guillaume, IEEE Trans. Instrum.
 Meas. 55, 2006), whose input matrix is well conditioned at each bin.
 """
@@ -16,11 +16,11 @@ from typing import Literal
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, positive, whole
 
 Grid = Literal["full", "odd", "odd-random"] | np.ndarray
 Amplitude = Callable[[np.ndarray], np.ndarray] | np.ndarray | None
-GROUP = 4  # consecutive odd bins of which one is left out in the "odd-random" grid
+GROUP = 4  # consecutive odd bins of which one is left out in the "odd-random" grid (Pintelon & Schoukens, 2012)
 
 
 def excited_bins(
@@ -32,7 +32,7 @@ def excited_bins(
     grid: Grid = "full",
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """Bins ``n`` (frequency ``n fs / n_samples``) that a multisine excites.
+    """Return the bins ``n`` (frequencies ``n fs / n_samples``) that a multisine excites.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def excited_bins(
     Raises
     ------
     InputError
-        When the band holds no bin or reaches beyond ``fs / 2``, or the grid is unknown.
+        If the band holds no bin or reaches beyond ``fs / 2``, or the grid is unknown.
     """
     if n_samples < 3 or not fs > 0 or not 0 <= f_min <= f_max <= fs / 2:
         raise InputError(
@@ -98,7 +98,7 @@ def multisine(
     periods: int = 1,
     rms: float | None = 1.0,
 ) -> np.ndarray:
-    """Random-phase multisine, Krikelis et al. (2024), Eq. 18–19.
+    """Make a random-phase multisine, Krikelis et al. (2024), Eq. 18–19.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def multisine(
     amplitude : callable or array, optional
         Amplitude spectrum ``A_n``: a function of frequency in Hz, or one value for each excited bin. Flat by default.
     grid : {"full", "odd", "odd-random"} or array of int
-        See :func:`excited_bins`; draw the bins there and pass them here where they must be known.
+        All bins, the odd ones, the odd ones with one left out at random in every group of four, or the bins themselves.
     periods : int
         Number of periods.
     rms : float, optional
@@ -126,11 +126,11 @@ def multisine(
     Raises
     ------
     InputError
-        When band, grid, amplitude, periods or rms cannot be used.
+        If band, grid, amplitude, periods or rms cannot be used.
     """
     bins = excited_bins(n_samples, f_max, fs, f_min=f_min, grid=grid, rng=rng)
     phasors = _amplitudes(bins, n_samples, fs, amplitude, rms) * _random_phasors(rng, bins.shape)
-    return np.tile(_from_spectrum(phasors, bins, n_samples), count(periods, "periods"))
+    return np.tile(_from_spectrum(phasors, bins, n_samples), whole(periods, "periods", 1))
 
 
 def orthogonal_multisine(
@@ -147,7 +147,7 @@ def orthogonal_multisine(
     rms: float | None = 1.0,
     matrix: Literal["dft", "hadamard"] = "dft",
 ) -> np.ndarray:
-    """Multisines for several inputs whose spectra are orthogonal over `n_u` experiments.
+    """Make multisines for several inputs whose spectra are orthogonal over `n_u` experiments.
 
     At each excited bin the matrix of input spectra (inputs × experiments) is ``U = diag(A e^{jφ}) T`` with ``T`` the
     DFT or Hadamard matrix, so ``U Uᴴ`` is diagonal; each signal by itself is a random-phase multisine.
@@ -169,21 +169,156 @@ def orthogonal_multisine(
     Raises
     ------
     InputError
-        As :func:`multisine`, and when there is no such matrix.
+        As :func:`multisine`, and if there is no such matrix.
     """
-    n_u = count(n_u, "n_u")
+    n_u = whole(n_u, "n_u", 1)
     bins = excited_bins(n_samples, f_max, fs, f_min=f_min, grid=grid, rng=rng)
     phasors = _amplitudes(bins, n_samples, fs, amplitude, rms) * _random_phasors(rng, (n_u, bins.size))
     spectra = _orthogonal(n_u, matrix)[:, :, None] * phasors[None, :, :]  # experiments, inputs, bins
     u = np.swapaxes(_from_spectrum(spectra, bins, n_samples), 1, 2)
-    return np.tile(u, (1, count(periods, "periods"), 1))
+    return np.tile(u, (1, whole(periods, "periods", 1), 1))
 
 
-def count(value: int, name: str) -> int:
-    """Return a whole number of at least 1, or raise :class:`InputError` naming it."""
-    if not isinstance(value, (int, np.integer)) or value < 1:
-        raise InputError(f"{name} is {value!r}; give a whole number of at least 1.")
-    return int(value)
+def tukey_realizations(
+    n_realizations: int,
+    n_period: int,
+    f_max: float,
+    fs: float,
+    rng: np.random.Generator,
+    *,
+    f_min: float = 0.0,
+    amplitude: Amplitude = None,
+    grid: Grid = "full",
+    normalize: Literal["record", "steady"] = "record",
+) -> np.ndarray:
+    """Make the training signal of Krikelis et al. (2024), Sec. 6.2.1: realizations of a multisine that fade in and out.
+
+    Each realization has 2 `n_period` samples: half a period ramped up, one full steady period, half a period ramped
+    down by a Tukey (cosine-tapered) window. It starts at zero and the next one joins it there without a step.
+
+    Parameters
+    ----------
+    n_realizations : int
+        Number of realizations, each with its own phases (and random grid).
+    n_period : int
+        Samples per period; even.
+    f_max, fs, rng, f_min, amplitude, grid
+        As for :func:`multisine`.
+    normalize : {"record", "steady"}
+        Part that gets unit standard deviation: the whole record, ramps included, or each steady period.
+
+    Returns
+    -------
+    u : array, (2 * n_period * n_realizations,)
+
+    Raises
+    ------
+    InputError
+        As :func:`multisine`, and for an odd `n_period` or an unknown `normalize`.
+
+    See Also
+    --------
+    steady_periods : where the steady periods lie.
+    """
+    if n_period % 2:
+        raise InputError(f"a period of {n_period} samples cannot be halved for the ramps; choose an even n_period.")
+    if normalize not in ("record", "steady"):
+        raise InputError(f"normalize is {normalize!r}; use 'record' or 'steady'.")
+    half = n_period // 2
+    ramp = np.sin(0.5 * np.pi * np.arange(half) / half) ** 2
+    window = np.concatenate([ramp, np.ones(n_period), 1.0 - ramp])
+    pieces = []
+    for _ in range(whole(n_realizations, "n_realizations", 1)):
+        period = multisine(n_period, f_max, fs, rng, f_min=f_min, amplitude=amplitude, grid=grid)
+        pieces.append(window * np.concatenate([period[half:], period, period[:half]]))
+    u = np.concatenate(pieces)
+    return u / u.std() if normalize == "record" else u
+
+
+def steady_periods(n_realizations: int, n_period: int) -> tuple[slice, ...]:
+    """Return the samples of the steady periods of :func:`tukey_realizations`, one slice for each realization."""
+    starts = [2 * n_period * i + n_period // 2 for i in range(n_realizations)]
+    return tuple(slice(start, start + n_period) for start in starts)
+
+
+def sine_sweep(
+    f0: float, f1: float, fs: float, *, rate: float | None = None, duration: float | None = None, amplitude: float = 1.0
+) -> np.ndarray:
+    """Make a sine whose frequency changes linearly, ``amplitude · sin(2π (f0 t + (f1 − f0) t² / 2T))``.
+
+    Parameters
+    ----------
+    f0, f1 : float
+        Frequencies at start and end, Hz; `f1` may be the lower.
+    fs : float
+        Sampling frequency, Hz.
+    rate, duration : float
+        Sweep rate in Hz/s (its magnitude) or the duration ``T`` in s; give one of them.
+    amplitude : float
+        Peak of the sine.
+
+    Returns
+    -------
+    u : array, (round(T * fs),)
+
+    Raises
+    ------
+    InputError
+        If not exactly one of `rate` and `duration` is given, or a value cannot be used.
+    """
+    if (rate is None) == (duration is None):
+        raise InputError("a sine sweep needs its rate in Hz/s or its duration in s; give exactly one of them.")
+    if not fs > 0 or not (0 <= f0 <= fs / 2 and 0 <= f1 <= fs / 2) or (rate is not None and f0 == f1):
+        raise InputError(
+            f"a sweep from {f0:g} to {f1:g} Hz cannot be sampled at {fs:g} Hz; choose two frequencies from 0 to fs/2."
+        )
+    length = abs(f1 - f0) / rate if rate else duration
+    if length is None or not np.isfinite(length) or round(length * fs) < 2:
+        raise InputError(
+            f"rate {rate} or duration {duration} gives no sweep; choose one above zero, of two samples or more."
+        )
+    t = np.arange(round(length * fs)) / fs
+    return amplitude * np.sin(2 * np.pi * (f0 * t + 0.5 * (f1 - f0) / length * t**2))
+
+
+def prbs(
+    n_samples: int, rng: np.random.Generator, *, order: int | None = None, hold: int = 1, amplitude: float = 1.0
+) -> np.ndarray:
+    """Make a pseudo-random binary sequence of maximum length that starts at a random place.
+
+    Parameters
+    ----------
+    n_samples : int
+        Samples to make; the sequence repeats after ``hold * (2**order - 1)``.
+    rng : numpy.random.Generator
+        Draws the start.
+    order : int, optional
+        Length of the shift register, 2 to 32; by default the shortest that does not repeat within `n_samples`.
+    hold : int
+        Samples for which each value is held.
+    amplitude : float
+        The values are ``±amplitude``.
+
+    Returns
+    -------
+    u : array, (n_samples,)
+
+    Raises
+    ------
+    InputError
+        If a value cannot be used.
+    """
+    from scipy.signal import max_len_seq
+
+    n_values = -(-whole(n_samples, "n_samples", 1) // whole(hold, "hold", 1))
+    if order is None:
+        order = max(2, int(n_values).bit_length())
+    if not 2 <= order <= 32:
+        raise InputError(f"the order {order} of the binary sequence lies outside 2 to 32; choose one inside.")
+    seed = int(rng.integers(1, 2**order))
+    state = np.array([seed >> i & 1 for i in range(order)], dtype=np.int8)
+    values, _ = max_len_seq(order, state=state, length=n_values)
+    return amplitude * np.repeat(2.0 * values - 1.0, hold)[:n_samples]
 
 
 def _random_phasors(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
@@ -191,7 +326,7 @@ def _random_phasors(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndar
 
 
 def _amplitudes(bins: np.ndarray, n_samples: int, fs: float, amplitude: Amplitude, rms: float | None) -> np.ndarray:
-    """Amplitude of the sine at each bin, (n_bins,)."""
+    """Return the amplitude of the sine at each bin, (n_bins,)."""
     given = np.ones(bins.size) if amplitude is None else amplitude
     a = np.asarray(given(bins * fs / n_samples) if callable(given) else given, dtype=float)
     if a.shape != bins.shape or not np.isfinite(a).all() or (a < 0).any() or not a.any():
@@ -201,19 +336,19 @@ def _amplitudes(bins: np.ndarray, n_samples: int, fs: float, amplitude: Amplitud
         )
     if rms is None:
         return a / np.sqrt(n_samples)
-    if not rms > 0:
-        raise InputError(f"rms is {rms!r}; give a value above zero, or None for the scale of the amplitudes.")
+    positive(rms, "rms", "the root mean square of the signal (None for the scale of the amplitudes)")
     return a * (rms / np.sqrt(np.sum(a**2) / 2))
 
 
 def _from_spectrum(phasors: np.ndarray, bins: np.ndarray, n_samples: int) -> np.ndarray:
-    """Sum of ``|phasor| sin(2πkn/N + arg phasor)`` over the bins (last axis), one period."""
+    """Sum ``|phasor| sin(2πkn/N + arg phasor)`` over the bins (last axis), one period."""
     spectrum = np.zeros((*phasors.shape[:-1], n_samples // 2 + 1), dtype=complex)
     spectrum[..., bins] = -0.5j * n_samples * phasors
     return np.fft.irfft(spectrum, n_samples)
 
 
 def _orthogonal(n: int, kind: str) -> np.ndarray:
+    """Return the DFT or the Hadamard matrix, (n, n)."""
     if kind == "dft":
         index = np.arange(n)
         return np.exp(2j * np.pi * np.outer(index, index) / n)
@@ -221,7 +356,6 @@ def _orthogonal(n: int, kind: str) -> np.ndarray:
         raise InputError(f"the matrix {kind!r} is unknown; use 'dft' or 'hadamard'.")
     if n & (n - 1):
         raise InputError(f"a Hadamard matrix for {n} inputs is not available, only for powers of two; use 'dft'.")
-    matrix = np.ones((1, 1))
-    while len(matrix) < n:
-        matrix = np.kron(matrix, np.array([[1.0, 1.0], [1.0, -1.0]]))
-    return matrix
+    from scipy.linalg import hadamard
+
+    return np.asarray(hadamard(n, dtype=float))
