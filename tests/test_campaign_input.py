@@ -6,13 +6,13 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 
 import pytest
+from pilfr_casadi.cli.run_command import _alike
 from run_files import changed, prepared
 from test_cli import refused
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError, worker_process as hand
 from pilfr_casadi.cli.app import main
-from pilfr_casadi.cli.run_command import _alike
 from pilfr_casadi.models import named_structure
 from pilfr_casadi.studies import Cell, cluster, reasons, side_by_side
 from pilfr_casadi.studies.manifest import Manifest

@@ -8,24 +8,26 @@ them. The others are of a rig of which the simulator `demo_data/rig.py` leaves s
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from .._base import deferred_interrupt, progress_bar, worker_pool
+from .._base import deferred_interrupt, processors, progress_bar, worker_pool
 from ..data import Recording, read_csv
 from ..identify import Fit, fit
 from ..models import PILFR, Play, PrandtlIshlinskii
 from ..optimise import Status
 from ..simulators import load_simulator
+from ._common import DONE, INTERRUPTED, MOST_WORKERS, NO_RESULT, make_folder, option, takes_options, whole
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
-INTERRUPTED = 130
 SETS = ("train", "multisine", "sweep")
-FLOOR = 0.0032
+FLOOR = 0.0032  # NRMSE of the noise, 50 dB below the signal
 # Krikelis et al. (2024), Table 2: NRMSE on training, multisine test and sweep test (25th percentiles of 100 starts)
 PUBLISHED: Mapping[str, tuple[float, float, float]] = {
     "LTI": (0.3026, 0.2910, 0.4799),
@@ -38,7 +40,7 @@ SHOWN = ("LTI", "PI-LFR N=20")
 
 
 def demo_recordings() -> dict[str, Recording]:
-    """The recordings `train`, `multisine` and `sweep`: force u in N, displacement x2 in m, 120 Hz."""
+    """Read the recordings `train`, `multisine` and `sweep`: force u in N, displacement x2 in m, 120 Hz."""
     out = {}
     for name in SETS:
         with as_file(files(__package__) / "demo_data" / f"{name}.csv") as path:
@@ -47,7 +49,7 @@ def demo_recordings() -> dict[str, Recording]:
 
 
 def rig_recordings() -> dict[str, Recording]:
-    """The recordings `train` and `test` of the rig to diagnose: force in N, displacement x2 in m, 100 Hz."""
+    """Read the recordings `train` and `test` of the rig to diagnose: force in N, displacement x2 in m, 100 Hz."""
     out = {}
     for name in ("train", "test"):
         with as_file(files(__package__) / "demo_data" / f"rig_{name}.csv") as path:
@@ -56,15 +58,25 @@ def rig_recordings() -> dict[str, Recording]:
 
 
 def structure(n: int) -> PILFR:
-    """The paper's model: five states and N plays, or none (n = 0)."""
+    """Describe the paper's model: five states and N plays, or none (n = 0)."""
     return PILFR(5, PrandtlIshlinskii(Play, n) if n else None)
 
 
-def run_demo(folder: Path, workers: int) -> int:
-    """Identify one rig, diagnose the simulator of another; returns the exit status."""
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """The options of `pilfr demo`."""
+
+    out: Annotated[str, option("Folder for the reports (default: runs/demo).", metavar="DIR")] = "runs/demo"
+    workers: Annotated[int | None, whole(1, MOST_WORKERS, "Processes (default: one a processor, at most four).")] = None
+
+
+@takes_options
+def demo_command(options: DemoOptions) -> int:
+    """A rig is identified beside the published figures; the simulator of another one is diagnosed."""
     from rich.console import Console
 
     console = Console(highlight=False)
+    folder, workers = make_folder(options.out), options.workers or min(4, processors())
     status = identify_rig(folder, workers, console)
     if status == INTERRUPTED:
         return status
@@ -72,8 +84,63 @@ def run_demo(folder: Path, workers: int) -> int:
     return max(status, diagnose_rig(folder / "diagnosis", workers, console))
 
 
+def identify_rig(folder: Path, workers: int, console: Console) -> int:
+    """Identify a rig, print the table beside the published one, write the report; return the exit status."""
+    from ..report import fit_report
+
+    recordings = demo_recordings()
+    console.print("A force drives one mass, its displacement is measured; a second mass hangs on a hysteretic spring.")
+    found = _fit_rows(recordings, workers)
+    interrupted = len(found) < len(SHOWN) or any(f.status is Status.INTERRUPTED for f in found)
+    console.print(_table(found, recordings))
+    best = min(found, key=lambda f: f.train_nrmse[0]) if interrupted else found[-1]
+    target = folder / "model.json"
+    try:
+        with deferred_interrupt():
+            best.save(target)
+        page = fit_report(best, [recordings["train"]], [recordings["multisine"], recordings["sweep"]], folder)
+    except KeyboardInterrupt:
+        console.print(f"Interrupted; the model is in {target}, a report was not written.", soft_wrap=True)
+        return INTERRUPTED
+    console.print("Interrupted; the best model so far was written." if interrupted else best.status.value)
+    console.print(f"The model is in {target}; for the pictures open {page} in a browser.", soft_wrap=True)
+    if interrupted:
+        return INTERRUPTED
+    return DONE if best.status.converged else NO_RESULT
+
+
+def _fit_rows(recordings: Mapping[str, Recording], workers: int) -> list[Fit]:
+    """Fit the rows of the table; fewer of them where Ctrl-C ends it."""
+    found: list[Fit] = []
+    try:
+        with worker_pool(workers) as pool:
+            for row in SHOWN:
+                n = 0 if row == "LTI" else int(row.partition("=")[2])
+                with progress_bar() as progress:
+                    found.append(fit(structure(n), recordings["train"], executor=pool, progress=progress))
+                if found[-1].status is Status.INTERRUPTED:
+                    break
+    except KeyboardInterrupt:
+        if not found:
+            raise
+    return found
+
+
+def _table(found: Sequence[Fit], recordings: Mapping[str, Recording]) -> Table:
+    from rich.table import Table
+
+    table = Table("model", *SETS, "time", title="NRMSE in simulation, in brackets Krikelis et al. (2024), Table 2")
+    for row, result in zip(SHOWN, found, strict=False):
+        errors = [result.nrmse(recordings[s]) for s in SETS]
+        cells = [f"{e:.4f} ({p:.4f})" for e, p in zip(errors, PUBLISHED[row], strict=True)]
+        name = f"{row}, interrupted" if result.status is Status.INTERRUPTED else row
+        table.add_row(name, *cells, f"{result.seconds:.1f} s")
+    table.add_row("noise floor", *(f"{FLOOR:.4f}" for _ in SETS), "")
+    return table
+
+
 def diagnose_rig(folder: Path, workers: int, console: Console) -> int:
-    """Find what a simulator leaves out, say where, what and how sure, write the report; returns the exit status."""
+    """Find what a simulator leaves out, say where, what and how sure, write the report; return the exit status."""
     from ..diagnose import diagnose
     from ..report import diagnosis_report
 
@@ -100,50 +167,4 @@ def diagnose_rig(folder: Path, workers: int, console: Console) -> int:
     shown = f"{errors['before']:.4f} -> {errors['after']:.4f} -> noise floor {found.floor['nrmse']:.4f}"
     console.print(f"NRMSE on the test recording, refitted without -> with: {shown}", soft_wrap=True)
     console.print(f"{found.seconds:.1f} s. For the pictures open {page} in a browser.", soft_wrap=True)
-    return 0 if found.effects else 1
-
-
-def identify_rig(folder: Path, workers: int, console: Console) -> int:
-    """Identify, print the table beside the published one, write the report; returns the exit status."""
-    from rich.table import Table
-
-    from ..report import fit_report
-
-    recordings = demo_recordings()
-    console.print("A force drives one mass, its displacement is measured; a second mass hangs on a hysteretic spring.")
-    table = Table("model", *SETS, "time", title="NRMSE in simulation, in brackets Krikelis et al. (2024), Table 2")
-    found: list[Fit] = []
-    interrupted, target = False, folder / "model.json"
-    try:
-        with worker_pool(workers) as pool:
-            for row in SHOWN:
-                published = PUBLISHED[row]
-                n = 0 if row == "LTI" else int(row.partition("=")[2])
-                with progress_bar() as progress:
-                    result = fit(structure(n), recordings["train"], executor=pool, progress=progress)
-                interrupted = result.status is Status.INTERRUPTED
-                errors = [result.nrmse(recordings[s]) for s in SETS]
-                cells = [f"{e:.4f} ({p:.4f})" for e, p in zip(errors, published, strict=True)]
-                table.add_row(f"{row}, interrupted" if interrupted else row, *cells, f"{result.seconds:.1f} s")
-                found.append(result)
-                if interrupted:
-                    break
-    except KeyboardInterrupt:
-        if not found:
-            raise
-        interrupted = True
-    table.add_row("noise floor", *(f"{FLOOR:.4f}" for _ in SETS), "")
-    console.print(table)
-    best = min(found, key=lambda f: f.train_nrmse[0]) if interrupted else found[-1]
-    try:
-        with deferred_interrupt():
-            best.save(target)
-        page = fit_report(best, [recordings["train"]], [recordings["multisine"], recordings["sweep"]], folder)
-    except KeyboardInterrupt:
-        console.print(f"Interrupted; the model is in {target}, a report was not written.", soft_wrap=True)
-        return INTERRUPTED
-    console.print("Interrupted; the best model so far was written." if interrupted else best.status.value)
-    console.print(f"The model is in {target}; for the pictures open {page} in a browser.", soft_wrap=True)
-    if interrupted:
-        return INTERRUPTED
-    return 0 if best.status.converged else 1
+    return DONE if found.effects else NO_RESULT

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .campaigns import campaign as campaign
+    from .campaigns import campaign as campaign, seeds_advice as seeds_advice
     from .cluster import dask_executor as dask_executor
     from .described import ROLES as ROLES, Run as Run, read_run as read_run
     from .execute import NoModel as NoModel, RunInterrupted as RunInterrupted, RunResult as RunResult, run as run
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     )
     from .grid import Cell as Cell, grid_keys as grid_keys
     from .jobs import jobs_of as jobs_of
+    from .limits import LARGEST_SIZE as LARGEST_SIZE
     from .results import reasons as reasons
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

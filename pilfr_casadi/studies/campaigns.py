@@ -15,10 +15,11 @@ from typing import Any
 
 from .._base import InputError, Progress, close_hands
 from ..identify import drawn
-from ..models import PILFR, PrandtlIshlinskii, places
+from ..models import PILFR, places
 from .described import Run, read_run
 from .execute import RunResult, carried_out
 from .executor import AHEAD, Sent, check_executor, side_by_side
+from .grid import Cell
 from .jobs import Batch, Recordings, RunJob, attempt
 
 
@@ -82,19 +83,26 @@ def campaign(
     return carried_out(given, perform, out, overwrite, progress, tell, campaign=True)
 
 
+def seeds_advice(cell: Cell) -> str:
+    """Say why every seed gives the same model of a cell, and what to do; empty where starts are random."""
+    model, start, starts = cell.model, cell.search.get("start", ""), cell.search.get("starts", 1)
+    if not isinstance(model, PILFR):
+        return ""
+    if model.element is None:
+        return "a linear model has no starts, so every seed gives the same one; use one seed"
+    if any(drawn(model, start, i) for i in range(min(starts, len(places(model)) + 1))):
+        return ""
+    first = len(places(model))
+    more = f", or {first + 1} starts or more" if drawn(model, start, first) else ""
+    return f"no start is random, so every seed gives the same model; use one seed, start = 'paper' in [solver]{more}"
+
+
 def _check_seeds(run: Run) -> None:
-    """Refuse seeds that would all give the same model: the first starts of a grid start are not random."""
-    for cell in run.cells:
-        search = cell.search
-        if not isinstance(cell.model, PILFR) or not isinstance(cell.model.element, PrandtlIshlinskii):
-            continue
-        first = len(places(cell.model))
-        if len(run.seeds) > 1 and search["start"] == "grid" and search["starts"] <= first:
-            more = f", or {first + 1} starts or more" if drawn(cell.model, "grid", first) else ", or one seed"
-            raise InputError(
-                f"{run.file}: the first {first} of the starts 'grid' are not random, so {len(run.seeds)} seeds with "
-                f"starts = {search['starts']} would give one model; give start = 'paper' in [solver]{more}."
-            )
+    """Refuse seeds that would all give the same model; a linear model in a grid of others is none of them."""
+    for cell in run.cells if len(run.seeds) > 1 else ():
+        advice = seeds_advice(cell)
+        if advice and cell.model.element is not None:
+            raise InputError(f"{run.file}: {len(run.seeds)} seeds were given, but {advice}.")
 
 
 def _perform(

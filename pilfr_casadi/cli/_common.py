@@ -1,0 +1,284 @@
+"""What several commands share: exit statuses, the types of options, and reading recordings as the options say."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+
+import typer
+
+from .._base import InputError
+
+if TYPE_CHECKING:
+    from ..data import Recording
+    from ..identify import Fit
+
+DONE, NO_RESULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer's own name for it has moved between releases
+MOST_SAMPLES = 10**9  # of a period or of samples left out: 8 GB a channel
+MOST_WORKERS = 1024  # processes; each takes 100 MB and more
+
+
+def say(sentence: str, status: int) -> int:
+    """Print one line on stderr; return the status."""
+    print("pilfr: " + " ".join(sentence.split()), file=sys.stderr)
+    return status
+
+
+def takes_options(function: Callable[[Any], int]) -> Callable[..., int]:
+    """Turn a function of one dataclass into a command: every field of the dataclass is an option or an argument."""
+    (kind,) = (hint for name, hint in get_type_hints(function).items() if name != "return")
+    hints = get_type_hints(kind, include_extras=True)
+
+    def command(**given: Any) -> int:
+        return function(kind(**given))
+
+    parameters = [
+        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=_default(f), annotation=hints[f.name])
+        for f in fields(kind)
+    ]
+    vars(command)["__signature__"] = inspect.Signature(parameters)
+    command.__annotations__, command.__doc__, command.__name__ = hints, function.__doc__, function.__name__
+    return command
+
+
+def _default(given: Field[Any]) -> Any:
+    if given.default_factory is not MISSING:
+        return given.default_factory()
+    return inspect.Parameter.empty if given.default is MISSING else given.default
+
+
+def whole(least: int, most: int, text: str, *names: str, metavar: str = "N") -> Any:
+    """Make an option that takes a whole number."""
+
+    def parse(given: str) -> int:
+        try:
+            value = int(given)
+        except ValueError:
+            value = least - 1
+        if not least <= value <= most:
+            raise typer.BadParameter(f"{given} was given; give a whole number from {least} to {most}.")
+        return value
+
+    return typer.Option(*names, parser=parse, metavar=metavar, help=text, show_default=False)
+
+
+def seconds(text: str, *names: str) -> Any:
+    """Make an option that takes a time above zero."""
+
+    def parse(given: str) -> float:
+        try:
+            value = float(given)
+        except ValueError:
+            value = math.nan
+        if not 0 < value < math.inf:
+            raise typer.BadParameter(f"{given} was given; give a number of seconds above zero.")
+        return value
+
+    return typer.Option(*names, parser=parse, metavar="SECONDS", help=text, show_default=False)
+
+
+def option(text: str, *names: str, metavar: str | None = None) -> Any:
+    """Make an option of any other type."""
+    return typer.Option(*names, metavar=metavar, help=text, show_default=False)
+
+
+WORKERS = whole(1, MOST_WORKERS, "Processes; the numbers do not depend on it (default: 1).")
+TESTS = option("Recording to report on, never fitted (repeatable).", "--test", metavar="FILE")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataOptions:
+    """How recordings are read."""
+
+    inputs: Annotated[
+        str | None, option("Names of the inputs (default: the model's or simulator's).", metavar="NAME[,NAME]")
+    ] = None
+    outputs: Annotated[
+        str | None, option("Names of the outputs (default: the model's or simulator's).", metavar="NAME[,NAME]")
+    ] = None
+    column: Annotated[
+        list[str],
+        option("Column of a name, or of the time t, where it differs (repeatable).", metavar="NAME=COLUMN"),
+    ] = field(default_factory=list)
+    initial: Annotated[
+        Literal["estimate", "zero", "periodic"] | None,
+        option("State at the first sample (default: estimate; zero where no outputs were measured)."),
+    ] = None
+    period: Annotated[
+        int | None,
+        whole(0, MOST_SAMPLES, "Samples a period, with --initial periodic.", metavar="SAMPLES"),
+    ] = None
+    hold: Annotated[Literal["zero", "linear"] | None, option("What the input does between samples.")] = None
+    skip: Annotated[
+        int, whole(0, MOST_SAMPLES, "Leading samples that are simulated, not scored.", metavar="SAMPLES")
+    ] = 0
+    dt: Annotated[float | None, option("Step, where the file has no time column.", metavar="SECONDS")] = None
+    time_tolerance: Annotated[
+        float | None,
+        option(
+            "How far samples may lie off a uniform grid (default: 1e-4 steps, beyond rounding).",
+            metavar="STEPS",
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.period is not None and self.initial is None:
+            raise InputError(
+                f"--period {self.period} was given without --initial; give --initial periodic for a record in steady "
+                "state from its first sample, or --initial estimate for one that settles first."
+            )
+
+    def columns(self, path: str) -> dict[str, str]:
+        """Return the column of each name in a file."""
+        return pairs(self.column, "--column")
+
+    def read(self, path: str, inputs: tuple[str, ...], outputs: tuple[str, ...], only_these: bool = False) -> Recording:
+        """Read a recording.
+
+        Parameters
+        ----------
+        path : str
+        inputs, outputs : tuple of str
+        only_these : bool
+            Allow `--column` to name channels that are not among these.
+        """
+        from ..data import TIME_NAMES, read  # here, so that `pilfr --help` is quick
+
+        columns = self.columns(path)
+        if only_these:
+            columns = {name: column for name, column in columns.items() if name in (*inputs, *outputs, *TIME_NAMES)}
+        more = {key: getattr(self, key) for key in ("period", "hold", "skip", "dt", "time_tolerance")}
+        return read(path, inputs, outputs, columns=columns, initial=self.initial or "estimate", **more)
+
+
+def name_list(text: str, option: str) -> tuple[str, ...]:
+    """Split names at commas.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    names = tuple(part.strip() for part in text.split(",") if part.strip())
+    if not names:
+        raise InputError(f"{option} {text!r} holds no name; write {option} NAME, or several separated by commas.")
+    return names
+
+
+def pairs(texts: Sequence[str], option: str) -> dict[str, str]:
+    """Split each `NAME=VALUE`.
+
+    Raises
+    ------
+    InputError
+        If one is not of this form, or a name is given twice.
+    """
+    out: dict[str, str] = {}
+    for text in texts:
+        name, sign, value = text.partition("=")
+        if not (name and sign and value):
+            raise InputError(f"{option} {text!r} was given; write {option} NAME=VALUE.")
+        if name in out:
+            raise InputError(f"{option} is given twice for {name}; leave one out.")
+        out[name] = value
+    return out
+
+
+def numbers_of(texts: Sequence[str], option: str) -> dict[str, float]:
+    """Split each `NAME=NUMBER`.
+
+    Raises
+    ------
+    InputError
+        If one is not of this form.
+    """
+    return {name: number(value, f"{option} {name}={value}") for name, value in pairs(texts, option).items()}
+
+
+def number(text: str, given: str) -> float:
+    """Read a number; `given` begins the sentence where it is none.
+
+    Raises
+    ------
+    InputError
+        If it is none.
+    """
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{given} was given, and {text!r} is not a number; write one like 0.5.") from None
+
+
+def check_given_once(paths: Sequence[str]) -> None:
+    """Refuse a file that is given twice.
+
+    Raises
+    ------
+    InputError
+        If one is.
+    """
+    if len({os.path.realpath(path) for path in paths}) < len(paths):
+        raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
+
+
+def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> None:
+    """Refuse names that are not the model's in its order: swapped ones would be simulated silently.
+
+    Raises
+    ------
+    InputError
+        If they differ.
+    """
+    for role, names, own in (("inputs", inputs, fitted.model.inputs), ("outputs", outputs, fitted.model.outputs)):
+        if tuple(names) != tuple(own):
+            raise InputError(
+                f"--{role} {','.join(names)} was given but the model's {role} are {','.join(own)}, in this order; "
+                f"use its names and say which column each is, as in --column {own[0]}=COLUMN."
+            )
+
+
+def describe(kind: str, path: str, recording: Recording) -> str:
+    """Say what was read from a file, in a line."""
+    names = f"inputs {', '.join(recording.inputs)}, outputs {', '.join(recording.outputs)}"
+    return f"{kind} data: {path}, {len(recording)} samples, step {recording.dt:.6g} s, {names}"
+
+
+def new_file(folder: str, name: str, overwrite: bool) -> Path:
+    """Return the path of a result.
+
+    Raises
+    ------
+    InputError
+        If it exists and may not be replaced.
+    """
+    target = Path(folder) / name
+    if target.exists() and not overwrite:
+        raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
+    return target
+
+
+def make_folder(path: str) -> Path:
+    """Make the folder of the results before any long work, so that a bad one is reported at once.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made or written to.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".writable-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"The folder {path} cannot be written ({reason}); give another --out.") from None
+    return folder

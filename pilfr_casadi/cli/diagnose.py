@@ -1,0 +1,287 @@
+"""`pilfr diagnose`: read and check the files, find the physics that is missing, write and print what was found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from .._base import InputError, deferred_interrupt, listed, progress_bar
+from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
+from ..export import write_atomically
+from ..identify import load
+from ..simulators import Simulator, as_simulator, simulator_variable
+from ._common import (
+    DONE,
+    INTERRUPTED,
+    MOST_WORKERS,
+    NO_RESULT,
+    TESTS,
+    DataOptions,
+    check_given_once,
+    describe,
+    make_folder,
+    name_list,
+    new_file,
+    numbers_of,
+    option,
+    say,
+    takes_options,
+    whole,
+)
+
+if TYPE_CHECKING:
+    from ..diagnose import Diagnosis
+
+TABLES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npz", ".npy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnoseOptions(DataOptions):
+    """The options of `pilfr diagnose`."""
+
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[SIMULATOR] TRAIN",
+            help="A Python file that sets `simulator` (or a model.json), then training recordings (.csv, .mat, .npz).",
+        ),
+    ]
+    simulated: Annotated[
+        str | None,
+        option("Inputs and outputs of the simulation itself, in place of the simulator file.", metavar="SIM"),
+    ] = None
+    test: Annotated[list[str], TESTS] = field(default_factory=list)
+    limit: Annotated[
+        list[str],
+        option(
+            "Largest amplitude of an input in the experiment that is proposed next (repeatable; default: as recorded).",
+            metavar="INPUT=AMPLITUDE",
+        ),
+    ] = field(default_factory=list)
+    workers: Annotated[
+        int | None, whole(1, MOST_WORKERS, "Fits side by side (default: one a processor, at most four).")
+    ] = None
+    out: Annotated[str, option("Folder for diagnosis.json and report.html (default: diagnosis).", metavar="DIR")] = (
+        "diagnosis"
+    )
+    overwrite: Annotated[bool, option("Replace a diagnosis that is in that folder already.", "--overwrite")] = False
+
+    @property
+    def source(self) -> str | None:
+        """The simulator file; None with `--simulated`."""
+        return None if self.simulated else self.files[0]
+
+    @property
+    def train(self) -> list[str]:
+        """The training recordings."""
+        return self.files if self.simulated else self.files[1:]
+
+    @property
+    def recordings(self) -> list[str]:
+        """Every recording: the simulation's, those to train, those to test."""
+        return [*([self.simulated] if self.simulated else []), *self.train, *self.test]
+
+    def columns(self, path: str) -> dict[str, str]:
+        """Return the column of each name in a file; one file may have the name itself, and another one the column."""
+        columns = super().columns(path)
+        if not columns or not self.simulated:
+            return columns
+        names = {f: column_names(f, list(columns.values())) for f in self.recordings}
+        there, anywhere = names[path], {name for found in names.values() for name in found}
+        return {n: c for n, c in columns.items() if c in there or n not in there or c not in anywhere}
+
+
+@takes_options
+def diagnose_command(options: DiagnoseOptions) -> int:
+    """The answer goes to DIR/diagnosis.json, the report to DIR/report.html."""
+    _check_files(options)
+    new_file(options.out, "diagnosis.json", options.overwrite)
+    given = None
+    if options.source is None:
+        inputs, outputs = _simulated_names(options)
+    else:
+        is_model = Path(options.source).suffix.lower() == ".json"
+        given = load(options.source) if is_model else simulator_variable(options.source)
+        simulator = as_simulator(given)
+        inputs, outputs = simulator.inputs, simulator.output_names
+    train = {path: options.read(path, inputs, outputs) for path in options.train}
+    tests = {path: options.read(path, inputs, outputs) for path in options.test}
+    _check_recordings(train, tests)
+    folder = make_folder(options.out)
+    error, poor = 0.0, ""
+    if given is not None:
+        simulator = as_simulator(given, list(train.values()))
+        name = f"simulator: {options.source}"
+    else:
+        simulator, error, poor = _surrogate(options, inputs, outputs)
+        name = f"surrogate of {options.simulated} (NRMSE {error:.4f})"
+    _announce(simulator, name, train, tests)
+    if poor:
+        print(f"note: {poor}", flush=True)
+    with deferred_interrupt():
+        from ..diagnose import diagnose
+    try:
+        with progress_bar() as progress:
+            diagnosis = diagnose(
+                simulator,
+                list(train.values()),
+                test=list(tests.values()) or None,
+                hold=options.hold,
+                limits=numbers_of(options.limit, "--limit"),
+                workers=options.workers,
+                stand_in_error=error,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
+    return _write(diagnosis, folder)
+
+
+def _write(diagnosis: Diagnosis, folder: Path) -> int:
+    """Write diagnosis.json, then the page; print the diagnosis and where it is; return the exit status."""
+    target = folder / "diagnosis.json"
+    content = json.dumps(diagnosis.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    try:
+        with deferred_interrupt():
+            write_atomically(target, content)
+            print(diagnosis, flush=True)
+            from ..report import diagnosis_report
+        with progress_bar() as progress:
+            progress("writing the report", 0, 0, np.nan)
+            page = diagnosis_report(diagnosis, folder)
+    except KeyboardInterrupt:
+        return say(f"Interrupted; the diagnosis is in {target}, a report was not written.", INTERRUPTED)
+    except (InputError, OSError):
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        return say(f"The diagnosis is in {target}, but a report could not be written ({reason}).", NO_RESULT)
+    print(f"diagnosis: {target}\nreport: {page}")
+    return INTERRUPTED if diagnosis.interrupted else DONE
+
+
+def _check_files(options: DiagnoseOptions) -> None:
+    source = options.source
+    if source is not None and Path(source).suffix.lower() in TABLES:
+        raise InputError(
+            f"{source} is no simulator file; give SIMULATOR.py first, or the simulation's own inputs and outputs with "
+            "--simulated SIM.csv."
+        )
+    scripts = [path for path in (*options.train, *options.test) if Path(path).suffix.lower() == ".py"]
+    if scripts:
+        raise InputError(
+            f"{scripts[0]} was given as a recording; give one simulator file, first, and none with --simulated."
+        )
+    if not options.train:
+        raise InputError("No training recording was given; give the simulator file and at least one recording.")
+    if source is not None and (options.inputs or options.outputs):
+        raise InputError("--inputs and --outputs go with --simulated; a simulator file has names of its own.")
+    check_given_once(options.recordings)
+
+
+def _check_recordings(train: dict[str, Recording], tests: dict[str, Recording]) -> None:
+    """Refuse a test on training data, and recordings of different steps."""
+    for there, t in tests.items():
+        for path, r in train.items():
+            if len(r) == len(t) and np.array_equal(r.u, t.u) and np.array_equal(r.y, t.y):
+                raise InputError(f"{there} holds the same samples as {path}; a test on training data says nothing.")
+    path, first = next(iter(train.items()))
+    for other, r in (train | tests).items():
+        if abs(r.dt / first.dt - 1) > SAME_STEP:
+            raise InputError(f"{other} has a step of {r.dt:g} s, {path} one of {first.dt:g} s; resample one of them.")
+
+
+def _announce(simulator: Simulator, name: str, train: dict[str, Recording], tests: dict[str, Recording]) -> None:
+    ports = listed([port.name for port in simulator.all_ports()])
+    free = sum(not bool(np.all(p.fixed)) for p in simulator.parameters.values())
+    counts = f"{len(simulator.states)} states, {len(simulator.parameters)} parameters ({free} free)"
+    print(f"{name}, {counts}; ports {ports}", flush=True)
+    for kind, recordings in (("training", train), ("test", tests)):
+        for path, recording in recordings.items():
+            print(describe(kind, path, recording), flush=True)
+
+
+def _surrogate(
+    options: DiagnoseOptions, inputs: tuple[str, ...], outputs: tuple[str, ...]
+) -> tuple[Simulator, float, str]:
+    """Fit a linear model to the simulation's answers; return it, its NRMSE, and a note where it follows badly."""
+    with deferred_interrupt():
+        from ..diagnose import POOR, TOO_POOR, surrogate
+    assert options.simulated is not None
+    with progress_bar() as progress:
+        progress("linear model of the simulation", 0, 0, np.nan)
+        simulator, error = surrogate(options.read(options.simulated, inputs, outputs))
+    return simulator, error, TOO_POOR if error > POOR else ""
+
+
+def _simulated_names(options: DiagnoseOptions) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return inputs and outputs as given, else the columns that the files share, told apart by their values."""
+    if options.inputs and options.outputs:
+        return name_list(options.inputs, "--inputs"), name_list(options.outputs, "--outputs")
+    if options.inputs or options.outputs:
+        raise InputError("Only one of --inputs and --outputs was given; give both.")
+    files = options.recordings
+    first, *others = (_column_names(options, f) for f in files)
+    shared = [n for n in first if n not in TIME_NAMES and all(n in other for other in others)]
+    inputs = tuple(n for n in shared if _same_samples(options, n)) or tuple(n for n in shared if n[:1] in "uU")
+    if not inputs and len(shared) == 2:
+        inputs = _cause(options, shared)
+    outputs = tuple(n for n in shared if n not in inputs)
+    if not inputs or not outputs:
+        raise InputError(
+            f"The columns {listed(shared) or '(none)'} that {files[0]} and the recordings share do not tell inputs "
+            "from outputs; give --inputs NAMES and --outputs NAMES."
+        )
+    for note in _unshared(files, (first, *others), shared):
+        print(note, flush=True)
+    print(f"inputs {listed(inputs)}, outputs {listed(outputs)}, as found in the files", flush=True)
+    return inputs, outputs
+
+
+def _column_names(options: DiagnoseOptions, path: str) -> list[str]:
+    """Return a file's columns by the names that options give them."""
+    names = {column: name for name, column in options.columns(path).items()}
+    return [names.get(column, column) for column in column_names(path)]
+
+
+def _unshared(files: Sequence[str], columns: Sequence[Sequence[str]], shared: Sequence[str]) -> Iterator[str]:
+    """Note each column that only one file has; where both have some, one may be the other under another name."""
+    first, *others = ([n for n in names if n not in TIME_NAMES and n not in shared] for names in columns)
+    for path, names, own in zip(files[1:], columns[1:], others, strict=True):
+        lost = [n for n in first if n not in names]
+        if lost and own:
+            raise InputError(
+                f"{files[0]} has {listed(lost)}, which {path} has not, and {path} has {listed(own)} of its own; say "
+                f"which are the same, as in --column {lost[0]}={own[0]}, or which to use, with --inputs and --outputs."
+            )
+        for extra, there, lacks in ((lost, files[0], path), (own, path, files[0])):
+            if extra:
+                yield f"note: {listed(extra)} of {there} is left out, for {lacks} has no such column"
+
+
+def _cause(options: DiagnoseOptions, shared: Sequence[str]) -> tuple[str, ...]:
+    """Return the one of two columns that the other follows from: a linear model fits from cause to effect only."""
+    from ..diagnose import surrogate
+
+    assert options.simulated is not None
+    errors = {}
+    for name, other in (shared, shared[::-1]):
+        try:
+            recording = options.read(options.simulated, (name,), (other,), only_these=True)
+            errors[name] = surrogate(recording, nx=4)[1]
+        except InputError:
+            errors[name] = np.inf
+    best = min(shared, key=lambda n: errors[n])
+    return (best,) if errors[best] < 0.3 * max(errors.values()) else ()
+
+
+def _same_samples(options: DiagnoseOptions, name: str) -> bool:
+    """Whether the simulation has the samples of one of the recordings."""
+    first, *others = (options.read(f, (name,), (), only_these=True).u for f in options.recordings)
+    return any(len(o) == len(first) and bool(np.allclose(o, first, rtol=1e-6, atol=0.0)) for o in others)

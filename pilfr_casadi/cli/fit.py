@@ -1,0 +1,267 @@
+"""`pilfr fit`: identify a model from recordings, write it with a report."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import typer
+
+from .._base import Clock, InputError, Progress, deferred_interrupt, listed, progress_bar, time_limit, worker_pool
+from ..data import NOTHING_SENTENCE, Recording, check_for_identification, explains_nothing
+from ..engine import VirtualMachine, compiler, make_engine
+from ..identify import Fit, fit, load
+from ..linear import select_order
+from ..models import ANY, PILFR, TAKES, Lagged, named_structure
+from ..optimise import GaussNewton, Ipopt, Status
+from ..studies import LARGEST_SIZE
+from ._common import (
+    DONE,
+    INTERRUPTED,
+    NO_RESULT,
+    TESTS,
+    WORKERS,
+    DataOptions,
+    check_given_once,
+    check_names,
+    describe,
+    make_folder,
+    name_list,
+    new_file,
+    number,
+    numbers_of,
+    option,
+    pairs,
+    say,
+    seconds,
+    takes_options,
+    whole,
+)
+
+# options of a search, which a saved model to start from has already
+SEARCH = ("nx", "operators", "operator", "channels", "structure", "hidden", "lags", "bound", "fix", "starts", "seed")
+STRUCTURE_NAMES = {"bound": "bounds"}  # options that the structures call otherwise
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions(DataOptions):
+    """The options of `pilfr fit`; those of a search have no default, to see which ones were given."""
+
+    train: Annotated[list[str], typer.Argument(help="Training recordings (.csv, .mat, .npz).", metavar="TRAIN")]
+    inputs: Annotated[str, option("Names of the inputs.", metavar="NAME[,NAME]")]
+    outputs: Annotated[str, option("Names of the outputs.", metavar="NAME[,NAME]")]
+    test: Annotated[list[str], TESTS] = field(default_factory=list)
+    nx: Annotated[
+        int | None,
+        whole(0, LARGEST_SIZE["nx"], "States of the linear part (default: chosen on the training data)."),
+    ] = None
+    operators: Annotated[
+        int | None,
+        whole(
+            0,
+            LARGEST_SIZE["operators"],
+            "Hysteresis operators a channel (default: 20); 0 for a linear model.",
+        ),
+    ] = None
+    operator: Annotated[
+        Literal["play", "stop", "generalized_play"] | None, option("Kind of operator (default: play).")
+    ] = None
+    channels: Annotated[int | None, whole(1, LARGEST_SIZE["channels"], "Channels of the element (default: 1).")] = None
+    structure: Annotated[
+        Literal["lfr", "hammerstein", "wiener", "ssnn", "network_lfr", "narx", "noe"] | None,
+        option("Where the element sits (default: lfr), or a network to compare with."),
+    ] = None
+    hidden: Annotated[
+        int | None,
+        whole(1, LARGEST_SIZE["hidden"], "Neurons of a network (default: 15; 10 of narx and noe)."),
+    ] = None
+    lags: Annotated[int | None, whole(1, LARGEST_SIZE["lags"], "Past outputs and inputs of narx and noe.")] = None
+    bound: Annotated[list[str], option("Bounds of a parameter (repeatable).", metavar="NAME=LOW:HIGH")] = field(
+        default_factory=list
+    )
+    fix: Annotated[list[str], option("Hold a block of parameters at a value (repeatable).", metavar="NAME=VALUE")] = (
+        field(default_factory=list)
+    )
+    starts: Annotated[int | None, whole(1, LARGEST_SIZE["starts"], "Random starts (default: 8).")] = None
+    seed: Annotated[int | None, whole(0, LARGEST_SIZE["seed"], "Seed of all starts (default: 0).")] = None
+    start_from: Annotated[
+        str | None, option("Start from a saved model instead of searching.", "--from", metavar="MODEL.json")
+    ] = None
+    solver: Annotated[
+        Literal["gauss-newton", "ipopt"], option("Solver of the final problem (default: gauss-newton).")
+    ] = "gauss-newton"
+    workers: Annotated[int, WORKERS] = 1
+    engine: Annotated[
+        Literal["auto", "c", "vm"],
+        option("Generated C or CasADi's virtual machine (default: C where there is a compiler)."),
+    ] = "auto"
+    time_limit: Annotated[float | None, seconds("Stop then and keep the best so far (default: no limit).")] = None
+    out: Annotated[str, option("Folder for model.json and report.html (default: fit).", metavar="DIR")] = "fit"
+    overwrite: Annotated[bool, option("Replace a model that is in that folder already.", "--overwrite")] = False
+
+    @property
+    def search(self) -> list[str]:
+        """The options of a search that were given."""
+        return [name for name in SEARCH if getattr(self, name) not in (None, [])]
+
+
+@takes_options
+def fit_command(options: FitOptions) -> int:
+    """The model goes to DIR/model.json, the report to DIR/report.html."""
+    target = _check(options)
+    inputs, outputs = name_list(options.inputs, "--inputs"), name_list(options.outputs, "--outputs")
+    saved = load(options.start_from) if options.start_from else None
+    if saved is not None:
+        check_names(saved, inputs, outputs)
+    train = [options.read(path, inputs, outputs) for path in options.train]
+    tests = [options.read(path, inputs, outputs) for path in options.test]
+    make_folder(options.out)
+    for kind, paths, recordings in (("training", options.train, train), ("test", options.test, tests)):
+        for path, recording in zip(paths, recordings, strict=True):
+            print(describe(kind, path, recording), flush=True)
+    clock = Clock()
+    try:
+        with time_limit(options.time_limit, clock), progress_bar() as progress:
+            task, result = _identify(options, saved, train, progress)
+    except KeyboardInterrupt:
+        if clock.expired:
+            return say(f"No model was ready within --time-limit {options.time_limit:g}; give more time.", NO_RESULT)
+        raise
+    if result.status is Status.INTERRUPTED and clock.expired:
+        result = replace(result, solution=replace(result.solution, status=Status.TIME_LIMIT))
+    try:
+        _write(result, task, train, tests, target)
+    except KeyboardInterrupt:
+        return say(f"Interrupted; the model is in {target}, a report was not written.", INTERRUPTED)
+    if result.status is Status.INTERRUPTED:
+        return INTERRUPTED
+    if result.status is Status.INFEASIBLE:
+        missed = "; ".join(str(limit) for limit in result.limits if not limit.met)
+        return say(f"The model does not meet its constraints: {missed}.", NO_RESULT)
+    return say(NOTHING_SENTENCE, NO_RESULT) if explains_nothing(result.train_nrmse) else DONE
+
+
+def _check(options: FitOptions) -> Path:
+    """Refuse options that do not go together; return the file that is to be written."""
+    if options.start_from and options.search:
+        raise InputError(
+            f"{listed([f'--{name}' for name in options.search])} was given together with --from, whose model has its "
+            "structure and start already; leave one of them out."
+        )
+    check_given_once([*options.train, *options.test])
+    structure = options.structure or "lfr"
+    for name in options.search:
+        own = STRUCTURE_NAMES.get(name, name)
+        if own in ANY and own not in TAKES[structure]:
+            raise InputError(f"--{name} is not for --structure {structure}; leave it out.")
+    if "lags" in TAKES[structure] and options.lags is None:
+        raise InputError(f"--structure {structure} needs --lags, the number of past outputs; give it.")
+    return new_file(options.out, "model.json", options.overwrite)
+
+
+def _identify(
+    options: FitOptions, saved: Fit | None, train: list[Recording], progress: Progress
+) -> tuple[Fit | PILFR | Lagged, Fit]:
+    """Return what was to be fitted, and the fit."""
+    solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
+    with worker_pool(options.workers) as pool:
+        task = saved if saved is not None else _structure(options, train, progress)
+        if isinstance(task, Lagged):  # too many lags are refused before they are built
+            check_for_identification(train, task.unknowns(train[0].n_u, train[0].n_y) + 2)
+        progress("building the engine", 0, 0, np.nan)
+        engine = announced_engine(task, train[0], options.engine)
+        search: dict[str, Any] = {}
+        if saved is None:
+            search = {
+                "starts": 8 if options.starts is None else options.starts,
+                "seed": options.seed or 0,
+                "executor": pool,
+            }
+        result = fit(task, train, solver=solver, engine=engine, progress=progress, **search)
+    return task, replace(result, engine=engine)
+
+
+def _structure(options: FitOptions, train: Sequence[Recording], progress: Progress) -> PILFR | Lagged:
+    structure = options.structure or "lfr"
+    given: dict[str, Any] = {k: getattr(options, k) for k in ("operators", "operator", "channels", "hidden", "lags")}
+    if "nx" in TAKES[structure]:
+        nx, how = options.nx, "as given"
+        if nx is None:
+            progress("choosing the order", 0, 0, np.nan)
+            nx, how = int(select_order(train, range(1, 9), offset=True).recommended), "chosen on the training data"
+        print(f"order: {nx}, {how}", flush=True)
+        given |= {"nx": nx, "bounds": _bounds(options.bound), "fix": numbers_of(options.fix, "--fix")}
+    return named_structure(structure, **{k: v for k, v in given.items() if v is not None})
+
+
+def _bounds(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Split each `NAME=LOW:HIGH`; an end that is left out is infinite."""
+    out = {}
+    for name, value in pairs(texts, "--bound").items():
+        low, sign, high = value.partition(":")
+        given = f"--bound {name}={value}"
+        if not sign:
+            raise InputError(f"{given} was given; write --bound NAME=LOW:HIGH.")
+        ends = number(low, given) if low else -np.inf, number(high, given) if high else np.inf
+        if not ends[0] <= ends[1]:
+            raise InputError(
+                f"The bounds {value} of {name} are infeasible: the lower one exceeds the upper one; swap them."
+            )
+        out[name] = ends
+    return out
+
+
+def announced_engine(task: PILFR | Lagged | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
+    """Build the engine once, say which one it is and why; return the choice that gives it without a warning."""
+    if choice == "vm":
+        if not quiet:
+            print("engine: CasADi's virtual machine, as given", flush=True)
+        return choice
+    model = task.model if isinstance(task, Fit) else task.model(recording.n_u, recording.n_y)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        engine = make_engine(model, choice)
+    if not isinstance(engine, VirtualMachine):
+        if not quiet:
+            print("engine: generated C, compiled", flush=True)
+        return choice
+    found = [str(w.message) for w in caught if issubclass(w.category, RuntimeWarning)]
+    reason = "no C compiler was found" if compiler() is None else "it could not be built"
+    if found:
+        reason = found[-1].rpartition(";")[0] or found[-1]
+    print(f"engine: CasADi's virtual machine, which is slower: {' '.join(reason.split())}", flush=True)
+    return "vm"
+
+
+def _write(
+    result: Fit, task: Fit | PILFR | Lagged, train: list[Recording], tests: list[Recording], target: Path
+) -> None:
+    """Write the model and the report, and print the errors."""
+    with deferred_interrupt():
+        result.save(target)
+        from ..report import fit_report
+    print(result)
+    if isinstance(task, PILFR) and task.element is not None and result.structure != task:
+        print("No start was finished: this is the linear model that the starts begin with.")
+    for recording in tests:
+        print(_test_line(result, recording))
+    with progress_bar() as progress:
+        progress("writing the report", 0, 0, np.nan)
+        page = fit_report(result, train, tests, target.parent)
+    print(f"model: {target}\nreport: {page}")
+
+
+def _test_line(result: Fit, recording: Recording) -> str:
+    try:
+        error, first = result.nrmse(recording), result.scored_from(recording)
+    except InputError as reason:
+        return f"no NRMSE on {recording.name}: {reason}"
+    left = (result.simulate(recording) - recording.y)[first:]
+    share = 100 * np.sqrt(np.mean(left**2, axis=0)) / np.ptp(recording.y[first:], axis=0)
+    text = f"NRMSE on {recording.name}: {error:.4f} (rms error {', '.join(f'{s:.2f}' for s in share)} % of the range)"
+    fitted = first > recording.skip
+    return text + (f"; its initial state is fitted to the first {first} samples, not scored" if fitted else "")

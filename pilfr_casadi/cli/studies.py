@@ -1,0 +1,176 @@
+"""`pilfr run` and `pilfr campaign`: execute a run file, and print what its jobs amount to."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .._base import InputError, progress_bar, worker_pool
+from ..data import NOTHING_SENTENCE, explains_nothing
+from ..studies import (
+    AHEAD,
+    LARGEST_SIZE,
+    MODEL,
+    PAGE,
+    PICTURE,
+    ROLES,
+    SUMMARY,
+    TABLE,
+    NoModel,
+    Run,
+    RunInterrupted,
+    RunResult,
+    campaign,
+    check_own,
+    dask_executor,
+    grid_keys,
+    read_run,
+    reasons,
+    run,
+    seeds_advice,
+)
+from ._common import DONE, INTERRUPTED, NO_RESULT, make_folder, option, say, seconds, takes_options, whole
+
+LINE_WIDTH = 10_000  # characters: tables are never folded or cut off, since a number that is cut off is a wrong number
+EVERY_KEY = Path(__file__).parent / "demo_data" / "every_key.toml"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """The options of `pilfr run`."""
+
+    run_file: Annotated[str, typer.Argument(metavar="RUN.toml", help="What to do (.toml, or .py that sets `run`).")]
+    out: Annotated[
+        str | None, option("Folder of the results (default: as the file says, else RUN-run).", metavar="DIR")
+    ] = None
+    workers: Annotated[
+        int | None,
+        whole(1, LARGEST_SIZE["workers"], "Processes; the numbers do not depend on it (default: as the file says)."),
+    ] = None
+    overwrite: Annotated[bool, option("Compute everything again, whatever is in the folder.", "--overwrite")] = False
+
+    def read(self, kind: str) -> Run:
+        """Read the run file; folder and workers of the command line go before those of the file."""
+        given = read_run(self.run_file, kind)
+        if self.out is not None:
+            check_own(Path(self.out), given.file, self.overwrite)
+            given = replace(given, out=make_folder(self.out))
+        return given if self.workers is None else replace(given, workers=self.workers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampaignOptions(RunOptions):
+    """The options of `pilfr campaign`."""
+
+    dask: Annotated[str | None, option("Run the jobs on the Dask cluster of this scheduler.", metavar="ADDRESS")] = None
+    time_limit: Annotated[
+        float | None, seconds("End a job after this time (default: as the file says, else no limit).")
+    ] = None
+
+
+@takes_options
+def run_command(options: RunOptions) -> int:
+    """Jobs are done one after the other, the starts of each side by side."""
+    given = options.read("run")
+    count = len(given.seeds) * len(given.cells)
+    print(f"run: {given.file}, {count} job{'s' * (count > 1)}, results in {given.out}", flush=True)
+
+    def execute() -> RunResult:
+        with worker_pool(given.workers) as pool, progress_bar() as progress:
+            return run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=_print_line)
+
+    return _report(given, execute, TABLE, MODEL)
+
+
+@takes_options
+def campaign_command(options: CampaignOptions) -> int:
+    """Jobs are done side by side; one that fails, hangs or dies does not stop the others."""
+    if options.dask and options.workers is not None:
+        raise InputError("--workers and --dask were given; the cluster has its own workers, so leave one of them out.")
+    given = options.read("campaign")
+    if options.time_limit is not None:
+        given = replace(given, time_limit=options.time_limit)
+
+    def execute() -> RunResult:
+        with contextlib.ExitStack() as stack:
+            executor, workers, ahead = None, given.workers, AHEAD
+            if options.dask:
+                executor, workers, ahead = stack.enter_context(dask_executor(options.dask))
+            folds = f" x {given.folds} folds" if given.folds else ""
+            size = f"{len(given.cells)} cells x {len(given.seeds)} seeds{folds}"
+            print(f"campaign: {given.file}, {size}, {workers} workers, results in {given.out}", flush=True)
+            progress = stack.enter_context(progress_bar())
+            result = campaign(
+                given,
+                overwrite=options.overwrite,
+                executor=executor,
+                ahead=ahead,
+                progress=progress,
+                tell=_print_line,
+            )
+        _print_summary(result)
+        return result
+
+    return _report(given, execute, TABLE, SUMMARY, PICTURE, MODEL)
+
+
+def _report(given: Run, execute: Callable[[], RunResult], *files: str) -> int:
+    """Execute a run; print the errors of the model chosen and where everything is; return the exit status."""
+    try:
+        result = execute()
+    except RunInterrupted as stop:
+        return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
+    except KeyboardInterrupt:
+        return say("Interrupted; what is done stays, the same command goes on from there.", INTERRUPTED)
+    except NoModel as missed:
+        return say(str(missed), NO_RESULT)
+    for role in ROLES:
+        for s in result.scores:
+            if s.role == role and s.job == result.chosen:
+                print(f"NRMSE on {s.recording} ({role}): {s.nrmse:.4f}")
+    failed = f", {len(result.failed)} of them without a model" if result.failed else ""
+    print(f"chosen: {result.chosen}; {len(result.done)} jobs done now, {len(result.skipped)} before{failed}")
+    if result.note:
+        print(result.note)
+    for line in reasons(result.manifest["jobs"], result.failed):
+        print(f"without a model: {line}")
+    for cell in given.cells if len(given.seeds) > 1 else ():
+        advice = seeds_advice(cell)
+        if advice:
+            print(f"{cell.name or 'the model'}: {advice}")
+    for name in (*files, *([PAGE] if given.report else []), "manifest.json"):
+        print(result.folder / name)
+    return say(NOTHING_SENTENCE, NO_RESULT) if explains_nothing(result.fit.train_nrmse) else DONE
+
+
+def _print_summary(result: RunResult) -> None:
+    """Print the quartiles of every cell, and the structure that is recommended."""
+    from rich.console import Console
+    from rich.table import Table
+
+    keys = grid_keys(s.cell for s in result.summary)
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for name in ("recording", *keys, "jobs", "failed", "25 %", "median", "75 %", "s a job"):
+        table.add_column(name, justify="left" if name == "recording" else "right", no_wrap=True)
+    for s in result.summary:
+        quartiles = [f"{q:.4f}" for q in s.quartiles[1:4]]
+        cell = [str(s.cell.get(k, "-")) for k in keys]
+        counts = [str(s.jobs), f"{100 * s.failure_rate:.0f} %"]
+        table.add_row(f"{s.recording} ({s.role})", *cell, *counts, *quartiles, f"{s.seconds:.1f}")
+    Console(highlight=False, width=LINE_WIDTH).print(table)
+    if result.selection is not None:
+        print(result.selection)
+
+
+def _print_line(line: str) -> None:
+    print(line, flush=True)
+
+
+# shown at the end of the help of both commands
+for command in (run_command, campaign_command):
+    command.__doc__ = f"{command.__doc__}\n\nEvery key of a run file, in one that runs: {EVERY_KEY}"
