@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from test_cli import write_csv
+from command_line import write_csv
 
 import pilfr_casadi as pilfr
 

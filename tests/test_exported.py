@@ -12,8 +12,8 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from command_line import refused, run
 from scipy.integrate import solve_ivp
-from test_cli import refused, run
 from test_export import one_sentence, own_model, recording_for, signed, some_fit
 from test_exported_models import lfr, mass_on_spring, wave
 

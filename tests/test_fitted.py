@@ -281,13 +281,13 @@ def test_constraints_are_found_by_name(record, truth):
 
 
 def test_the_command_line_says_what_is_not_scored(of_record):
-    from pilfr_casadi.cli.commands import _tested
+    from pilfr_casadi.cli.fit import _test_line
 
     u, y = simulated(6, 400, X0)
-    line = _tested(of_record, Recording(u, y, 0.01, name="test"))
+    line = _test_line(of_record, Recording(u, y, 0.01, name="test"))
     assert line.startswith(f"NRMSE on test: {of_record.nrmse(Recording(u, y, 0.01)):.4f}")
     assert line.endswith("its initial state is fitted to the first 60 samples, not scored")
-    assert "not scored" not in _tested(of_record, Recording(u, y, 0.01, initial="zero"))
-    assert _tested(of_record, Recording(u[:50], y[:50], 0.01, name="short")).startswith(
+    assert "not scored" not in _test_line(of_record, Recording(u, y, 0.01, initial="zero"))
+    assert _test_line(of_record, Recording(u[:50], y[:50], 0.01, name="short")).startswith(
         "no NRMSE on short: The recording"
     )

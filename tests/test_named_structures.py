@@ -3,8 +3,8 @@
 import csv
 
 import pytest
+from command_line import fit_arguments, refused, run, write_csv
 from run_files import DATA
-from test_cli import fit_arguments, refused, run, write_csv
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError

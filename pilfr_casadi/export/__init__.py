@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .digests import digest as digest
+    from .digests import digest as digest, ordered_digest as ordered_digest
     from .exported_model import NAMES as NAMES, Exported as Exported
     from .files import made as made, write_atomically as write_atomically
     from .functions import FittedModel as FittedModel, exported as exported, to_casadi as to_casadi

@@ -6,15 +6,14 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 
 import pytest
-from pilfr_casadi.cli.run_command import _alike
+from command_line import refused
 from run_files import changed, prepared
-from test_cli import refused
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError, worker_process as hand
 from pilfr_casadi.cli.app import main
 from pilfr_casadi.models import named_structure
-from pilfr_casadi.studies import Cell, cluster, reasons, side_by_side
+from pilfr_casadi.studies import Cell, cluster, reasons, seeds_advice, side_by_side
 from pilfr_casadi.studies.manifest import Manifest
 
 
@@ -122,5 +121,5 @@ def test_reasons_are_grouped():
 def test_seeds_are_advised_on_only_where_it_is_true(structure, starts, says):
     own = {"hidden": 2} if structure == "ssnn" else {"operators": 3}
     cell = Cell({}, named_structure(structure, nx=1, **own), {"start": "grid", "starts": starts})
-    assert _alike(cell).endswith(says) and bool(_alike(cell)) == bool(says)
-    assert _alike(Cell({}, cell.model, {"start": "plain", "starts": starts})) == ""
+    assert seeds_advice(cell).endswith(says) and bool(seeds_advice(cell)) == bool(says)
+    assert seeds_advice(Cell({}, cell.model, {"start": "plain", "starts": starts})) == ""

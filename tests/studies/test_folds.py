@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from command_line import refused, write_csv
 from run_files import changed, prepared
-from test_cli import refused, write_csv
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError

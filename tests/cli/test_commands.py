@@ -1,33 +1,24 @@
 """The command line: whole runs on small recordings; bad input gets one plain sentence and exit status 2."""
 
+import contextlib
 import json
 import os
+import shutil
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
-from test_export import signed
+from command_line import fit_arguments, refused, run, write_csv
 
-from pilfr_casadi.cli.app import in_options, main
-
-
-def write_csv(path, seed=0, m=600, **columns):
-    """A recording of a play behind a first-order lag, with columns replaced or added."""
-    rng = np.random.default_rng(seed)
-    u = np.cumsum(rng.standard_normal(m))
-    u -= np.linspace(u[0], u[-1], m)
-    q, x, y = 0.0, 0.0, []
-    for value in u:
-        q = max(value - 1.0, min(value + 1.0, q))
-        y.append(x + 0.3 * q)
-        x = 0.8 * x + 0.2 * q
-    data = {"t": np.arange(m) * 0.01, "u": u, "y": np.array(y) + 1e-3 * rng.standard_normal(m), **columns}
-    rows = zip(*data.values(), strict=True)
-    path.write_text(",".join(data) + "\n" + "\n".join(",".join(map(str, row)) for row in rows) + "\n")
-    return path
+import pilfr_casadi as pilfr
+from pilfr_casadi.cli import main
+from pilfr_casadi.cli.app import in_options
+from pilfr_casadi.export import ordered_digest
 
 
 @pytest.fixture
@@ -35,38 +26,30 @@ def train(tmp_path):
     return write_csv(tmp_path / "train.csv")
 
 
-def run(capsys, *arguments):
-    """Exit status, stdout and stderr of a command run in this process."""
-    try:
-        status = main([str(a) for a in arguments])
-    except SystemExit as stop:
-        status = stop.code
-    out = capsys.readouterr()
-    return status, out.out, out.err
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A folder with recordings, the model of `pilfr fit` in out/, and its words in said.txt."""
+    folder = tmp_path_factory.mktemp("fitted")
+    train, test = write_csv(folder / "train.csv"), write_csv(folder / "test.csv", seed=1)
+    with (folder / "said.txt").open("w") as said, contextlib.redirect_stdout(said):
+        assert main([str(a) for a in fit_arguments(train, folder, "--test", test)]) == 0
+    return folder
 
 
-def fit_arguments(train, tmp_path, *more):
-    names = ("--inputs", "u", "--outputs", "y", "--initial", "zero")
-    return ("fit", train, *names, "--nx", 1, "--operators", 3, "--starts", 2, "--out", tmp_path / "out", *more)
+@pytest.fixture
+def model(fitted, tmp_path):
+    """A copy of the model that a test may change."""
+    return Path(shutil.copy(fitted / "out" / "model.json", tmp_path / "model.json"))
 
 
-def refused(capsys, *arguments, says):
-    """Assert the contract on bad input: status 2, one sentence on stderr that says it, no traceback."""
-    status, _, err = run(capsys, *arguments)
-    assert status == 2
-    assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err
-    for word in says if isinstance(says, tuple) else (says,):
-        assert word in err, err
-
-
-def test_fit_simulate_and_export_run_end_to_end(capsys, tmp_path, train):
-    test = write_csv(tmp_path / "test.csv", seed=1)
-    status, out, _ = run(capsys, *fit_arguments(train, tmp_path, "--test", test))
-    assert status == 0
+def test_fit_simulate_and_export_run_end_to_end(capsys, tmp_path, fitted):
+    out, test = (fitted / "said.txt").read_text(), fitted / "test.csv"
     assert "Converged" in out and "NRMSE on test" in out
-    model = tmp_path / "out" / "model.json"
+    assert f"training data: {fitted / 'train.csv'}, 600 samples, step 0.01 s, inputs u, outputs y\n" in out
+    assert "order: 1, as given" in out
+    model = fitted / "out" / "model.json"
     assert json.loads(model.read_text())["format"]
-    assert "<html" in (tmp_path / "out" / "report.html").read_text().lower()
+    assert "<html" in (fitted / "out" / "report.html").read_text().lower()
     simulated = tmp_path / "sim.csv"
     status, out, _ = run(capsys, "simulate", model, test, "--initial", "zero", "--out", simulated)
     assert status == 0
@@ -78,15 +61,11 @@ def test_fit_simulate_and_export_run_end_to_end(capsys, tmp_path, train):
     assert nrmse < 0.05
     status, _, _ = run(capsys, "export", model, "--out", tmp_path / "model.casadi")
     assert status == 0
-    import casadi as ca
-
     f = ca.Function.load(str(tmp_path / "model.casadi"))
     assert f.name_in() == ["x", "u"] and f.name_out() == ["x_next", "y"]
 
 
-def test_a_saved_model_can_be_fitted_further(capsys, tmp_path, train):
-    assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
-    model = tmp_path / "out" / "model.json"
+def test_a_saved_model_can_be_fitted_further(capsys, tmp_path, train, model):
     names = ("--inputs", "u", "--outputs", "y", "--initial", "zero")
     further = ("fit", train, *names, "--from", model, "--out", tmp_path / "further")
     status, out, _ = run(capsys, *further)
@@ -145,11 +124,19 @@ def test_too_few_samples_for_the_order(capsys, tmp_path):
         (("--bound", "nothing=0:1"), "nothing"),
         (("--fix", "D_yu=a"), "not a number"),
         (("--fix", "Q=0"), "'Q'"),
-        (("--nx", "-1"), "states"),
+        (("--nx", "-1"), "--nx -1 was given; give a whole number from 0 to 1000"),
         (("--operators", "-2"), "--operators"),
         (("--starts", "0"), "starts"),
         (("--seed", "-1"), "--seed"),
         (("--channels", "0"), "--channels"),
+        (("--operators", "999999999"), "--operators 999999999 was given; give a whole number from 0 to 10000"),
+        (("--channels", "99999999"), "--channels 99999999 was given; give a whole number from 1 to 100"),
+        (("--starts", "9" * 40), "--starts"),
+        (("--seed", "9" * 40), "--seed"),
+        (("--workers", "9" * 9), "--workers"),
+        (("--skip", "9" * 40), "--skip"),
+        (("--period", "9" * 5000), "--period"),
+        (("--period", "20"), "--period 20 was given without --initial periodic"),
         (("--fix", "D_yu=0", "--fix", "D_yu=1"), "twice"),
         (("--time-limit", "0"), "--time-limit"),
         (("--period", "1"), "--period 1"),
@@ -168,10 +155,9 @@ def test_a_test_on_training_data_is_refused(capsys, tmp_path, train):
     refused(capsys, *fit_arguments(train, tmp_path, "--test", train), says="twice")
 
 
-def test_a_recording_is_never_overwritten(capsys, tmp_path, train):
-    assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
+def test_a_recording_is_never_overwritten(capsys, train, model):
     before = train.read_text()
-    refused(capsys, "simulate", tmp_path / "out" / "model.json", train, "--out", train, says="overwrite")
+    refused(capsys, "simulate", model, train, "--out", train, says="overwrite")
     assert train.read_text() == before
 
 
@@ -181,9 +167,8 @@ def test_a_folder_that_cannot_be_written(capsys, tmp_path, train):
     assert (tmp_path / "file").read_text() == "kept"
 
 
-def test_unusable_model_files_are_refused_and_left_alone(capsys, tmp_path, train):
-    assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
-    good = (tmp_path / "out" / "model.json").read_text()
+def test_unusable_model_files_are_refused_and_left_alone(capsys, tmp_path, train, model):
+    good = model.read_text()
     for name, text in {
         "half": good[: len(good) // 2],
         "empty": "",
@@ -197,13 +182,12 @@ def test_unusable_model_files_are_refused_and_left_alone(capsys, tmp_path, train
     refused(capsys, "simulate", tmp_path / "nowhere.json", train, "--out", tmp_path / "sim.csv", says="nowhere.json")
 
 
-def test_an_unstable_start_is_refused(capsys, tmp_path, train):
-    assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
-    path = tmp_path / "out" / "model.json"
-    document = json.loads(path.read_text())
+def test_an_unstable_start_is_refused(capsys, tmp_path, train, model):
+    document = json.loads(model.read_text())
+    del document["sha256"]
     document["parameters"]["A"]["value"] = [[1e6]]
     wild = tmp_path / "wild.json"
-    wild.write_text(json.dumps(signed(document)))
+    wild.write_text(json.dumps({**document, "sha256": ordered_digest(document)}))
     names = ("--inputs", "u", "--outputs", "y", "--initial", "zero")
     refused(capsys, "fit", train, *names, "--from", wild, "--out", tmp_path / "wild", says="diverges")
 
@@ -242,59 +226,76 @@ def test_keywords_become_options(python, options):
     assert in_options(python) == options
 
 
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (("fitt",), "No such command 'fitt'; did you mean 'fit'?"),
+        (("campain", "rig.toml"), "did you mean 'campaign'?"),
+        (("nonsense",), "No such command 'nonsense'; see pilfr --help."),
+        ((), "Missing command; see pilfr --help."),
+        (("fit",), "Missing argument 'TRAIN'; see pilfr fit --help."),
+        (("fit", "a.csv", "--inputs", "u", "--outputs", "y", "--strats", "3"), "--starts"),
+        (("fit", "a.csv", "--inputs", "u", "--outputs", "y", "--hold", "often"), "'zero', 'linear'"),
+        (("export", "model.json", "--out", "c", "--c", "--casadi"), "--casadi and --c were given"),
+    ],
+)
+def test_misspelt_commands_and_options_get_a_suggestion(capsys, given, says):
+    refused(capsys, *given, says=says)
+
+
+def test_version_and_help(capsys):
+    assert run(capsys, "--version") == (0, f"pilfr {pilfr.__version__}\n", "")
+    status, out, err = run(capsys, "--help")
+    assert status == 0 and err == ""
+    for name in ("fit", "diagnose", "simulate", "export", "run", "campaign", "demo"):
+        assert f"\n  {name} " in out
+        assert run(capsys, name, "--help")[0] == 0
+
+
 def test_options_are_not_abbreviated(capsys, tmp_path, train):
     status, _, err = run(capsys, *fit_arguments(train, tmp_path)[:-2], "--start", "3")
-    assert status == 2 and "unrecognized arguments: --start" in err
+    assert status == 2 and "No such option: --start" in err
 
 
 def test_a_model_is_overwritten_only_when_asked(capsys, tmp_path, train):
-    assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
     model = tmp_path / "out" / "model.json"
-    before = model.read_text()
-    refused(capsys, *fit_arguments(train, tmp_path, "--seed", 1), says=("model.json exists", "--overwrite"))
-    assert model.read_text() == before
-    assert run(capsys, *fit_arguments(train, tmp_path, "--seed", 1, "--overwrite"))[0] == 0
-    assert model.read_text() != before
+    model.parent.mkdir()
+    model.write_text("mine")
+    linear = fit_arguments(train, tmp_path, "--operators", 0)
+    refused(capsys, *linear, says=("model.json exists", "--overwrite"))
+    assert model.read_text() == "mine"
+    assert run(capsys, *linear, "--overwrite")[0] == 0
+    assert json.loads(model.read_text())["format"]
 
 
 def test_fit_says_what_it_works_with(capsys, tmp_path, train, monkeypatch):
-    status, out, _ = run(capsys, *fit_arguments(train, tmp_path))
-    assert status == 0
-    assert f"training data: {train}, 600 samples, step 0.01 s, inputs u, outputs y\n" in out
-    assert "order: 1, as given" in out
-    arguments = list(fit_arguments(train, tmp_path, "--overwrite", "--operators", 0))
+    arguments = list(fit_arguments(train, tmp_path, "--operators", 0))
     del arguments[arguments.index("--nx") : arguments.index("--nx") + 2]
     monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: None)
-    monkeypatch.setattr("pilfr_casadi.cli.commands.compiler", lambda: None)
+    monkeypatch.setattr("pilfr_casadi.cli.fit.compiler", lambda: None)
     status, out, err = run(capsys, *arguments)
-    assert status == 0 and err == ""
+    assert status == 0 and "warning" not in err
     assert ", chosen on the training data\n" in out
     assert "engine: CasADi's virtual machine, which is slower: no C compiler was found\n" in out
 
 
 def test_a_compiler_that_fails_is_named(capsys, tmp_path, train, monkeypatch):
     monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: "/bin/false")
-    status, out, err = run(capsys, *fit_arguments(train, tmp_path, "--operators", 2))
-    assert status == 0 and err == ""
+    status, out, err = run(capsys, *fit_arguments(train, tmp_path, "--operators", 0))
+    assert status == 0 and "warning" not in err
     assert out.count("virtual machine") == 1 and "/bin/false could not build the model" in out
 
 
 def test_a_time_limit_keeps_the_best_so_far(capsys, tmp_path):
-    path = write_csv(tmp_path / "train.csv", m=20000)
-    names = ("--inputs", "u", "--outputs", "y", "--nx", 4, "--operators", 20, "--starts", 2000)
+    path = write_csv(tmp_path / "train.csv", m=2000)
+    names = ("--inputs", "u", "--outputs", "y", "--nx", 3, "--operators", 20, "--starts", 2000)
     began = time.monotonic()
-    status, out, _ = run(capsys, "fit", path, *names, "--time-limit", 6, "--out", tmp_path / "out")
+    status, out, _ = run(capsys, "fit", path, *names, "--time-limit", 3, "--out", tmp_path / "out")
     assert time.monotonic() - began < 40
     assert status == 0 and "the time limit was reached" in out
     assert json.loads((tmp_path / "out" / "model.json").read_text())["parameters"]["A"]
     status, _, err = run(capsys, "fit", path, *names, "--time-limit", 1e-3, "--out", tmp_path / "none")
     assert status == 1 and "--time-limit 0.001" in err and not (tmp_path / "none" / "model.json").exists()
-
-
-@pytest.fixture
-def model(capsys, tmp_path, train):
-    assert run(capsys, *fit_arguments(train, tmp_path))[0] == 0
-    return tmp_path / "out" / "model.json"
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".mat"])
@@ -363,44 +364,31 @@ def test_the_piezo_problem_names_its_remedy(capsys, tmp_path, monkeypatch):
 
 
 def test_an_interrupted_run_writes_the_best_so_far(tmp_path):
-    path = write_csv(tmp_path / "train.csv", m=20000)
-    command = [sys.executable, "-c", "import sys; from pilfr_casadi.cli import main; sys.exit(main(sys.argv[1:]))"]
-    command += [
-        "fit",
-        str(path),
-        "--inputs",
-        "u",
-        "--outputs",
-        "y",
-        "--nx",
-        "4",
-        "--operators",
-        "20",
-        "--starts",
-        "500",
-    ]
+    path = write_csv(tmp_path / "train.csv", m=2000)
+    program = "import sys; from pilfr_casadi.cli import main; sys.exit(main(sys.argv[1:]))"
+    names = ("--inputs", "u", "--outputs", "y", "--nx", "3", "--operators", "20", "--starts", "2000")
     process = subprocess.Popen(
-        [*command, "--out", str(tmp_path / "out")],
+        [sys.executable, "-c", program, "fit", str(path), *names, "--out", str(tmp_path / "out")],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
         text=True,
     )
     try:
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(timeout=12)
-        process.send_signal(2)
+        assert any(line.startswith("engine:") for line in process.stdout)
+        time.sleep(3)
+        process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=60)
     finally:
         process.kill()
     assert process.returncode == 130
     assert "interrupted" in out
-    assert json.loads(Path(tmp_path / "out" / "model.json").read_text())["parameters"]["A"]
+    assert json.loads((tmp_path / "out" / "model.json").read_text())["parameters"]["A"]
 
 
 def test_a_model_that_misses_its_constraints_is_no_usable_result(capsys, tmp_path):
     """What contradicts itself is bad input (2), what no solver could meet no usable result (1), as in a run."""
-    write_csv(tmp_path / "train.csv", seed=0, m=400)
-    data = fit_arguments(tmp_path / "train.csv", tmp_path)
+    write_csv(tmp_path / "train.csv", seed=0, m=200)
+    data = fit_arguments(tmp_path / "train.csv", tmp_path, "--operators", 2, "--starts", 1)
     says = ("'spectral radius <= 1' is infeasible", "gives 2, limits 0 and 1")
     refused(capsys, *data, "--fix", "A=2", says=says)
     refused(capsys, *data, "--bound", "A=1.01:2", says=("bounds of A, 1.01 to 2, allow no", "widen the bounds of A"))

@@ -11,10 +11,10 @@ import time
 
 import numpy as np
 import pytest
+from command_line import refused, run
 from scipy.integrate import solve_ivp
 
 from pilfr_casadi import multisine
-from pilfr_casadi.cli.app import main
 
 RIG = """
 from pilfr_casadi import Parameter, Port, Simulator
@@ -75,15 +75,6 @@ def files(tmp_path, truth):
     return tmp_path
 
 
-def run(capsys, *arguments):
-    try:
-        status = main([str(a) for a in arguments])
-    except SystemExit as stop:
-        status = stop.code
-    out = capsys.readouterr()
-    return status, out.out, out.err
-
-
 def arguments(folder, *more, simulator="rig.py", train="train.csv", test="test.csv"):
     source = ("--simulated", folder / "simulated.csv") if simulator is None else (folder / simulator,)
     return (
@@ -98,14 +89,6 @@ def arguments(folder, *more, simulator="rig.py", train="train.csv", test="test.c
         1,
         *more,
     )
-
-
-def refused(capsys, *given, says):
-    status, _, err = run(capsys, *given)
-    assert err.startswith("pilfr: ") and err.count("\n") == 1 and "Traceback" not in err, err
-    assert status == 2, err
-    for word in says if isinstance(says, tuple) else (says,):
-        assert word in err, err
 
 
 def test_a_whole_diagnosis(capsys, files):

@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 import run_files
+from command_line import refused, write_csv
 from run_files import PYTHON, RUN, command, contents
-from test_cli import refused, write_csv
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import write_csv
 from run_files import PYTHON, changed, command, contents, prepared
-from test_cli import write_csv
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import Clock, InputError, time_limit, worker_process as hand
