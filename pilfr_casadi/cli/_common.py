@@ -113,7 +113,7 @@ class DataOptions:
     ] = None
     period: Annotated[
         int | None,
-        whole(0, MOST_SAMPLES, "Samples a period, with --initial periodic.", metavar="SAMPLES"),
+        whole(0, MOST_SAMPLES, "Samples a period; goes with --initial.", metavar="SAMPLES"),
     ] = None
     hold: Annotated[Literal["zero", "linear"] | None, option("What the input does between samples.")] = None
     skip: Annotated[

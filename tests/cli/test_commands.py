@@ -136,7 +136,8 @@ def test_too_few_samples_for_the_order(capsys, tmp_path):
         (("--workers", "9" * 9), "--workers"),
         (("--skip", "9" * 40), "--skip"),
         (("--period", "9" * 5000), "--period"),
-        (("--period", "20"), "--period 20 was given without --initial periodic"),
+        (("--outputs", "t"), "t"),
+        (("--time-tolerance", "nan"), "--time-tolerance nan"),
         (("--fix", "D_yu=0", "--fix", "D_yu=1"), "twice"),
         (("--time-limit", "0"), "--time-limit"),
         (("--period", "1"), "--period 1"),
@@ -241,6 +242,12 @@ def test_keywords_become_options(python, options):
 )
 def test_misspelt_commands_and_options_get_a_suggestion(capsys, given, says):
     refused(capsys, *given, says=says)
+
+
+def test_a_period_without_an_initial_state_is_refused(capsys, tmp_path, train, model):
+    names = ("--inputs", "u", "--outputs", "y", "--period", 20)
+    refused(capsys, "fit", train, *names, "--out", tmp_path / "out", says="--period 20 was given without --initial")
+    refused(capsys, "simulate", model, train, "--period", 20, "--out", tmp_path / "s.csv", says="--period 20")
 
 
 def test_version_and_help(capsys):
