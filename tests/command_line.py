@@ -1,4 +1,4 @@
-"""What tests of the command line share: a recording in a file, commands run in this process, and how input is refused."""
+"""What tests of the command line share: a recording in a file, commands in this process, and how input is refused."""
 
 import numpy as np
 
