@@ -115,7 +115,6 @@ if TYPE_CHECKING:
         generalized_play as generalized_play,
         hammerstein as hammerstein,
         network_lfr as network_lfr,
-        normalise as normalise,
         open_model as open_model,
         play as play,
         ssnn as ssnn,

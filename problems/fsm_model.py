@@ -10,9 +10,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from pilfr_casadi.models.envelope import CREST
 
 from pilfr_casadi.models import PILFR, Combined, Envelope, Part, Play, PrandtlIshlinskii, Products, Stop, stop
-from pilfr_casadi.models.envelope import CREST
 
 from .fsm_linear import U_UNIT, Y_UNIT, Levels, in_modes
 

@@ -1,19 +1,16 @@
-"""Gauge freedoms: tangents, the normal form, and standard errors checked by Monte Carlo."""
+"""Gauge freedoms: tangents, and standard errors checked by Monte Carlo."""
 
 from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import example, given, settings, strategies as st
 from random_models import OPERATORS, envelope, random_input, random_lfr, reference
 
-from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.identify import covariance, standard_errors, variance
 from pilfr_casadi.identify.uncertainty import _snap_to_bounds, gauge_tangents, gradient_covariance
 from pilfr_casadi.models import (
-    PILFR,
     GeneralizedPlay,
     Parameter,
     ParameterSet,
@@ -22,7 +19,6 @@ from pilfr_casadi.models import (
     Stop,
     generators,
     hammerstein,
-    normalise,
     open_model,
     wiener,
 )
@@ -170,149 +166,6 @@ def test_fixed_blocks_leave_fewer_freedoms():
         tangents = gauge_tangents(problem, problem.start, structure, np.zeros(problem.size, dtype=bool))
         assert np.linalg.matrix_rank(tangents) == left
         assert np.max(np.abs(problem.jacobian(problem.start) @ tangents)) < 1e-11
-
-
-# ---- normal form ----
-
-
-@settings(max_examples=25)
-@given(st.integers(0, 10**6), st.sampled_from(OPERATORS), st.integers(1, 2), st.integers(0, 4), st.booleans())
-@example(813270, GeneralizedPlay, 1, 0, True)
-@example(423326, GeneralizedPlay, 2, 4, False)
-def test_equal_models_normalise_to_equal_numbers(seed, operator, n_w, nx, crosses):
-    rng = np.random.default_rng(seed)
-    structure, values = random_lfr(seed % 50, nx=nx, n_u=2, n_y=2, n_w=n_w, operator=operator)
-    if operator is GeneralizedPlay and not crosses:
-        values["gamma_r_a0"], values["gamma_r_c"] = values["gamma_l_a0"], values["gamma_r_c"] + 2.0
-        assert not crossing(values, 0)
-    other, to_other = moved(values, operator, rng)
-    u = random_input(seed, 60, 2)
-    state = rng.normal(size=len(to_other))
-    y, z, _, _ = signals(operator, values, u, state)
-    y_other, z_other, _, _ = signals(operator, other, u, to_other @ state)
-    np.testing.assert_allclose(y_other, y, atol=1e-9 * np.max(np.abs(y)))  # `moved` is a gauge transformation
-    first, change_1 = normalise(structure, values, z, u=u, y=y)
-    second, change_2 = normalise(structure, other, z_other, u=u, y=y)
-    assert set(first) == set(values)
-    for name in first:
-        np.testing.assert_allclose(second[name], first[name], rtol=1e-6, atol=1e-7, err_msg=name)
-    np.testing.assert_allclose(change_2 @ to_other @ state, change_1 @ state, atol=1e-6)
-    # it is the same model, and in the form promised
-    again, z_again, _, _ = signals(operator, first, u, change_1 @ state)
-    np.testing.assert_allclose(again, y, rtol=0, atol=1e-9 * np.max(np.abs(y)))
-    np.testing.assert_allclose(np.std(z_again, axis=0), 1.0, rtol=1e-9)
-    np.testing.assert_allclose(first["w"].sum(axis=1), 1.0, rtol=1e-12)
-    assert np.all(np.diff(first["r"], axis=1) >= 0)
-    assert np.all(np.diff(np.sum(first["w"] * first["r"], axis=1)) >= 0)
-    third, change_3 = normalise(structure, first, z_again, u=u, y=y)
-    for name in first:
-        np.testing.assert_allclose(third[name], first[name], rtol=1e-6, atol=1e-8, err_msg=name)
-    np.testing.assert_allclose(change_3, np.eye(len(change_3)), atol=1e-7)
-
-
-def resonant(nx, seed=0):
-    """A lightly damped structure of nx / 2 modes with three inputs, outputs and channels, as in a large fit."""
-    rng = np.random.default_rng(seed)
-    structure, values = random_lfr(seed, nx=nx, n_u=3, n_y=3, n_w=3)
-    a = np.zeros((nx, nx))
-    for k in range(nx // 2):
-        angle, radius = 0.1 + 2.8 * (k + rng.uniform(0, 0.5)) / (nx // 2), rng.uniform(0.9, 0.99)
-        a[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = radius * np.array(
-            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
-        )
-    return structure, {**values, "A": a, "B_w": 0.1 * values["B_w"]}
-
-
-def test_forty_states():
-    structure, values = resonant(40)
-    rng = np.random.default_rng(1)
-    other, _ = moved(values, Play, rng, mild=3.0)
-    u = random_input(1, 300, 3)
-    y, z, _, _ = signals(Play, values, u)
-    first, _ = normalise(structure, values, z, u=u, y=y)
-    second, change = normalise(structure, other, signals(Play, other, u)[1], u=u, y=y)
-    for name in first:
-        np.testing.assert_allclose(second[name], first[name], rtol=1e-7, atol=1e-8, err_msg=name)
-    again = signals(Play, second, u, change @ np.zeros(len(change)))[0]
-    np.testing.assert_allclose(again, y, rtol=0, atol=1e-10 * np.max(np.abs(y)))
-    assert np.max(np.abs(second["A"])) <= 1.0
-
-
-def test_the_states_are_input_normal():
-    structure, values = random_lfr(4, nx=4, n_u=2, n_y=2)
-    u = random_input(4, 100, 2)
-    out, _ = normalise(structure, values, signals(Play, values, u)[1])
-    b, c = np.hstack([out["B_u"], out["B_w"]]), np.vstack([out["C_y"], out["C_z"]])
-    np.testing.assert_allclose(out["A"] @ out["A"].T + b @ b.T, np.eye(4), atol=1e-10)
-    observability, power = np.zeros((4, 4)), np.eye(4)
-    for _ in range(2000):
-        observability += power.T @ c.T @ c @ power
-        power = out["A"] @ power
-    squares = np.diag(observability)
-    np.testing.assert_allclose(observability, np.diag(squares), atol=1e-9 * squares[0])
-    assert np.all(np.diff(squares) < 0)
-
-
-@pytest.mark.parametrize("radius", [0.9999, 1.0, 1.05])
-def test_a_slow_or_unstable_linear_part_has_a_normal_form_too(radius):
-    structure, values = random_lfr(6, radius=radius, gain=0.01)
-    other, _ = moved(values, Play, np.random.default_rng(0))
-    z = np.random.default_rng(1).normal(size=(50, 1))
-    scale = (other["D_zu"] / values["D_zu"]).item()
-    first, second = normalise(structure, values, z)[0], normalise(structure, other, scale * z)[0]
-    for name in first:
-        np.testing.assert_allclose(second[name], first[name], rtol=1e-7, atol=1e-8)
-
-
-@pytest.mark.parametrize("build", [hammerstein, wiener])
-def test_fixed_blocks_stay(build):
-    structure = build(3, PrandtlIshlinskii(Play, 4))
-    _, values = random_lfr(7)
-    values |= {k: np.broadcast_to(v, values[k].shape) * 1.0 for k, v in structure.fixed.items()}
-    u = random_input(7, 200)
-    y, z, _, _ = signals(Play, values, u)
-    out, _ = normalise(structure, values, z)
-    for name, value in structure.fixed.items():
-        np.testing.assert_allclose(out[name], np.broadcast_to(value, out[name].shape), atol=1e-14)
-    np.testing.assert_allclose(signals(Play, out, u)[0], y, atol=1e-11)
-    if build is hammerstein:
-        np.testing.assert_allclose(out["w"].sum(), 1.0)
-    else:
-        np.testing.assert_allclose(np.std(signals(Play, out, u)[1]), 1.0)
-
-
-def test_reach_in_place_of_deviation():
-    structure, values = random_lfr(8)
-    u = random_input(8, 100)
-    out, _ = normalise(structure, values, signals(Play, values, u)[1], by="reach")
-    assert np.max(np.abs(signals(Play, out, u)[1])) == pytest.approx(1.0)
-
-
-def test_a_linear_model_needs_no_z():
-    structure, values = random_lfr(9, n_w=0)
-    out, change = normalise(structure, values)
-    b = np.hstack([out["B_u"], out["B_w"]])
-    np.testing.assert_allclose(out["A"] @ out["A"].T + b @ b.T, np.eye(3), atol=1e-10)
-    np.testing.assert_allclose(change @ values["B_u"], out["B_u"])
-
-
-def test_what_cannot_be_normalised():
-    structure, values = random_lfr(10)
-    z = np.ones((20, 1)) * np.arange(20)[:, None]
-    for given_z, options, words in (
-        (None, {}, "For the signal z nothing was given"),
-        (z[:, 0], {}, r"shape \(20,\) was given"),
-        (0 * z, {}, "does not move"),
-        (z, {"by": "rms"}, "use 'std' or 'reach'"),
-    ):
-        with pytest.raises(InputError, match=words):
-            normalise(structure, values, given_z, **options)
-    dead = {**values, "B_u": 0 * values["B_u"], "B_w": 0 * values["B_w"]}
-    with pytest.raises(InputError, match="reaches some state"):
-        normalise(structure, dead, z)
-    rounded = PILFR(3, PrandtlIshlinskii(Play, 4, rounded=True))
-    with pytest.raises(InputError, match="rounded"):
-        normalise(rounded, {**values, "eps": np.array(0.1)}, z)
 
 
 # ---- standard errors ----

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..laws import Law, Local, trace
-from ..models import mapped
+from ..models import map_points
 from ..simulators import signals, states_along
 from .candidate import Candidate
 from .kinship import FLEXIBLE
@@ -57,7 +57,7 @@ def felt(bench: Workbench, fitted: Fitted, port: str) -> Local:
         with np.errstate(over="ignore", invalid="ignore"):
             x = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps, : len(simulator.states)]
             slope = np.gradient(r.u, r.dt, axis=0) if bench.hold == "linear" and len(r) > 2 else np.zeros_like(r.u)
-            z, dz, *_ = mapped(own, x, r.u, slope, r.dt * np.arange(len(r))[:, None], fitted.vector)
+            z, dz, *_ = map_points(own, x, r.u, slope, r.dt * np.arange(len(r))[:, None], fitted.vector)
         parts.append((z[:, index, 0], dz[:, index, 0]))
     lengths = tuple(len(z) for z, _ in parts)
     z, dz = (np.concatenate([part[k] for part in parts]) for k in (0, 1))

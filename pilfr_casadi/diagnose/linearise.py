@@ -21,7 +21,7 @@ import numpy as np
 
 from .._base import one_at_a_time
 from ..laws import Law, Local
-from ..models import Model, mapped
+from ..models import Model, map_points
 from ..simulators import Simulator, discretise, kalman_gain, led, signals, states_along
 from .workbench import FINER, Fitted, Workbench
 
@@ -165,7 +165,7 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     means = []
     for begin in range(0, len(states), CHUNK * n):  # matrices of all sub-steps would be large
         now = slice(begin, begin + CHUNK * n)
-        y, a, b, c, d = mapped(probe.step, states[now], drive[now])
+        y, a, b, c, d = map_points(probe.step, states[now], drive[now])
         means.append([len(y) * v.mean(axis=0) for v in (a, b, c)])
         if gain is not None:
             a, b = a - gain @ c, b - gain @ d
@@ -179,7 +179,7 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     slope = np.gradient(u, r.dt, axis=0) if bench.hold == "linear" and len(u) > 2 else np.zeros_like(u)
     own = p[: len(p) - len(probe.ports)]
     at = states[::n, : probe.n_x], u, slope, r.dt * np.arange(len(u))[:, None], own
-    z, dz, lift, push = (v[:, :, 0] for v in mapped(probe.local, *at))
+    z, dz, lift, push = (v[:, :, 0] for v in map_points(probe.local, *at))
     moved, sign = np.abs(lift).max(axis=0) > 0, -np.sign(np.median(push, axis=0))
     sense = {"sign": np.where(moved, 0.0, sign), "back": np.where(moved, -np.sign(np.median(lift, axis=0)), sign)}
     felt = {"lift": np.abs(lift).max(axis=0), "push": np.abs(push).max(axis=0)}

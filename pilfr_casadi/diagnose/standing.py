@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
-from ..models import ParameterSet, mapped
+from ..models import ParameterSet, map_points
 from ..simulators import Equations, Instant, Simulator, on_grid
 
 
@@ -47,6 +47,6 @@ def standing(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, 
     local = equations.evaluate(Instant(at[:n_xq], at[n_xq:], now, ca.SX.zeros(len(u)), 0.0))[3]
     z = ca.Function("z", [at, now, p], [ca.vertcat(*(local[i][0] for i in moved))])
     for _ in moved:  # one law's signal may be what another gives out
-        for i, value in zip(moved, mapped(z, state[None], u, vector[: p.numel()])[0].ravel(), strict=True):
+        for i, value in zip(moved, map_points(z, state[None], u, vector[: p.numel()])[0].ravel(), strict=True):
             state[spans[i]] = simulator.elements[i].law.standing(float(value))
     return state

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
-from ..models import accumulated, mapped
+from ..models import accumulate_steps, map_points
 from .base import Law, Local
 
 
@@ -56,9 +56,9 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
         if step.size1_in(0):
             same = np.broadcast_to(vector, (m, len(vector)))
             first = kind().standing(0.0 if any(local.from_zero[i : i + 1]) else zs[0])
-            found.append(accumulated(step, np.tile(first, len(shapes)), rows, same)[1])
+            found.append(accumulate_steps(step, np.tile(first, len(shapes)), rows, same)[1])
         else:
-            found.append(mapped(step, np.zeros((m, 0)), rows, vector)[1][:, :, 0])
+            found.append(map_points(step, np.zeros((m, 0)), rows, vector)[1][:, :, 0])
     forces = np.concatenate(found) if len(found) > 1 else found[0]
     return forces.reshape(len(local.z), len(shapes), -1)
 

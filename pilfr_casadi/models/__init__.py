@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .arrays import Buffered as Buffered, accumulated as accumulated, mapped as mapped
+    from .arrays import Buffered as Buffered, accumulate_steps as accumulate_steps, map_points as map_points
     from .baselines import (
         NARX as NARX,
         NOE as NOE,
@@ -20,31 +20,29 @@ if TYPE_CHECKING:
         reading_output as reading_output,
         ssnn as ssnn,
     )
-    from .combined import (
+    from .conversion import to_plays as to_plays, to_stops as to_stops
+    from .elements import (
+        LAYER as LAYER,
         Combined as Combined,
+        Element as Element,
+        Envelope as Envelope,
         Part as Part,
+        PrandtlIshlinskii as PrandtlIshlinskii,
+        Products as Products,
+        StaticNetwork as StaticNetwork,
         element_bound as element_bound,
         element_slopes as element_slopes,
         unknown_slope as unknown_slope,
     )
-    from .conversion import to_plays as to_plays, to_stops as to_stops
-    from .elements import (
-        LAYER as LAYER,
-        Element as Element,
-        PrandtlIshlinskii as PrandtlIshlinskii,
-        StaticNetwork as StaticNetwork,
-        weight_density as weight_density,
-    )
-    from .envelope import Envelope as Envelope
+    from .elements import weight_density as weight_density
     from .gauge_orbit import generators as generators
-    from .magnitude import Neighbours as Neighbours, or_one as or_one
     from .model import (
         Model as Model,
+        StepExpressions as StepExpressions,
         close_loop as close_loop,
         from_expressions as from_expressions,
         open_model as open_model,
     )
-    from .normal_form import normalise as normalise
     from .operators import (
         GeneralizedPlay as GeneralizedPlay,
         Play as Play,
@@ -53,23 +51,25 @@ if TYPE_CHECKING:
         play as play,
         stop as stop,
     )
-    from .parameters import Parameter as Parameter, ParameterSet as ParameterSet
+    from .parameters import (
+        Neighbours as Neighbours,
+        Parameter as Parameter,
+        ParameterSet as ParameterSet,
+        or_one as or_one,
+    )
     from .pilfr import (
         BLOCKS as BLOCKS,
         PILFR as PILFR,
         block_shapes as block_shapes,
-        hammerstein as hammerstein,
-        wiener as wiener,
-    )
-    from .placement import (
         direction_fixed as direction_fixed,
         driven_through as driven_through,
         fixed_whole as fixed_whole,
+        hammerstein as hammerstein,
         is_zero as is_zero,
         places as places,
         read_through as read_through,
+        wiener as wiener,
     )
-    from .products import Products as Products
     from .structures import (
         ANY as ANY,
         HYSTERETIC as HYSTERETIC,

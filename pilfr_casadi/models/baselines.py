@@ -1,14 +1,14 @@
 """Black-box models to compare with: state-space networks, static networks in a loop, NARX and NOE.
 
-All are linear models closed by a `StaticNetwork` (`PILFR`), with some blocks held:
+Each is a linear model closed by a `StaticNetwork` (a `PILFR`) with some blocks fixed:
 
-- `ssnn`: `x⁺ = A x + B u + W_x tanh(V_x [x; u] + b_x)`, `y = C x + D u + W_y tanh(V_y [x; u] + b_y) + y_0`, a network
-  with one hidden layer for the state and one for the output beside a linear model (Suykens et al. 1995, Schoukens
-  2021): one neuron a channel, the first half of the channels enters the state, the second the output;
+- `ssnn`: `x⁺ = A x + B u + W_x tanh(V_x [x; u] + b_x)`, `y = C x + D u + W_y tanh(V_y [x; u] + b_y) + y_0`, a linear
+  model beside two networks with one hidden layer, one for the state and one for the output (Suykens et al. 1995,
+  Schoukens 2021). With one neuron a channel, the first half of the channels enters the state, the second the output;
 - `network_lfr`: one network in the port of a linear model, `w = Σ gain_j tanh(slope_j z + bias_j)`;
-- `NARX`, `NOE`: `y(k+1) = f(y(k), …, y(k-n_a+1), u(k), …, u(k-n_b+1))` with `f` a linear part and one hidden layer. The
-  state holds the past of y and u, so `A` is a shift but for its first rows. Trained in one step they are the same model
-  reading the measured output (`reading_output`), and in use, as a NOE in training, they read their own.
+- `NARX`, `NOE`: `y(k+1) = f(y(k), …, y(k-n_a+1), u(k), …, u(k-n_b+1))`, with `f` a linear part and one hidden layer.
+  The state holds the past of y and u, so `A` is a shift except in its first rows. For one-step training the model reads
+  the measured output (`reading_output`); in use, and in the training of a NOE, it reads its own output.
 """
 
 from __future__ import annotations
@@ -22,18 +22,17 @@ import numpy as np
 from .._base import InputError, is_number
 from ..data import Recording
 from .elements import StaticNetwork
-from .magnitude import or_one
 from .model import Model
-from .parameters import Parameter, ParameterSet
+from .parameters import Parameter, ParameterSet, or_one
 from .pilfr import PILFR
 
 Array = np.ndarray
 NEURONS = {"gain": 1.0, "slope": 1.0}  # one neuron a channel: its weights are the linear blocks
-SHARE = "read"  # name of the share of the measured output that a step reads
+SHARE = "read"  # name of the parameter: share of the measured output that a step reads
 
 
 def ssnn(nx: int, hidden: int = 15, offset: bool = True) -> PILFR:
-    """State-space neural network: `hidden` neurons for the next state and as many for the output.
+    """Make a state-space neural network: `hidden` neurons for the next state and as many for the output.
 
     Parameters
     ----------
@@ -47,7 +46,7 @@ def ssnn(nx: int, hidden: int = 15, offset: bool = True) -> PILFR:
     Returns
     -------
     PILFR
-        Usable in `fit` like any other; it begins as the linear model of the same order.
+        A structure for `fit` like any other; it starts as the linear model of the same order.
 
     Raises
     ------
@@ -55,12 +54,12 @@ def ssnn(nx: int, hidden: int = 15, offset: bool = True) -> PILFR:
         If a number is not whole or too small.
     """
     state = np.repeat([1.0, 0.0], StaticNetwork(hidden).hidden)
-    held = {"B_w": np.where(state == 1, np.nan, 0.0), "D_yw": np.where(state == 1, 0.0, np.nan)}
-    return PILFR(nx, StaticNetwork(1, 2 * hidden), {**held, **NEURONS}, offset=offset)
+    fixed = {"B_w": np.where(state == 1, np.nan, 0.0), "D_yw": np.where(state == 1, 0.0, np.nan)}
+    return PILFR(nx, StaticNetwork(1, 2 * hidden), {**fixed, **NEURONS}, offset=offset)
 
 
 def network_lfr(nx: int, hidden: int = 15, channels: int = 1, offset: bool = True) -> PILFR:
-    """A linear model of nx states with a static network of `hidden` neurons a channel in its port.
+    """Make a linear model of nx states with a static network of `hidden` neurons a channel in its port.
 
     Raises
     ------
@@ -72,7 +71,7 @@ def network_lfr(nx: int, hidden: int = 15, channels: int = 1, offset: bool = Tru
 
 @dataclass(frozen=True)
 class Lagged:
-    """A model of past outputs and inputs: what `NARX` and `NOE` share."""
+    """A model of past outputs and inputs: the common part of `NARX` and `NOE`."""
 
     lags: int
     hidden: int = 10
@@ -97,16 +96,16 @@ class Lagged:
         return StaticNetwork(1, self.hidden)
 
     def unknowns(self, n_u: int, n_y: int) -> int:
-        """How many parameters are free, told without building the model, which of many lags takes long."""
+        """Count the free parameters without building the model, which takes long for many lags."""
         past = self.lags * n_y + (self.input_lags or self.lags) * n_u
         return self.hidden * (past + 1 + n_y) + n_y * (past * self.linear + 1)
 
     def structure(self, n_u: int, n_y: int) -> PILFR:
-        """The LFR for n_u inputs and n_y outputs."""
-        return lagged(self.lags, self.input_lags or self.lags, self.hidden, n_u, n_y, self.linear)
+        """Make the LFR for n_u inputs and n_y outputs."""
+        return _lagged_structure(self.lags, self.input_lags or self.lags, self.hidden, n_u, n_y, self.linear)
 
     def model(self, n_u: int, n_y: int) -> Model:
-        """The closed model for n_u inputs and n_y outputs, at no values in particular."""
+        """Build the closed model for n_u inputs and n_y outputs; its values are zero."""
         return self.structure(n_u, n_y).model(n_u, n_y)
 
 
@@ -123,8 +122,8 @@ class NARX(Lagged):
     input_lags : int, optional
         Past inputs, n_b; as many as `lags` by default. The input acts from the next sample on.
     validation : float
-        Share of the training data that is held back; the training stops when its one-step error no longer falls. 0:
-        none, all data is used.
+        Share of the training data that is held back; training stops when the one-step error on it no longer falls. 0
+        uses all data for training.
     linear : bool
         Whether a linear part stands beside the neurons.
 
@@ -139,15 +138,15 @@ class NARX(Lagged):
 class NOE(Lagged):
     """Nonlinear output-error model: a NARX trained in simulation, with early stopping.
 
-    Every start is a NARX first, and then reads less and less of the measured output until it reads its own.
+    Every start is trained as a NARX first; then the share of the measured output that it reads is lowered to zero.
 
     Parameters
     ----------
     lags, hidden, input_lags, linear
         As for `NARX`.
     validation : float
-        Share of the training data that is held back; the training stops when its simulation error no longer falls, and
-        the best point there is taken. 0: none.
+        Share of the training data that is held back; training stops when the simulation error on it no longer falls,
+        and the point of the lowest error is returned. 0 uses all data for training.
 
     Raises
     ------
@@ -158,8 +157,8 @@ class NOE(Lagged):
     validation: float = 0.25
 
 
-def lagged(n_a: int, n_b: int, hidden: int, n_u: int, n_y: int, linear: bool = True) -> PILFR:
-    """The LFR whose state is `[y(k), …, y(k-n_a+1), u(k-1), …, u(k-n_b+1)]` and whose output is `y(k)`."""
+def _lagged_structure(n_a: int, n_b: int, hidden: int, n_u: int, n_y: int, linear: bool = True) -> PILFR:
+    """Make the LFR whose state is `[y(k), …, y(k-n_a+1), u(k-1), …, u(k-n_b+1)]` and whose output is `y(k)`."""
     past_y, past_u = n_a * n_y, (n_b - 1) * n_u
     nx, own = past_y + past_u, np.nan if linear else 0.0
     a, b, w = np.zeros((nx, nx)), np.zeros((nx, n_u)), np.zeros((nx, hidden))
@@ -172,8 +171,8 @@ def lagged(n_a: int, n_b: int, hidden: int, n_u: int, n_y: int, linear: bool = T
     return PILFR(nx, StaticNetwork(1, hidden), {**fixed, **NEURONS})
 
 
-def lagged_states(model: Lagged, recording: Recording, level: Array) -> Array:
-    """The states (M, nx) along a recording, outputs as measured less their level (n_y,); zero before its start."""
+def _lagged_states(model: Lagged, recording: Recording, level: Array) -> Array:
+    """Collect the states (M, nx) along a recording, from outputs less their level (n_y,); zero before its start."""
     m, past = len(recording), [(recording.y - level, k) for k in range(model.lags)]
     past += [(recording.u, k) for k in range(1, model.input_lags or model.lags)]
     return np.hstack([np.vstack([np.zeros((min(k, m), x.shape[1])), x[: max(m - k, 0)]]) for x, k in past])
@@ -182,22 +181,21 @@ def lagged_states(model: Lagged, recording: Recording, level: Array) -> Array:
 def lagged_start(
     model: Lagged, structure: PILFR, recordings: Sequence[Recording], rng: np.random.Generator
 ) -> dict[str, Array]:
-    """A linear one-step predictor by least squares, and neurons that do nothing yet, in random directions of the past.
+    """Estimate a linear one-step predictor by least squares, and draw neurons without effect in random directions.
 
-    Directions are drawn in units of each past signal's deviation.
+    Directions are drawn in units of the standard deviation of each past signal.
     """
     level = np.mean(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
     level = level if structure.offset else np.zeros_like(level)
-    states = [lagged_states(model, r, level) for r in recordings]
+    states = [_lagged_states(model, r, level) for r in recordings]
     n_y, n_u = recordings[0].n_y, recordings[0].n_u
     rows = np.concatenate([np.hstack([x, r.u])[r.skip : -1] for x, r in zip(states, recordings, strict=True)])
     following = np.concatenate([(r.y - level)[r.skip + 1 :] for r in recordings])
-    size = np.std(rows, axis=0)
-    size = np.where(size > 0, size, 1.0)
+    size = or_one(np.std(rows, axis=0))
     a, b = np.zeros((structure.nx, structure.nx)), np.zeros((structure.nx, n_u))
     if model.linear:
-        found = (np.linalg.lstsq(rows / size, following, rcond=1e-8)[0] / size[:, None]).T
-        a[:n_y], b[:n_y] = found[:, : structure.nx], found[:, structure.nx :]
+        predictor = (np.linalg.lstsq(rows / size, following, rcond=1e-8)[0] / size[:, None]).T
+        a[:n_y], b[:n_y] = predictor[:, : structure.nx], predictor[:, structure.nx :]
     element = structure.element
     assert isinstance(element, StaticNetwork)
     directions = rng.uniform(-1, 1, (element.channels, rows.shape[1])) / size
@@ -209,7 +207,7 @@ def lagged_start(
 
 
 def neurons_over(structure: PILFR, element: StaticNetwork, z: np.ndarray, rng: np.random.Generator) -> dict[str, Array]:
-    """Gains, slopes and biases of neurons that bend within 1.5 deviations of the mean of z (M, channels)."""
+    """Draw gains, slopes and biases of neurons that bend within 1.5 deviations of the mean of z (M, channels)."""
     shape = (element.channels, element.hidden)
     size = or_one(np.std(z, axis=0))[:, None]
     slope = rng.uniform(1, 3, shape) / size
@@ -219,10 +217,10 @@ def neurons_over(structure: PILFR, element: StaticNetwork, z: np.ndarray, rng: n
 
 
 def reading_output(model: Model, share: float = 1.0) -> Model:
-    """The same model reading the measured output y.
+    """Make the model read the measured output y.
 
-    Its first states, the outputs less `y_0`, become `x + share (y - ŷ)` before a step. With a share of one this
-    predicts one step ahead, with zero it runs freely; the share is a parameter that is held.
+    Its first states, the outputs less `y_0`, become `x + share (y - ŷ)` before each step. A share of one predicts one
+    step ahead, a share of zero simulates; the share is a fixed parameter.
 
     Raises
     ------
@@ -239,12 +237,12 @@ def reading_output(model: Model, share: float = 1.0) -> Model:
     own, both = p[: model.parameters.size], ca.vertcat(u, y)
     z, s = ca.SX.sym("z", model.n_w), ca.SX(0, 1)
     _, y_hat = model.step(x, u, ca.SX.zeros(model.n_w), own)
-    seen = ca.vertcat(x[:n_y] + p[-1] * (y - y_hat), *(x[i] for i in range(n_y, model.n_x)))
-    x_next, _ = model.step(seen, u, w, own)
+    corrected = ca.vertcat(x[:n_y] + p[-1] * (y - y_hat), *(x[i] for i in range(n_y, model.n_x)))
+    x_next, _ = model.step(corrected, u, w, own)
     return replace(
         model,
         step=ca.Function("step", [x, both, w, p], [x_next, y_hat], ["x", "u", "w", "p"], ["x_next", "y"]),
-        port=ca.Function("port", [x, both, p], [model.port(seen, u, own)], ["x", "u", "p"], ["z"]),
+        port=ca.Function("port", [x, both, p], [model.port(corrected, u, own)], ["x", "u", "p"], ["z"]),
         memory=ca.Function("memory", [z, s, p], list(model.memory(z, s, own)), ["z", "s", "p"], ["w", "s_next"]),
         parameters=parameters,
         reads=("u", "y"),

@@ -1,4 +1,4 @@
-"""Plays into stops and back: a whole PI-LFR in its other form, with the same outputs.
+"""Rewrite a PI-LFR with plays as one with stops, or the other way round, with the same outputs.
 
 `P_r[z] + S_r[z] = z`, Krikelis et al. (2024), Eq. 8, so with the sums of weights `s_i = Σ_j w_ij` of the channels
 
@@ -9,9 +9,9 @@ and the part `diag(s) z` joins the linear blocks (Sec. 4.1 states the equivalenc
     A  += B_w diag(s) C_z,     B_u  += B_w diag(s) D_zu,    B_w  -> -B_w,
     C_y += D_yw diag(s) C_z,   D_yu += D_yw diag(s) D_zu,   D_yw -> -D_yw.
 
-The same formulas lead back: they are an involution. Weights and thresholds stay, and so do all initial states: the stop
-of `operators` remembers its play state `z - v`, the very number that the play remembers. Rounded operators (`eps > 0`)
-convert exactly too.
+The same formulas lead back: they are an involution. Weights, thresholds and initial states are unchanged, because the
+memory of the stop in `operators` is its play state `z - v`, the same number as the memory of the play. Rounded
+operators (`eps > 0`) convert exactly too.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ import numpy as np
 from .._base import InputError
 from .elements import PrandtlIshlinskii
 from .operators import Play, Stop
-from .pilfr import PILFR
+from .pilfr import PILFR, is_zero
 
 Array = np.ndarray
-# a block that takes up the slope, and the two blocks whose product it takes up
+# each block that takes up a slope, and the two blocks whose product it takes up
 SLOPES = {"A": ("B_w", "C_z"), "B_u": ("B_w", "D_zu"), "C_y": ("D_yw", "C_z"), "D_yu": ("D_yw", "D_zu")}
 MIRRORED = ("B_w", "D_yw")
 
 
 def complement(values: Mapping[str, Any]) -> dict[str, Array]:
-    """Blocks of the PI-LFR with stops that equals one with plays, and the other way round.
+    """Convert the blocks of a PI-LFR with plays to the equal one with stops, or the other way round.
 
     Parameters
     ----------
     values : mapping
-        The blocks of `lfr.BLOCKS` and `w`, `r` (n_w, N) by name; further names are passed on.
+        The blocks of `pilfr.BLOCKS` and `w`, `r` (n_w, N) by name; further names are passed on.
 
     Returns
     -------
     dict
-        All values in the other form; applied twice, the ones given.
+        All values in the other form; applied twice, the given values.
     """
     out = {name: np.array(value, dtype=float) for name, value in values.items()}
     total = out["w"].sum(axis=1)
@@ -56,11 +56,17 @@ def complement(values: Mapping[str, Any]) -> dict[str, Array]:
 
 
 def to_stops(structure: PILFR, values: Mapping[str, Any]) -> tuple[PILFR, dict[str, Array]]:
-    """Structure and values with stops for plays; unchanged where there are stops already.
+    """Replace plays by stops; a structure with stops is returned unchanged.
 
-    What is fixed, bounded or held by a prior stays so where the conversion does not touch it, and is mirrored for
-    `B_w` and `D_yw`. A block that takes up the slope (`A, B_u, C_y, D_yu`) becomes free: its restriction would be
-    another one in the new form. Thus a Hammerstein model with plays has a free `B_u` when written with stops.
+    Fixed values, bounds and priors remain where the conversion does not touch them, and are mirrored for `B_w` and
+    `D_yw`. A block that takes up the slope (`A, B_u, C_y, D_yu`) becomes free, because its restriction would be another
+    one in the new form. Thus a Hammerstein model with plays has a free `B_u` when written with stops.
+
+    Parameters
+    ----------
+    structure : PILFR
+    values : mapping
+        Values of its blocks and of the element by name.
 
     Raises
     ------
@@ -71,7 +77,7 @@ def to_stops(structure: PILFR, values: Mapping[str, Any]) -> tuple[PILFR, dict[s
 
 
 def to_plays(structure: PILFR, values: Mapping[str, Any]) -> tuple[PILFR, dict[str, Array]]:
-    """Structure and values with plays for stops; see `to_stops`."""
+    """Replace stops by plays; see `to_stops`."""
     return _convert(structure, values, Play())
 
 
@@ -86,7 +92,7 @@ def _convert(structure: PILFR, values: Mapping[str, Any], operator: Play | Stop)
     element = _layer(structure)
     if type(element.operator) is type(operator):
         return structure, {name: np.array(value, dtype=float) for name, value in values.items()}
-    touched = {block for block, factors in SLOPES.items() if not any(_is_zero(structure, f) for f in factors)}
+    touched = {block for block, factors in SLOPES.items() if not any(is_zero(structure, f) for f in factors)}
     fixed = {k: -np.asarray(v) if k in MIRRORED else v for k, v in structure.fixed.items() if k not in touched}
     bounds = {k: _mirror(v) if k in MIRRORED else v for k, v in structure.bounds.items() if k not in touched}
     priors = {
@@ -94,10 +100,6 @@ def _convert(structure: PILFR, values: Mapping[str, Any], operator: Play | Stop)
     }
     layer = replace(element, operator=operator)
     return replace(structure, element=layer, fixed=fixed, bounds=bounds, priors=priors), complement(values)
-
-
-def _is_zero(structure: PILFR, name: str) -> bool:
-    return name in structure.fixed and not np.any(structure.fixed[name])
 
 
 def _mirror(bounds: tuple[Any, Any]) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""Gauge freedoms of a PI-LFR: the ways to change its numbers that change no output, as tangents.
+"""Gauge freedoms of a PI-LFR: directions in its parameters that change no output.
 
 The outputs of a PI-LFR do not change under
 
@@ -8,10 +8,10 @@ The outputs of a PI-LFR do not change under
 - a scaling of the weights, `w_i -> μ w_i` with `(B_w, D_yw)_i -> (...)/μ`;
 - for a play with `r_ij = 0` (it passes z on), a shift of `w_ij` that the linear blocks take up;
 - for a static network, the scalings of its signals, `slope_i -> slope_i/α` and `gain_i -> μ gain_i`;
-- for generalized plays, a shift of all `r_i` against the two envelopes, and one of the output that `y_0`, the envelopes
-  and the initial state make up for.
+- for generalized plays, a shift of all `r_i` against the two envelopes, and a shift of the output that `y_0`, the
+  envelopes and the initial state compensate.
 
-An affine change of the initial states goes with each.
+Each comes with an affine change of the initial states.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ENVELOPE = {"c": (0, 1), "a0": (-1, 1), "a": (0, 1), "b": (-1, 0), "d": (0, 0)}
 
 
 def generators(structure: PILFR, values: Mapping[str, Array]) -> Iterator[Generator]:
-    """Tangents of the gauge orbit at `values`: the change of each block, and the one of the state with memory."""
+    """Generate the tangents of the gauge orbit at `values`: the change of each block, and of the state with memory."""
     nx = structure.nx
     element = structure.element
     for k in range(nx * nx):
@@ -40,14 +40,14 @@ def generators(structure: PILFR, values: Mapping[str, Array]) -> Iterator[Genera
         e.flat[k] = 1.0
         change = {name: -e @ values[name] for name in ("B_u", "B_w")}
         change |= {name: values[name] @ e for name in ("C_y", "C_z")} | {"A": values["A"] @ e - e @ values["A"]}
-        yield change, partial(_turn, e)
+        yield change, partial(_change_of_basis, e)
     if isinstance(element, PrandtlIshlinskii):
         for channel in range(element.channels):
-            yield from _scalings(element, values, channel, nx)
+            yield from _scale_channel(element, values, channel, nx)
             if isinstance(element.operator, Play):
-                yield from _pass_through(element, values, channel)
+                yield from _shift_weight(element, values, channel)
             if isinstance(element.operator, GeneralizedPlay) and element.operator.networks:
-                yield from _offsets(element, values, channel, nx)
+                yield from _shift_offset(element, values, channel, nx)
     if isinstance(element, StaticNetwork):
         for channel in range(element.channels):
             here = (np.arange(element.channels) == channel) * 1.0
@@ -57,12 +57,14 @@ def generators(structure: PILFR, values: Mapping[str, Array]) -> Iterator[Genera
             yield {**out, "gain": values["gain"] * here[:, None]}, np.zeros_like
 
 
-def _turn(e: Array, state: Array) -> Array:
+def _change_of_basis(e: Array, state: Array) -> Array:
     return np.concatenate([-e @ state[: len(e)], np.zeros(len(state) - len(e))])
 
 
-def _scalings(element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int, nx: int) -> Iterator[Generator]:
-    """Scalings of one channel, in powers of the scales of z, of the operators' output and of the weights."""
+def _scale_channel(
+    element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int, nx: int
+) -> Iterator[Generator]:
+    """Scale one channel, in powers of the scales of z, of the operators' output and of the weights."""
     here = np.arange(element.channels) == channel
     memory = np.concatenate([np.zeros(nx), np.repeat(here, element.n)])
     general = isinstance(element.operator, GeneralizedPlay)
@@ -81,8 +83,8 @@ def _scalings(element: PrandtlIshlinskii, values: Mapping[str, Array], channel: 
         yield change, partial(np.multiply, of_v * memory)
 
 
-def _pass_through(element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int) -> Iterator[Generator]:
-    """A play with r = 0 passes z on: its weight may go to the linear blocks."""
+def _shift_weight(element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int) -> Iterator[Generator]:
+    """Shift the weight of a play with r = 0, which passes z on, to the linear blocks."""
     b, d = values["B_w"][:, [channel]], values["D_yw"][:, [channel]]
     c, e = values["C_z"][[channel]], values["D_zu"][[channel]]
     if element.rounded and np.any(values["eps"] > 0):
@@ -93,8 +95,10 @@ def _pass_through(element: PrandtlIshlinskii, values: Mapping[str, Array], chann
         yield {"w": weight, "A": -b @ c, "B_u": -b @ e, "C_y": -d @ c, "D_yu": -d @ e}, np.zeros_like
 
 
-def _offsets(element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int, nx: int) -> Iterator[Generator]:
-    """A generalized play's thresholds against its envelopes, and its output's offset against all that follows."""
+def _shift_offset(
+    element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int, nx: int
+) -> Iterator[Generator]:
+    """Shift thresholds against the envelopes, and the output's offset against the blocks that follow it."""
     here = (np.arange(element.channels) == channel)[:, None] * 1.0
     yield {"r": here * np.ones(values["r"].shape), "gamma_l_c": here, "gamma_r_c": -here}, np.zeros_like
     to_state = np.eye(nx) - values["A"]

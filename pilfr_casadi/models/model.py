@@ -36,6 +36,8 @@ def _default_names(names: tuple[str, ...], n: int, letter: str) -> tuple[str, ..
 class Model:
     """A discrete-time model, open (`element is None` and `n_w > 0`) or closed.
 
+    The state of a closed model is `[x; s]`: the states of the step, then the memory of the element.
+
     Attributes
     ----------
     step : casadi.Function
@@ -47,12 +49,12 @@ class Model:
     parameters : ParameterSet
         All parameters, the element's included.
     reads : tuple of {"u", "next", "t", "y"}
-        What the columns of the step's u are; see `drive`.
+        Signals in the columns of the step's u; see `drive`.
     substeps : int
-        Steps within a sample; outputs are those at the first of them.
+        Steps within a sample; outputs are taken at the first of them.
     stages : casadi.Function, optional
-        `(x, u, w, p, c) -> (values of c, c by c, x_next by c)`: the step by way of intermediate values c (n_c,), each
-        of which depends on those before it alone. Its derivatives are sparse where those of `step` are dense.
+        `(x, u, w, p, c) -> (values of c, c by c, x_next by c)`: the step by way of intermediate values c (n_c,), where
+        each depends only on earlier ones. Its derivatives are sparse where those of `step` are dense.
     """
 
     step: ca.Function
@@ -68,7 +70,7 @@ class Model:
     stages: ca.Function | None = None
 
     def drive(self, recording: Recording) -> np.ndarray:
-        """What the step reads while a recording is run, shape (M * substeps, n_u): the columns named in `reads`.
+        """Make the signals that the step reads along a recording, shape (M * substeps, n_u), in the order of `reads`.
 
         `u` is the input at the start of a sub-step and `next` at its end (both interpolated between samples; `u` alone
         is held over the sample), `t` the time in s since the recording's first sample, `y` the measured output.
@@ -76,17 +78,17 @@ class Model:
         n, m = self.substeps, len(recording)
         share = np.tile(np.arange(n) / n, m)
         columns = []
-        for what in self.reads:
-            if what == "t":
+        for signal in self.reads:
+            if signal == "t":
                 columns.append((np.repeat(np.arange(m), n) + share)[:, None] * recording.dt)
-            elif what == "u" and "next" not in self.reads:
+            elif signal == "u" and "next" not in self.reads:
                 columns.append(np.repeat(recording.u, n, axis=0))
             else:
-                values = recording.y if what == "y" else recording.u
-                whole = recording.period if recording.period and m % recording.period == 0 else None
-                after = values[m - whole] if whole else values[-1]
+                values = recording.y if signal == "y" else recording.u
+                period = recording.period if recording.period and m % recording.period == 0 else None
+                after = values[m - period] if period else values[-1]
                 a, b = np.repeat(values, n, axis=0), np.repeat(np.vstack([values[1:], after]), n, axis=0)
-                columns.append(a + (b - a) * (share + (1 / n if what == "next" else 0.0))[:, None])
+                columns.append(a + (b - a) * (share + (1 / n if signal == "next" else 0.0))[:, None])
         return np.ascontiguousarray(np.hstack(columns)) if len(columns) != 1 else columns[0]
 
     @property
@@ -120,7 +122,7 @@ class Model:
         return self.n_x + self.n_s
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """Fresh symbols x, s, u, p of this model's sizes."""
+        """Make fresh symbols x, s, u, p of this model's sizes."""
         sizes = (("x", self.n_x), ("s", self.n_s), ("u", self.n_u), ("p", self.parameters.size))
         x, s, u, p = (ca.SX.sym(name, n) for name, n in sizes)
         return x, s, u, p
@@ -136,7 +138,7 @@ class Model:
         return ca.Function("closed", [state, u, p], [ca.vertcat(x_next, s_next), y], ["x", "u", "p"], ["x_next", "y"])
 
     def with_parameters(self, parameters: ParameterSet) -> Model:
-        """The same equations with other start values, bounds or fixed flags."""
+        """Copy with other start values, bounds or fixed flags of the same parameters."""
         if tuple(parameters) != tuple(self.parameters) or parameters.size != self.parameters.size:
             raise InputError("The parameters given do not match the model's; change values with `parameters.change`.")
         return replace(self, parameters=parameters)
@@ -154,7 +156,7 @@ def open_model(
     inputs: tuple[str, ...] = (),
     outputs: tuple[str, ...] = (),
 ) -> Model:
-    """An open model from Python expressions `step(x, u, w, p) -> (x_next, y)` and `port(x, u, p) -> z`.
+    """Make an open model from Python expressions `step(x, u, w, p) -> (x_next, y)` and `port(x, u, p) -> z`.
 
     Parameters
     ----------
@@ -165,12 +167,19 @@ def open_model(
     n_x, n_u, n_w : int
         States, inputs, and channels of the port (0: no port, `port` is not called).
     states, inputs, outputs : tuple of str
-        Names; numbered where left out.
+        Names; signals without names are numbered.
 
     Raises
     ------
     InputError
         If an expression has another number of rows than there are states or channels, or names are too few or too many.
+
+    Examples
+    --------
+    >>> lag = open_model(lambda x, u, w, p: (p["a"] * x + u - w, x), lambda x, u, p: x,
+    ...                  ParameterSet({"a": Parameter(0.9)}), n_x=1, n_u=1, n_w=1)
+    >>> close_loop(lag, PrandtlIshlinskii(Play, 3)).n_state
+    4
     """
     x, u, w = ca.SX.sym("x", n_x), ca.SX.sym("u", n_u), ca.SX.sym("w", n_w)
     vector = ca.SX.sym("p", parameters.size)
@@ -193,44 +202,53 @@ def open_model(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class StepExpressions:
+    """One step of a closed model as expressions of symbols.
+
+    Attributes
+    ----------
+    x, s, u, p
+        Symbols of the states, the memory, the drive and the parameters.
+    x_next, s_next, y
+        Expressions of the next states, the next memory and the outputs.
+    port : (z, channels, moved), optional
+        The signals that move the memory (expressions of x, u and p), the symbols by which `s_next` reads them, and the
+        symbols by which `x_next` and `y` read the moved memory; each as long as s. Without a port, s is empty.
+    stages : (c, values, by_c, x_next), optional
+        Symbols of intermediate values, and the outputs of `Model.stages`.
+    """
+
+    x: Any
+    s: Any
+    u: Any
+    p: Any
+    x_next: Any
+    s_next: Any
+    y: Any
+    port: tuple[Any, Any, Any] | None = None
+    stages: tuple[Any, Any, Any, Any] | None = None
+
+
 def from_expressions(
-    state: tuple[Any, Any],
-    u: Any,
-    p: Any,
-    following: tuple[Any, Any],
-    y: Any,
+    e: StepExpressions,
     parameters: ParameterSet,
     *,
-    port: tuple[Any, Any, Any] | None = None,
     states: tuple[str, ...],
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
     reads: tuple[str, ...] = ("u",),
     substeps: int = 1,
-    stages: tuple[Any, Any, Any, Any] | None = None,
 ) -> Model:
-    """A closed model from expressions of symbols; the other fields are as in `Model`.
-
-    Parameters
-    ----------
-    state, following : (x, s), (x_next, s_next)
-        States and memory (symbols), and those of the next step.
-    u, p, y
-        Inputs and parameters (symbols), and the outputs.
-    port : (z, channels, moved), optional
-        The signals that move the memory (expressions of x, u and p), the symbols by which `s_next` reads them, and
-        those by which `x_next` and `y` read the memory once moved; each as long as s. Without it, s is empty.
-    stages : (c, values, by_c, x_next), optional
-        Symbols of intermediate values, and what `Model.stages` gives.
-    """
-    (x, s), (x_next, s_next) = state, following
-    z, channels, moved = port or (ca.SX(0, 1),) * 3
-    w = s_next if port else ca.SX(0, 1)
-    c, *staged = stages or (ca.SX(0, 1),)
+    """Make a closed model from expressions of symbols; the names and numbers are those of `Model`."""
+    x, s, u, p = e.x, e.s, e.u, e.p
+    z, channels, moved = e.port or (ca.SX(0, 1),) * 3
+    w = e.s_next if e.port else ca.SX(0, 1)
+    c, *staged = e.stages or (ca.SX(0, 1),)
     return Model(
-        step=ca.Function("step", [x, u, moved, p], [x_next, y], ["x", "u", "w", "p"], ["x_next", "y"]),
+        step=ca.Function("step", [x, u, moved, p], [e.x_next, e.y], ["x", "u", "w", "p"], ["x_next", "y"]),
         port=ca.Function("port", [x, u, p], [z], ["x", "u", "p"], ["z"]),
-        memory=ca.Function("memory", [channels, s, p], [w, s_next], ["z", "s", "p"], ["w", "s_next"]),
+        memory=ca.Function("memory", [channels, s, p], [w, e.s_next], ["z", "s", "p"], ["w", "s_next"]),
         parameters=parameters,
         element=None,
         states=states,
@@ -238,12 +256,24 @@ def from_expressions(
         outputs=outputs,
         reads=reads,
         substeps=substeps,
-        stages=ca.Function("stages", [x, u, moved, p, c], staged) if stages else None,
+        stages=ca.Function("stages", [x, u, moved, p, c], staged) if e.stages else None,
     )
 
 
 def close_loop(model: Any, element: Element, port: str | None = None) -> Any:
-    """Put an element into a model's port, or into a port of a simulator by its name; the result is of the same kind.
+    """Put an element into a model's port, or into the named port of a simulator.
+
+    Parameters
+    ----------
+    model : Model or Simulator
+    element : Element or Law
+    port : str, optional
+        Name of the simulator's port; a model has one port, without a name.
+
+    Returns
+    -------
+    Model or Simulator
+        The closed model or simulator.
 
     Raises
     ------

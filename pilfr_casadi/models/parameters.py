@@ -1,8 +1,8 @@
 """Named, bounded, shaped parameters and the one way they become a vector.
 
 A model carries a `ParameterSet`: an ordered, immutable mapping from names to `Parameter`. Arrays are stacked column by
-column (CasADi's `vec`), in the order of the names, so numbers and symbols share one layout. Bounds are bounds: they go
-to the solver as they are, a parameter is never re-expressed to satisfy them.
+column (CasADi's `vec`) in the order of the names, so numbers and symbols share one layout. Bounds go to the solver as
+they are; a parameter is never transformed to satisfy them.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, filled
+from .._base import InputError, filled, listed
 
 Array = np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Parameter:
-    """A parameter of a model: a start value with its unit, bounds and whether it is estimated.
+    """A parameter of a model: a start value with its unit, its bounds, and whether it is estimated.
 
     Parameters
     ----------
     value : float or array
-        Start value (or the value, where `fixed`). Scalars, vectors (n,) and matrices (n, m) are legal.
+        Start value (the value itself where `fixed`). Scalars, vectors (n,) and matrices (n, m) are allowed.
     unit : str
         Unit in plain text.
     bounds : (lower, upper)
-        Scalars or arrays of the value's shape; infinite where there is none.
+        Scalars or arrays of the value's shape; infinite where there is no bound.
     fixed : bool or bool array
         Entries that are not estimated.
     prior : (mean, std), optional
@@ -40,7 +40,14 @@ class Parameter:
     Raises
     ------
     InputError
-        If a number is not finite, a lower bound exceeds its upper bound, or the value lies outside its bounds.
+        If a number is not finite, a lower bound exceeds its upper bound, the value lies outside its bounds, or an
+        argument has the wrong type.
+
+    Examples
+    --------
+    >>> stiffness = Parameter(1100.0, unit="N/m", bounds=(500, 3000))
+    >>> stiffness.shape, stiffness.size
+    ((1, 1), 1)
     """
 
     value: Any
@@ -58,6 +65,8 @@ class Parameter:
             raise InputError(f"A parameter has {value.ndim} dimensions; give a scalar, a vector or a matrix.")
         if not np.all(np.isfinite(value)):
             raise InputError("A parameter's value is not finite; give a number.")
+        if not isinstance(self.unit, str):
+            raise InputError(f"A parameter's unit is {self.unit!r}; give plain text, such as 'N/m'.")
         lower, upper = (_filled(bound, value.shape, "A bound") for bound in _pair(self.bounds, "bounds (lower, upper)"))
         fixed = _filled(self.fixed, value.shape, "A fixed flag").astype(bool)
         between = f"({self.bounds[0]}, {self.bounds[1]})"
@@ -86,18 +95,26 @@ class Parameter:
         """Number of entries."""
         return int(self.value.size)
 
+    def _moved_to(self, value: Array) -> Parameter:
+        """Copy with another value, which is trusted: finite, inside the bounds, of the same shape, nobody else's."""
+        copy = object.__new__(type(self))
+        copy.__dict__.update(self.__dict__)
+        value.setflags(write=False)
+        copy.__dict__["value"] = value
+        return copy
 
-def _pair(given: Any, what: str) -> tuple[Any, Any]:
+
+def _pair(given: Any, name: str) -> tuple[Any, Any]:
     try:
         first, second = given
     except (TypeError, ValueError):
-        raise InputError(f"A parameter's {what} were given as {given!r}; give a pair.") from None
+        raise InputError(f"A parameter's {name} were given as {given!r}; give a pair.") from None
     return first, second
 
 
-def _filled(given: Any, shape: tuple[int, ...], what: str) -> Array:
-    """Numbers of a parameter's shape, a copy."""
-    return np.array(filled(given, f"{what} of a parameter", shape, nan=True, infinite=True))
+def _filled(given: Any, shape: tuple[int, ...], name: str) -> Array:
+    """Copy numbers into a parameter's shape."""
+    return np.array(filled(given, f"{name} of a parameter", shape, nan=True, infinite=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +136,7 @@ class ParameterSet(Mapping[str, Parameter]):
         return len(self.entries)
 
     def __or__(self, other: Mapping[str, Parameter]) -> ParameterSet:
-        """Both sets, names of `other` appended; a name in both is an error."""
+        """Join both sets, names of `other` last; a name in both is an error."""
         twice = set(self) & set(other)
         if twice:
             raise InputError(
@@ -158,7 +175,7 @@ class ParameterSet(Mapping[str, Parameter]):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """One readable name an entry: `m`, `w[3]`, `A[0,1]` (indices from 0)."""
+        """One readable name for each entry: `m`, `w[3]`, `A[0,1]` (indices from 0)."""
         out: list[str] = []
         for name, p in self.items():
             if p.value.ndim == 0:
@@ -169,20 +186,25 @@ class ParameterSet(Mapping[str, Parameter]):
                 out += [f"{name}[{i},{j}]" for j in range(p.shape[1]) for i in range(p.shape[0])]
         return tuple(out)
 
+    def _slices(self) -> Iterator[tuple[str, Parameter, slice]]:
+        begin = 0
+        for name, p in self.items():
+            yield name, p, slice(begin, begin + p.size)
+            begin += p.size
+
     def position(self, name: str) -> slice:
-        """Where a parameter sits in the vector."""
-        at = 0
-        for n, p in self.items():
-            if n == name:
-                return slice(at, at + p.size)
-            at += p.size
-        raise InputError(f"There is no parameter {name!r}; there are {', '.join(self)}.")
+        """Find the entries of a parameter in the vector."""
+        self._require([name])
+        return next(entries for n, _, entries in self._slices() if n == name)
+
+    def _require(self, names: Any) -> None:
+        for name in names:
+            if name not in self.entries:
+                raise InputError(f"There is no parameter {name!r}; there are {listed(list(self))}.")
 
     def pack(self, values: Mapping[str, Any]) -> Array:
-        """Vector from values by name; names left out keep their start value."""
-        for name in values:
-            if name not in self.entries:
-                raise InputError(f"There is no parameter {name!r}; there are {', '.join(self)}.")
+        """Make a vector from values by name; parameters that are not named keep their start value."""
+        self._require(values)
         full = {}
         for n, p in self.items():
             value = np.asarray(values.get(n, p.value), dtype=float)
@@ -192,24 +214,77 @@ class ParameterSet(Mapping[str, Parameter]):
         return self._stack(full)
 
     def unpack(self, vector: Array) -> dict[str, Array]:
-        """Values by name from a vector of shape (size,)."""
+        """Make values by name from a vector of shape (size,)."""
         vector = np.asarray(vector, dtype=float).ravel()
         if vector.size != self.size:
             raise InputError(f"A parameter vector of length {vector.size} was given; expected {self.size}.")
-        return {n: vector[self.position(n)].reshape(p.value.shape, order="F") for n, p in self.items()}
+        return {n: vector[entries].reshape(p.value.shape, order="F") for n, p, entries in self._slices()}
 
     def symbols(self, vector: Any) -> dict[str, Any]:
-        """CasADi expressions by name (as matrices) from a symbolic vector of shape (size, 1)."""
-        return {n: ca.reshape(vector[self.position(n)], *p.shape) for n, p in self.items()}
+        """Make CasADi expressions by name (as matrices) from a symbolic vector of shape (size, 1)."""
+        return {n: ca.reshape(vector[entries], *p.shape) for n, p, entries in self._slices()}
 
     def at(self, vector: Array) -> ParameterSet:
-        """The same set with start values from a vector, moved onto the bounds where rounding left them outside."""
+        """Copy with start values from a vector, clipped to the bounds.
+
+        Raises
+        ------
+        InputError
+            If the vector has another length or an entry is not finite.
+        """
         values = self.unpack(np.clip(vector, self.lower, self.upper))
-        return ParameterSet({n: replace(p, value=values[n]) for n, p in self.items()})
+        if not all(np.all(np.isfinite(value)) for value in values.values()):
+            raise InputError("A parameter's value is not finite; give a number.")
+        return ParameterSet({n: p._moved_to(values[n]) for n, p in self.items()})
 
     def change(self, **changes: Mapping[str, Any]) -> ParameterSet:
-        """A copy with fields of some parameters replaced: `change(A={"fixed": True}, w={"bounds": (0, 1)})`."""
-        for name in changes:
-            if name not in self.entries:
-                raise InputError(f"There is no parameter {name!r}; there are {', '.join(self)}.")
+        """Copy with fields of some parameters replaced: `change(A={"fixed": True}, w={"bounds": (0, 1)})`."""
+        self._require(changes)
         return ParameterSet({n: replace(p, **changes[n]) if n in changes else p for n, p in self.items()})
+
+
+class Neighbours:
+    """Judge the size of an entry by the other entries of its row, its column and its matrix.
+
+    An entry that is zero has no size of its own. `sqrt(largest of its row × largest of its column)` is never less than
+    the entry itself, and has its unit wherever the entries of a row or of a column share a unit.
+
+    Parameters
+    ----------
+    labels : tuple of str
+        Names of the entries, such as `A[0,1]`; see `ParameterSet.labels`.
+    """
+
+    def __init__(self, labels: tuple[str, ...]) -> None:
+        keys = [_row_column_matrix(label) for label in labels]
+        self._row, self._column, self._matrix = (
+            np.unique([key[k] for key in keys], return_inverse=True)[1] if keys else np.zeros(0, dtype=int)
+            for k in range(3)
+        )
+
+    def sizes(self, values: Array) -> Array:
+        """Size of each entry by its row and column, shape (n,)."""
+        values = np.abs(values)
+        return np.sqrt(_largest(values, self._row)) * np.sqrt(_largest(values, self._column))
+
+    def largest(self, values: Array) -> Array:
+        """Largest value of the matrix that each entry belongs to, shape (n,)."""
+        return _largest(values, self._matrix)
+
+
+def _row_column_matrix(label: str) -> tuple[str, str, str]:
+    name, _, inside = label.partition("[")
+    indices, _, rest = inside.partition("]")
+    row, _, column = indices.partition(",")
+    return f"{name}{rest} {row}", f"{name}{rest} ,{column}", name + rest
+
+
+def _largest(values: Array, group: Array) -> Array:
+    out = np.zeros(int(group.max(initial=-1)) + 1)
+    np.maximum.at(out, group, values)
+    return np.asarray(out[group])
+
+
+def or_one(scale: Array) -> Array:
+    """Replace scales of zero by one, so that a constant signal can be divided by its scale."""
+    return np.where(scale > 0, scale, 1.0)

@@ -1,9 +1,11 @@
-"""The PI-LFR model class and what is the same with some blocks fixed.
+"""The PI-LFR model class, its special cases with fixed blocks, and the place of the element in it.
 
     x⁺ = A x + B_u u + B_w w,   y = C_y x + D_yu u + D_yw w + y_0,   z = C_z x + D_zu u,   w = element(z)
 
 Krikelis et al. (2024), Eq. 15-17, with `n_z = n_w` channels, and a constant `y_0` for sensors that do not read zero
-at rest. Without an element this is a linear state-space model; `hammerstein` and `wiener` fix blocks.
+at rest. Without an element this is a linear state-space model. A Hammerstein model (`hammerstein`) fixes `B_u = 0` and
+`D_zu = I`, a Wiener model (`wiener`) fixes `C_y = 0` and `D_yw = I`. The functions at the end of this file recognise
+such structures, because their start values need no direction of z.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, filled
-from .elements import Element
+from .elements import Element, is_element
 from .model import Model, close_loop, open_model
 from .parameters import Parameter, ParameterSet
 
@@ -23,7 +25,7 @@ BLOCKS = ("A", "B_u", "B_w", "C_y", "D_yu", "D_yw", "C_z", "D_zu", "y_0")
 
 
 def block_shapes(nx: int, n_u: Any, n_y: Any, n_w: int) -> dict[str, tuple[Any, ...]]:
-    """Shapes of the linear blocks; names in place of n_u and n_y, where these are not known, stay names."""
+    """Give the shapes of the linear blocks; strings in place of unknown n_u and n_y are passed through."""
     return {
         "A": (nx, nx),
         "B_u": (nx, n_u),
@@ -39,7 +41,7 @@ def block_shapes(nx: int, n_u: Any, n_y: Any, n_w: int) -> dict[str, tuple[Any, 
 
 @dataclass(frozen=True)
 class PILFR:
-    """A PI-LFR model structure: what to identify, before data says how many inputs and outputs there are.
+    """A PI-LFR model structure, before data says how many inputs and outputs there are.
 
     Parameters
     ----------
@@ -48,12 +50,12 @@ class PILFR:
     element : Element or None
         The element in the loop, usually `PrandtlIshlinskii`; None for a linear model.
     fixed : mapping
-        Blocks held at a value, for example `{"D_yu": 0.0}`; a number fills the block, an array has its shape, entries
-        that are nan stay free: `{"A": [[0.9, nan], [0.0, nan]]}` says what is known of the physics. Of `B_w` and `D_yw`
-        a row of zeros and nan, one for each channel of the element, says which channels enter.
+        Blocks fixed at a value, for example `{"D_yu": 0.0}`. A number fills the block; an array has its shape, and its
+        nan entries stay free: `{"A": [[0.9, nan], [0.0, nan]]}`. For `B_w` and `D_yw` a row of zeros and nan, one for
+        each channel of the element, selects the channels that enter.
     bounds : mapping
-        `(lower, upper)` by parameter name, for example `{"w": (0, 2)}`; those of the element, such as `w ≥ 0` and
-        `r ≥ 0`, hold beside them.
+        `(lower, upper)` by parameter name, for example `{"w": (0, 2)}`, in addition to the element's own, such as
+        `w ≥ 0` and `r ≥ 0`.
     priors : mapping
         `(mean, std)` by parameter name: a quadratic prior, see `Parameter`.
     offset : bool
@@ -62,9 +64,16 @@ class PILFR:
     Raises
     ------
     InputError
-        If nx is no whole number of 0 or more, the element is none, a fixed, bounded or prior parameter is unknown, a
-        bound or prior is no pair, what is given is neither a number nor an array of the parameter's shape, or it is
-        beyond the element's own bounds.
+        If nx is not a whole number of 0 or more, the element is not an element, a fixed, bounded or prior parameter is
+        unknown, a bound or prior is not a pair, a value is neither a number nor an array of the parameter's shape, or
+        it lies outside the element's own bounds.
+
+    Examples
+    --------
+    >>> from pilfr_casadi import Play, PrandtlIshlinskii
+    >>> structure = PILFR(nx=5, element=PrandtlIshlinskii(Play, 20), fixed={"D_yu": 0.0})
+    >>> structure.count(n_u=1, n_y=1)
+    88
     """
 
     nx: int
@@ -81,10 +90,10 @@ class PILFR:
             raise InputError(f"The number of states is {self.nx}; give a whole number, 0 or more.")
         object.__setattr__(self, "nx", int(self.nx))
         _check_element(self.element)
-        for what in ("fixed", "bounds", "priors"):
-            given = getattr(self, what)
+        for option in ("fixed", "bounds", "priors"):
+            given = getattr(self, option)
             if not isinstance(given, Mapping):
-                raise InputError(f"{what} = {given!r} was given; give values by parameter name, a mapping.")
+                raise InputError(f"{option} = {given!r} was given; give values by parameter name, a mapping.")
         known = (*BLOCKS, *(self.element.parameters() if self.element else ()))
         for name in (*self.fixed, *self.bounds, *self.priors):
             if name not in known:
@@ -96,9 +105,9 @@ class PILFR:
         elements = self.element.parameters() if self.element else {}
         shapes = {**block_shapes(self.nx, "n_u", "n_y", self.n_w), **{k: p.value.shape for k, p in elements.items()}}
         for name, shape in shapes.items():
-            told = self._given(name, shape)
+            given = self._given(name, shape)
             if name in elements:
-                _check_within(name, elements[name], told)
+                _check_within(name, elements[name], given)
 
     @property
     def n_w(self) -> int:
@@ -106,19 +115,19 @@ class PILFR:
         return 0 if self.element is None else self.element.channels
 
     def _given(self, name: str, shape: tuple[Any, ...]) -> dict[str, Any]:
-        """What is said of a parameter, filled to its shape: `fixed`, `bounds`, `prior`, as far as they are given.
+        """Collect `fixed`, `bounds` and `prior` of a parameter, as far as they are given, filled to its shape.
 
         Raises
         ------
         InputError
-            If something is neither a number nor an array of this shape.
+            If one of them is neither a number nor an array of this shape.
         """
         out: dict[str, Any] = {}
         if name in self.fixed:
             value = self.fixed[name]
-            if name in ("B_w", "D_yw") and _says_which(value, self.n_w):
+            if name in ("B_w", "D_yw") and _selects_channels(value, self.n_w):
                 value = np.tile(value, (shape[0], 1)) if isinstance(shape[0], int) else np.nan
-            out["fixed"] = filled(value, f"What {name!r} is fixed at", shape, nan=True)
+            out["fixed"] = filled(value, f"The fixed value of {name!r}", shape, nan=True)
         if name in self.bounds:
             low, high = self.bounds[name]
             ends = ((low, "lower"), (high, "upper"))
@@ -139,7 +148,7 @@ class PILFR:
         inputs: tuple[str, ...] = (),
         outputs: tuple[str, ...] = (),
     ) -> Model:
-        """The closed model for n_u inputs and n_y outputs, blocks starting at `values` (zero where not given)."""
+        """Build the closed model for n_u inputs and n_y outputs; blocks start at `values`, or at zero."""
         values = dict(values or {})
         self._check_channels(n_u, n_y)
         shapes = block_shapes(self.nx, n_u, n_y, self.n_w)
@@ -147,33 +156,38 @@ class PILFR:
         model = open_model(_step, _port, blocks, n_x=self.nx, n_u=n_u, n_w=self.n_w, inputs=inputs, outputs=outputs)
         if self.element is not None:
             model = close_loop(model, self.element)
-        changes: dict[str, dict[str, Any]] = {}
-        for name, p in model.parameters.items():
-            told, shape = self._given(name, p.value.shape), p.value.shape
-            lower, upper = told.get("bounds", p.bounds)
-            low, high = np.maximum(lower, p.bounds[0]), np.minimum(upper, p.bounds[1])
-            given = values.get(name, p.value) if p.value.size else p.value  # a larger structure has more blocks
-            begin = np.clip(filled(given, f"The value of {name!r}", shape), low, high)
-            changes[name] = {"value": begin, "bounds": (low, high)}
-            if name == "y_0" and not self.offset:
-                told.setdefault("fixed", np.zeros(shape))
-            if "fixed" in told:
-                free = np.isnan(told["fixed"])
-                changes[name] |= {"value": np.where(free, begin, told["fixed"]), "fixed": ~free}
-            if "prior" in told:
-                changes[name]["prior"] = told["prior"]
+        changes = {name: self._fields(name, p, values) for name, p in model.parameters.items()}
         return model.with_parameters(model.parameters.change(**changes))
 
+    def _fields(self, name: str, p: Parameter, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Make the fields of a parameter from the structure's options and the start values."""
+        shape = p.value.shape
+        options = self._given(name, shape)
+        lower, upper = options.get("bounds", p.bounds)
+        low, high = np.maximum(lower, p.bounds[0]), np.minimum(upper, p.bounds[1])
+        given = values.get(name, p.value) if p.value.size else p.value  # a larger structure has more blocks
+        start = np.clip(filled(given, f"The value of {name!r}", shape), low, high)
+        fields: dict[str, Any] = {"value": start, "bounds": (low, high)}
+        if name == "y_0" and not self.offset:
+            options.setdefault("fixed", np.zeros(shape))
+        if "fixed" in options:
+            free = np.isnan(options["fixed"])
+            fields |= {"value": np.where(free, start, options["fixed"]), "fixed": ~free}
+        if "prior" in options:
+            fields["prior"] = options["prior"]
+        return fields
+
     def _check_channels(self, n_u: int, n_y: int) -> None:
-        for name, count, what in (("D_zu", n_u, "input"), ("D_yw", n_y, "output")):
-            if _is_identity(self.fixed.get(name), self.n_w) and count != self.n_w:
+        for name, count, signal in (("D_zu", n_u, "input"), ("D_yw", n_y, "output")):
+            square = np.shape(self.fixed.get(name)) == (self.n_w, self.n_w)
+            if self.n_w and square and _is_identity(self, name) and count != self.n_w:
                 raise InputError(
                     f"{name} is fixed to the identity (as in a Hammerstein or Wiener model) with {self.n_w} channel(s) "
-                    f"of the element, but there are {count} {what}(s); give channels={count} to the element."
+                    f"of the element, but there are {count} {signal}(s); give channels={count} to the element."
                 )
 
     def count(self, n_u: int, n_y: int) -> int:
-        """How many parameters are free, without building the model, which takes long where there are millions."""
+        """Count the free parameters without building the model, which takes long where there are millions."""
         self._check_channels(n_u, n_y)
         own = {name: ~p.fixed for name, p in (self.element.parameters() if self.element else {}).items()}
         total = 0
@@ -189,50 +203,45 @@ class PILFR:
         return 0 if fixed is None else int(np.isnan(fixed).sum())
 
     def linear(self) -> PILFR:
-        """The linear model of the same order, everything free."""
+        """Make the linear structure of the same order, everything free."""
         return PILFR(self.nx, offset=self.offset)
 
 
 def _check_element(element: Any) -> None:
-    wanted = "give an element, such as PrandtlIshlinskii(Play, 20), or None for a linear model"
-    if element is None:
+    if element is None or is_element(element):
         return
-    if isinstance(element, type):
-        raise InputError(f"The element is {element.__name__}, a class; {wanted}.")
-    if not all(hasattr(element, name) for name in ("channels", "memory", "parameters", "step")):
-        raise InputError(f"The element is {element!r}; {wanted}.")
+    given = f"{element.__name__}, a class" if isinstance(element, type) else repr(element)
+    raise InputError(
+        f"The element is {given}; give an element, such as PrandtlIshlinskii(Play, 20), or None for a linear model."
+    )
 
 
-def _check_pair(what: str, given: Any, wanted: str) -> None:
+def _check_pair(name: str, given: Any, wanted: str) -> None:
     try:
         first, second = (np.asarray(part, dtype=float) for part in given)
     except (TypeError, ValueError):
         first = second = np.asarray(np.nan)
     if np.any(np.isnan(first)) or np.any(np.isnan(second)):
-        raise InputError(f"{given!r} was given as {what}; give a pair of numbers {wanted}.")
+        raise InputError(f"{given!r} was given as {name}; give a pair of numbers {wanted}.")
 
 
-def _check_within(name: str, own: Parameter, told: dict[str, Any]) -> None:
-    """Refuse bounds and fixed values beyond those of the element, such as thresholds and weights below zero."""
+def _check_within(name: str, own: Parameter, options: dict[str, Any]) -> None:
+    """Refuse bounds and fixed values outside the bounds of the element, such as weights below zero."""
     low, high = own.bounds
-    bounds = [(f"A bound of {name!r}", value) for value in told.get("bounds", ())]
-    for what, value in (*bounds, (f"What {name!r} is fixed at", told.get("fixed", np.nan))):
+    bounds = [(f"A bound of {name!r}", value) for value in options.get("bounds", ())]
+    for option, value in (*bounds, (f"The fixed value of {name!r}", options.get("fixed", np.nan))):
         beyond = np.isfinite(value) & ((value < low) | (value > high))
         if np.any(beyond):
             most = f" and at most {np.max(high):g}" if np.all(np.isfinite(high)) else ""
             raise InputError(
-                f"{what} is {float(np.broadcast_to(value, beyond.shape)[beyond][0]):g}, but the element's {name} is at "
-                f"least {np.min(low):g}{most}; give a number within, or as a bound numpy.inf for none of your own."
+                f"{option} is {float(np.broadcast_to(value, beyond.shape)[beyond][0]):g}, but the element's {name} is "
+                f"at least {np.min(low):g}{most}; give a number within, or as a bound numpy.inf for none of your own."
             )
 
 
-def _says_which(value: Any, n: int) -> bool:
-    """Whether a value is a row of n zeros and nan."""
+def _selects_channels(value: Any, n: int) -> bool:
+    """Tell whether a value is a row of n zeros and nan."""
     return isinstance(value, np.ndarray) and value.shape == (n,) and bool(np.all(np.isnan(value) | (value == 0)))
-
-
-def _is_identity(value: Any, n: int) -> bool:
-    return n > 0 and np.shape(value) == (n, n) and bool(np.all(np.asarray(value) == np.eye(n)))
 
 
 def _step(x: Any, u: Any, w: Any, p: dict[str, Any]) -> tuple[Any, Any]:
@@ -245,9 +254,9 @@ def _port(x: Any, u: Any, p: dict[str, Any]) -> Any:
 
 
 def hammerstein(nx: int, element: Element, offset: bool = True) -> PILFR:
-    """PI-Hammerstein: the input passes the element first; `z = u`, and u reaches the dynamics only through w.
+    """Make a PI-Hammerstein structure: the input passes the element first, so `z = u`.
 
-    The element has one channel for each input.
+    The input reaches the dynamics only through w. The element has one channel for each input.
     """
     _check_element(element)
     eye = np.eye(element.channels)
@@ -255,10 +264,46 @@ def hammerstein(nx: int, element: Element, offset: bool = True) -> PILFR:
 
 
 def wiener(nx: int, element: Element, offset: bool = True) -> PILFR:
-    """PI-Wiener: the linear dynamics come first, the output is read through the element; `y = w`.
+    """Make a PI-Wiener structure: the output is the signal of the linear dynamics after the element, `y = w`.
 
     The element has one channel for each output.
     """
     _check_element(element)
     eye = np.eye(element.channels)
     return PILFR(nx, element, {"B_w": 0.0, "C_y": 0.0, "D_yu": 0.0, "D_yw": eye}, offset=offset)
+
+
+def is_zero(structure: PILFR, name: str) -> bool:
+    """Tell whether a block is fixed at zero."""
+    return name in structure.fixed and not np.any(structure.fixed[name])
+
+
+def _is_identity(structure: PILFR, name: str) -> bool:
+    """Tell whether a block between channels is fixed at the identity."""
+    given, eye = structure.fixed.get(name, np.nan), np.eye(structure.n_w)
+    return np.shape(given) in ((), eye.shape) and np.array_equal(np.broadcast_to(given, eye.shape), eye)
+
+
+def fixed_whole(structure: PILFR) -> list[str]:
+    """List the blocks that have no free entry."""
+    return [k for k, v in structure.fixed.items() if not np.any(np.isnan(np.asarray(v, dtype=float)))]
+
+
+def read_through(structure: PILFR) -> bool:
+    """Tell whether the output is read through the element alone (Wiener)."""
+    return is_zero(structure, "C_y") and _is_identity(structure, "D_yw")
+
+
+def driven_through(structure: PILFR) -> bool:
+    """Tell whether the input reaches the dynamics through the element alone (Hammerstein)."""
+    return is_zero(structure, "B_u") and _is_identity(structure, "D_zu")
+
+
+def direction_fixed(structure: PILFR) -> bool:
+    """Tell whether z has no free direction: `C_z` and `D_zu` are fixed, or z is that of the output (Wiener)."""
+    return {"C_z", "D_zu"} <= set(fixed_whole(structure)) or read_through(structure)
+
+
+def places(structure: PILFR) -> tuple[str, ...]:
+    """List the places of the element in the first starts, one where z has no free direction; later starts draw it."""
+    return ("output",) if direction_fixed(structure) else ("output", "input")

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..data import Recording
 from ..diagnose import Constant, Fitted, Workbench
-from ..models import ParameterSet, mapped
+from ..models import ParameterSet, map_points
 from ..simulators import Equations, Instant, Simulator, discretise, on_grid, signals, states_along
 from .smoother import UnknownForce
 
@@ -102,7 +102,7 @@ def _law_signals(
     x, s, u, v, t = (ca.SX.sym(k, m) for k, m in (("x", n_x), ("s", n_s), ("u", n_u), ("v", n_u), ("t", 1)))
     found = equations.evaluate(Instant(x, s, u, v, t))[3][number]
     function = ca.Function("law", [ca.vertcat(x, s), u, v, t, vector], [ca.vertcat(*map(ca.SX, found))])
-    (rows,) = mapped(function, states, r.u, _slope(bench, r), r.t[:, None], fitted.vector)
+    (rows,) = map_points(function, states, r.u, _slope(bench, r), r.t[:, None], fitted.vector)
     return rows[:, 0, 0], rows[:, 1, 0], rows[:, 2, 0]
 
 
@@ -165,7 +165,7 @@ def _recover(
         p[:, row] = np.repeat(held, n)
         states = states_along(model, drive, p, x0)
         cut = slice(window.start * n, window.stop * n)
-        simulated, *blocks = mapped(step, states[cut], drive[cut], p[cut])
+        simulated, *blocks = map_points(step, states[cut], drive[cut], p[cut])
         error = r.y[window] - simulated[::n, :, 0]
         if not np.all(np.isfinite(error)):
             break

@@ -20,7 +20,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..models import Model, ParameterSet, accumulated, from_expressions
+from ..models import Model, ParameterSet, StepExpressions, accumulate_steps, from_expressions
 from .expressions import Named, call
 from .simulator import Placed, Simulator, in_series
 
@@ -208,20 +208,15 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
         state, following = (ca.vertcat(x, s), empty), (ca.vertcat(x_next, begun), empty)
         if stages is not None:
             stages = stages[0], staged[0], staged[1], ca.vertcat(staged[2], begun)
+    (x, s), (x_next, s_next) = state, following
     return from_expressions(
-        state,
-        ca.vertcat(*columns),
-        vector,
-        following,
-        y,
+        StepExpressions(x, s, ca.vertcat(*columns), vector, x_next, s_next, y, port, stages),
         own,
-        port=port,
         states=simulator.states,
         inputs=simulator.inputs,
         outputs=simulator.output_names,
         reads=tuple(reads),
         substeps=substeps,
-        stages=stages,
     )
 
 
@@ -229,7 +224,7 @@ def states_along(model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray) 
     """States at the start of each step of a run from x, shape (K, n_x); p (n_p,), or (K, n_p) where it changes."""
     rows = p if p.ndim == 2 else np.broadcast_to(p, (len(drive), len(p)))
     with np.errstate(all="ignore"):
-        found = accumulated(model.closed, x, drive, rows)[0]
+        found = accumulate_steps(model.closed, x, drive, rows)[0]
     return np.vstack([x[None], found[:-1]])
 
 

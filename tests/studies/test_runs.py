@@ -209,7 +209,7 @@ def test_a_missing_model_is_made_again(folder):
         ("[solver]", "[regularization]\npath = 3\n[solver]", "'path'"),
         ("[solver]", "[regularization]\npath = [true]\n[solver]", "'path' in [regularization] is [True]"),
         ("[solver]", "[regularization]\npath = [0.0]\n[solver]", "strengths above zero"),
-        ("nx = 1", "nx = 1\nfix = { A = [[0.9, 0.1]] }", "'A' is fixed at has the shape (1, 2)"),
+        ("nx = 1", "nx = 1\nfix = { A = [[0.9, 0.1]] }", "The fixed value of 'A' has the shape (1, 2)"),
         ("nx = 1", "nx = 1\nbounds = { w = [[0.0, 0.1], 1.0] }", "The lower bound of 'w' has the shape (2,)"),
         ("nx = 1", "nx = 1\npriors = { A = [[0.9, 0.1], 1.0] }", "The mean of the prior of 'A' has the shape (2,)"),
         ("[solver]", "[constraints]\ndc_gain = [1.0, 2.0]\n[solver]", "dc_gain have the shape (2,)"),

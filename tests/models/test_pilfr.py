@@ -206,16 +206,19 @@ NAN = float("nan")
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"fixed": {"A": [[0.9, 0.1]]}}, r"'A' is fixed at has the shape \(1, 2\); give a number .* shape \(2, 2\)"),
-        ({"fixed": {"A": [[0.9], [0.1]]}}, r"'A' is fixed at has the shape \(2, 1\)"),
-        ({"fixed": {"A": [0.9, 0.1]}}, r"'A' is fixed at has the shape \(2,\)"),
-        ({"fixed": {"A": [[0.9, 0.1], [1.0]]}}, r"'A' is fixed at is \[\[0.9, 0.1\], \[1.0\]\]; give a number"),
-        ({"fixed": {"A": None}}, "'A' is fixed at is None; give a number"),
-        ({"fixed": {"A": "0.9"}}, "'A' is fixed at is 0.9; give a number"),
-        ({"fixed": {"A": np.inf}}, "'A' is fixed at holds a value that is not finite"),
-        ({"fixed": {"B_w": np.array([1.0])}}, r"'B_w' is fixed at has the shape \(1,\)"),
+        (
+            {"fixed": {"A": [[0.9, 0.1]]}},
+            r"The fixed value of .A. has the shape \(1, 2\); give .* shape \(2, 2\)",
+        ),
+        ({"fixed": {"A": [[0.9], [0.1]]}}, r"The fixed value of 'A' has the shape \(2, 1\)"),
+        ({"fixed": {"A": [0.9, 0.1]}}, r"The fixed value of 'A' has the shape \(2,\)"),
+        ({"fixed": {"A": [[0.9, 0.1], [1.0]]}}, r"The fixed value of 'A' is \[\[0.9, 0.1\], \[1.0\]\]; give a number"),
+        ({"fixed": {"A": None}}, "The fixed value of 'A' is None; give a number"),
+        ({"fixed": {"A": "0.9"}}, "The fixed value of 'A' is 0.9; give a number"),
+        ({"fixed": {"A": np.inf}}, "The fixed value of 'A' holds a value that is not finite"),
+        ({"fixed": {"B_w": np.array([1.0])}}, r"The fixed value of 'B_w' has the shape \(1,\)"),
         ({"fixed": {"B_u": [[1.0, 0.0]]}}, r"shape \(1, 2\); give a number or an array of shape \(2, n_u\)"),
-        ({"fixed": {"r": [0.1, 0.2]}}, r"'r' is fixed at has the shape \(2,\); give a number .* shape \(1, 3\)"),
+        ({"fixed": {"r": [0.1, 0.2]}}, r"The fixed value of 'r' has the shape \(2,\); give a number .* shape \(1, 3\)"),
         ({"bounds": {"w": ([[0.0, 0.0]], 1.0)}}, r"The lower bound of 'w' has the shape \(1, 2\)"),
         ({"bounds": {"A": (-1.0, [1.0, 1.0])}}, r"The upper bound of 'A' has the shape \(2,\)"),
         ({"bounds": {"A": ([[0, 1], [2]], 1.0)}}, "bounds of 'A'; give a pair"),
@@ -224,7 +227,7 @@ NAN = float("nan")
             "A bound of 'r' is -1, but the element's r is at least 0; give",
         ),
         ({"bounds": {"w": (-np.inf, [[-0.5, 1.0, 1.0]])}}, "A bound of 'w' is -0.5, but"),
-        ({"fixed": {"w": [[NAN, 0.3, -0.2]]}}, "What 'w' is fixed at is -0.2, but the element's w is at least 0"),
+        ({"fixed": {"w": [[NAN, 0.3, -0.2]]}}, "The fixed value of 'w' is -0.2, but the element's w is at least 0"),
         ({"priors": {"A": ([[0.9, 0.1]], 1.0)}}, r"The mean of the prior of 'A' has the shape \(1, 2\)"),
         ({"priors": {"A": (np.inf, 1.0)}}, "The mean of the prior of 'A' holds a value that is not finite"),
         ({"priors": {"w": (0.0, [1.0, 1.0])}}, r"The standard deviation of the prior of 'w' has the shape \(2,\)"),
@@ -241,7 +244,7 @@ def test_shapes_that_data_tells_are_checked_with_it():
     structure = PILFR(2, ONE, fixed={"B_u": [[1.0], [0.0]], "A": [[0.9, NAN], [0.0, NAN]]})
     p = structure.model(1, 1).parameters
     assert p["A"].fixed.tolist() == [[True, False], [True, False]] and p["B_u"].fixed.all()
-    with pytest.raises(InputError, match=r"'B_u' is fixed at has the shape \(2, 1\); give .* shape \(2, 2\)"):
+    with pytest.raises(InputError, match=r"The fixed value of 'B_u' has the shape \(2, 1\); give .* shape \(2, 2\)"):
         structure.model(2, 1)
     with pytest.raises(InputError, match=r"The value of 'A' has the shape \(1, 2\)"):
         structure.model(1, 1, {"A": [[0.9, 0.1]]})

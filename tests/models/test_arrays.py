@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pilfr_casadi.models import accumulated, mapped
+from pilfr_casadi.models import accumulate_steps, map_points
 from pilfr_casadi.models.arrays import BLOCK
 
 
@@ -20,7 +20,7 @@ def parts():
 def test_every_point(parts, count):
     rng = np.random.default_rng(0)
     x, u, p = rng.normal(size=(count, 3)), rng.normal(size=(count, 1)), np.array([0.7, -2.0])
-    found = mapped(parts[0], x, u, p)
+    found = map_points(parts[0], x, u, p)
     assert [a.shape for a in found] == [(count, 3, 3), (count, 2, 1)]
     for k in (0, count // 2, count - 1):
         for a, expected in zip(found, parts[0](x[k], u[k], p), strict=True):
@@ -31,7 +31,7 @@ def test_every_point(parts, count):
 def test_every_step(parts, count):
     rng = np.random.default_rng(1)
     state, u, p = rng.normal(size=3), rng.normal(size=(count, 1)), np.tile([0.7, -2.0], (count, 1))
-    states, seen = accumulated(parts[1], state, u, p)
+    states, seen = accumulate_steps(parts[1], state, u, p)
     for k in range(count):
         state, y = (np.asarray(v).ravel() for v in parts[1](state, u[k], p[k]))
         assert np.array_equal(states[k], state) and np.array_equal(seen[k], y)
@@ -41,5 +41,5 @@ def test_without_states():
     x, u = ca.SX.sym("x", 0), ca.SX.sym("u")
     step = ca.Function("static", [x, u], [x, 2 * u])
     u = np.arange(5.0)[:, None]
-    assert np.array_equal(mapped(step, np.zeros((5, 0)), u)[1][:, :, 0], 2 * u)
-    assert np.array_equal(accumulated(step, np.zeros(0), u)[1], 2 * u)
+    assert np.array_equal(map_points(step, np.zeros((5, 0)), u)[1][:, :, 0], 2 * u)
+    assert np.array_equal(accumulate_steps(step, np.zeros(0), u)[1], 2 * u)
