@@ -33,8 +33,8 @@ if TYPE_CHECKING:
         element_bound as element_bound,
         element_slopes as element_slopes,
         unknown_slope as unknown_slope,
+        weight_density as weight_density,
     )
-    from .elements import weight_density as weight_density
     from .gauge_orbit import generators as generators
     from .model import (
         Model as Model,
