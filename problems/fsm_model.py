@@ -10,9 +10,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from pilfr_casadi.models.envelope import CREST
 
-from pilfr_casadi.models import PILFR, Combined, Envelope, Part, Play, PrandtlIshlinskii, Products, Stop, stop
+from pilfr_casadi.models import CREST, PILFR, Combined, Envelope, Part, Play, PrandtlIshlinskii, Products, Stop, stop
 
 from .fsm_linear import U_UNIT, Y_UNIT, Levels, in_modes
 

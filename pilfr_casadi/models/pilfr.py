@@ -179,7 +179,7 @@ class PILFR:
 
     def _check_channels(self, n_u: int, n_y: int) -> None:
         for name, count, signal in (("D_zu", n_u, "input"), ("D_yw", n_y, "output")):
-            square = np.shape(self.fixed.get(name)) == (self.n_w, self.n_w)
+            square = np.shape(self.fixed.get(name, 0.0)) == (self.n_w, self.n_w)
             if self.n_w and square and _is_identity(self, name) and count != self.n_w:
                 raise InputError(
                     f"{name} is fixed to the identity (as in a Hammerstein or Wiener model) with {self.n_w} channel(s) "
