@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     )
     from .conversion import to_plays as to_plays, to_stops as to_stops
     from .elements import (
+        CREST as CREST,
         LAYER as LAYER,
         Combined as Combined,
         Element as Element,
