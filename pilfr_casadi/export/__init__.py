@@ -5,10 +5,19 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .digests import digest as digest, ordered_digest as ordered_digest
-    from .exported_model import NAMES as NAMES, Exported as Exported
-    from .files import made as made, write_atomically as write_atomically
-    from .functions import FittedModel as FittedModel, exported as exported, to_casadi as to_casadi
+    from .exported_model import (
+        NAMES as NAMES,
+        Exported as Exported,
+        FittedModel as FittedModel,
+        exported as exported,
+        to_casadi as to_casadi,
+    )
+    from .files import (
+        digest as digest,
+        made as made,
+        ordered_digest as ordered_digest,
+        write_atomically as write_atomically,
+    )
     from .loading import read_model_file as read_model_file
     from .saving import (
         FitContent as FitContent,
@@ -16,7 +25,6 @@ if TYPE_CHECKING:
         model_text as model_text,
         write_model_file as write_model_file,
     )
-    from .sides import with_sides as with_sides
-    from .smoothing import smoothed as smoothed
+    from .smoothing import enclosed as enclosed, smoothed as smoothed, with_sides as with_sides
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -1,15 +1,16 @@
-"""A step as C: the code that CasADi generates, behind two plain functions and a header that says what is where.
+"""A step as C: the code that CasADi generates, behind two plain functions and a header with names and indices.
 
     rig_x0(x);                          the state to start from
     rig_step(x, u, x_next, y);          arrays of RIG_NX, RIG_NU, RIG_NX, RIG_NY doubles; x_next may be x itself
 
-Names and units of signals come from files and are written into comments and constants only after everything that could
-end a comment, or is no letter, digit or underscore, has been taken out.
+Names and units of signals come from files. They are written into comments and constants only without whatever could end
+a comment or is no letter, digit or underscore.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ def _source(step: ca.Function, names: Mapping[str, Any]) -> str:
     lines = [
         f'#include "{name}.h"',
         "",
-        generator.dump(),
+        _use_all_parameters(generator.dump()),
         f"void {name}_x0(double *x) {{",
         *start,
         "}",
@@ -132,6 +133,16 @@ def _source(step: ca.Function, names: Mapping[str, Any]) -> str:
 _WORK = {"arg": "const casadi_real *arg", "res": "casadi_real *res", "iw": "casadi_int iw", "w": "casadi_real w"}
 
 
+def _use_all_parameters(code: str) -> str:
+    """Mark the parameters of CasADi's functions as used: some functions ignore some of them, of which -Wextra warns."""
+
+    def marked(match: re.Match[str]) -> str:
+        names = [parameter.split()[-1] for parameter in match[1].split(",")]
+        return "\n  ".join([match[0], " ".join(f"(void){name};" for name in names)])
+
+    return re.sub(r"^[^\n]*\(([^()\n]*\bint mem)\) \{$", marked, code, flags=re.MULTILINE)
+
+
 def _accuracy(smooth: float) -> str:
     return f"min and max rounded, eps = {smooth:g}" if smooth else "min and max exact"
 
@@ -143,7 +154,7 @@ def _labelled(names: Mapping[str, Any], name: str) -> str:
 
 
 def _comment(text: str) -> str:
-    """Text that cannot end, open or bend a comment."""
+    """Take out of a text whatever could end, open or continue a comment."""
     kept = "".join(c if c.isprintable() and c not in "\\?" else "_" for c in text[:200])
     while "*/" in kept or "/*" in kept:
         kept = kept.replace("*/", "* ").replace("/*", " *")
@@ -151,7 +162,7 @@ def _comment(text: str) -> str:
 
 
 def _constants(prefix: str, names: Sequence[str]) -> list[str]:
-    """A constant for each name: letters, digits and underscores, all different."""
+    """Make a constant of each name: letters, digits and underscores, all different."""
     out: list[str] = []
     for name in names:
         plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name.upper()[:60]).strip("_")

@@ -14,8 +14,7 @@ from typing import Any, NoReturn, TypeVar
 import numpy as np
 
 from .._base import InputError
-from .digests import ordered_digest
-from .files import path_text, short
+from .files import ordered_digest, path_text, short
 from .saving import FORMAT, VERSION
 
 WITHOUT_DIGEST = 1  # the version of the format that had none

@@ -1,9 +1,15 @@
-"""Writing files so that none is ever half there."""
+"""Files that are never half written, and SHA-256 digests by which later changes are noticed.
+
+A digest finds damage and changes made by accident or by hand. It is no signature: whoever changes a file on purpose can
+write a new digest into it.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
+import json
 import os
 import secrets
 from pathlib import Path
@@ -55,28 +61,39 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
 
 
 def made(folder: str | os.PathLike[str]) -> Path:
-    """A folder, made where it does not exist.
+    """Make a folder where it does not exist.
 
     Raises
     ------
     InputError
         If it cannot be made.
     """
-    made = Path(path_text(folder, "folder"))
+    target = Path(path_text(folder, "folder"))
     try:
-        made.mkdir(parents=True, exist_ok=True)
+        target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"The folder {short(folder)} cannot be made ({error.strerror}); give another one.") from error
-    return made
+    return target
+
+
+def digest(content: Any) -> str:
+    """SHA-256 of bytes, or of a table in its one canonical form: sorted keys, numbers to the last digit."""
+    data = content if isinstance(content, bytes) else json.dumps(content, sort_keys=True, allow_nan=False).encode()
+    return hashlib.sha256(data).hexdigest()
+
+
+def ordered_digest(content: dict[str, Any]) -> str:
+    """SHA-256 of a table whose order carries meaning too, such as that of a model's variables."""
+    return digest(json.dumps(content, allow_nan=False).encode())
 
 
 def path_text(path: Any, kind: str) -> str:
-    """A path as text.
+    """Return a path as text.
 
     Raises
     ------
     InputError
-        If it is none, or empty.
+        If it is not a path, or empty.
     """
     try:
         name = os.fspath(path)
@@ -88,13 +105,13 @@ def path_text(path: Any, kind: str) -> str:
 
 
 def short(path: Any) -> str:
-    """A path in a sentence."""
+    """Shorten a path for a message."""
     text = str(path)
     return text if len(text) <= 200 else f"{text[:100]}...{text[-60:]}"
 
 
 def _sync_folder(folder: Path) -> None:
-    """Force the new name to disk too, where the system can do that."""
+    """Force the new name to disk too, where the system allows it."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

@@ -29,8 +29,7 @@ from ..models import (
     StaticNetwork,
 )
 from ..optimise import Limit, Solution
-from .digests import ordered_digest
-from .files import write_atomically
+from .files import ordered_digest, write_atomically
 
 FORMAT = "pilfr_casadi model"
 VERSION = 2  # version 1 had no digest; it is still read

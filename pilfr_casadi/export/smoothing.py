@@ -1,19 +1,27 @@
-"""Steps without kinks, and how far a step can be off for it.
+"""Steps without kinks: rounded, with a bound on the error, or split into the pieces between their kinks.
 
-Every max, min and |·| of a step is rounded,
+**Rounded.** Every max, min and |·| of a step becomes smooth,
 
     max(a, b) -> (a + b + sqrt((a - b)² + eps²)) / 2,   min(a, b) = -max(-a, -b),   |a| = max(a, -a),
 
 each off by at most eps/2, max and |·| upwards, min downwards; sign(a), the slope of |a|, by its slope. A play `max(z -
-r, min(z + r, q))` and a stop are thus off by at most eps/2 a step, since the two signs do not add; a generalized play,
-whose upper curve is a max itself, by at most eps. In a PI-LFR model (Krikelis et al. 2024, Eq. 15-16) with plays or
-stops an output is off by at most `|D_yw| Σ_j w_j eps/2`, a state by `|B_w| Σ_j w_j eps/2`. What is off in general
-follows by interval arithmetic: each value of the step is enclosed together with its rounded twin, and each rounding
-widens the interval by eps/2 (Moore, Kearfott & Cloud 2009, ch. 2).
+r, min(z + r, q))` and a stop are off by at most eps/2 a step, since the two signs do not add; a generalized play, whose
+upper curve is itself a max, by at most eps. In a PI-LFR model (Krikelis et al. 2024, Eq. 15-16) with plays or stops an
+output is off by at most `|D_yw| Σ_j w_j eps/2`, a state by `|B_w| Σ_j w_j eps/2`. The general bound follows by interval
+arithmetic: each value of the step is enclosed together with its rounded twin, and each rounding widens the interval by
+eps/2 (Moore, Kearfott & Cloud 2009, ch. 2).
 
-The bound is one step's, from the same x and u. Over many steps a rounded play creeps towards its signal, by about
-eps²/4d a sample at the distance d from its edges, and so forgets; this is for the horizon of a controller, not for a
-long simulation.
+The bound holds for one step from the same x and u. Over many steps a rounded play creeps towards its signal, by about
+eps²/4d a sample at the distance d from its edges, and so forgets; use it over the horizon of a controller, not for a
+long simulation. (`models.fmax` rounds within a narrow band instead: it keeps the memory of long records, as a fit
+needs, but its second derivative jumps, which Newton-type solvers do not take.)
+
+**Pieces.** Each max, min and |·| is told which side it is on,
+
+    max(a, b) -> s a + (1 - s) b,  gap a - b;   min(a, b) -> s a + (1 - s) b,  gap b - a;   |a| -> (2 s - 1) a,  gap a.
+
+A side s is 1 where its gap is not negative, else 0. With the sides held a step has no kinks; its equations are those of
+one piece, which ends where a gap changes its sign (Griewank 2013, on piecewise linear models).
 """
 
 from __future__ import annotations
@@ -29,6 +37,7 @@ from .._base import InputError
 
 Interval = tuple[float, float]
 EVERYTHING = (-math.inf, math.inf)
+KINKS = ("FMAX", "FMIN", "FABS")
 _NAMES = {getattr(ca, k): k[3:] for k in sorted(dir(ca)) if k.startswith("OP_")}
 _RISING: dict[str, Callable[[float], float]] = {
     "EXP": np.exp,
@@ -51,8 +60,8 @@ _RISING: dict[str, Callable[[float], float]] = {
 
 
 def smoothed(function: ca.Function, eps: float) -> ca.Function:
-    """The same function of scalar expressions with every max, min, |·| and sign rounded by eps."""
-    arguments = [ca.SX.sym(name, n) for name, n in zip(function.name_in(), _sizes(function), strict=True)]
+    """Round every max, min, |·| and sign of a function of scalar expressions by eps."""
+    arguments = _symbols(function)
 
     def apply(op: str, code: int, a: Any, b: Any = None) -> Any:
         if op in ("FMAX", "FMIN"):
@@ -62,20 +71,45 @@ def smoothed(function: ca.Function, eps: float) -> ca.Function:
             return ca.sqrt(a**2 + eps**2 / 4)
         if op == "SIGN":
             return a / ca.sqrt(a**2 + eps**2 / 4)
-        return ca.SX.unary(code, a) if b is None else ca.SX.binary(code, a, b)
+        return _same(code, a, b)
 
-    found = walk(function, [ca.vertsplit(a) if a.numel() else [] for a in arguments], apply, ca.SX)
-    results = [ca.vertcat(ca.SX(0, 1), *row) for row in found]
+    results = [ca.vertcat(ca.SX(0, 1), *row) for row in _walk(function, _entries(arguments), apply, ca.SX)]
     return ca.Function(function.name(), arguments, results, function.name_in(), function.name_out())
 
 
-def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) -> list[list[Interval]]:
-    """Intervals that hold every result of a function of scalar expressions, rounded by eps or not.
+def with_sides(function: ca.Function, *, held: bool) -> ca.Function:
+    """Return `(x, u, s) -> (x_next, y, gaps)` of `(x, u) -> (x_next, y)`; without `held`, x and u decide, not s.
 
     Raises
     ------
     InputError
-        If the function has an operation that nothing is known of.
+        If the function holds an operation that cannot be run on other values.
+    """
+    arguments = _symbols(function)
+    sides: list[Any] = []
+    gaps: list[Any] = []
+
+    def apply(op: str, code: int, a: Any, b: Any = None) -> Any:
+        if op in KINKS:
+            sides.append(ca.SX.sym(f"s{len(sides)}"))
+            gaps.append(a if op == "FABS" else a - b if op == "FMAX" else b - a)
+            if held:
+                return (2 * sides[-1] - 1) * a if op == "FABS" else sides[-1] * a + (1 - sides[-1]) * b
+        return _same(code, a, b)
+
+    found = _walk(function, _entries(arguments), apply, ca.SX)
+    none = ca.SX(0, 1)
+    results = [ca.vertcat(none, *row) for row in (*found, gaps)]
+    return ca.Function(function.name(), [*arguments, ca.vertcat(none, *sides)], results)
+
+
+def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) -> list[list[Interval]]:
+    """Enclose every result of a function of scalar expressions, rounded by eps or not, in an interval.
+
+    Raises
+    ------
+    InputError
+        If the function holds an operation without a known enclosure.
     """
 
     def apply(op: str, code: int, a: Interval, b: Interval | None = None) -> Interval:
@@ -86,17 +120,26 @@ def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) 
                 return EVERYTHING
         return EVERYTHING if math.isnan(low) or math.isnan(high) else (float(low), float(high))
 
-    return walk(function, list(arguments), apply, lambda value: (float(value), float(value)))
+    return _walk(function, list(arguments), apply, lambda value: (float(value), float(value)))
 
 
-def _sizes(function: ca.Function) -> list[int]:
-    return [int(function.numel_in(i)) for i in range(function.n_in())]
+def _symbols(function: ca.Function) -> list[Any]:
+    return [ca.SX.sym(name, int(function.numel_in(i))) for i, name in enumerate(function.name_in())]
 
 
-def walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any], constant: Callable[..., Any]) -> Any:
+def _entries(arguments: list[Any]) -> list[Any]:
+    return [ca.vertsplit(a) if a.numel() else [] for a in arguments]
+
+
+def _same(code: int, a: Any, b: Any) -> Any:
+    """Apply an operation as it is."""
+    return ca.SX.unary(code, a) if b is None else ca.SX.binary(code, a, b)
+
+
+def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any], constant: Callable[..., Any]) -> Any:
     """Run a function's instructions on other values; a choice between the two sides of a comparison is a max or a min.
 
-    Equal expressions get one number, by which the choice `a > b ? a : b` is known, which CasADi writes as a sum of two.
+    Equal expressions get one number, which shows up the choice `a > b ? a : b`: CasADi writes it as a sum of two.
     """
     numbers: dict[Any, int] = {}  # (operation, numbers of its arguments) -> number
     nodes: list[Any] = []
@@ -136,7 +179,7 @@ def walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any],
 
 
 def _choice(nodes: list[Any], node: Any) -> Any:
-    """(FMAX or FMIN, a, b) where the node is one of these, written as a choice; else None."""
+    """Return (FMAX or FMIN, a, b) where the node is one of these, written as a choice; else None."""
     if node[0] == "ADD":
         one, two = (_picked(nodes, nodes[part]) for part in node[1:])
         if one is None or two is None or one[0] != two[0] or one[1] == two[1]:
@@ -155,7 +198,7 @@ def _choice(nodes: list[Any], node: Any) -> Any:
 
 
 def _picked(nodes: list[Any], node: Any) -> tuple[int, bool, int] | None:
-    """(comparison, whether it must hold, value) of `comparison ? value : 0`."""
+    """Take `comparison ? value : 0` apart: (comparison, whether it must hold, value)."""
     if node[0] != "IF_ELSE_ZERO":
         return None
     condition, yes = node[1], True
@@ -231,7 +274,7 @@ def _binary(op: str, a: Interval, b: Interval, eps: float) -> Interval:
 
 
 def _power(a: Interval, b: Interval) -> Interval:
-    """A power of what may be negative: known for whole exponents."""
+    """Enclose a power of a base that may be negative: known for whole exponents."""
     n = b[0]
     if b[0] != b[1] or n != round(n) or (n < 0 and a[0] <= 0 <= a[1]):
         return EVERYTHING

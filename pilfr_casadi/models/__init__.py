@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         GeneralizedPlay as GeneralizedPlay,
         Play as Play,
         Stop as Stop,
+        fmin as fmin,
         generalized_play as generalized_play,
         play as play,
         stop as stop,

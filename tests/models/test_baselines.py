@@ -10,7 +10,7 @@ from random_models import random_input
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.export.digests import ordered_digest
+from pilfr_casadi.export import ordered_digest
 from pilfr_casadi.identify.lagged import hold_back, solve_watched
 from pilfr_casadi.identify.uncertainty import gauge_tangents
 from pilfr_casadi.models import reading_output

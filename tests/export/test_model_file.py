@@ -1,6 +1,5 @@
-"""Models on disk come back to the last digit or not at all, and the exported function steps like the fit."""
+"""Models on disk come back to the last digit or not at all, and later changes to a file are noticed."""
 
-import copy
 import json
 import os
 from dataclasses import replace
@@ -8,97 +7,14 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from exported_fits import CASES, changed, leaves, one_sentence, own_model, recording_for, signed, some_fit
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from pilfr_casadi import export
-from pilfr_casadi._base import InputError
-from pilfr_casadi.data import Recording
-from pilfr_casadi.engine import compiler
-from pilfr_casadi.export import to_casadi, write_atomically
-from pilfr_casadi.export.digests import ordered_digest
-from pilfr_casadi.identify import Fit, fit, load, save
-from pilfr_casadi.models import (
-    PILFR,
-    GeneralizedPlay,
-    Parameter,
-    ParameterSet,
-    Play,
-    PrandtlIshlinskii,
-    Stop,
-    hammerstein,
-)
-from pilfr_casadi.optimise import Iteration, Solution, Status
-
-CASES = {
-    "play": (PILFR(3, PrandtlIshlinskii(Play, 4)), 1, 1),
-    "stops, two channels": (
-        PILFR(
-            2,
-            PrandtlIshlinskii(Stop, 3, 2),
-            bounds={"w": (0, 2), "A": (-3.0, np.inf)},
-            priors={"C_z": (0.0, 1.0)},
-            offset=False,
-        ),
-        2,
-        3,
-    ),
-    "generalized play": (PILFR(1, PrandtlIshlinskii(GeneralizedPlay(2), 3)), 1, 2),
-    "rounded": (PILFR(2, PrandtlIshlinskii(Play, 3, rounded=True)), 1, 1),
-    "linear": (PILFR(3), 2, 1),
-    "hammerstein": (hammerstein(2, PrandtlIshlinskii(Play, 2)), 1, 1),
-    "no states": (PILFR(0, PrandtlIshlinskii(Play, 3), fixed={"D_yu": 0.5}), 1, 1),
-}
-
-
-def some_fit(case="play", seed=0, engine="vm", **more):
-    """A fit with random values, as if it had been estimated."""
-    structure, n_u, n_y = CASES[case]
-    rng = np.random.default_rng(seed)
-    start = structure.model(n_u, n_y, inputs=tuple("ab"[:n_u]), outputs=tuple("xyz"[:n_y]))
-    values = {name: np.clip(rng.normal(size=p.value.shape) / 3, *p.bounds) for name, p in start.parameters.items()}
-    values |= {
-        name: np.abs(rng.normal(size=p.value.shape)) for name, p in start.parameters.items() if name in ("w", "r")
-    }
-    values |= {name: p.value for name, p in start.parameters.items() if name in structure.fixed or name == "y_0"}
-    model = structure.model(n_u, n_y, values, inputs=start.inputs, outputs=start.outputs)
-    size = model.n_x + model.n_s
-    labels = (
-        *np.array(model.parameters.labels, dtype=object)[model.parameters.free],
-        *(f"initial[0].{k}" for k in range(size)),
-    )
-    state = rng.normal(size=size)
-    theta = np.concatenate([model.parameters.start[model.parameters.free], state])
-    solution = Solution(
-        theta,
-        1e-5,
-        Status.MAX_ITERATIONS,
-        7,
-        0.5,
-        multipliers=rng.normal(size=theta.size),
-        history=(Iteration(0, 1.0, 0.1), Iteration(1, np.inf, 0.2, 0.3, 1e-3)),
-        message="told",
-    )
-    errors = {name: rng.uniform(size=p.value.shape) for name, p in model.parameters.items()}
-    errors["C_y"] = np.full(errors["C_y"].shape, np.nan)
-    errors["D_yu"] = np.full(errors["D_yu"].shape, np.inf)
-    if "multipliers" in more:
-        solution = replace(solution, multipliers=more.pop("multipliers"))
-    fields = dict(
-        train_nrmse=(0.01, np.inf),
-        initial={"0123456789abcdef": state},
-        labels=labels,
-        errors=errors,
-        active=("w[0] = 0",),
-        units={"a": "V", "x": "µm"},
-    )
-    return Fit(model, structure, 1 / 120, solution, engine=engine, seconds=1.25, **(fields | more))
-
-
-def recording_for(fitted, samples=200, initial="zero", seed=1):
-    rng = np.random.default_rng(seed)
-    u = np.cumsum(rng.normal(size=(samples, fitted.model.n_u)), axis=0)
-    y = rng.normal(size=(samples, fitted.model.n_y))
-    return Recording(u, y, fitted.dt, fitted.model.inputs, fitted.model.outputs, initial=initial)
+from pilfr_casadi import InputError, Limit, Recording, fit, load, save
+from pilfr_casadi.cli.app import main
+from pilfr_casadi.export import write_atomically
+from pilfr_casadi.models import PILFR, GeneralizedPlay, Play, PrandtlIshlinskii
+from pilfr_casadi.optimise import Status
 
 
 @pytest.fixture(scope="module")
@@ -112,12 +28,6 @@ def real_fit():
     y = 2 * u + play + 0.01 * rng.normal(size=300)
     train = Recording(u, y, 0.01, units={"u": "V"})
     return fit(PILFR(1, PrandtlIshlinskii(Play, 3)), train, starts=2, engine="vm"), train
-
-
-def one_sentence(error):
-    text = str(error.value)
-    assert "\n" not in text and text.endswith(".") and not text.endswith(".."), text
-    return text
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -186,7 +96,7 @@ def test_the_file_is_standard_json_with_everything_asked_for(tmp_path):
         raise AssertionError(f"{name} is not standard JSON")
 
     content = json.loads((tmp_path / "model.json").read_text(encoding="utf-8"), parse_constant=refuse)
-    assert (content["format"], content["version"]) == (export.FORMAT, export.VERSION)
+    assert (content["format"], content["version"]) == ("pilfr_casadi model", 2)
     assert content["written_by"] == {"pilfr_casadi": "0.1.0", "casadi": ca.__version__}
     assert content["model"]["inputs"] == [{"name": "a", "unit": "V"}]
     assert content["structure"]["element"] == {
@@ -246,25 +156,6 @@ def test_written_files_follow_links_and_the_users_mask(tmp_path):
     (tmp_path / "link.txt").symlink_to(tmp_path / "real.txt")
     write_atomically(tmp_path / "link.txt", b"two")
     assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "real.txt").read_text() == "two"
-
-
-def changed(content, path, value):
-    """The content with the entry at a path replaced, or taken out where the value is `...`."""
-    content = copy.deepcopy(content)
-    parent = content
-    for key in path[:-1]:
-        parent = parent[key]
-    if value is ...:
-        del parent[path[-1]]
-    else:
-        parent[path[-1]] = value
-    return content
-
-
-def signed(content):
-    """The content with the digest of what it now is."""
-    content = {key: value for key, value in content.items() if key != "sha256"}
-    return {**content, "sha256": ordered_digest(content)}
 
 
 DAMAGE = {
@@ -377,13 +268,6 @@ def test_a_file_cut_off_anywhere_is_one_sentence(tmp_path):
         one_sentence(error)
 
 
-def leaves(content, path=()):
-    yield path
-    items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
-    for key, value in items:
-        yield from leaves(value, (*path, key))
-
-
 JUNK = (None, True, -1, 0, 3, 1e308, 10**400, "", "x", "inf", [], {}, [[1.0]], [None], {"value": 1}, ...)
 
 
@@ -405,17 +289,6 @@ def test_a_tampered_file_loads_or_is_one_sentence(tmp_path, data):
     else:
         assert all(np.all(np.isfinite(v)) for v in fitted.parameters.values())
         assert fitted.simulate(recording_for(replace(fitted, engine="vm"), 5)).shape == (5, fitted.model.n_y)
-
-
-def own_model(n=3):
-    """A model of the user's own equations, with units."""
-    from pilfr_casadi.models import close_loop, open_model
-
-    p = ParameterSet({"k": Parameter(2.0, unit="N/m", bounds=(0, 5)), "d": Parameter([0.1, 0.2])})
-    model = open_model(
-        lambda x, u, w, p: (0.9 * x + p["k"] * u + w, x + p["d"][0] * u), lambda x, u, p: x, p, n_x=1, n_u=1, n_w=1
-    )
-    return close_loop(model, PrandtlIshlinskii(Play, n))
 
 
 def test_a_model_of_own_equations_is_saved_by_its_values(tmp_path):
@@ -459,37 +332,181 @@ def test_envelopes_of_ones_own_need_the_structure(tmp_path):
     assert np.ptp(after.simulate(data)) > 0
 
 
-@pytest.mark.parametrize(
-    "engine", ["vm", pytest.param("c", marks=pytest.mark.skipif(compiler() is None, reason="no C compiler"))]
-)
-@pytest.mark.parametrize("case", CASES)
-def test_the_exported_function_steps_like_the_fit(case, engine):
-    fitted = some_fit(case, engine=engine)
-    x0 = np.random.default_rng(5).normal(size=fitted.model.n_x + fitted.model.n_s)
-    data = recording_for(fitted, 1000, initial=x0 if len(x0) else "zero")
-    data = data.with_(u=data.u / 20)
-    step = to_casadi(fitted)
-    assert (step.name(), step.name_in(), step.name_out()) == ("model", ["x", "u"], ["x_next", "y"])
-    x, rows = fitted.initial_state(data), []
-    for u in data.u:
-        out = step(x=x, u=u)
-        x = out["x_next"]
-        rows.append(np.asarray(out["y"]).ravel())
-    expected = fitted.simulate(data)
-    assert np.max(np.abs(rows - expected)) <= 1e-12 * max(1.0, np.max(np.abs(expected)))
+CHANGED = "was changed after it was written .*; restore it, or save the model again"
+DIGEST_CASES = ("play", "generalized play", "linear")
 
 
-def test_states_come_before_memory_channel_by_channel():
-    structure = PILFR(1, PrandtlIshlinskii(Play, 2, 2), fixed={"B_w": 0.0})
-    values = {"A": 0.5, "C_z": 0.0, "D_zu": np.array([[1.0], [-2.0]]), "r": np.array([[0.1, 0.2], [0.3, 0.4]])}
-    fitted = replace(some_fit(), model=structure.model(1, 1, values), structure=structure)
-    x_next, _ = fitted.to_casadi("rig")(np.array([8.0, 0, 0, 0, 0]), 1.0)
-    assert np.asarray(x_next).ravel() == pytest.approx([4.0, 0.9, 0.8, -1.7, -1.6], abs=1e-15)
-    assert fitted.to_casadi("rig").name() == "rig"
+@pytest.fixture(scope="module", params=DIGEST_CASES)
+def written(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("written") / "model.json"
+    save(some_fit(request.param), path)
+    return path
 
 
-@pytest.mark.parametrize("name", ["", "two words", "1st", "a__b", "null"])
-def test_a_name_that_casadi_does_not_take(name):
-    with pytest.raises(InputError, match="cannot be used") as error:
-        to_casadi(some_fit(), name)
+def loads_the_same_or_refuses(written, text, name="tampered.json"):
+    path = written.with_name(name)
+    path.write_bytes(text)
+    try:
+        fitted = load(path)
+    except InputError as error:
+        assert "\n" not in str(error) and str(error).endswith("."), error
+        return False
+    save(fitted, path)
+    assert path.read_bytes() == written.read_bytes()
+    return True
+
+
+@given(st.data())
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_character_changed_is_refused_or_changes_nothing(written, data):
+    text = bytearray(written.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(text) - 1))
+        kind = data.draw(st.sampled_from(["other", "digit", "out", "in"]))
+        if kind == "out":
+            del text[at]
+        elif kind == "in":
+            text.insert(at, data.draw(st.integers(0, 255)))
+        else:
+            text[at] = data.draw(st.integers(0, 255) if kind == "other" else st.sampled_from(b"0123456789"))
+    loads_the_same_or_refuses(written, bytes(text))
+
+
+def test_every_digit_of_the_numbers_counts(written):
+    text, noticed = written.read_bytes(), 0
+    begin, end = text.index(b'"parameters"'), text.index(b'"initial_states"')
+    digits = [k for k in range(begin, end) if text[k : k + 1].isdigit()]
+    for at in digits[:: len(digits) // 40]:
+        altered = text[:at] + b"%d" % ((text[at] - 47) % 10) + text[at + 1 :]
+        refused = not loads_the_same_or_refuses(written, altered)
+        noticed += refused
+        assert refused == (json.loads(altered) != json.loads(text))  # a 17th digit may name the same number
+    assert noticed > 35
+
+
+@given(st.data())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_key_out_and_any_value_changed_is_refused(written, data):
+    content = json.loads(written.read_text())
+    path = data.draw(st.sampled_from([p for p in leaves(content) if p]))
+    value = data.draw(st.sampled_from([..., None, True, 0, 1, 2.5, "", "x", [], {}]))
+    altered = changed(content, path, value)
+    same = json.dumps(altered) == json.dumps(content)
+    assert loads_the_same_or_refuses(written, json.dumps(altered).encode()) == same
+
+
+def test_a_changed_number_is_said_to_be_one(written):
+    content = json.loads(written.read_text())
+    for altered in (
+        changed(content, ("parameters", "A", "value", 0, 0), 0.123),
+        changed(content, ("sha256",), "0" * 64),
+        changed(content, ("sha256",), ...),
+        changed(changed(content, ("version",), 1), ("parameters", "A", "value", 0, 0), 0.123),
+    ):
+        written.with_name("other.json").write_text(json.dumps(altered))
+        with pytest.raises(InputError, match=CHANGED) as error:
+            load(written.with_name("other.json"))
+        assert str(written.with_name("other.json")) in one_sentence(error)
+
+
+def test_the_layout_of_the_text_does_not_count(written):
+    content = json.loads(written.read_text())
+    for text in (json.dumps(content), json.dumps(content, indent=4), json.dumps(content, separators=(",", ":"))):
+        assert loads_the_same_or_refuses(written, text.encode())
+
+
+def test_the_order_of_the_variables_counts(written):
+    content = json.loads(written.read_text())
+    table = content["training"]["variables"]
+    altered = changed(content, ("training", "variables"), dict(reversed(table.items())))
+    assert not loads_the_same_or_refuses(written, json.dumps(altered).encode())
+
+
+def test_files_from_before_the_digest_are_read(written):
+    content = changed(changed(json.loads(written.read_text()), ("sha256",), ...), ("version",), 1)
+    says = r"carries no digest \(it has version 1 .*changes made to it .* cannot be noticed; save the model again"
+    with pytest.warns(UserWarning, match=says):
+        assert loads_the_same_or_refuses(written, json.dumps(content).encode())
+    older = changed(changed(content, ("training", "limits"), ...), ("training", "linear_nrmse"), ...)
+    with pytest.warns(UserWarning, match=says):
+        assert loads_the_same_or_refuses(written, json.dumps(older).encode())
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_command_warns_of_a_file_without_a_digest_in_one_line(written, capsys):
+    content = changed(changed(json.loads(written.read_text()), ("sha256",), ...), ("version",), 1)
+    path = written.with_name("older.json")
+    path.write_text(json.dumps(content))
+    assert main(["export", str(path), "--out", str(path.with_name("older.casadi"))]) == 0
+    said = capsys.readouterr().err
+    assert said.startswith("pilfr: warning: The file ") and "carries no digest" in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("version", [True, 1.0, 2.0, "2", None, [2], {}, 3, 0, -1, 10**400])
+def test_versions_that_are_none(written, version):
+    content = signed(changed(json.loads(written.read_text()), ("version",), version))
+    written.with_name("other.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"has version .* reads versions 1 and 2") as error:
+        load(written.with_name("other.json"))
     one_sentence(error)
+
+
+UNKNOWN = {
+    (): "unknown key 'more';",
+    ("model",): "unknown key 'more' in model",
+    ("structure",): "unknown key 'more' in structure",
+    ("structure", "element"): "unknown key 'more' in structure.element",
+    ("parameters", "A"): "unknown key 'more' in parameters.A",
+    ("training",): "unknown key 'more' in training",
+    ("training", "solve"): "unknown key 'more' in training.solve",
+    ("training", "history"): "unknown key 'more' in training.history",
+    ("model", "inputs", 0): "unknown key 'more' in model.inputs.0",
+}
+WRONG = {
+    ("written_by", "casadi"): (3, "written_by.casadi is not a text"),
+    ("written_by", "pilfr_casadi"): (None, "written_by.pilfr_casadi is not a text"),
+    ("model", "states", 0): (1.5, "model.states.0 is not a text"),
+    ("parameters", "A", "unit"): ({}, "parameters.A.unit is not a text"),
+    ("training", "sentence"): (0, "training.sentence is not a text"),
+    ("training", "multipliers"): ([0.0], r"it has 1 multipliers of \d+ variables and constraints"),
+    ("training", "variables"): ({}, "multipliers of 0 variables"),
+}
+
+
+@pytest.mark.parametrize("path", UNKNOWN)
+def test_unknown_keys_are_refused(path, tmp_path):
+    refused(tmp_path, (*path, "more"), 1, UNKNOWN[path])
+
+
+@pytest.mark.parametrize("path", WRONG)
+def test_entries_of_the_wrong_kind_or_length_are_refused(path, tmp_path):
+    refused(tmp_path, path, *WRONG[path])
+
+
+def refused(tmp_path, path, value, words):
+    """A change that came with its own digest."""
+    save(some_fit(), tmp_path / "model.json")
+    content = signed(changed(json.loads((tmp_path / "model.json").read_text()), path, value))
+    (tmp_path / "model.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=words) as error:
+        load(tmp_path / "model.json")
+    one_sentence(error)
+
+
+def test_a_key_given_twice_is_refused(tmp_path):
+    save(some_fit(), tmp_path / "model.json")
+    text = (tmp_path / "model.json").read_text()
+    (tmp_path / "model.json").write_text(text.replace('"version": 2', '"version": 2, "version": 2'))
+    with pytest.raises(InputError, match="the key 'version' twice") as error:
+        load(tmp_path / "model.json")
+    one_sentence(error)
+
+
+def test_multipliers_of_constraints_come_back_and_those_of_another_problem_are_left_out(tmp_path):
+    n = len(some_fit().solution.theta)
+    one = Limit("spectral radius", "constraint", 0.9, -np.inf, 0.9, 0.1, active=True)
+    for more, kept in ((1, n + 1), (0, 0), (2, 0)):
+        fitted = some_fit(limits=(one,), multipliers=np.arange(n + more))
+        save(fitted, tmp_path / "model.json")
+        after = load(tmp_path / "model.json")
+        assert len(after.solution.multipliers) == kept and after.limits == (one,)
