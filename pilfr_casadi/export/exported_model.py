@@ -368,9 +368,9 @@ def _choose_substeps_at_rest(simulator: Simulator, dt: float) -> int:
         return 1
     # a recording needs an input, so a simulator without inputs gets one that its equations do not read
     driven = simulator if simulator.inputs else replace(simulator, inputs=("none",))
-    shapes = ((REST_SAMPLES, len(names)) for names in (driven.inputs, driven.output_names))
+    u, y = (np.zeros((REST_SAMPLES, len(names))) for names in (driven.inputs, driven.output_names))
     least = max((getattr(e.law, "substeps", 1) for e in simulator.elements), default=1)
-    return max(choose_substeps(driven, [Recording(*map(np.zeros, shapes), dt)]), least)
+    return max(choose_substeps(driven, [Recording(u, y, dt)]), least)
 
 
 def _start_state(model: Any, closed: Model, step: Sampled, start: Any) -> np.ndarray:
