@@ -1,6 +1,4 @@
-"""Observer, limits of observability, inversion and predictive control."""
-
-import re
+"""Observer, limits of observability, inversion."""
 
 import casadi as ca
 import numpy as np
@@ -8,7 +6,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import pilfr_casadi as pilfr
-from pilfr_casadi import InputError, PredictiveController
+from pilfr_casadi import InputError
 from pilfr_casadi.cli.demo import demo_recordings
 from pilfr_casadi.control.kalman import ekf_step
 from pilfr_casadi.models import play
@@ -253,82 +251,6 @@ def test_what_cannot_be_inverted_says_why(small):
         pilfr.feedforward(*phase, ahead=1)
     with pytest.raises(pilfr.InputError, match="reaches the output only after 1 "):
         pilfr.feedforward(*phase, ahead=0)
-
-
-# --- predictive control
-
-
-def test_both_solvers_find_the_same_plan_inside_all_limits(small):
-    fit, _ = small
-    function = fit.to_casadi()
-    limits = {"inputs": (-2.0, 2.0), "outputs": (-4.0, 4.5), "rate": 0.7, "move": 1e-2}
-    x = np.array([0.5, -0.3, 0.2, -0.1, 0.0])
-    wanted = 6 * np.sin(np.arange(15) / 4)
-    plans = [pilfr.PredictiveController(function, 15, solver=s, **limits)(x, wanted, [0.1]) for s in ("sqp", "ipopt")]
-    for plan in plans:
-        assert plan.converged
-        assert np.max(np.abs(plan.inputs)) <= 2.0
-        assert np.max(np.abs(np.diff(plan.inputs[:, 0], prepend=0.1))) <= 0.7 + 1e-6
-        assert np.max(plan.outputs) <= 4.5 + 1e-4 and plan.slack <= 1e-4
-    assert np.max(plans[0].outputs) > 4.4  # a limit is active
-    assert plans[0].cost == pytest.approx(plans[1].cost, rel=1e-3)
-
-
-def test_plans_of_a_model_with_two_inputs_are_optimal():
-    values = {"A": A, "B_u": np.eye(2), "C_y": np.eye(2)}
-    fit, _ = fitted(pilfr.PILFR(2), values, n_u=2, n_y=2)
-    function, n = fit.to_casadi(), 6
-    wanted = np.array([[1.0, -1.0]] * n)
-    controller = pilfr.PredictiveController(function, n, inputs=(-1, 1), move=1e-3)
-    plan = controller(np.zeros(2), wanted, np.zeros(2))
-    assert plan.inputs.shape == plan.outputs.shape == (n, 2)
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        other = np.clip(plan.inputs + 1e-2 * rng.standard_normal((n, 2)), -1, 1)
-        y = np.asarray(function.mapaccum("run", n)(np.zeros(2), other.T)[1]).T
-        assert controller._cost(other.ravel(), y.ravel(), wanted.ravel(), np.zeros(2)) >= plan.cost
-
-
-def test_what_the_controller_cannot_use_is_refused(small):
-    function = small[0].to_casadi()
-    with pytest.raises(pilfr.InputError, match="solver 'qp'"):
-        pilfr.PredictiveController(function, 5, inputs=(0, 1), solver="qp")
-    with pytest.raises(pilfr.InputError, match="low below high"):
-        pilfr.PredictiveController(function, 5, inputs=(1, 0))
-    with pytest.raises(pilfr.InputError, match=r"The reference has the shape \(4,\); give \(5, 1\)"):
-        pilfr.PredictiveController(function, 5, inputs=(0, 1))(np.zeros(5), np.zeros(4), [0.0])
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"function": 3}, "casadi.Function"),
-        ({"horizon": 2.5}, "horizon"),
-        ({"inputs": 3}, "(low, high)"),
-        ({"inputs": ("a", "b")}, "numbers"),
-        ({"inputs": (np.nan, 1.0)}, "not finite"),
-        ({"outputs": (np.zeros(3), np.ones(3))}, "shape"),
-        ({"y_scale": 0}, "above zero"),
-        ({"y_scale": np.nan}, "not finite"),
-        ({"move": -1}, "above zero"),
-    ],
-)
-def test_unfit_controllers_are_refused(change, says):
-    x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    given = {"function": ca.Function("f", [x, u], [0.9 * x + u, x]), "horizon": 5, "inputs": (-1.0, 1.0), **change}
-    with pytest.raises(InputError, match=re.escape(says)):
-        PredictiveController(given.pop("function"), given.pop("horizon"), **given)
-
-
-@pytest.mark.parametrize(("place", "value"), [(0, [np.nan]), (0, [0.0, 0.0]), (1, [np.nan] * 5), (2, np.nan)])
-def test_no_plan_is_made_from_numbers_that_are_none(place, value):
-    x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    controller = PredictiveController(ca.Function("f", [x, u], [0.9 * x + u, x]), 5, inputs=(-1.0, 1.0))
-    given = [[0.0], [0.1] * 5, 0.0]
-    assert controller(*given).converged
-    given[place] = value
-    with pytest.raises(InputError, match=r"finite|numbers"):
-        controller(*given)
 
 
 @pytest.mark.parametrize("limits", [3, "a", ("a", "b"), (np.nan, 1.0), (1.0, -1.0), (1.0, 2.0, 3.0)])

@@ -13,8 +13,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers
-from .asked import ENORMOUS, asked, planned_with
-from .mpc_cost import price_of
+from .mpc_options import NO_LIMIT, check_task, limit_price, step_function
 
 Array = np.ndarray
 MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
@@ -55,7 +54,7 @@ def do_mpc_model(function: Any) -> Any:
     InputError
         If do-mpc is not installed, or there is no such function.
     """
-    function = planned_with(function)
+    function = step_function(function)
     model = imported().model.Model("discrete", "SX")
     x = model.set_variable("_x", "x", (function.size1_in(0), 1))
     u = model.set_variable("_u", "u", (function.size1_in(1), 1))
@@ -98,7 +97,7 @@ def do_mpc_controller(
     InputError
         If do-mpc is not installed, or an argument is unfit.
     """
-    task = asked(function, horizon, inputs, outputs, None, move, y_scale, u_scale)
+    task = check_task(function, horizon, inputs, outputs, None, move, y_scale, u_scale)
     function, n_y = task.function, task.function.size1_out(1)
     path = numbers(reference, "The reference")
     path = path[:, None] if path.ndim == 1 else path
@@ -115,10 +114,10 @@ def do_mpc_controller(
     mpc.set_objective(lterm=ca.sumsqr(error), mterm=ca.SX(0))
     mpc.set_rterm(u=task.move / u_size**2)
     mpc.bounds["lower", "_u", "u"], mpc.bounds["upper", "_u", "u"] = low, high
-    price = price_of(np.maximum(low_y - path, path - high_y) / y_size)
+    price = limit_price(np.maximum(low_y - path, path - high_y) / y_size)
     soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": price}
     for name, side, limit in (("above", 1, high_y), ("below", -1, low_y)):
-        held = np.flatnonzero(np.abs(limit) < ENORMOUS)
+        held = np.flatnonzero(np.abs(limit) < NO_LIMIT)
         if len(held):
             mpc.set_nl_cons(name, side * (model.aux["y"] - limit)[held] / y_size[held], **soft)
     template = mpc.get_tvp_template()

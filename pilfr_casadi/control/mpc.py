@@ -1,38 +1,95 @@
 """Predictive control: the inputs that let the predicted outputs follow a reference within limits.
 
     minimise   Σ |(y_k - r_k) / y_scale|² + move |(u_k - u_{k-1}) / u_scale|² + price · s_k / y_scale
-    subject to low_u <= u_k <= high_u,   |u_k - u_{k-1}| <= rate,   low_y - s_k <= y_k <= high_y + s_k,   s_k >= 0,
+    subject to low_u <= u_k <= high_u,   |u_k - u_{k-1}| <= rate,   low_y - s_k <= y_k <= high_y + s_k,   s_k >= 0
 
-over N samples from a state x with memory, s_k a slack for each output (`mpc_cost`). Two ways to solve it: `"sqp"`,
-states eliminated, Gauss-Newton steps from a dense QP (`mpc_sqp`), warm-started by the shifted plan, fast enough for
-sample times of a millisecond; and `"ipopt"`, multiple shooting with a variable for each state (`mpc_ipopt`), some 10 to
-30 times slower. Kinks make the problem one of many pieces with local optima; SQP goes from piece to piece until none
-that adjoins promises a lower cost (`mpc_pieces`): that is what converged means, an optimum nearby, not of all plans.
-From 150 random states and inputs of a model with eight plays, far from one another, all first plans by either solver
-converged, none by one was more than one percent worse than that by the other, and no random step lowered one by SQP by
-more than 0.1 %. With several inputs and outputs behind plays there are more optima: of 60 plans for each of three
-models with two of both those by SQP cost 0.60 to 0.97 of IPOPT's in the median, and 97 to 100 % of them were no more
-than one percent worse. A plan that has NOT converged was cut short by `iterations`, by equations that are not finite or
-curved too strongly, or is of a model of which SQP knows no pieces. Like any other it keeps the limits of inputs and
-rates.
+over N samples from a state x with memory. Each output and sample has a slack s of its own, so one violation that cannot
+be avoided gives no leave to another. States are eliminated (single shooting), and the Hessian is the Gauss-Newton one,
+`2 JᵀJ` of the weighted deviations. CasADi solves the problem by `sqpmethod` with the QP solver DAQP (`solver="sqp"`) or
+by IPOPT (`solver="ipopt"`), starting from the last plan shifted by a sample.
+
+Operators with memory make the model piecewise linear. Within a piece the Gauss-Newton step ends in the optimum; between
+pieces the line search decides, and a plan may stop at a kink that is no optimum. It is then marked as not converged:
+rare with one input, common with several inputs behind plays. A plan is never worse than the last one shifted, and it
+keeps the limits of inputs and rates in any case. Nocedal & Wright (2006), Numerical Optimization, ch. 18.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers
-from .asked import SOLVERS, asked, count, path, within
-from .mpc_cost import Cost
-from .mpc_ipopt import Shooting
-from .mpc_sqp import GaussNewton
-from .plan import Plan
+from ..models import Buffered
+from .mpc_options import ControlTask, check_task, is_count
 
 Array = np.ndarray
-FIRST = 10  # times as many steps for the first plan
+FIRST = 10  # times as many iterations for the first plan, which starts from a held input
+KEPT = 1e-5  # of y_scale: a violation of an output limit below the solver's tolerance is none
+SLACK_CURVATURE = 0.1  # Hessian of the slacks: makes the QP strictly convex, small against the price of 30
+QUIET = {"print_time": False, "error_on_fail": False}
+SQP = {
+    "qpsol": "daqp",
+    "qpsol_options": {"error_on_fail": False},
+    "tol_pr": 1e-5,  # of the scaled constraints: DAQP's own tolerance with the curvature of the slacks
+    "tol_du": 1e-4,
+    "beta": 0.5,  # the line search halves a step until the cost falls: kinks stand in the way of full steps
+    "max_iter_ls": 8,
+    "merit_memory": 1,
+    "min_step_size": 1e-6,  # of u_scale: a smaller step has nothing to gain
+    **dict.fromkeys(("print_header", "print_iteration", "print_status"), False),
+}
+IPOPT = {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 200}}
+SUCCESS = ("Solve_Succeeded", "Search_Direction_Becomes_Too_Small", "Solved_To_Acceptable_Level")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The answer of a predictive controller.
+
+    Attributes
+    ----------
+    inputs, outputs : array, shape (N, n_u), (N, n_y)
+        Planned inputs and predicted outputs.
+    cost, slack : float
+        Cost, and the largest violation of an output limit, in units of the outputs.
+    seconds : float
+        Time that the plan took.
+    converged : bool
+        Whether the solver ended in an optimum.
+    limited : bool
+        Whether output limits were given; without them the slack is zero.
+    """
+
+    inputs: Array
+    outputs: Array
+    cost: float
+    slack: float
+    seconds: float
+    converged: bool
+    limited: bool = True
+
+    @property
+    def u(self) -> Array:
+        """The input to apply now, (n_u,)."""
+        return self.inputs[0]
+
+    def __str__(self) -> str:
+        how = "converged" if self.converged else "NOT converged"
+        applied = ", ".join(f"{v:.5g}" for v in self.u)
+        limits = (
+            f"; outputs beyond their limits by {self.slack:.3g}" if self.slack > 0 else "; outputs within their limits"
+        )
+        return (
+            f"plan over {len(self.inputs)} samples, {how} in {1e3 * self.seconds:.2f} ms, cost {self.cost:.5g}\n"
+            f"input to apply now: {applied}{limits if self.limited else ''}"
+        )
+
+    __repr__ = __str__
 
 
 class PredictiveController:
@@ -47,27 +104,26 @@ class PredictiveController:
     inputs : (low, high)
         Limits of the inputs, numbers or arrays (n_u,); infinite where there is none.
     outputs : (low, high), optional
-        Limits of the outputs, each kept where that is possible; where it is not, the output comes as close as it can.
+        Limits of the outputs. Each is kept where that is possible; otherwise the output comes as close as it can.
     rate : float or array, optional
         Largest change of an input from sample to sample. Where the previous input is so far outside the limits that
         both cannot be kept, the first change is as large as it takes.
     move : float
         Weight of changes of the inputs.
     y_scale, u_scale : float or array, optional
-        What counts as one. By default half of the width between the limits of an input and of an output, and no more
-        than the output can range over within the horizon; a tenth of that range where no output limits are given
-        (`mpc_scales`). What was taken is in `controller.y_scale` and `u_scale`, and the same in each call.
+        Size that counts as one in the cost. By default half of the width between the limits of an input and of an
+        output, and no more than the output can cover within the horizon; a tenth of that range without output limits.
+        The attributes `y_scale` and `u_scale` hold the values in use.
     solver : {"sqp", "ipopt"}
-        See above.
+        `"sqp"` takes about a millisecond, `"ipopt"` some ten times as long.
     iterations : int
-        Most Gauss-Newton steps a call; where kinks are in the way, eight pieces for each may be entered as well. The
-        first call, which starts from a held input, may take ten times as many. IPOPT has its own limits.
+        Largest number of SQP iterations in a call; the first call may take ten times as many. IPOPT has its own limit.
 
     Raises
     ------
     InputError
-        If limits are unfit, or the solver is unknown; in a call, if state, reference or previous input have another
-        shape, or are not finite.
+        If limits are unfit or the solver is unknown; in a call, if the state, the reference or the previous input has
+        another shape or is not finite.
     """
 
     def __init__(
@@ -84,24 +140,24 @@ class PredictiveController:
         solver: str = "sqp",
         iterations: int = 5,
     ) -> None:
-        task = asked(function, horizon, inputs, outputs, rate, move, y_scale, u_scale)
-        if solver not in SOLVERS or not count(iterations):
+        task = check_task(function, horizon, inputs, outputs, rate, move, y_scale, u_scale)
+        if solver not in ("sqp", "ipopt") or not is_count(iterations):
             raise InputError(
                 f"The solver {solver!r} and {iterations!r} iterations were given; give 'sqp' or 'ipopt', and 1 or more."
             )
         self.function, self.horizon, self.solver, self.iterations = task.function, task.horizon, solver, iterations
-        self.low, self.high, self.low_y, self.high_y = task.low, task.high, task.low_y, task.high_y
-        self.limited, self.rate, self.y_scale, self.u_scale = task.limited, task.rate, task.y_scale, task.u_scale
-        self._task, self._cost = task, Cost(task)
+        self.y_scale, self.u_scale = task.y_scale, task.u_scale
+        self._task, self._problem = task, Transcription(task)
+        self._first = self._problem.solver(solver, FIRST * iterations)
+        self._next = self._problem.solver(solver, iterations) if solver == "sqp" else self._first
         self._plan: Array | None = None
-        self._solver = (GaussNewton if solver == "sqp" else Shooting)(task, self._cost)
 
     def __str__(self) -> str:
-        n, n_u, n_y = (self.function.size1_in(0), self.function.size1_in(1), self.function.size1_out(1))
-        limits = "inputs and outputs" if self.limited else "inputs"
+        (n, n_u, n_y), task = self._task.sizes, self._task
+        limits = "inputs and outputs" if task.limited else "inputs"
         return (
             f"predictive controller over {self.horizon} samples by {self.solver}: {n} states, {n_u} inputs, {n_y} "
-            f"outputs, limits of the {limits}" + (", rates limited" if np.isfinite(self.rate).any() else "")
+            f"outputs, limits of the {limits}" + (", rates limited" if np.isfinite(task.rate).any() else "")
         )
 
     __repr__ = __str__
@@ -109,28 +165,113 @@ class PredictiveController:
     def __call__(self, x: Array, reference: Array, u_previous: Array) -> Plan:
         """Plan from the state x of sample k, towards the reference (N, n_y) of the samples k to k + N - 1.
 
-        The plan's first input acts in sample k, its first output belongs to sample k, and so does the first row of the
-        reference: the output that goes with x, which in a model without feedthrough no input can change any more.
-        `u_previous` is the input of sample k - 1. The last plan, shifted by a sample, is where the search begins.
+        The plan's first input acts in sample k. Its first output, like the first row of the reference, belongs to
+        sample k: in a model without feedthrough no input can change it any more. `u_previous` is the input of sample
+        k - 1. The search starts from the last plan, shifted by a sample.
         """
         begin = perf_counter()
-        n_u, n_y = self.function.size1_in(1), self.function.size1_out(1)
-        wanted = path(reference, self.horizon, n_y)
-        before = numbers(u_previous, "The previous input").reshape(-1)
-        state = numbers(x, "The state").ravel()
-        if len(before) != n_u or len(state) != self.function.size1_in(0):
+        task, problem = self._task, self._problem
+        n, n_u, n_y = task.sizes
+        wanted = _reference(reference, self.horizon, n_y)
+        before, state = numbers(u_previous, "The previous input").reshape(-1), numbers(x, "The state").ravel()
+        if len(before) != n_u or len(state) != n:
             raise InputError(
-                f"A state of {len(state)} numbers and {len(before)} previous inputs were given; give "
-                f"{self.function.size1_in(0)} and {n_u}."
+                f"A state of {len(state)} numbers and {len(before)} previous inputs were given; give {n} and {n_u}."
             )
-        start = np.tile(before, self.horizon) if self._plan is None else np.append(self._plan[n_u:], self._plan[-n_u:])
-        rate = self.rate.copy()
-        rate[:n_u] = np.maximum(rate[:n_u], np.maximum(self.low[:n_u] - before, before - self.high[:n_u]))
-        most = self.iterations * (FIRST if self._plan is None else 1)
-        first = within(self._task, start, before, rate)
-        u, y, converged = self._solver.solve(state, wanted, before, first, rate, most)
+        rate, last = task.first_rate(before), self._plan
+        start = np.tile(before, self.horizon) if last is None else np.append(last[n_u:], last[-n_u:])
+        start = task.clip(start, before, rate)
+        at = state, wanted, before
+        found, converged = problem.solve(self._first if last is None else self._next, start, rate, *at)
+        u = task.clip(found, before, rate)
+        cost, y = problem.cost(u, *at)
+        if not converged:
+            kept, y_kept = problem.cost(start, *at)
+            if not cost <= kept:
+                u, cost, y = start, kept, y_kept
         self._plan = u
+        beyond = task.beyond(y)
+        slack = float(np.max(beyond[beyond > KEPT * task.y_scale], initial=0.0))
         shaped = u.reshape(-1, n_u), y.reshape(-1, n_y)
-        cost = self._cost(u, y, wanted, before)
-        spent, converged = perf_counter() - begin, converged and bool(np.isfinite(cost))
-        return Plan(*shaped, cost, self._cost.over(y), spent, converged, self.limited)
+        converged = converged and bool(np.isfinite(cost))
+        return Plan(*shaped, cost, slack, perf_counter() - begin, converged, task.limited)
+
+
+class Transcription:
+    """The nonlinear program of a task, in units of u_scale and y_scale.
+
+    Variables are the inputs (N n_u,) and, with output limits, a slack for each output and sample; parameters are the
+    state, the reference, the previous input and the price of a violated limit.
+    """
+
+    def __init__(self, task: ControlTask) -> None:
+        self._task = task
+        n, n_u, n_y = task.sizes
+        samples, slacks = task.horizon, task.horizon * n_y * task.limited
+        v, s, x = ca.SX.sym("v", samples * n_u), ca.SX.sym("s", slacks), ca.SX.sym("x", n)
+        wanted, before, price = ca.SX.sym("r", samples * n_y), ca.SX.sym("u_before", n_u), ca.SX.sym("price")
+        u, state, outputs = v * task.u_scale, x, []
+        for k in range(samples):
+            state, y = task.function(state, u[k * n_u : (k + 1) * n_u])
+            outputs.append(y)
+        y = ca.vertcat(*outputs) / task.y_scale
+        changes = (u - ca.vertcat(before, u[:-n_u])) / task.u_scale
+        residual = ca.vertcat(y - wanted / task.y_scale, np.sqrt(task.move) * changes)
+        self._variables, self._parameters = ca.vertcat(v, s), ca.vertcat(x, wanted, before, price)
+        self._cost = ca.sumsqr(residual) + price * ca.sum1(s)
+        jacobian = ca.jacobian(residual, self._variables)
+        curvature = ca.diag(ca.vertcat(ca.SX.zeros(samples * n_u), SLACK_CURVATURE * ca.SX.ones(slacks)))
+        self._hessian = 2 * jacobian.T @ jacobian + curvature
+        rated = np.flatnonzero(np.isfinite(task.rate))
+        self._rated, rows = rated, [changes[rated.tolist()]]
+        low, high, free = task.low_y / task.y_scale, task.high_y / task.y_scale, np.full(slacks, np.inf)
+        self._sides = np.zeros(0), np.zeros(0)
+        if task.limited:
+            rows += [y + s, y - s]
+            self._sides = np.concatenate([low, -free]), np.concatenate([free, high])
+        self._constraints = ca.vertcat(*rows)
+        self._box = np.append(task.low / task.u_scale, np.zeros(slacks)), np.append(task.high / task.u_scale, free)
+        self._none = np.zeros(slacks)
+        names = ["u", "x", "reference", "u_before"], ["cost", "y"]
+        predict = ca.Function("predict", [v, x, wanted, before], [ca.sumsqr(residual), ca.densify(y)], *names)
+        self._predict = Buffered(predict)
+
+    def solver(self, name: str, iterations: int) -> Buffered:
+        """Build CasADi's solver of the program."""
+        x, p, g = self._variables, self._parameters, self._constraints
+        factor, multipliers = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", g.shape[0])
+        hessian = factor * self._hessian
+        names, out = ["x", "p", "lam_f", "lam_g"], "hess_gamma_x_x"
+        if name == "ipopt":
+            hessian, out = ca.triu(hessian), "triu_hess_gamma_x_x"
+        gauss_newton = ca.Function("gauss_newton", [x, p, factor, multipliers], [hessian], names, [out])
+        own = {**SQP, "max_iter": iterations} if name == "sqp" else IPOPT
+        plugin = "sqpmethod" if name == "sqp" else "ipopt"
+        program = {"x": x, "p": p, "f": self._cost, "g": g}
+        return Buffered(ca.nlpsol("mpc", plugin, program, {**QUIET, **own, "hess_lag": gauss_newton}))
+
+    def solve(
+        self, solver: Buffered, start: Array, rate: Array, x: Array, wanted: Array, before: Array
+    ) -> tuple[Array, bool]:
+        """Inputs (N n_u,) found from a start, and whether the solver converged."""
+        task, most = self._task, (rate / self._task.u_scale)[self._rated]
+        p = np.concatenate([x, wanted, before, [task.price(wanted)]])
+        low, high = np.append(-most, self._sides[0]), np.append(most, self._sides[1])
+        found = solver(np.append(start / task.u_scale, self._none), p, *self._box, low, high)[0][: len(start)]
+        return found * task.u_scale, solver.status in SUCCESS and bool(np.all(np.isfinite(found)))
+
+    def cost(self, u: Array, x: Array, wanted: Array, before: Array) -> tuple[float, Array]:
+        """Cost of inputs (N n_u,) and their outputs (N n_y,), violated limits included."""
+        task = self._task
+        cost, y = self._predict(u / task.u_scale, x, wanted, before)
+        y = y * task.y_scale
+        over = float(np.sum(task.beyond(y) / task.y_scale)) if task.limited else 0.0
+        return float(cost[0]) + task.price(wanted) * over, y
+
+
+def _reference(reference: Any, samples: int, n_y: int) -> Array:
+    """A reference (samples, n_y) as one vector; one of a single output may come without its second dimension."""
+    found = numbers(reference, "The reference")
+    if found.shape == (samples, n_y) or (n_y == 1 and found.size == samples == max(found.shape, default=0)):
+        return found.reshape(-1)
+    raise InputError(f"The reference has the shape {found.shape}; give {(samples, n_y)}, a row a sample.")

@@ -86,6 +86,6 @@ class Buffered:
         return [out[0].copy() if len(out) == 1 else out.T.copy() for out in self._results]
 
     @property
-    def success(self) -> bool:
-        """Whether the last call of a solver found its solution."""
-        return bool(self._buffer.stats()["success"])
+    def status(self) -> str:
+        """Return CasADi's word for how the last call of a solver ended."""
+        return str(self._buffer.stats()["return_status"])

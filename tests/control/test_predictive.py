@@ -1,0 +1,500 @@
+"""Predictive control: plans are optimal and keep their limits, from any state and in any units, by every solver."""
+
+import re
+import sys
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from small_fits import A, fitted, plays, refused
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import PredictiveController
+from pilfr_casadi.control import do_mpc_controller, do_mpc_model, kalman_filter
+from problems import mpc_masing, mpc_piezo
+from problems.closed_loop import LINEAR, table
+from problems.masing import simulate
+from problems.masing_data import FS
+
+N = 12
+THRESHOLDS = np.linspace(0.1, 1.6, 8)
+WIDTHS = np.array([0.01, 0.617, 0.643, 1.268, 1.257, 1.907, 1.888, 2.669])
+BOTH = pytest.mark.parametrize("solver", ["sqp", "ipopt"])
+
+
+def eight_plays(y_unit=1.0, u_unit=1.0):
+    """Two states behind eight plays; an output of about 1 for an input of 1, in other units on request."""
+    x, u = ca.SX.sym("x", 10), ca.SX.sym("u")
+    q = [ca.fmin(u / u_unit + r, ca.fmax(u / u_unit - r, x[2 + i])) for i, r in enumerate(THRESHOLDS)]
+    v = 0.4 * u / u_unit + sum(0.6 / 8 * (1 + np.cos(i)) * q[i] for i in range(8))
+    y = y_unit * (x[0] + 0.3 * x[1])
+    return ca.Function("F", [x, u], [ca.vertcat(0.6 * x[0] + 0.3 * v, 0.5 * x[1] + 0.2 * x[0], *q), y])
+
+
+def sluggish():
+    """An oscillator driven by as much hysteresis as input: plans from afar meet many kinks."""
+    a, b = ca.DM([[0.939, -0.13], [0.272, 0.761]]), ca.DM([[-0.068, -0.081], [0.039, 0.046]])
+    x, u, w = ca.SX.sym("x", 10), ca.SX.sym("u"), ca.DM([0.17, 0.326, 0.336, 0.242, 0.256, 0.147, 0.181, 0])
+    z = 1.259 * u - 0.006 * x[0] - 0.001 * x[1]
+    q = ca.fmin(z + WIDTHS, ca.fmax(z - WIDTHS, x[2:]))
+    following = ca.mtimes(a, x[:2]) + ca.mtimes(b, ca.vertcat(u, ca.dot(w, q)))
+    return ca.Function("F", [x, u], [ca.vertcat(following, q), -0.081 * x[0] - 0.141 * x[1]])
+
+
+def lags(*poles):
+    """One output per input, each lagging behind by at least a sample."""
+    x, u, a = ca.SX.sym("x", len(poles)), ca.SX.sym("u", len(poles)), ca.DM(poles)
+    return ca.Function("F", [x, u], [a * x + (1 - a) * u, x])
+
+
+def first_order(pole=0.9):
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    return ca.Function("f", [x, u], [pole * x + u, x])
+
+
+@pytest.fixture(scope="module")
+def small():
+    fit, record = fitted(*plays([0.2, 1.0, 50.0], [0.5, 0.3, 0.2]))
+    return fit, record, kalman_filter(fit, record, share=1e-3)
+
+
+@pytest.fixture(scope="module")
+def square():
+    return fitted(pilfr.PILFR(2), {"A": A, "B_u": np.eye(2), "C_y": np.eye(2)}, n_u=2, n_y=2)
+
+
+def states_and_references(cases, seed=3):
+    """States with memory, references and previous inputs of `sluggish`, far from one another."""
+    rng = np.random.default_rng(seed)
+    for _ in range(cases):
+        z, x = rng.uniform(-2, 2), np.append(0.2 * rng.standard_normal(2), rng.uniform(-2, 2, 8))
+        x[2:] = np.clip(x[2:], z - WIDTHS, z + WIDTHS)
+        yield x, 0.3 * np.sin(0.3 * np.arange(N) + rng.uniform(0, 6)), rng.uniform(-2, 2)
+
+
+def cost_of(function, inputs, x, wanted, before, y_scale, u_scale, move=1e-3):
+    """The cost that the documentation states, for inputs (N, n_u) and a reference (N, n_y)."""
+    y = np.asarray(function.mapaccum(len(inputs))(x, inputs.T)[1]).T
+    changes = np.diff(inputs, axis=0, prepend=np.reshape(before, (1, -1)))
+    return np.sum(((y - wanted) / y_scale) ** 2) + move * np.sum((changes / u_scale) ** 2)
+
+
+# --- plans are optimal
+
+
+@pytest.mark.parametrize("limits", [{"outputs": (-0.3, 0.3), "rate": 0.5}, {}])
+def test_first_plans_cost_no_more_than_those_of_ipopt(limits):
+    options = {"inputs": (-3, 3), "y_scale": 0.1, **limits}
+    ipopt = PredictiveController(sluggish(), N, solver="ipopt", **options)
+    for given_state in states_and_references(8):
+        ours = PredictiveController(sluggish(), N, **options)(*given_state)
+        theirs = ipopt(*given_state)
+        assert ours.cost < 1.01 * theirs.cost
+
+
+def test_no_random_change_lowers_the_cost_of_a_first_plan():
+    function, rng, converged, gains = sluggish(), np.random.default_rng(1), [], []
+    for x, wanted, before in states_and_references(25, seed=11):
+        plan = PredictiveController(function, N, inputs=(-3, 3), y_scale=0.1)(x, wanted, before)
+        converged.append(plan.converged)
+        assert plan.cost == pytest.approx(cost_of(function, plan.inputs, x, wanted[:, None], before, 0.1, 3.0))
+        for size in 10.0 ** rng.uniform(-4, -1, 30):
+            moved = np.clip(plan.inputs + 3 * size * rng.standard_normal((N, 1)) * (rng.random((N, 1)) < 0.5), -3, 3)
+            gains.append(1 - cost_of(function, moved, x, wanted[:, None], before, 0.1, 3.0) / plan.cost)
+    assert np.mean(converged) > 0.9 and np.max(gains) < 1e-3
+
+
+@BOTH
+def test_a_plan_is_never_worse_than_the_last_one_shifted(solver):
+    function, controller = sluggish(), PredictiveController(sluggish(), N, inputs=(-3, 3), y_scale=0.1, solver=solver)
+    last = None
+    for x, wanted, before in states_and_references(6):
+        plan = controller(x, wanted, before)
+        if last is not None:
+            start = np.vstack([last[1:], last[-1:]])
+            assert plan.cost <= cost_of(function, start, x, wanted[:, None], before, 0.1, 3.0) * (1 + 1e-9)
+        last = plan.inputs
+
+
+def test_a_plan_that_was_cut_short_is_not_called_converged():
+    options, cut = {"inputs": (-3, 3), "y_scale": 0.1, "rate": 0.5}, 0
+    short = PredictiveController(sluggish(), N, iterations=1, **options)
+    for x, wanted, before in states_and_references(20):  # each begins with the plan of another
+        whole = PredictiveController(sluggish(), N, **options)(x, wanted, before)
+        plan = short(x, wanted, before)
+        stuck = plan.cost > 1.01 * whole.cost
+        cut += stuck
+        assert not (stuck and plan.converged)
+    assert cut
+
+
+def test_both_solvers_find_the_same_plan_inside_all_limits(small):
+    limits = {"inputs": (-2.0, 2.0), "outputs": (-4.0, 4.5), "rate": 0.7, "move": 1e-2}
+    x, wanted = np.array([0.5, -0.3, 0.2, -0.1, 0.0]), 6 * np.sin(np.arange(15) / 4)
+    plans = [PredictiveController(small[0], 15, solver=s, **limits)(x, wanted, [0.1]) for s in ("sqp", "ipopt")]
+    for plan in plans:
+        assert plan.converged
+        assert np.max(np.abs(plan.inputs)) <= 2.0
+        assert np.max(np.abs(np.diff(plan.inputs[:, 0], prepend=0.1))) <= 0.7 + 1e-6
+        assert np.max(plan.outputs) <= 4.5 + 1e-4 and plan.slack <= 1e-4
+    assert np.max(plans[0].outputs) > 4.4  # a limit is active
+    assert plans[0].cost == pytest.approx(plans[1].cost, rel=1e-3)
+
+
+def test_plans_of_a_model_with_two_inputs_are_optimal(square):
+    function, n = square[0].to_casadi(), 6
+    wanted = np.array([[1.0, -1.0]] * n)
+    controller = PredictiveController(function, n, inputs=(-1, 1))
+    plan = controller(np.zeros(2), wanted, np.zeros(2))
+    scales = controller.y_scale.reshape(n, 2), controller.u_scale.reshape(n, 2)
+    assert plan.inputs.shape == plan.outputs.shape == (n, 2)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        other = np.clip(plan.inputs + 1e-2 * rng.standard_normal((n, 2)), -1, 1)
+        assert cost_of(function, other, np.zeros(2), wanted, np.zeros(2), *scales) >= plan.cost
+
+
+# --- scales
+
+
+def loop(controller, function, path):
+    """Outputs, and whether each plan converged."""
+    x, u, y, converged = np.zeros(10), np.zeros(1), [], []
+    for k in range(len(path) - N):
+        plan = controller(x, path[k : k + N], u)
+        u = plan.u
+        x, now = function(x, u)
+        x = np.asarray(x).ravel()
+        y.append(float(now))
+        converged.append(plan.converged)
+    return np.array(y), np.array(converged)
+
+
+def test_a_loop_needs_no_scales_in_any_units():
+    path, errors, converged, scales = 0.9 * np.sin(np.arange(90) / 9), [], [], []
+    for y_unit, u_unit in ((1.0, 1.0), (1e-6, 1.0), (1e5, 1e-3)):
+        function = eight_plays(y_unit, u_unit)
+        for outputs in (None, (-0.8 * y_unit, 0.8 * y_unit)):
+            controller = PredictiveController(function, N, inputs=(-3 * u_unit, 3 * u_unit), outputs=outputs)
+            y, said = loop(controller, function, y_unit * path)
+            wanted = path[: len(y)] if outputs is None else np.clip(path[: len(y)], -0.8, 0.8)
+            errors.append(np.sqrt(np.mean((y / y_unit - wanted)[10:] ** 2)))
+            converged.append(np.mean(said))
+            scales.append(controller.y_scale[0] / y_unit)
+    assert np.max(errors) < 0.02 * np.std(path), errors
+    np.testing.assert_allclose(scales[2:], scales[:2] * 2, rtol=1e-9)
+    np.testing.assert_allclose(errors[2:], errors[:2] * 2, rtol=0.1)  # rounding picks the side of a kink
+    assert np.min(converged) > 0.8, converged
+
+
+def test_scales_that_are_given_are_taken():
+    controller = PredictiveController(eight_plays(), N, inputs=(-3, 3), outputs=(-9, 9), y_scale=0.7, u_scale=2.0)
+    assert np.all(controller.y_scale == 0.7) and np.all(controller.u_scale == 2.0)
+    free = PredictiveController(eight_plays(), N, inputs=(-np.inf, 3))
+    assert np.all(free.u_scale == 1.0) and np.all(free.y_scale > 0)
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    deaf = PredictiveController(ca.Function("deaf", [x, u], [0.5 * x, x]), N, inputs=(-1, 1))
+    assert np.all(deaf.y_scale == 1.0)
+
+
+# --- limits
+
+
+def closed(function, controller, x, wanted, u, samples):
+    """Outputs of a loop and its plans."""
+    y, plans = [], []
+    for _ in range(samples):
+        plans.append(controller(x, np.tile(wanted, (controller.horizon, 1)), u))
+        u = plans[-1].u
+        x, now = (np.asarray(v).ravel() for v in function(x, u))
+        y.append(now)
+    return np.array(y), plans
+
+
+def test_limits_hold_by_default_for_a_reference_beyond_them():
+    function = eight_plays(1e-4)
+    controller = PredictiveController(function, N, inputs=(-3, 3), outputs=(-8e-5, 8e-5))
+    y, _ = loop(controller, function, np.full(40, 1.2e-4))
+    assert np.max(y) < 8e-5 * 1.001 and y[-1] > 7.9e-5
+
+
+@BOTH
+def test_an_output_beyond_its_limit_comes_back_at_once(solver):
+    controller = PredictiveController(lags(0.8), N, inputs=(-3, 3), outputs=(-1.5, 1.5), solver=solver)
+    y, plans = closed(lags(0.8), controller, np.array([1.9]), [2.0], np.array([1.9]), 5)
+    assert y[0] == 1.9 and np.all(np.abs(y[1:] - 1.5) < 1e-6), y
+    assert "beyond their limits by 0.4" in str(plans[0]) and "within their limits" in str(plans[-1])
+    without = PredictiveController(lags(0.8), N, inputs=(-3, 3), solver=solver)
+    assert "limits" not in str(closed(lags(0.8), without, np.zeros(1), [2.0], np.zeros(1), 1)[1][0])
+
+
+@BOTH
+def test_an_output_beyond_its_limit_gives_no_leave_to_another(solver):
+    function = lags(0.99, 0.8)
+    controller = PredictiveController(function, N, inputs=(-3, 3), outputs=(-1.5, 1.5), solver=solver)
+    y, plans = closed(function, controller, np.array([2.0, 0.0]), [0.0, 1.9], np.array([2.0, 0.0]), 10)
+    assert np.min(y[:, 0]) > 1.5  # the first takes longer than that
+    assert np.max(y[:, 1]) < 1.5 + 1e-6 and abs(y[-1, 1] - 1.5) < 1e-6
+    assert np.max([plan.outputs[:, 1].max() for plan in plans]) < 1.5 + 1e-6
+
+
+@BOTH
+@pytest.mark.parametrize("far", [2.0, 1e3, 1e5])
+def test_limits_are_kept_and_reached_however_far_the_reference_is(solver, far):
+    for options in ({}, {"y_scale": 0.5}):
+        kept = PredictiveController(lags(0.8), N, inputs=(-3, 3), outputs=(-1.5, 1.5), solver=solver, **options)
+        y, plans = closed(lags(0.8), kept, np.zeros(1), [far], np.zeros(1), 12)
+        assert np.max(y) < 1.5 + 1e-6 and y[-1] > 1.5 - 1e-5 and plans[-1].converged
+        free = PredictiveController(lags(0.8), N, inputs=(-3, 3), solver=solver, **options)
+        plan = free(np.zeros(1), np.full((N, 1), far if far > 3 else 3.0), np.zeros(1))
+        assert plan.u[0] == pytest.approx(3.0, abs=1e-5) and plan.converged
+
+
+@BOTH
+def test_limits_that_cannot_be_reached_are_approached(solver):
+    controller = PredictiveController(lags(0.8), N, inputs=(-1, 1), outputs=(50, 60), solver=solver)
+    plan = controller(np.zeros(1), np.zeros((N, 1)), np.zeros(1))
+    np.testing.assert_allclose(plan.inputs[:-1], 1.0, atol=1e-5)
+    assert plan.converged and plan.slack == pytest.approx(50.0)
+
+
+@BOTH
+def test_rates_hold_to_the_last_digit(solver):
+    controller = PredictiveController(lags(0.8), N, inputs=(-3, 3), rate=0.1, solver=solver)
+    plan = controller(np.zeros(1), np.full((N, 1), 2.0), np.zeros(1))
+    changes = np.diff(plan.inputs[:, 0], prepend=0.0)
+    assert np.max(np.abs(changes)) <= 0.1 * (1 + 1e-12) and changes[0] > 0.0999
+
+
+@BOTH
+def test_a_rate_of_one_input_holds_where_the_other_has_none(square, solver):
+    controller = PredictiveController(square[0], 8, inputs=([-3, -5], [3, 5]), rate=[0.2, np.inf], solver=solver)
+    plan = controller(np.zeros(2), np.tile([1.0, -2.0], (8, 1)), np.zeros(2))
+    moves = np.max(np.abs(np.diff(plan.inputs, axis=0, prepend=0.0)), axis=0)
+    assert plan.converged and moves[0] <= 0.2 + 1e-6 and moves[1] > 0.5
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-3, 3), st.lists(st.floats(-20, 20), min_size=2, max_size=4), st.floats(0.05, 1.0), st.floats(-20, 20))
+def test_rates_and_limits_hold_whatever_was_applied_before(x, befores, rate, level):
+    """Also where the last plan was not followed, as under a manual mode."""
+    controller = PredictiveController(first_order(), 6, inputs=(-1.0, 1.0), outputs=(-2.0, 2.0), rate=rate)
+    for before in befores:
+        u = controller([x], np.full(6, level), [before]).inputs[:, 0]
+        assert np.all(np.abs(u) <= 1.0 + 1e-9)
+        first = max(rate, abs(before) - 1.0)  # as large as it takes to come back inside the limits
+        assert abs(u[0] - before) <= first + 1e-6 and np.all(np.abs(np.diff(u)) <= rate + 1e-6)
+
+
+@BOTH
+def test_a_previous_input_outside_its_limits_is_brought_back(solver):
+    controller = PredictiveController(first_order(), 6, inputs=(-1.0, 1.0), rate=0.1, solver=solver)
+    plan = controller([0.0], np.zeros(6), [5.0])
+    assert plan.converged and plan.u[0] == pytest.approx(1.0, abs=1e-6)
+
+
+@BOTH
+@pytest.mark.filterwarnings("ignore")
+def test_a_plan_that_diverges_is_not_called_converged(solver):
+    controller = PredictiveController(first_order(1e8), 60, inputs=(-1.0, 1.0), solver=solver)
+    plan = controller([1.0], np.zeros(60), [0.0])
+    assert not plan.converged and np.all(np.abs(plan.inputs) <= 1.0)
+
+
+# --- closed loops
+
+
+def small_model():
+    x, u = ca.SX.sym("x", 4), ca.SX.sym("u")
+    structure = pilfr.PILFR(2, pilfr.PrandtlIshlinskii(pilfr.Play, 2))
+    blocks = {"A": A, "B_u": [[1.0], [0.5]], "B_w": [[0.3], [0.1]], "C_y": [[1.0, 0.4]]}
+    model = structure.model(1, 1, {**blocks, "D_zu": [[1.0]], "w": [[0.5, 0.3]], "r": [[0.2, 1.0]]})
+    return ca.Function("F", [x, u], model.closed(x, u, ca.DM(model.parameters.start)))
+
+
+OPTIONS = {"inputs": (-1.0, 1.0), "outputs": (-3.0, 3.5), "move": 1e-2, "y_scale": 1.0, "u_scale": 1.0}
+PATH = 4 * np.sin(np.arange(25) / 4)
+
+
+def inputs_of_both(theirs, horizon=8):
+    """Inputs of SQP in closed loop, and those that `theirs(x, reference, u_before)` gives at the same states."""
+    function, x, u, both = small_model(), np.zeros(4), np.zeros(1), []
+    ours = PredictiveController(function, horizon, **OPTIONS)
+    for k in range(len(PATH)):
+        ahead = PATH[np.minimum(k + np.arange(horizon), len(PATH) - 1)]
+        other = theirs(x, ahead, u)
+        u = ours(x, ahead, u).u
+        both.append((u.item(), other))
+        x = np.asarray(function(x, u)[0]).ravel()
+    return np.array(both).T
+
+
+def test_ipopt_closes_the_same_loop():
+    planner = PredictiveController(small_model(), 8, solver="ipopt", **OPTIONS)
+    ours, theirs = inputs_of_both(lambda x, ahead, u: planner(x, ahead, u).u.item())
+    np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_do_mpc_closes_the_same_loop():
+    pytest.importorskip("do_mpc", reason="do-mpc, an optional extra, is not installed")
+    planner = do_mpc_controller(small_model(), 8, PATH, **OPTIONS)
+    planner.x0, planner.u0 = np.zeros((4, 1)), np.zeros((1, 1))
+    planner.set_initial_guess()
+
+    def theirs(x, ahead, u):
+        planner.u0 = u[:, None]
+        return np.asarray(planner.make_step(x[:, None])).item()
+
+    ours, others = inputs_of_both(theirs)
+    np.testing.assert_allclose(ours, others, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_piezo_stage_is_tracked_with_a_fifth_of_the_linear_error():
+    found = {o.name: o for o in mpc_piezo.outcomes(250, quick=True)[0]}
+    for name in ("MPC, hysteresis model", "inverse on the observer's state", "inverse, no sensor"):
+        own = found[name]
+        assert own.error < 0.2 * found[LINEAR].error, table([*found.values()], "µm", 1e-3, mpc_piezo.TOLERANCE)
+        assert own.violation < mpc_piezo.TOLERANCE
+
+
+@pytest.mark.slow
+def test_masing_rig_is_tracked_with_half_of_the_linear_error():
+    found = {o.name: o for o in mpc_masing.outcomes(250, quick=True)[0]}
+    own = found["MPC, hysteresis model"]
+    assert own.error < 0.5 * found[LINEAR].error, table([*found.values()], "m", 1 / FS, mpc_masing.TOLERANCE)
+    assert own.violation < mpc_masing.TOLERANCE
+    assert own.median < 1 / FS
+
+
+def test_the_rig_in_motion_is_the_simulator():
+    u = np.random.default_rng(0).standard_normal(300)
+    rig, y = mpc_masing.RigInMotion(), []
+    for value in u:
+        y.append(rig.y)
+        rig.advance(float(value))
+    np.testing.assert_array_equal(y, simulate(u, FS).x2)
+
+
+# --- do-mpc
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_do_mpc_takes_scales_and_limits_for_each_signal():
+    pytest.importorskip("do_mpc", reason="do-mpc, an optional extra, is not installed")
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    function = ca.Function("F", [x, u], [ca.mtimes(ca.DM(A), x) + u, x])
+    wanted = np.tile([0.5, -0.3], (20, 1))
+    options = {"inputs": ([-0.2, -1.0], [0.2, 1.0]), "outputs": ([-1.0, -np.inf], [1.0, np.inf])}
+    options |= {"y_scale": [0.1, 0.4], "u_scale": [1.0, 2.0], "move": 0.1}
+    theirs = do_mpc_controller(function, 6, wanted, **options)
+    theirs.x0, theirs.u0 = np.zeros((2, 1)), np.zeros((2, 1))
+    theirs.set_initial_guess()
+    ours = PredictiveController(function, 6, **options)(np.zeros(2), wanted[:6], np.zeros(2))
+    np.testing.assert_allclose(theirs.make_step(np.zeros((2, 1))).ravel(), ours.u, atol=1e-5)
+    scales = np.arange(1.0, 13.0).reshape(6, 2)
+    refused(lambda: do_mpc_controller(function, 6, wanted, inputs=(-1, 1), y_scale=scales), "changes over the horizon")
+
+
+def test_do_mpc_takes_what_a_controller_plans_with(small):
+    pytest.importorskip("do_mpc")
+    fit, _, observer = small
+    for given_model in (fit, observer, fit.export(), fit.to_casadi()):
+        model = do_mpc_model(given_model)
+        assert (model.x.shape[0], model.u.shape[0]) == (5, 1)
+        assert PredictiveController(given_model, 3, inputs=(-1, 1)).function.size1_in(0) == 5
+    refused(lambda: do_mpc_model("f"), "A str cannot be planned with; give a Fit")
+
+
+def test_without_do_mpc_one_sentence_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "do_mpc", None)
+    refused(lambda: do_mpc_model(small_model()), r"pip install pilfr-casadi\[do-mpc\]")
+
+
+# --- arguments
+
+
+def test_a_plan_and_a_controller_print_in_a_line_or_two(small):
+    controller = PredictiveController(small[0], 4, inputs=(-1, 1), outputs=(-9, 9), rate=0.5)
+    plan = controller(np.zeros(5), np.zeros(4), [0.0])
+    for thing, words in (
+        (controller, "over 4 samples by sqp: 5 states, 1 inputs, 1 outputs, limits of the inputs and outputs, rates"),
+        (plan, "plan over 4 samples, converged in"),
+    ):
+        assert words in str(thing) == repr(thing) and len(str(thing)) < 300 and "array(" not in str(thing), str(thing)
+    assert "outputs within their limits" in str(plan)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"function": 3}, "casadi.Function"),
+        ({"function": ca.Function("g", [ca.SX.sym("x")], [ca.SX(1)])}, r"give \(x, u\) -> \(x_next, y\)"),
+        ({"horizon": 2.5}, "horizon"),
+        ({"horizon": True}, "horizon"),
+        ({"horizon": 0}, "horizon"),
+        ({"inputs": 3}, r"\(low, high\)"),
+        ({"inputs": ("a", "b")}, "numbers"),
+        ({"inputs": (np.nan, 1.0)}, "not finite"),
+        ({"inputs": (None, 1.0)}, "A limit of the inputs is None"),
+        ({"inputs": (1, 0)}, "low below high"),
+        ({"outputs": (None, 1.0)}, "A limit of the outputs is None"),
+        ({"outputs": (np.zeros(3), np.ones(3))}, "shape"),
+        ({"outputs": (1.0, 1.0)}, "outputs is not below"),
+        ({"rate": "a"}, "rate"),
+        ({"y_scale": 0}, "above zero"),
+        ({"y_scale": np.nan}, "not finite"),
+        ({"move": -1}, "above zero"),
+        ({"move": "a"}, "move"),
+        ({"move": None}, "move"),
+        ({"move": np.inf}, "move"),
+        ({"iterations": 0}, "iterations"),
+        ({"iterations": "a"}, "iterations"),
+        ({"iterations": 2.5}, "iterations"),
+        ({"solver": None}, "'sqp' or 'ipopt'"),
+        ({"solver": "qp"}, "solver 'qp'"),
+    ],
+)
+def test_options_that_fit_no_controller_are_refused(change, words):
+    arguments = {"function": first_order(), "horizon": 5, "inputs": (-1.0, 1.0), **change}
+    refused(lambda: PredictiveController(arguments.pop("function"), arguments.pop("horizon"), **arguments), words)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"), [(0, [np.nan]), (0, [0.0, 0.0]), (1, [np.nan] * 5), (1, np.zeros(4)), (2, np.nan)]
+)
+def test_states_and_references_that_do_not_fit_are_refused(place, value):
+    controller = PredictiveController(first_order(), 5, inputs=(-1.0, 1.0))
+    arguments = [[0.0], [0.1] * 5, 0.0]
+    assert controller(*arguments).converged
+    arguments[place] = value
+    refused(lambda: controller(*arguments), r"finite|numbers|has the shape \(4,\); give \(5, 1\)")
+
+
+def test_a_transposed_reference_is_refused(square):
+    controller = PredictiveController(square[0], 8, inputs=(-5, 5))
+    wanted = np.tile([1.0, -2.0], (8, 1))
+    np.testing.assert_allclose(controller(np.zeros(2), wanted, np.zeros(2)).outputs[-1], [1.0, -2.0], atol=1e-3)
+    for reference in (wanted.T, wanted.ravel(), wanted[:4], wanted[:, :1], 1.0):
+        refused(lambda reference=reference: controller(np.zeros(2), reference, np.zeros(2)), re.escape("give (8, 2)"))
+
+
+def test_do_mpc_gets_the_same_sentences():
+    limits = {"inputs": (-1.0, 1.0)}
+    refused(lambda: do_mpc_controller(3, 5, np.zeros(9), **limits), "casadi.Function")
+    refused(lambda: do_mpc_controller(first_order(), 0, np.zeros(9), **limits), "horizon")
+    refused(lambda: do_mpc_controller(first_order(), 5, "a", **limits), "reference")
+    refused(lambda: do_mpc_controller(first_order(), 5, np.zeros((9, 2)), **limits), re.escape("give (samples, 1)"))
+    refused(lambda: do_mpc_controller(first_order(), 5, [np.nan] * 9, **limits), "finite")
+    refused(lambda: do_mpc_controller(first_order(), 5, np.zeros(9), inputs=(1.0, -1.0)), "low below high")
+
+
+def test_interpolated_inputs_are_refused():
+    dynamics, outputs = (lambda x, u: dict(v=u.f - 4.0 * x.v)), (lambda x: dict(v=x.v))
+    simulator = pilfr.Simulator(dynamics, outputs, states=("v",), inputs=("f",))
+    linear, zero = pilfr.exported(simulator, dt=0.1, hold="linear"), pilfr.exported(simulator, dt=0.1)
+    refused(lambda: PredictiveController(linear, 5, inputs=(-1.0, 1.0)), "interpolated")
+    refused(lambda: do_mpc_controller(linear, 5, np.zeros(9), inputs=(-1.0, 1.0)), "interpolated")
+    assert PredictiveController(zero, 5, inputs=(-1.0, 1.0)).function.size1_in(1) == 1
