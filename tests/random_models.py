@@ -3,6 +3,7 @@
 import numpy as np
 
 from pilfr_casadi.data import Recording, multisine
+from pilfr_casadi.linear import resolvent
 from pilfr_casadi.models import PILFR, GeneralizedPlay, Play, PrandtlIshlinskii, Stop, block_shapes
 
 
@@ -107,3 +108,10 @@ def simulate_lti(system, u, x=None):
         out.append(system.C @ x + system.D @ u_k)
         x = system.A @ x + system.B @ u_k
     return np.array(out)
+
+
+def frequency_response(system, frequency):
+    """Response of a control.StateSpace at frequencies in Hz, (F, n_y, n_u); not finite at a pole."""
+    z = np.exp(2j * np.pi * np.asarray(frequency) * system.dt)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return resolvent(np.asarray(system.A), np.asarray(system.C), z) @ np.asarray(system.B) + np.asarray(system.D)

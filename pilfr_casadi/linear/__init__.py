@@ -5,16 +5,15 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .bla import BLA as BLA, output_spectra as output_spectra, robust_bla as robust_bla
-    from .local_polynomial import plain_bla as plain_bla
+    from .bla import BLA as BLA, output_spectra as output_spectra, plain_bla as plain_bla, robust_bla as robust_bla
     from .modal_form import in_modal_coordinates as in_modal_coordinates, is_modal as is_modal, modal as modal
     from .order_selection import select_order as select_order
     from .statespace import propagate as propagate, resolvent as resolvent
     from .subspace import (
+        FrequencyProblem as FrequencyProblem,
         frequency_subspace as frequency_subspace,
         subspace_matrices as subspace_matrices,
         time_subspace as time_subspace,
     )
-    from .subspace_frequency import FrequencyProblem as FrequencyProblem
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -1,13 +1,10 @@
 """Modal coordinates: a state matrix of 2 × 2 blocks on the diagonal, for linear parts of high order.
 
-A full state matrix has n_x² entries of which a change of basis x = T x' makes all but 2 n_x superfluous. Every
-diagonalizable A is similar to one of blocks, a pair of poles in each (and one pole alone where n_x is odd): complex
-ones, or any two real ones, since a block is free in all its four entries. The model class stays the same (but for
-defective A), while sensitivities cost a tenth at 15 states. The model of Krikelis et al. (2024), Eq. 15, with
-
-    fixed={"A": modal(15)}
-
-is identified in these coordinates from the linear model on (Sec. 5.3).
+A full state matrix has n_x² entries, but a change of basis x = T x' leaves only 2 n_x of them free. Every
+diagonalizable A is similar to a matrix of blocks with a pair of poles each (and a single pole if n_x is odd): a complex
+pair, or any two real poles, since all four entries of a block are free. The model class stays the same (except for
+defective A), while sensitivities cost a tenth at 15 states. With `fixed={"A": modal(15)}` the model of Krikelis et al.
+(2024), Eq. 15, is identified in these coordinates from the linear model on (Sec. 5.3).
 """
 
 from __future__ import annotations
@@ -17,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, whole
 from ..data import Recording
 from .statespace import propagate
 
 Array = np.ndarray
-DEFECTIVE = 1e10  # condition number of the eigenvectors above which A counts as defective
+DEFECTIVE = 1e10  # condition number of the eigenvectors above which A counts as defective to rounding
 
 
 def modal(nx: int) -> Array:
-    """What is known of `A` in modal coordinates: nan (free) in 2 × 2 blocks on the diagonal, zero elsewhere.
+    """Return the pattern of `A` in modal coordinates: nan (free) in 2 × 2 blocks on the diagonal, zero elsewhere.
 
     Parameters
     ----------
@@ -41,22 +38,20 @@ def modal(nx: int) -> Array:
     Raises
     ------
     InputError
-        If nx is no whole number above zero.
+        If nx is not a whole number above zero.
     """
-    if isinstance(nx, bool) or not isinstance(nx, int | np.integer) or nx < 1:
-        raise InputError(f"Modal coordinates of {nx!r} states were asked for; give a whole number above zero.")
-    block = np.arange(nx) // 2
+    block = np.arange(whole(nx, "the number of states nx", 1)) // 2
     return np.where(block[:, None] == block, np.nan, 0.0)
 
 
 def is_modal(fixed: Mapping[str, Any], nx: int) -> bool:
-    """Whether what a structure fixes says that `A` is in modal coordinates."""
+    """Tell whether the fixed entries of a structure put `A` in modal coordinates."""
     given = np.asarray(fixed.get("A", 0.0), dtype=float)
     return nx > 0 and given.shape == (nx, nx) and np.array_equal(given, modal(nx), equal_nan=True)
 
 
 def modal_basis(a: Array) -> Array:
-    """Basis T (nx, nx) in which `T⁻¹ A T` has 2 × 2 blocks on the diagonal: complex poles first, each kind by its size.
+    """Return a basis T (nx, nx) in which `T⁻¹ A T` has 2 × 2 blocks on the diagonal: complex poles first, sorted.
 
     Raises
     ------
@@ -78,7 +73,7 @@ def modal_basis(a: Array) -> Array:
 
 
 def in_modal_coordinates(blocks: Mapping[str, Array], recordings: tuple[Recording, ...]) -> dict[str, Array]:
-    """Linear blocks `A`, `B_u`, `C_y` in modal coordinates, the states of unit deviation over the recordings."""
+    """Transform `A`, `B_u`, `C_y` to modal coordinates, with states of unit rms over the recordings."""
     t = modal_basis(blocks["A"])
     back = np.linalg.inv(t)
     a, b = back @ blocks["A"] @ t, back @ blocks["B_u"]

@@ -1,45 +1,20 @@
-r"""Discrete linear state-space models: response, states over time, reflection of the poles.
+r"""Discrete linear state-space models: resolvent, reflection of the poles, states over time.
 
 .. math:: x(k+1) = A x(k) + B u(k), \qquad y(k) = C x(k) + D u(k), \qquad G(z) = C (z I - A)^{-1} B + D
 
-The response takes one complex Schur form of `A` for all frequencies; the states are found in pieces of the record that
-run side by side, joined by powers of `A`; both in plain NumPy, for any number of samples and lines.
+The resolvent takes one complex Schur form of `A` for all frequencies; the states are computed in pieces of the record,
+all pieces at once, joined by powers of `A`. Both are plain NumPy, for any number of samples and frequencies.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
-
-if TYPE_CHECKING:
-    pass
 
 Array = np.ndarray
 
 
-def frequency_response(system: Any, frequency: Array) -> Array:
-    """Frequency response of a discrete state-space model, fast for many frequencies.
-
-    Parameters
-    ----------
-    system : control.StateSpace
-        Or anything with `A`, `B`, `C`, `D` and `dt`.
-    frequency : array, (F,)
-        Frequencies in Hz.
-
-    Returns
-    -------
-    complex array, (F, n_y, n_u)
-        Not finite at a pole.
-    """
-    z = np.exp(2j * np.pi * np.asarray(frequency) * system.dt)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return resolvent(np.asarray(system.A), np.asarray(system.C), z) @ np.asarray(system.B) + np.asarray(system.D)
-
-
 def resolvent(A: Array, C: Array, z: Array) -> Array:
-    """``C (z I - A)⁻¹`` at every `z`, (F,) -> (F, n_y, nx), by one Schur form and substitution."""
+    """Return ``C (z I - A)⁻¹`` at every `z`, (F,) -> (F, n_y, nx), by one Schur form and substitution."""
     from scipy.linalg import schur
 
     T, V = schur(A, output="complex")
@@ -50,7 +25,7 @@ def resolvent(A: Array, C: Array, z: Array) -> Array:
     return X @ V.conj().T
 
 
-def reflected(A: Array) -> Array:
+def reflect_poles(A: Array) -> Array:
     """Move eigenvalues outside the unit circle (or on it) to ``1 / conj(lambda)``, strictly inside."""
     from scipy.linalg import schur
 
@@ -69,9 +44,9 @@ def reflected(A: Array) -> Array:
 
 
 def propagate(At: Array, v: Array, x0: Array) -> tuple[Array, Array]:
-    """States of ``x(k+1) = x(k) At + v(k)`` (rows) for several runs at once, and the state after the last sample.
+    """Return the states of ``x(k+1) = x(k) At + v(k)`` (rows) for several runs, and the state after the last sample.
 
-    The samples are cut into about sqrt(M) pieces that are run side by side, so that Python loops over sqrt(M) steps.
+    The samples are cut into about sqrt(M) pieces that advance together, so that Python loops over sqrt(M) steps.
 
     Parameters
     ----------

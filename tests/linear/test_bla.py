@@ -3,12 +3,11 @@
 import control
 import numpy as np
 import pytest
-from random_models import simulate_lti
+from random_models import frequency_response, simulate_lti
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.linear import BLA, output_spectra, plain_bla, robust_bla
-from pilfr_casadi.linear.statespace import frequency_response
 
 DT = 0.01
 
