@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from .choice import Choice
 from .clipping import clipped_input
+from .description import Description, find_description
 from .gates import Gate
 from .held import held_value
 from .proof import mean_nrmse
@@ -29,6 +30,8 @@ class Conclusion:
         The effects that are named; others may be closed in.
     let_go : str
         The held parameter that does what a law was named for.
+    description : Description or None
+        The elements of `fitted` that have no sure name, for an unexplained mismatch.
     """
 
     verdict: str
@@ -37,6 +40,7 @@ class Conclusion:
     fitted: Fitted
     named: list[Choice]
     let_go: str = ""
+    description: Description | None = None
 
 
 def concluded(search: Search, gates: tuple[Gate, ...]) -> Conclusion:
@@ -57,6 +61,10 @@ def concluded(search: Search, gates: tuple[Gate, ...]) -> Conclusion:
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "
             f"{mean_nrmse(search.bench, search.without):.3g} of the outputs' deviation."
         )
+    elif verdict == "unexplained" and (found := find_description(search)) is not None:
+        description, fitted = found
+        sentence = f"{sentence} {description.sentence}"
+        return Conclusion(verdict, sentence, gates, fitted, [], description=description)
     return Conclusion(verdict, sentence, gates, search.without, [])
 
 

@@ -7,7 +7,6 @@ two apart. Where the simulator is not linear, or has several inputs, the fits do
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -30,7 +29,7 @@ def every_sensor(search: Search) -> None:
     behind = [p for p in steps if p.choice is not None and p.choice.winner.port.startswith("actuator:")]
     if not behind or len(names) < 2 or len(own) - len(search.bench.simulator.elements) != len(found):
         return
-    began, first = time.perf_counter(), behind[0]
+    began, first = search.begin("every sensor"), behind[0]
     assert first.choice is not None
     ports, law = [f"sensor:{name}" for name in names], first.choice.winner.law
     rival = _rival(search, ports, first.choice.winner)

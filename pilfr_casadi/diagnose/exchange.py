@@ -6,7 +6,6 @@ So it is tried at the second's port, and wherever it came near alone, with the s
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -39,7 +38,7 @@ def exchange(search: Search) -> None:
     one, other = steps[0].choice.winner, steps[1].choice.winner
     if type(one.law) is type(other.law):
         return
-    began = time.perf_counter()
+    began = search.begin("exchange")
     ways = _ways(steps[0], one, other)
     stay, *tried = side_by_side(lambda way: _placed(search, way), [[], *ways], search.workers)
     pairs = [(found, way) for found, way in zip(tried, ways, strict=True) if found is not None]

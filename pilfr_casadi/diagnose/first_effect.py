@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -27,7 +26,7 @@ def led_out(search: Search) -> bool:
     """
     if not search.may_be_led:
         return False
-    base, began = search.base, time.perf_counter()
+    base, began = search.base, search.begin("look back")
     try:
         alone = search.bench.fit(search.bench.simulator, [base.values], states=base.begin, solver=THOROUGH)
     except InputError:
@@ -44,7 +43,7 @@ def wrongly_held(search: Search) -> bool:
     """Whether, with the effects in place, inputs seem to do the other thing between samples."""
     if search.hold_said:
         return False
-    base, began = search.base, time.perf_counter()
+    base, began = search.base, search.begin("look back")
     try:
         other = search.bench.otherwise_held().fit(base.simulator, [base.values], states=base.initial, solver=THOROUGH)
     except InputError:
@@ -57,7 +56,7 @@ def wrongly_held(search: Search) -> bool:
 
 def offset_beside(search: Search) -> None:
     """A constant that the first effect had hidden is a parameter of the simulator, with and without the effect."""
-    began = time.perf_counter()
+    began = search.begin("look back")
     bench, base, gates = offsets(search.bench, search.base)
     try:
         if gates:

@@ -31,7 +31,7 @@ def otherwise_held(asked: Asked, ready: Prepared, search: Search) -> tuple[Prepa
     wrong = search.misheld > MISHELD
     try:
         hold = search.bench.otherwise_held().hold
-        held = replace(asked, hold=hold)
+        held = replace(asked, hold=hold, say=asked.say.under("other hold: "))
         # one effect shows whether it is worth the search for two
         other, again = prepared_search(held if wrong else replace(held, effects=1))
         nearer = again.base.cost <= search.base.cost

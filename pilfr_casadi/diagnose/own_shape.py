@@ -7,7 +7,6 @@ put up against a free curve beside the first law, of nothing but the signal that
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -76,7 +75,7 @@ def own_shape(search: Search, second: Candidate) -> bool:
     curve = _beside(first.law, local) if local is not None and second.port != first.port else None
     if curve is None:
         return False
-    began = time.perf_counter()
+    began = search.begin("own shape")
     placed = search.base.simulator.with_element(first.port, curve)
     found = attempt(search.bench, placed, [search.base.values], states=search.base.begin)
     search.timed("own shape", began)

@@ -10,7 +10,6 @@ The best pairs are fitted together; then each law of the best is put up against 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -164,8 +163,7 @@ def _better(search: Search, found: tuple[Fitted, list[Pass]], cost: float) -> bo
 
 def _two(search: Search) -> tuple[Fitted, list[Pass]] | None:
     """Both laws fitted, and the pass that put each up against all others."""
-    began, bench = time.perf_counter(), search.bench
-    search.say("two at once", 0, 1, search.base.cost**0.5)
+    began, bench = search.begin("two at once"), search.bench
     rest = Remainder.of(bench, *linearised(bench, search.without), search.laws)
     pairs = promising(rest)
     fits = side_by_side(lambda pair: _fitted_together(search, rest, pair), pairs, search.workers)

@@ -21,11 +21,13 @@ from .linearise import along, linearised, observer_gain
 from .offset import another_zero, offsets
 from .proof import errors_of
 from .settling import without_transients
+from .stages import Stages
 from .stale import stale_samples
 from .timing import FAR, as_given, in_steps, timing
 from .workbench import THOROUGH, Fitted, Workbench
 
 SUSPECT, LEAST = 25.0, 4e-4  # times the noise, and mean square error, beyond which signs and units are looked at
+CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the parts of it that are reported
 LED = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer in turn
 
 
@@ -58,11 +60,14 @@ def prepare(
     workers: int = 1,
     starts: Sequence[Mapping[str, Any]] = (),
     early: bool = True,
+    say: Stages | None = None,
 ) -> Prepared:
     """Open the bench, look at the dull causes, refit from the user's values and from `starts`, measure the floor.
 
     Without `early` a channel that seems early is so only where it is all that is wrong.
     """
+    say = say or Stages(lambda *_: None)
+    say(CHECKS, 0, CHECKED)
     recordings, spikes = without_glitches(recordings)
     recordings, transients = without_transients(recordings)
     bench, gates = opened(simulator, recordings, hold or "zero", engine)
@@ -70,7 +75,9 @@ def prepare(
     between, notes = choose_hold(simulator, bench.recordings, hold, engine)
     bench = Workbench.of(simulator, bench.recordings, between, engine)
     nominal = errors_of(bench, bench.model(simulator))
+    say(CHECKS, 1, CHECKED)
     without = refitted(bench, starts)
+    say(CHECKS, 2, CHECKED, without.cost**0.5)
     unsaid = said_hold(simulator, recordings, hold) is None
     first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     noise2 = float(np.mean((first.deviation / bench.scale) ** 2))
@@ -85,6 +92,7 @@ def prepare(
             without = bench.fit(simulator, [found[1].values, {}, *starts], solver=THOROUGH)
             gates = [*gates, *found[2]]
     gates = [*gates, *notes]
+    say(CHECKS, 3, CHECKED, without.cost**0.5)
     bench, without, more = unclip(bench, without)
     gates += more
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
@@ -97,6 +105,7 @@ def prepare(
             gates, notes = [g for g in gates if g not in notes] + held, held
         floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
         noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
+    say(CHECKS, 4, CHECKED, without.cost**0.5)
     bench, without = on_steps_as_fine(bench, without)
     given, before = bench, without
     # where inputs are taken as held but are interpolated, a late channel is late by half a sample more or less
@@ -114,6 +123,7 @@ def prepare(
             held = [hold_note(simulator, bench.hold, ratio)] if ratio > 1.02 else []
             gates = [g for g in gates if g not in notes] + held
     gates += more
+    say(CHECKS, 5, CHECKED, without.cost**0.5)
     bench, without, more = offsets(bench, without)
     gates += more
     if gates:  # values and states that wrong data led to may be a dead end
@@ -122,6 +132,7 @@ def prepare(
     floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
     bench.check_followed(without)
     bench = replace(bench, typical=along(bench, without))
+    say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
     return Prepared(bench, without, nominal, tuple(gates), floor)
 
 

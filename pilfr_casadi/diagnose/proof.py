@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..data import Recording, nrmse
-from ..engine import make_engine
+from ..engine import Engine, make_engine
 from ..models import Model, ParameterSet
 from ..optimise import first_state, samples_for_state
 from ..simulators import Simulator
@@ -23,23 +23,38 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
     return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
 
 
-def errors_of(bench: Workbench, model: Model) -> float:
-    """NRMSE of a model as it stands; infinite where the simulation diverges.
+def run_free(model: Model, engine: Engine, recording: Recording) -> tuple[np.ndarray, int]:
+    """Simulate a model as it stands along a recording.
 
-    Initial states that are to be estimated are fitted to the first part of each recording, which is not scored then.
+    An initial state that is to be estimated is fitted to the first part of the recording.
+
+    Returns
+    -------
+    array, shape (M, n_y)
+        Simulated outputs; not finite where the simulation diverges.
+    int
+        First sample that is scored: the fitted part is left out.
     """
+    estimated = recording.begins == "estimate" and model.n_state > 0
+    used = min(samples_for_state(model), len(recording) // 3) if estimated else 0
+    with np.errstate(all="ignore"):
+        try:
+            state = first_state(model, engine, recording, used or None)
+            y = engine.simulate(model.drive(recording), model.parameters.start, state)[0]
+        except (RuntimeError, FloatingPointError):  # a quadratic program of huge numbers
+            y = np.full(recording.y.shape, np.nan)
+    return np.asarray(y), max(recording.skip, used)
+
+
+def errors_of(bench: Workbench, model: Model) -> float:
+    """NRMSE of a model as it stands, averaged over recordings; infinite where the simulation diverges."""
     engine = make_engine(model, bench.engine)
     errors = []
     for r in bench.recordings:
-        estimated = r.begins == "estimate" and model.n_state > 0
-        used = min(samples_for_state(model), len(r) // 3) if estimated else 0
-        with np.errstate(all="ignore"):
-            try:
-                state = first_state(model, engine, r, used or None)
-                y = engine.simulate(model.drive(r), model.parameters.start, state)[0]
-            except (RuntimeError, FloatingPointError):  # a quadratic program of huge numbers
-                return np.inf
-            errors.append(nrmse(r.y, y, skip=max(r.skip, used)) if np.all(np.isfinite(y)) else np.inf)
+        y, skip = run_free(model, engine, r)
+        if not np.all(np.isfinite(y)):
+            return np.inf
+        errors.append(nrmse(r.y, y, skip=skip))
     return float(np.mean(errors))
 
 

@@ -1,26 +1,34 @@
-"""What a diagnosis found: immutable, printable, and as the contract's diagnosis.json."""
+"""The answer of a diagnosis: immutable, printable, and written as the contract's diagnosis.json."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..data import Recording
-from ..simulators import Simulator
+from .._base import InputError
+from ..data import SAME_STEP, Recording, nrmse
+from ..engine import make_engine
+from ..models import ParameterSet
+from ..simulators import Simulator, discretise
+from .arranged import arranged
+from .description import Description
 from .gates import Gate
+from .proof import run_free
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
-MOST = 8  # values of the simulator that are printed
-LEFT = 2.0  # times the noise that is left, to be told
-WORSE = 1.05  # times the test error without the effects that one with them is worth a warning
-CONSTANT = 0.9  # error of a refitted simulator that follows next to nothing
-INTERRUPTED = "The search was interrupted: this is what was found until then, and the rest was not tried."
-FAR = 3.0  # times the training error that a test error is worth a warning
+MOST = 8  # parameters of the simulator that are printed
+LEFT = 2.0  # ratio of the remaining training error to the noise from which the answer says that more is missing
+WORSE = 1.05  # ratio of the test errors after and before from which a correction makes the test recordings worse
+SURE = 0.5  # confidence above which an effect is stated as found; below it is a guess
+CONSTANT = 0.9  # error from which a refitted simulator is hardly better than a constant
+FAR = 3.0  # ratio of the test error to the training error from which the answer warns
+INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +80,10 @@ class Diagnosis:
     substeps : int
         Integration steps a sample with which the corrected simulator was fitted.
     let_go : str
-        Parameter that was fixed or at a bound and is let go in the corrected simulator; see `held`.
+        Parameter that was fixed or at a bound and is free in the corrected simulator; see `held`.
+    description : Description or None
+        For an unexplained mismatch: the elements of `corrected`, which follow unseen data better than the refit but
+        have no sure name. They are not effects.
     """
 
     verdict: str
@@ -96,13 +107,47 @@ class Diagnosis:
     evidence: Mapping[str, Any] = field(default_factory=dict)
     substeps: int = 1
     let_go: str = ""
+    description: Description | None = None
+
+    @property
+    def sure(self) -> bool:
+        """Whether every named effect has a confidence above one half; False without effects."""
+        return bool(self.effects) and min(e.confidence for e in self.effects) > SURE
+
+    @property
+    def outcome(self) -> str:
+        """How the correction changes the error on the test recordings: "better", "same", "worse"; "" where unknown.
+
+        It is unknown without test recordings and where the corrected simulator is the refitted one.
+        """
+        errors = self.errors.get("test")
+        if not errors or not (self.effects or self.description or self.let_go):
+            return ""
+        before, after = errors["before"], errors["after"]
+        if not after <= WORSE * before:
+            return "worse"
+        return "better" if after < before else "same"
+
+    @property
+    def summary(self) -> str:
+        """The verdict's sentence, and a second one where the correction does not help on the test recordings."""
+        errors = self.errors.get("test")
+        if not errors or self.outcome not in ("worse", "same"):
+            return self.sentence
+        before, after = (_percent(errors[k]) for k in ("before", "after"))
+        if self.outcome == "same":
+            return f"{self.sentence} On the test recordings it makes no difference: {before} before, {after} after."
+        return (
+            f"{self.sentence} But this correction makes the test recordings worse: their error is {before} refitted "
+            f"and {after} with it. Do not use it as a correction."
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The content of diagnosis.json; numbers that are not finite are None."""
         raw = {
             "schema": 1,
             "verdict": self.verdict,
-            "sentence": self.sentence,
+            "sentence": self.summary,
             "effects": [e.to_dict() for e in self.effects],
             "candidates": list(self.candidates),
             "gates": [g.to_dict() for g in self.gates],
@@ -110,67 +155,150 @@ class Diagnosis:
             "parameters": self.parameters,
             "fit": {**self.errors, "noise_floor": self.floor},
             "next_experiment": self.next_experiment,
+            "description": self.description.to_dict() if self.description else None,
             "notes": self.warnings(),
             "interrupted": self.interrupted,
         }
         clean: dict[str, Any] = plain(raw)
         return clean
 
+    def simulate(self, recording: Recording) -> np.ndarray:
+        """Simulate the corrected simulator along the inputs of a recording.
+
+        Recordings are corrected as the training recordings were (sign, unit, shift: see `gates`). An unknown initial
+        state is estimated from the first samples.
+
+        Parameters
+        ----------
+        recording : Recording
+            Has the simulator's inputs and outputs by name, in any order.
+
+        Returns
+        -------
+        array, shape (M, n_y)
+            Outputs in the simulator's order; not finite where the simulation diverges.
+
+        Raises
+        ------
+        InputError
+            If the recording lacks a channel or has another step than the training recordings.
+        """
+        return self._run(recording)[1]
+
+    def nrmse(self, recording: Recording) -> float:
+        """Error of the corrected simulator on a recording: NRMSE (Eq. 27), averaged over outputs.
+
+        Samples that an initial state was estimated from are not scored; see `simulate` for everything else. The error
+        is infinite where the simulation diverges.
+        """
+        r, y, skip = self._run(recording)
+        return nrmse(r.y, y, skip=skip) if np.all(np.isfinite(y)) else np.inf
+
+    def plot(self, recording: Recording) -> Any:
+        """Draw a recording beside the refitted and the corrected simulator.
+
+        Parameters
+        ----------
+        recording : Recording
+            See `simulate`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            A row for each output: the signals around the largest swing, and the errors over the whole recording.
+        """
+        from ..plots import compared_residuals, compared_traces, new_figure
+
+        r, after, _ = self._run(recording)
+        simulated = [("refitted", self._run(recording, self.refitted)[1]), ("corrected", after)]
+        finite = [(label, y if np.all(np.isfinite(y)) else None) for label, y in simulated]
+        figure = new_figure(11.0, 3.4 * r.n_y)
+        axes = figure.subplots(r.n_y, 2, squeeze=False)
+        noise = self.floor["nrmse"] * np.std(r.y[r.skip :], axis=0)
+        for i, (left, right) in enumerate(axes):
+            unit = r.units.get(r.outputs[i], "")
+            compared_traces(r, finite, i, unit, ax=left)
+            compared_residuals(r, finite, i, unit, float(noise[i]), ax=right)
+        return figure
+
+    def _run(self, recording: Recording, simulator: Simulator | None = None) -> tuple[Recording, np.ndarray, int]:
+        """The recording as corrected, the outputs of a simulator along it, and the first scored sample."""
+        simulator = simulator or self.corrected
+        r, dt = arranged(simulator, recording), self.train[0].dt
+        if abs(r.dt / dt - 1) > SAME_STEP:
+            raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
+        for gate in self.gates:
+            r = gate.change(r) if gate.change is not None else r
+        fitted = self.evidence.get("after" if simulator is self.corrected else "without")
+        substeps = fitted.model.substeps if fitted is not None else self.substeps
+        model = discretise(simulator, dt, self.hold, substeps)
+        y, skip = run_free(model, make_engine(model), r)
+        return r, y, skip
+
     def export(self, **options: Any) -> Any:
-        """The corrected simulator as a step over a sample, in steps and sub-steps as fitted; see `export.exported`."""
+        """Make the corrected simulator a step over one sample, with the hold and sub-steps of the fit.
+
+        `options` are those of `pilfr.exported`; the result has `step`, `c_code` and the other exports.
+        """
         from ..export import exported
 
         return exported(self.corrected, dt=self.train[0].dt, hold=self.hold, substeps=self.substeps, **options)
 
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
-        """The corrected simulator as `casadi.Function (x, u) -> (x_next, y)`; see `export.to_casadi`."""
+        """Make the corrected simulator a `casadi.Function (x, u) -> (x_next, y)`; see `pilfr.to_casadi`."""
         return self.export(name=name, smooth=smooth).step
 
-    def report(self, folder: str | os.PathLike[str]) -> None:
-        """Write report.html, diagnosis.json and figures into a folder."""
+    def report(self, folder: str | os.PathLike[str]) -> Path:
+        """Write report.html, diagnosis.json and figures into a folder; return the page's path."""
         from ..report import diagnosis_report
 
-        diagnosis_report(self, folder)
+        return diagnosis_report(self, folder)
 
     def warnings(self) -> list[str]:
-        """What makes the answer less certain than it looks: an interrupt, parameters at bounds, errors that stay large.
-
-        At zero is what a named effect has replaced, such as a damper that was there for friction.
-        """
-        out, own = [INTERRUPTED] if self.interrupted else [], self.corrected.parameters
-        ends = {k: (np.asarray(own[k].value), *own[k].bounds) for k in self.parameters if not own[k].fixed}
-        held = {k: np.ravel(v)[0] for k, (v, low, high) in ends.items() if np.any((v <= low) | (v >= high))}
-        held = {k: v for k, v in held.items() if v or not self.effects}
-        if held:
-            names = ", ".join(f"{k} ({v:.4g})" for k, v in held.items())
-            one = len(held) == 1
+        """List the reasons for doubt: an interrupt, parameters at their bounds, errors that stay large."""
+        out = [INTERRUPTED] if self.interrupted else []
+        at_bounds = self._at_bounds()
+        if at_bounds:
+            one = len(at_bounds) == 1
             out.append(
-                f"{names} came out at {'its bound' if one else 'their bounds'}: more is missing, or "
+                f"{', '.join(at_bounds)} came out at {'its bound' if one else 'their bounds'}: more is missing, or "
                 f"{'it has' if one else 'they have'} too little room."
             )
         test, train = self.errors["test"], self.errors["train"]
         if train and train["before"] > CONSTANT and self.verdict in ("missing-physics", "unexplained"):
             out.append(
                 f"Refitted, the simulator alone is hardly better than a constant (error {train['before']:.2g} of the "
-                "outputs' deviation): look at its values, their units and their bounds before anything that is named."
+                "outputs' deviation). Check its values, units and bounds before you trust a name."
             )
         times = train["after"] / max(self.floor["nrmse"], 1e-300) if train and self.effects else 1.0
         if times > LEFT:
-            out.append(f"What is left is {times:.2g} times the noise: more is missing, or a law is only near.")
-        if test and self.effects and test["after"] > WORSE * test["before"]:
+            out.append(f"The remaining error is {times:.2g} times the noise: more is missing, or a law is only near.")
+        far = test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"])
+        if far and self.outcome != "worse":
             out.append(
-                f"On the test recording the simulator is worse with what is named ({test['after']:.3g} of the outputs' "
-                f"deviation) than refitted without ({test['before']:.3g}): do not rely on it there."
-            )
-        elif test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"]):
-            out.append(
-                "The test error is far above the training error: what was found is only near what happens, or the test "
-                "recording visits what the training recordings do not."
+                "The test error is far above the training error: the model is only near the truth, or the test "
+                "recording visits states that the training recordings do not."
             )
         return out
 
+    def _at_bounds(self) -> list[str]:
+        """Free entries of parameters at a bound, each with its value.
+
+        Zero is left out beside named effects: there an effect has replaced the parameter (friction a damper).
+        """
+        own, out = self.corrected.parameters, []
+        for name in self.parameters:
+            p = own[name]
+            low, high = (np.broadcast_to(b, p.value.shape) for b in p.bounds)
+            labels = ParameterSet({name: p}).labels
+            columns = [np.ravel(a, order="F") for a in (p.value, low, high, np.broadcast_to(p.fixed, p.value.shape))]
+            for label, v, below, above, fixed in zip(labels, *columns, strict=True):
+                if not fixed and (v <= below or v >= above) and (v or not self.effects):
+                    out.append(f"{label} ({v:.4g})")
+        return out
+
     def __str__(self) -> str:
-        lines = [self.sentence]
+        lines = [self.summary]
         for e in self.effects:
             lines.append(f"{e.port}: {e.law}{f' ({e.form})' if e.form else ''}, confidence {e.confidence:.2f}")
             lines.append(f"  {e.sentence}: {e.equation}")
@@ -209,6 +337,11 @@ class Diagnosis:
             lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}")
         more = [f"  and {len(moved) - MOST} more"] if len(moved) > MOST else []
         return ["the simulator's own values, refitted:", *lines, *more] if lines else []
+
+
+def _percent(value: float) -> str:
+    """A relative error as text."""
+    return f"{100 * value:.3g} %" if np.isfinite(value) else "infinite (the simulation diverges)"
 
 
 def _change(row: Mapping[str, Any]) -> float:

@@ -6,7 +6,6 @@ does as well alone.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -63,7 +62,7 @@ def put_more_finely(search: Search) -> None:
     for kind in FINER.get(type(winner.law), ()):
         if local is None:
             return
-        began = time.perf_counter()
+        began = search.begin("finer form")
         given = element.own(search.base.values)
         shapes = list(kind.finer_starts(given, local))
         law = kind().at(shapes[0], kind().bounds(local))
@@ -87,7 +86,7 @@ def put_more_finely(search: Search) -> None:
 
 def look_back(search: Search) -> None:
     """With the second effect in place: its rivals in the first's place, and the second alone."""
-    began = time.perf_counter()
+    began = search.begin("look back")
     first, second = search.passes[-2], search.passes[-1]
     assert first.choice is not None
     assert second.choice is not None

@@ -26,6 +26,7 @@ from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .result import Diagnosis, Effect
 from .search import Pass, Search
 from .search_start import Asked, prepared_search
+from .stages import Stages
 from .surrogates import told_of_surrogate
 from .tones import tones
 from .verdict import UNSURE, confidence
@@ -50,7 +51,7 @@ def run_diagnosis(
     """Carry out `diagnose`, whose parameters these are."""
     began = time.perf_counter()
     workers = workers or min(processors(), 4)
-    say = progress or (lambda stage, done, total, best: None)
+    say = Stages(progress or (lambda stage, done, total, best: None))
     simulator = as_simulator(simulator, as_recordings(train))
     recordings = check_for_identification([arranged(simulator, r) for r in as_recordings(train)], 20)
     tests = tuple(arranged(simulator, r) for r in as_recordings(test)) if test is not None else ()
@@ -69,7 +70,6 @@ def run_diagnosis(
             raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")
     laws = CATALOGUE if laws is None else laws
     laws = (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
-    say("refit", 0, 1, np.inf)
     asked = Asked(simulator, recordings, laws, hold, engine, workers, effects, stand_in_error, say)
     ready, search = prepared_search(asked)
     if not asked.hold_said and doubted(search):
@@ -77,11 +77,15 @@ def run_diagnosis(
         ready, search = otherwise_held(asked, ready, search)
         search.times["the other hold"] = time.perf_counter() - ended if search is first else ended - began
     let_idle_offsets_go(search)
+    began_conclusion = search.begin("conclusion")
     found = concluded(search, (*ready.gates, *search.gates, *tones(search.bench, search.base)))
-    return _told(asked, ready, search, found, tests, limits, began)
+    search.times["conclusion"] = time.perf_counter() - began_conclusion
+    say("conclusion", 1, 1)
+    say("proof", 0, 1)
+    return _build_diagnosis(asked, ready, search, found, tests, limits, began)
 
 
-def _told(
+def _build_diagnosis(
     asked: Asked,
     ready: Prepared,
     search: Search,
@@ -90,7 +94,7 @@ def _told(
     limits: Mapping[str, float] | None,
     began: float,
 ) -> Diagnosis:
-    """What the search came to, with its proof."""
+    """Put the search's conclusion and its proof into a Diagnosis."""
     proving = time.perf_counter()
     bench, without, after = search.bench, search.without, found.fitted
     std = deviations(bench, after)
@@ -103,6 +107,7 @@ def _told(
     settled = found.verdict in ("complete", "recording-fault") or sure
     experiment = _next(search, found.named, limits)
     now = time.perf_counter()
+    asked.say("proof", 1, 1)
     return Diagnosis(
         verdict=found.verdict,
         sentence=found.sentence,
@@ -134,6 +139,7 @@ def _told(
         evidence={"search": search, "without": without, "after": after},
         substeps=after.model.substeps,
         let_go=found.let_go,
+        description=found.description,
     )
 
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .._base import Progress
 from ..laws import Law
 from ..simulators import Placed
 from .candidate import Candidate, heads, judged, polish
@@ -34,6 +33,7 @@ from .passed_over import passed_over
 from .review import look_back, prefer_what_leaves_nothing, put_more_finely
 from .screen import Scored, screen
 from .second_effect import believed, mends
+from .stages import Stages
 from .verdict import HINT, LITTLE, MAINLY, UNSURE, confidence, explains, left_open
 from .workbench import THOROUGH, Fitted, Workbench
 
@@ -90,7 +90,7 @@ class Search:
     floor: Floor
     laws: Sequence[type[Law]]
     workers: int
-    say: Progress
+    say: Stages
     hold_said: bool = True
     misheld: float = 1.0
     stand_in_error: float = 0.0
@@ -114,8 +114,13 @@ class Search:
         """The effects accepted so far."""
         return [p.choice for p in self.passes if p.accepted and p.choice is not None]
 
-    def timed(self, stage: str, began: float) -> None:
-        """Add the seconds since `began` to a stage; a fit in it may have ended early, and the search is to end then.
+    def begin(self, stage: str) -> float:
+        """Report that a stage begins; return the time in s, for `timed`."""
+        self.say(stage, 0, 1, self.base.cost**0.5)
+        return time.perf_counter()
+
+    def timed(self, stage: str, began: float, told: bool = False) -> None:
+        """Report that a stage is done and add the seconds since `began` to it; end the search if a fit was interrupted.
 
         Raises
         ------
@@ -123,12 +128,14 @@ class Search:
             If a fit was interrupted, which returns its best so far and goes no further with that.
         """
         self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - began
+        if not told:  # the stage has not reported its own end
+            self.say(stage, 1, 1, self.base.cost**0.5)
         if self.bench.struck:
             raise KeyboardInterrupt
 
     def flexible(self, fitted: Fitted) -> dict[str, float]:
         """Share of a fit's residual that a flexible force explains, by port."""
-        began = time.perf_counter()
+        began = self.begin("flexible")
         found = explainable(self.bench, fitted)
         self.timed("flexible", began)
         return found
@@ -201,8 +208,7 @@ class Search:
 
     def screened(self) -> Seen:
         """Every law at every port beside the effects so far, scored."""
-        began = time.perf_counter()
-        self.say("screen", 0, 1, self.base.cost**0.5)
+        began = self.begin("screen")
         seen = screen(self.bench, self.base, self.laws, self.floor.deviation, self.workers)
         self.timed("screen", began)
         return seen
@@ -218,12 +224,14 @@ class Search:
             return Pass(None, (), tuple(scored), before, False)
         began = time.perf_counter()
         candidates = self._explained(number, scored, gain)
+        self.say("imitations", 0, 1)
         missed = [*passed_over(candidates, scored), *imitated(self.bench, candidates, scored)]
+        self.say("imitations", 1, 1)
         if missed:
-            more = self._explained(number, missed, gain)
+            more = self._explained(number, missed, gain, "more fits")
             candidates = sorted([*candidates, *more], key=lambda c: c.error)
-        self.timed("fits", began)
-        began = time.perf_counter()
+        self.timed("fits", began, told=True)
+        began = self.begin("choice")
         best = candidates[0].error
         # what coarse steps, and knees that steps are too coarse for, cost is not to decide
         near = [
@@ -232,7 +240,7 @@ class Search:
             if c.error < (NEAR_KNEE if c.knee else NEAR) * best or self.bench.too_coarse(c.fitted)
         ]
         with ThreadPoolExecutor(self.workers) as pool:
-            bare = pool.submit(self._judged, self.base)
+            bare = pool.submit(self.errors_on_parts, self.base)
             kept = [*pool.map(lambda c: polish(self.bench, c), near), *(c for c in candidates if c not in near)]
             before = bare.result()
         self._lower_floor([c.fitted for c in candidates[:5]])
@@ -255,10 +263,12 @@ class Search:
         """What stands in the ports so far."""
         return self.base.simulator.elements[len(self.bench.simulator.elements) :]
 
-    def _explained(self, number: int, scored: Sequence[Scored], gain: np.ndarray | None) -> list[Candidate]:
+    def _explained(
+        self, number: int, scored: Sequence[Scored], gain: np.ndarray | None, stage: str = "fits"
+    ) -> list[Candidate]:
         """Full fits, smallest error first."""
         enough = float(np.sqrt(self.floor2 + NEARLY * max(self.base.cost - self.floor2, 0.0)))
-        stage = "fits" if not number else "fits, second effect"
+        stage += ", second effect" if number else ""
         return explain(
             self.bench, scored, self.base, gain, self.workers, enough, lambda i, n, e: self.say(stage, i, n, e)
         )
@@ -268,8 +278,8 @@ class Search:
         best = min(candidates, key=lambda c: c.error, default=None)
         return max(effective_size(best.fitted.residual if best else self.base.residual), FEWEST)
 
-    def _judged(self, fitted: Fitted) -> tuple[float, float]:
-        """Errors of a simulator fitted to the first part only, on both parts."""
+    def errors_on_parts(self, fitted: Fitted) -> tuple[float, float]:
+        """Fit a simulator to the first parts only; mean square errors on those parts and on the rest."""
         part = self.bench.on(heads(self.bench.recordings))
         return judged(
             self.bench, part.fit(fitted.simulator, [fitted.values, {}], states=fitted.initial, solver=THOROUGH)

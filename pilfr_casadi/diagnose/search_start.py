@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .._base import Progress
 from ..data import Recording
 from ..laws import Law
 from ..simulators import Simulator
 from .gates import said_hold
 from .preparation import Prepared, prepare
 from .search import Search
+from .stages import Stages
 from .verdict import UNSURE
 
 FURTHER = 0.5  # share of the mean square that is left at most where a channel that seemed early is not
@@ -35,7 +35,7 @@ class Asked:
     workers: int
     effects: int
     stand_in_error: float
-    say: Progress
+    say: Stages
 
     @property
     def hold_said(self) -> bool:
@@ -44,7 +44,9 @@ class Asked:
 
     def prepared(self, starts: Sequence[Mapping[str, Any]] = (), early: bool = True) -> Prepared:
         """What a search starts from; see `prepare`."""
-        return prepare(self.simulator, self.recordings, self.hold, self.engine, self.workers, starts, early)
+        return prepare(
+            self.simulator, self.recordings, self.hold, self.engine, self.workers, starts, early, say=self.say
+        )
 
     def search(self, ready: Prepared, times: dict[str, float], may_be_led: bool) -> Search:
         """A search that has not begun; its stages are added to `times`."""

@@ -121,10 +121,10 @@ COLOURS = (ORANGE, INK)
 
 
 def compared_traces(
-    r: Recording, simulated: Simulated, output: int = 0, unit: str = "", *, quiet: bool = False
+    r: Recording, simulated: Simulated, output: int = 0, unit: str = "", *, quiet: bool = False, ax: Axes | None = None
 ) -> Axes:
     """Measured output and simulations, a few swings around the largest one, or a stretch where it is `quiet`."""
-    ax = axes_or_new(None)
+    ax = axes_or_new(ax)
     y = r.y[:, output]
     begin, end = busiest(y - np.mean(y), r)
     first = round(begin / r.dt)
@@ -148,9 +148,11 @@ def _quiet(y: np.ndarray, length: int, skip: int) -> slice:
     return slice(a, a + length)
 
 
-def compared_residuals(r: Recording, simulated: Simulated, output: int, unit: str, floor: float) -> Axes:
+def compared_residuals(
+    r: Recording, simulated: Simulated, output: int, unit: str, floor: float, ax: Axes | None = None
+) -> Axes:
     """What the simulations leave over the whole recording; `floor` is the deviation of the noise."""
-    ax = axes_or_new(None)
+    ax = axes_or_new(ax)
     y = r.y[:, output]
     kept: list[tuple[str, np.ndarray, Any]] = [
         (label, drawable(v[:, output] - y, np.ptp(y)), colour)

@@ -152,7 +152,7 @@ def test_a_search_begins_anew_from_where_a_law_has_led(monkeypatch):
             self.led_to = values if self.may_be_led else {}
             return self
 
-    def prepare(*given):
+    def prepare(*given, **_):
         begun.append(given[5])
         if stops and len(begun) == 2:
             raise KeyboardInterrupt
@@ -187,7 +187,7 @@ def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monk
         def certainty(self):
             return 0.1
 
-    def prepare(*given):
+    def prepare(*given, **_):
         early_or_not.append(given[6])
         return SimpleNamespace(bench=None, without=None, floor=None, gates=gates if given[6] else ())
 
