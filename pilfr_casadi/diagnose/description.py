@@ -2,7 +2,8 @@
 
 A law may follow the recordings far better than the refitted simulator and still not be the physics that is missing.
 Its name is then no effect, but the fitted model is worth having. It is handed back where it beats the refit by more
-than a tenth on the parts of the training recordings that neither was fitted to. Test recordings are never looked at.
+than a tenth on the parts of the training recordings that neither was fitted to, and is no worse on the whole of them.
+Test recordings are never looked at.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def find_description(search: Search) -> tuple[Description, Fitted] | None:
     """
     without = np.sqrt(search.errors_on_parts(search.without)[1])
     for fitted, held_out in _models(search):
-        if not np.isfinite(held_out) or held_out > GAIN * without:
+        if not held_out <= GAIN * without or fitted.cost > search.without.cost:
             continue
         names = tuple((e.port, e.law.id, e.law.form) for e in _added(search, fitted))
         left, noise = fitted.cost**0.5, search.floor2**0.5

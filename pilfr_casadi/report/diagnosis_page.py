@@ -64,7 +64,7 @@ def diagnosis_page(diagnosis: Diagnosis) -> Page:
         Section("The proof" if diagnosis.test else "Measured and simulated", _proof(case)),
         *([] if faulty else [notes]),
         Section("The next experiment", _next(diagnosis)),
-        Section("How to use the corrected simulator" if diagnosis.effects else "How to use the result", _usage(case)),
+        Section(_usage_title(diagnosis), _usage(case)),
     ]
     names = f"{', '.join(diagnosis.refitted.inputs)} → {', '.join(diagnosis.refitted.output_names)}"
     return Page(
@@ -72,9 +72,14 @@ def diagnosis_page(diagnosis: Diagnosis) -> Page:
         [s for s in sections if s.blocks],
         subtitle=_subtitle(case),
         status=tables.headline(diagnosis),
-        tone=tables.TONES.get(diagnosis.verdict, "plain"),
+        tone=tables.tone(diagnosis),
         facts=tables.facts(diagnosis),
     )
+
+
+def _usage_title(d: Diagnosis) -> str:
+    corrected = (d.effects or d.description) and d.outcome != "worse"
+    return "How to use the corrected simulator" if corrected else "How to use the result"
 
 
 def _subtitle(case: _Case) -> str:
@@ -181,13 +186,13 @@ def _tried(d: Diagnosis) -> list[Block]:
         if k:
             before = " and ".join(f"{words(e.law)} at {e.port}" for e in d.effects[:k]) or "the first"
             title = f"A second look, with {before} in place"
-        cells = [(r["port"], words(r["law"]), tables.score(r)) for r in rows]
+        cells = [(r["port"], words(r["law"]), tables.held_out(r)) for r in rows]
         framed = [(port, words(law)) for port, law in own]
-        errors = (d.errors["train"] or {}).get("before") if not k else None
-        known = errors if errors is not None and np.isfinite(errors) else None
-        figure = plots.port_law_map(cells, framed, known, d.floor["nrmse"] or None).figure
-        caption = f"{title}: the error that remains on data not fitted, in %, by port and law (best form). "
-        caption += "Grey: left out by the quick test before the fits."
+        figure = plots.port_law_map(cells, framed, tables.held_out_before(d, k), d.floor["nrmse"] or None).figure
+        caption = (
+            f"{title}: the error on the part of the training recordings that was not fitted, in %, by port and law "
+            "(best form). Grey: left out by the quick test before the fits."
+        )
         out += [Picture(figure, caption, "Errors by port and law.", wide=len({r["port"] for r in rows}) > 6)]
         out += tables.candidate_tables(rows, own, title)
     return out
@@ -210,8 +215,8 @@ def _compared(case: _Case, c: Comparison, i: int) -> list[Block]:
     r, name = c.recording, c.recording.outputs[i]
     unit, floor = case.unit(name), float(case.noise[i])
     simulated: plots.Simulated = [("refitted", c.before)]
-    if what := tables.mended(case.diagnosis):
-        simulated.append((what.removesuffix(" put back"), c.after))
+    if what := tables.correction_words(case.diagnosis):
+        simulated.append((what.removesuffix(" put back").removesuffix(" added"), c.after))
     gone = [label for label, v in simulated if v is None]
     lost = f" The simulation diverges: {', '.join(gone)}." if gone else ""
     where = f"{name} in {r.name}"

@@ -38,18 +38,32 @@ def percent(value: float | None) -> str:
     return f"{number_text(100 * value, 3)}\u00a0%"
 
 
-def mended(diagnosis: Diagnosis) -> str:
-    """What was put right in the corrected simulator, in words; nothing where it was only refitted."""
+def correction_words(diagnosis: Diagnosis) -> str:
+    """Say in words how the corrected simulator differs from the refitted one; nothing where it does not.
+
+    Laws are "put back" only where their names are sure and they help on the test recordings.
+    """
     if diagnosis.effects:
-        more = [g.finding == "unsure" for g in diagnosis.gates]
-        names = [*(words(e.law) for e in diagnosis.effects), *(["what is not sure"] if any(more) else [])]
-        return f"with {' and '.join(names)} put back"
+        unsure = [g.finding == "unsure" for g in diagnosis.gates]
+        names = [*(words(e.law) for e in diagnosis.effects), *(["what is not sure"] if any(unsure) else [])]
+        stated = diagnosis.sure and diagnosis.outcome in ("better", "")
+        return f"with {' and '.join(names)} {'put back' if stated else 'added'}"
+    if diagnosis.description:
+        return f"with {diagnosis.description.words} added"
     return f"with {diagnosis.let_go} let go" if diagnosis.let_go else ""
+
+
+def tone(diagnosis: Diagnosis) -> str:
+    """Colour of the headline: good only where the answer is sure and its correction helps on the test recordings."""
+    if diagnosis.outcome == "worse":
+        return "bad"
+    doubtful = diagnosis.outcome == "same" or (bool(diagnosis.effects) and not diagnosis.sure)
+    return "warning" if doubtful else TONES.get(diagnosis.verdict, "plain")
 
 
 def _steps(diagnosis: Diagnosis) -> dict[str, str]:
     """Keys of the errors that are shown, and their names."""
-    last = "with the effects put back" if diagnosis.effects else mended(diagnosis)
+    last = correction_words(diagnosis)
     return STEPS | ({"after": last} if last else {})
 
 
@@ -63,9 +77,9 @@ def headline(diagnosis: Diagnosis) -> str:
     """The verdict with its numbers."""
     role, errors = judged(diagnosis)
     on = "On held-out recordings" if role == "test" else "On the training recordings (no test was given)"
-    text = f"{diagnosis.sentence.rstrip('. ')}. {on} the error is {percent(errors.get('nominal'))} as given"
+    text = f"{diagnosis.summary.rstrip('. ')}. {on} the error is {percent(errors.get('nominal'))} as given"
     text += f", {percent(errors.get('before'))} refitted"
-    if what := mended(diagnosis):
+    if what := correction_words(diagnosis):
         text += f", {percent(errors.get('after'))} {what}"
     return f"{text}; the noise floor is {percent(diagnosis.floor['nrmse'])}."
 
@@ -145,6 +159,21 @@ def score(row: Mapping[str, Any]) -> float:
     return float(np.sqrt(a) * np.sqrt(b)) if np.isfinite(a * b) else np.inf
 
 
+def held_out(row: Mapping[str, Any]) -> float:
+    """A candidate's error on the part of the training recordings that it was not fitted to."""
+    value = row.get("nrmse_validation")
+    return np.inf if value is None else float(value)
+
+
+def held_out_before(diagnosis: Diagnosis, number: int) -> float | None:
+    """The same error without the candidates of a pass, where it is known."""
+    search = diagnosis.evidence.get("search")
+    passes = [p for p in search.passes if p.candidates] if search is not None else []
+    if number >= len(passes) or not np.isfinite(passes[number].before[1]):
+        return None
+    return float(np.sqrt(passes[number].before[1]))
+
+
 def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, str]], title: str) -> list[Block]:
     """The ranking with margins, best first; the tail is folded."""
     winner = next((i for i, r in enumerate(rows) if (r["port"], r["law"]) in chosen), None)
@@ -195,7 +224,7 @@ def flexible_table(diagnosis: Diagnosis) -> Table | None:
 
 def parameter_table(diagnosis: Diagnosis) -> Table:
     """The simulator's own parameters: nominal, refitted, and with the effects in place."""
-    rows, what = [], "with the effects" if diagnosis.effects else mended(diagnosis)
+    rows, what = [], "with the effects" if diagnosis.effects else correction_words(diagnosis)
     for name, p in diagnosis.parameters.items():
         columns = ("nominal", "refit_without", "refit_with")
         given, without, after = (np.ravel(np.asarray(p[k], dtype=float)) for k in columns)

@@ -11,107 +11,17 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, in_a_browser
 from diagnosis_contract import SCHEMA, problems
+from diagnosis_example import NOISE, PAIRS, example, rig
 from test_report import EVIL, Reader
 
 from pilfr_casadi._base import InputError
-from pilfr_casadi.data import Recording
-from pilfr_casadi.diagnose import Diagnosis, Effect, Workbench
+from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Gate
-from pilfr_casadi.engine import make_engine
-from pilfr_casadi.laws import BoucWen, CubicStiffness, Saturation
-from pilfr_casadi.models import Parameter
+from pilfr_casadi.laws import CubicStiffness
 from pilfr_casadi.report import diagnosis_report, diagnosis_report as same
 from pilfr_casadi.report.diagnosis_force import hidden_force
 from pilfr_casadi.report.diagnosis_runs import comparisons, replay
 from pilfr_casadi.report.diagnosis_tables import usage
-from pilfr_casadi.simulators import Port, Simulator
-
-DT, NOISE = 0.01, 1e-3
-
-
-def rig(k=400.0, d=4.0, name="ground", outputs=("pos",)):
-    """A mass on a spring, measured at its position (and velocity)."""
-    return Simulator(
-        lambda x, u, p: dict(pos=x.vel, vel=u.force - p.k * x.pos - p.d * x.vel),
-        lambda x: {n: x["vel" if n == "vel" else "pos"] for n in outputs},
-        states=("pos", "vel"),
-        inputs=("force",),
-        parameters=dict(k=Parameter(k, unit="N/m", bounds=(50, 2000)), d=Parameter(d, unit="N s/m", bounds=(0, 50))),
-        ports=(Port(name, {"vel": -1.0}, lambda x: x.pos, lambda x: x.vel, "N", "m"),),
-    )
-
-
-LAWS = {
-    "ground": CubicStiffness().at({"k_3": 2.0e4}),
-    "hysteresis": BoucWen().at({"k_h": 300.0, "q_0": 0.02, "s": 0.5, "n": 1.0}),
-    "actuator:force": Saturation().at({"L": 10.0}),
-}
-PAIRS = [("ground", "ground"), ("ground", "hysteresis"), ("actuator:force", "actuator:force")]
-
-
-def recorded(true, seed, samples=700, **more):
-    """A simulated recording with white noise, from rest."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(samples) * DT
-    tones = [np.cos(2 * np.pi * f * t + rng.uniform(0, 6.28)) for f in np.linspace(0.4, 6, 25)]
-    u = (8 * np.sum(tones, axis=0) * (0.4 + 0.6 * t / t[-1]))[:, None] / 2
-    blank = Recording(u, np.zeros((samples, len(true.output_names))), DT, ("force",), true.output_names, initial="zero")
-    model = Workbench.of(true, [blank.with_(y=rng.standard_normal(blank.y.shape))], "zero").model(true)
-    y = make_engine(model, "vm").simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_x))[0]
-    return blank.with_(y=y + NOISE * np.std(y, axis=0) * rng.standard_normal(y.shape), **more)
-
-
-def example(verdict="missing-physics", port="ground", law="ground", test=True, outputs=("pos",), **more):
-    """A diagnosis as `diagnose` returns it, with the truth filled in by hand."""
-    clean = rig(name=port if ":" not in port else "ground", outputs=outputs)
-    true = clean.with_element(port, LAWS[law]) if verdict in ("missing-physics", "unexplained") else clean
-    train, held_out = [recorded(true, s) for s in (0, 1)], recorded(true, 2, name="slow & steady")
-    refit = rig(430.0, 5.0, clean.ports[0].name, outputs)
-    element = LAWS[law]
-    effect = Effect(
-        port,
-        element.id,
-        0.93,
-        element.sentence,
-        element.equation,
-        {k: {"value": float(v), "std": 0.01 * abs(v), "unit": "N/m^3"} for k, v in element.values.items()},
-        (("sensor:pos", "creep"),),
-        element.form,
-    )
-    columns = ("port", "law", "form", "nrmse_train", "nrmse_validation", "delta_bic")
-    tried = [
-        (port, element.id, element.form, 1e-3, 1.1e-3, -900.0),
-        ("sensor:pos", "creep", "", 1e-3, 1.2e-3, -880.0),
-        ("sensor:pos", "delay", "", 0.2, np.inf, np.nan),
-        *((port, f"law_{i}", "", 0.3, 0.3, 2.0) for i in range(15)),
-    ]
-    rows = [dict(zip(columns, row, strict=True)) for row in tried]
-    named = verdict == "missing-physics"
-    errors = {"nominal": 0.4, "before": 0.2, "after": NOISE if named else 0.2}
-    gate = Gate("pos", "wrong_sign", -1.0, "The sign of pos is the wrong way round.", True)
-    fields = dict(
-        verdict=verdict,
-        sentence={"missing-physics": f"The simulator leaves out {element.id} at {port}."}.get(
-            verdict, f"It is {verdict}."
-        ),
-        effects=(effect,) if named else (),
-        candidates=tuple(rows),
-        gates=(gate,) if verdict == "recording-fault" else (),
-        mismatch={"sentence": ""},
-        parameters={
-            n: {"nominal": v, "refit_without": 1.1 * v, "refit_with": np.asarray(v), "std": None, "unit": "N/m"}
-            for n, v in {"k": 380.0, "d": 4.4}.items()
-        },
-        errors={"train": errors, "test": errors if test else None},
-        floor={"nrmse": NOISE, "source": "estimated"},
-        corrected=true if named else refit,
-        refitted=refit,
-        hold="zero",
-        train=tuple(train),
-        test=(held_out,) if test else (),
-        seconds=3.0,
-    )
-    return Diagnosis(**{**fields, **more})
 
 
 def test_the_checker_can_fail():
@@ -187,7 +97,7 @@ def test_a_test_that_gets_worse_a_refit_that_follows_nothing_and_an_interrupt_ar
     worse = {role: {**e, "before": 0.97, "after": 1.4} for role, e in d.errors.items()}
     found = replace(d, errors=worse, interrupted=True)
     notes = " ".join(found.warnings())
-    assert "worse with what is named (1.4 of the outputs' deviation) than refitted without (0.97)" in notes
+    assert "makes the test recordings worse: their error is 97 % refitted and 140 % with it" in found.summary
     assert "hardly better than a constant (error 0.97" in notes and "The search was interrupted" in notes
     written = json.loads((diagnosis_report(found, tmp_path).parent / "diagnosis.json").read_text())
     text = Reader((tmp_path / "report.html").read_text()).text

@@ -1,0 +1,139 @@
+"""The answer of a diagnosis: its verbs, what it says of a doubtful correction, and the progress on the way to it."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from diagnosis_example import example, recorded, rig
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import InputError
+from pilfr_casadi.laws import CoulombFriction, CubicStiffness
+from pilfr_casadi.models import Parameter
+from pilfr_casadi.report import diagnosis_report
+from pilfr_casadi.simulators import Simulator
+
+LAWS = (CubicStiffness, CoulombFriction)
+HIDDEN = rig().with_element("ground", CubicStiffness().at({"k_3": 2.0e4}))
+
+
+@pytest.fixture(scope="module")
+def diagnosed():
+    """A diagnosis of a mass on a stiffening spring, its test recording, and everything that it reported on the way."""
+    reports, test = [], recorded(HIDDEN, 2, samples=400)
+    found = pilfr.diagnose(
+        rig(430.0, 5.0),
+        recorded(HIDDEN, 0, samples=400),
+        test=test,
+        hold="zero",
+        laws=LAWS,
+        effects=1,
+        workers=1,
+        engine="vm",
+        progress=lambda *given: reports.append(given),
+    )
+    return found, test, reports
+
+
+def test_the_verbs_tell_what_the_diagnosis_told(diagnosed):
+    found, test, _ = diagnosed
+    assert [(e.port, e.law) for e in found.effects] == [("ground", "cubic_stiffness")]
+    assert found.nrmse(test) == pytest.approx(found.errors["test"]["after"], rel=1e-9)
+    y = found.simulate(test)
+    assert y.shape == test.y.shape and np.std(y - test.y) < 2e-3 * np.std(test.y)
+    figure = found.plot(test)
+    assert len(figure.axes) == 2 and {"refitted", "corrected"} <= set(figure.axes[0].get_legend_handles_labels()[1])
+    assert found.outcome == "better" and found.sure and found.summary == found.sentence
+    with pytest.raises(InputError, match=r"step is 0\.02 s, the training's 0\.01 s"):
+        found.simulate(replace(test, dt=0.02))
+    step = found.export().step
+    assert step.n_in() == 2
+
+
+def test_a_recording_is_corrected_before_it_is_simulated():
+    flipped = [recorded(rig(), s, samples=400) for s in (0, 1)]
+    flipped = [r.with_(y=-r.y) for r in flipped]
+    found = pilfr.diagnose(
+        rig(430.0, 5.0), flipped[0], test=flipped[1], hold="zero", laws=LAWS, effects=1, workers=1, engine="vm"
+    )
+    assert found.verdict == "recording-fault"
+    assert found.nrmse(flipped[1]) == pytest.approx(found.errors["test"]["after"], rel=1e-9) and found.errors["test"][
+        "after"
+    ] == pytest.approx(1e-3, rel=0.5)
+
+
+def test_progress_tells_each_stage_and_the_best_never_rises(diagnosed):
+    _, _, reports = diagnosed
+    bests = [best for *_, best in reports]
+    assert all(b <= a for a, b in pairwise(bests))
+    assert bests[-1] < 2e-3 and not np.isnan(bests).any()
+    last = {stage: (done, total) for stage, done, total, _ in reports}
+    assert all(done == total for done, total in last.values()), last
+    assert {"checks and refit", "screen", "flexible", "fits", "choice", "conclusion", "proof"} <= set(last)
+    assert reports[0][:2] == ("checks and refit", 0)
+
+
+def test_a_search_with_the_other_hold_is_named_in_the_progress():
+    from pilfr_casadi.diagnose.stages import Stages
+
+    seen = []
+    first = Stages(lambda *given: seen.append(given))
+    first("fits", 1, 2, 0.3)
+    second = first.under("other hold: ")
+    second("fits", 1, 2, 0.5)
+    second("fits", 2, 2, 0.2)
+    first("proof", 0, 1)
+    assert seen[1:] == [("other hold: fits", 1, 2, 0.3), ("other hold: fits", 2, 2, 0.2), ("proof", 0, 1, 0.2)]
+
+
+def with_test_errors(before, after, confidence, **more):
+    d = example(**more)
+    errors = {**d.errors, "test": {"nominal": before, "before": before, "after": after}}
+    return replace(d, errors=errors, effects=tuple(replace(e, confidence=confidence) for e in d.effects))
+
+
+@pytest.mark.parametrize(
+    ("confidence", "after", "tone"),
+    [(0.03, 0.01, "warning"), (0.03, 2.58, "bad")],
+)
+def test_colour_and_words_follow_confidence_and_the_test_recording(confidence, after, tone, tmp_path):
+    d = with_test_errors(0.5, after, confidence)
+    page = diagnosis_report(d, tmp_path).read_text()
+    assert f'class="status {tone}"' in page
+    written = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert "put back" not in page and "with cubic stiffness added" in page
+    for text in (page, written["sentence"], str(d)):
+        assert ("makes the test recordings worse" in text) == (after > 1)
+    if after > 1:
+        assert "50 % refitted and 258 % with it" in written["sentence"]
+        assert "Do not use it as a correction" in str(d).splitlines()[0]
+        assert "How to use the corrected simulator" not in page
+
+
+@pytest.mark.parametrize(("after", "outcome"), [(0.4, "better"), (0.5, "same"), (0.52, "same"), (0.53, "worse")])
+def test_the_outcome_compares_the_test_errors(after, outcome):
+    assert with_test_errors(0.5, after, 0.9).outcome == outcome
+
+
+def test_a_correction_that_diverges_on_the_test_recording_is_worse():
+    d = with_test_errors(0.5, np.inf, 0.9)
+    assert d.outcome == "worse" and "the simulation diverges" in d.summary
+
+
+def test_a_free_vector_parameter_is_diagnosed_to_the_end(tmp_path):
+    """A simulator whose stiffness and damping are the two entries of one parameter."""
+    simulator = Simulator(
+        lambda x, u, p: dict(pos=x.vel, vel=u.force - p.c[0] * x.pos - p.c[1] * x.vel),
+        lambda x: {"pos": x.pos},
+        states=("pos", "vel"),
+        inputs=("force",),
+        parameters={"c": Parameter(np.array([430.0, 5.0]), bounds=(np.array([50.0, 4.5]), np.array([2000.0, 50.0])))},
+    )
+    found = pilfr.diagnose(
+        simulator, recorded(rig(), 0, samples=400), hold="zero", laws=LAWS, effects=1, workers=1, engine="vm"
+    )
+    assert any("c[1] (4.5) came out at its bound" in note for note in found.warnings())
+    page = found.report(tmp_path)
+    assert "c[1]" in page.read_text() and json.loads((tmp_path / "diagnosis.json").read_text())["parameters"]["c"]
