@@ -18,8 +18,8 @@ from .interrupts import repeated_interrupt
 
 Progress = Callable[[str, int, int, float], None]
 
-STAGE_LINE = 1.0  # seconds between plain lines when the stage changes; quicker work stays silent
-SAME_STAGE_LINE = 10.0  # seconds between plain lines within a stage
+NEW_STAGE_LINE = 1.0  # least seconds between plain lines when a new stage begins; quicker work stays silent
+LINE = 10.0  # least seconds between other plain lines
 
 
 @contextmanager
@@ -59,15 +59,17 @@ Show = Callable[[str, int, int], None]
 
 
 def _lines(shown: _Shown) -> Show:
-    """Print a line when the stage changes and about every ten seconds, never two within a second."""
-    last_stage, last_line = "", shown.began
+    """Print a line when a new stage begins and about every ten seconds, never two within a second."""
+    stages: set[str] = set()
+    last_line = shown.began
 
     def show(stage: str, done: int, total: int) -> None:
-        nonlocal last_stage, last_line
+        nonlocal last_line
         now = time.monotonic()
-        if now - last_line < (SAME_STAGE_LINE if stage == last_stage else STAGE_LINE):
+        if now - last_line < (LINE if stage in stages else NEW_STAGE_LINE):
             return
-        last_stage, last_line = stage, now
+        stages.add(stage)
+        last_line = now
         parts = [f"{stage} {_count(done, total)}".rstrip(), shown.best_text(), shown.time_text()]
         print(", ".join(part for part in parts if part), file=sys.stderr, flush=True)
 

@@ -3,12 +3,15 @@
 import contextlib
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+from pilfr_casadi import PILFR, Play, PrandtlIshlinskii, Recording, fit
 from pilfr_casadi._base import progress_bar
 
 NAN = float("nan")
@@ -30,12 +33,13 @@ def clock(monkeypatch):
     return clock
 
 
-def test_lines_tell_each_stage_and_every_ten_seconds(clock, capsys):
+def test_lines_tell_each_new_stage_and_every_ten_seconds(clock, capsys):
     reports = [
         (0.5, "linear model", 1, 1, NAN),  # too early for a line
         (2.0, "linear model", 1, 1, 0.5),
         (4.0, "starts", 1, 8, 0.02),
         (6.0, "starts", 2, 8, 0.01),
+        (8.0, "linear model", 1, 1, 0.5),  # back to a stage that has its line
         (14.5, "starts", 7, 8, 0.03),  # worse: the best stays
         (15.0, "polish", 0, 0, NAN),  # within a second of the last line
         (85.0, "polish", 0, 0, float("inf")),
@@ -58,6 +62,19 @@ def test_quick_work_prints_nothing(clock, capsys):
             clock.now += 0.1
             progress(f"stage {k}", 0, 1, 0.1)
     assert capsys.readouterr().err == ""
+
+
+def test_a_fit_tells_its_stages_and_its_best_error_never_rises(capsys, monkeypatch):
+    for name in ("NEW_STAGE_LINE", "LINE"):
+        monkeypatch.setattr(f"pilfr_casadi._base.progress.{name}", 0.0)
+    u = np.sin(np.arange(300) * 0.11) * np.linspace(0.5, 2, 300)
+    y = np.cumsum(np.convolve(u, [0.0, 0.5, 0.3])[:300]) * 0.1
+    fit(PILFR(1, PrandtlIshlinskii(Play, 2)), Recording(u, y, 0.1, initial="zero"), starts=2, progress=True)
+    lines = capsys.readouterr().err.splitlines()
+    matches = [re.fullmatch(r"([a-z ]+?)( \d+/\d+)?(?:, best NRMSE (\S+))?, \d+ s", line) for line in lines]
+    assert all(matches) and {"starts", "polish"} <= {m[1] for m in matches}
+    best = [float(m[3]) for m in matches if m[3]]
+    assert best and all(later <= earlier for earlier, later in zip(best, best[1:], strict=False))
 
 
 SCRIPT = """
