@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..laws import Law, Local, trace
+from ..laws import Law, Local, unit_forces
 from ..models import map_points
 from ..simulators import signals, states_along
 from .candidate import Candidate
@@ -41,7 +41,7 @@ def imitated(bench: Workbench, candidates: Sequence[Candidate], scored: Sequence
     if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):  # nor nan, as of a root below zero
         return []
     values, law = best.own, best.law
-    force = trace(law.at(values), local, [_shape(law, values)])[:, 0] @ _strengths(law, values)
+    force = unit_forces(law.at(values), local, [_shape(law, values)])[:, 0] @ _strengths(law, values)
     with np.errstate(over="ignore", invalid="ignore"):
         found = [(*_likest(s.law, local, force), s) for s in entries.values()]
     ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:MOST]
@@ -80,7 +80,7 @@ def _likest(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str,
     q = np.linalg.svd(base / np.maximum(np.linalg.norm(base, axis=0), 1e-300), full_matrices=False)[0]
     target = force[::every] - q @ (q.T @ force[::every])
     total, best, start = float(target @ target), np.inf, dict[str, Any]()
-    made = trace(law, local, shapes)[::every]
+    made = unit_forces(law, local, shapes)[::every]
     for k, shape in enumerate(shapes):
         columns = made[:, k] - q @ (q.T @ made[:, k])
         if not np.all(np.isfinite(columns)):

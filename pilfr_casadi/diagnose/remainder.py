@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..laws import Law, Local, columns, trace
+from ..laws import Law, Local, count_columns, unit_forces
 from ..simulators import Port
 from .linearise import Probe, Run, locals_of, propagate
 from .workbench import Workbench
@@ -90,7 +90,7 @@ class Remainder:
 
         Shapes (R, n) and (n,), the shapes and strengths of one law after those of the other.
         """
-        forces = np.hstack([trace(law, task.part, s).reshape(len(task.part.z), -1) for law, s in task.pairs])
+        forces = np.hstack([unit_forces(law, task.part, s).reshape(len(task.part.z), -1) for law, s in task.pairs])
         forces[~(np.abs(forces) < 1e100)] = 0.0
         size = lengths(forces) / np.sqrt(len(forces))
         size = np.where(size > 0, size, 1.0)
@@ -111,7 +111,7 @@ class Remainder:
         phi, size = self.columns(task)
         at = 0
         for law, shapes in task.pairs:
-            width = columns(law)
+            width = count_columns(law)
             spans = [slice(at + k * width, at + (k + 1) * width) for k in range(len(shapes))]
             yield law, [Dose(shape, phi[:, own], size[own]) for shape, own in zip(shapes, spans, strict=True)]
             at += width * len(shapes)

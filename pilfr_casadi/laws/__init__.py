@@ -18,7 +18,6 @@ if TYPE_CHECKING:
         Quadratic as Quadratic,
         Root as Root,
     )
-    from .density import SmoothHysteresis as SmoothHysteresis
     from .dynamic import (
         Attached as Attached,
         Creep as Creep,
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
         TwoStageCreep as TwoStageCreep,
         TwoStageRelaxation as TwoStageRelaxation,
     )
-    from .force_fit import columns as columns, trace as trace
+    from .forces import count_columns as count_columns, unit_forces as unit_forces
     from .friction import (
         AsymmetricFriction as AsymmetricFriction,
         CoulombFriction as CoulombFriction,
@@ -55,6 +54,7 @@ if TYPE_CHECKING:
         FinePlays as FinePlays,
         GeneralizedHysteresis as GeneralizedHysteresis,
         PlayHysteresis as PlayHysteresis,
+        SmoothHysteresis as SmoothHysteresis,
         StopHysteresis as StopHysteresis,
     )
     from .limits import (

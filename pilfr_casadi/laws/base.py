@@ -1,8 +1,27 @@
-"""What a law is: a small class a physical hypothesis, with its equation, source, sentence, parameters and start values.
+"""The base class of all laws: one small class for each physical hypothesis.
 
-A law is a force `w = Σ_i c_i φ_i(z, ż, q, t; shape)`, linear in its *strengths* c, nonlinear in its *shape*
+A law is a force `w = Σ_i c_i φ_i(z, ż, q, t; shape)`, linear in its *strengths* c and nonlinear in its *shape*
 (threshold, gap, knee, delay). `q̇ = flow(...)` are states of its own; a law with `step(z, s, p)` has a discrete memory
-instead. A law without strengths is the deviation of a signal from itself: `w = law(u) - u`.
+instead. In series at an actuator or a sensor the force is the deviation of the signal: `w = law(u) - u`.
+
+How to add a law: state its equation, its sentence, its units and strengths, and write `force`. `starts` and `ranges`
+give the values of the shape parameters that are tried, and their bounds, as multiples of an attribute of `Local`:
+
+>>> class RubberBlock(Law):
+...     id, equation = "rubber_block", "w = k L tan(z / L)"
+...     sentence = "a rubber block: its stiffness grows without limit as the deflection comes near L"
+...     units, strength = {"k": "w/z", "L": "z"}, ("k",)
+...     starts = {"L": ("reach", 0.7, 1.0, 2.0)}  # 0.7, 1 and 2 times the largest |z|
+...     ranges = {"L": ("reach", 0.65, 10.0)}
+...
+...     def force(self, z, p):
+...         return p.k * p.L * ca.tan(z / p.L)
+>>> signals = Local(z=np.linspace(-2.0, 2.0, 5), dz=np.ones(5), dt=0.1, lengths=(5,))
+>>> [round(shape["L"], 2) for shape in RubberBlock().shapes(signals)]
+[1.4, 2.0, 3.99]
+
+`diagnose(simulator, recordings, laws=(*CATALOGUE, RubberBlock))` tries it beside the others. To put it into the
+catalogue, add the class to the file of its kind and one line to `catalogue.py`.
 """
 
 from __future__ import annotations
@@ -17,14 +36,18 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
+from .._base import InputError
 from ..models import Parameter
 
-EDGE = 0.05  # share of a gap over which contact sets in
+EDGE = 0.05  # width of the onset of a contact, as a share of its gap
+
+# an attribute of `Local` ("" for none) and its multiples, for each shape parameter
+Multiples = Mapping[str, tuple[Any, ...]]
 
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Signals at a port along recordings, from which grids and limits of shapes follow.
+    """The signals at a port along recordings, which set the start values and bounds of shape parameters.
 
     Attributes
     ----------
@@ -35,13 +58,13 @@ class Local:
     lengths : tuple of int
         Samples of each recording.
     stiffest : float
-        Largest stiffness (w/z) that the simulation's steps can follow at the port: a harder contact is a wall.
+        Largest stiffness (w/z) at the port that the simulation's steps resolve; a harder contact is a wall.
     firmest : float
-        Largest damping (w*s/z) that the steps can follow at the port.
+        Largest damping (w*s/z) at the port that the steps resolve.
     inputs : mapping of str to array, shape (M,)
-        The simulator's inputs, for laws that one of them scales.
+        The simulator's inputs, for laws whose strength is scaled by one of them.
     from_zero : tuple of bool
-        Which recordings begin with everything at zero; in the others laws begin as if z had stood still before.
+        Whether each recording begins with everything at zero; else a law begins as if z had stood still before.
     """
 
     z: np.ndarray
@@ -86,36 +109,51 @@ class Local:
 
 @dataclass(frozen=True)
 class Law:
-    """A law; subclasses state the class variables and `force`, and `shapes` where there is a shape.
+    """A law; subclasses set the class variables and `force`, and `starts` and `ranges` where there is a shape.
 
     Attributes
     ----------
     id, form : str
-        Name in results, and which variant.
+        Name in results, and the variant of the law.
     equation, source, sentence : str
         In plain text.
     units : mapping
         Parameter -> unit, in terms of w, z and s: "w/z^3".
     strength : tuple of str
         Parameters in which the force is linear.
+    starts, ranges : mapping
+        Start values and (lower, upper) bounds of parameters, as multiples of an attribute of `Local`: "reach", "half",
+        "speed", "dt", "duration", "stiffest", or "" for plain numbers. Every combination of start values is tried.
     places : tuple of {"parallel", "series", "sensor"}
-        Inside the dynamics, at an actuator or a sensor, or at a sensor alone.
+        Allowed places: inside the dynamics, at an actuator or a sensor, or at a sensor alone.
     dissipative : bool
-        Strengths must oppose motion, but for those in `signed`.
+        Strengths must oppose motion, except those in `signed`.
     restoring : bool
         Strengths must push back.
     order : int
-        States of its own.
+        Number of its own states.
     follows : int
-        How many of these, the first, come to rest at the signal where it stands still; the others at zero.
+        Number of these, from the first, that settle at the signal where it stands still; the others settle at zero.
     shifts : bool
-        Its memory is a shift register, which takes in the signal at the begin of a step.
+        Its memory is a shift register, which takes in the signal at the beginning of a step.
     substeps : int
-        Integration steps a sample that it needs at least.
+        Smallest number of integration steps per sample.
     knee : str
-        Parameter over whose width, of speed about rest, the force turns round; steps have to be fine there.
+        Name of the speed over which the force reverses about rest; steps have to be fine there.
     scaled_by : str
-        Input that the force is multiplied by, where there is one; see `composed.scaled`.
+        Input that multiplies the force, if any; see `scaled`.
+
+    Parameters
+    ----------
+    values : mapping, optional
+        Start values by parameter name; strengths start at zero and shapes at one where not given.
+    limits : mapping, optional
+        `(lower, upper)` by parameter name.
+
+    Raises
+    ------
+    InputError
+        If a value or limit is not a number, or names a parameter that the law does not have.
     """
 
     id: ClassVar[str]
@@ -125,6 +163,8 @@ class Law:
     form: ClassVar[str] = ""
     units: ClassVar[Mapping[str, str]] = {}
     strength: ClassVar[tuple[str, ...]] = ()
+    starts: ClassVar[Multiples] = {}
+    ranges: ClassVar[Multiples] = {}
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     dissipative: ClassVar[bool] = False
     restoring: ClassVar[bool] = False
@@ -139,39 +179,56 @@ class Law:
     values: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        for option, count in (("values", 1), ("limits", 2)):
+            given = getattr(self, option)
+            if not isinstance(given, Mapping):
+                raise InputError(f"The {option} of the law {self.id!r} are {given!r}; give a dict by parameter name.")
+            for name, entry in given.items():
+                if name not in self.units:
+                    raise InputError(
+                        f"The law {self.id!r} has no parameter {name!r}; its parameters are {', '.join(self.units)}."
+                    )
+                if not _are_numbers([entry] if count == 1 else entry, count):
+                    wanted = "finite numbers" if count == 1 else "a pair (lower, upper) of increasing numbers"
+                    raise InputError(f"The {option} of the law {self.id!r} hold {name} = {entry!r}; give {wanted}.")
+
     def force(self, *args: Any, **kwargs: Any) -> Any:
         """Force w from any of z, dz, q, t, x, u, p by name."""
         raise NotImplementedError(f"{type(self).__name__} needs a force")
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        """Values of the shape parameters worth trying."""
-        yield {}
+        """Generate the values of the shape parameters to try: every combination of `starts`."""
+        yield from grid(**{name: _multiply(local, scale, np.array(of)) for name, (scale, *of) in self.starts.items()})
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        """Limits of the shape parameters that the data can speak to."""
-        return {}
+        """Bounds of the parameters on which the data carries information: `ranges`."""
+        return {
+            name: (_multiply(local, scale, low), _multiply(local, scale, high))
+            for name, (scale, low, high) in self.ranges.items()
+        }
 
     def applies(self, local: Local) -> str:
-        """Why the data cannot speak to this law, or nothing."""
+        """Reason why the data carries no information on this law; empty if it does."""
         return ""
 
     @property
     def lacks(self) -> str:
-        """What has to be said of the law before it can stand in a port, or nothing."""
+        """Input that is still needed before the law can stand in a port; empty if none."""
         return ""
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Whether at fitted values the law is hardly what its sentence says."""
+        """Tell whether the fitted values hardly agree with the law's sentence."""
         return False
 
     def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
-        """Start values that make it a law which it refines, fitted to `own`; none where it refines another."""
-        more = set(self.units) - set(plain.units)
-        refines = plain.strength and plain.units.items() <= self.units.items() and more <= set(self.strength)
+        """Start values at which it equals a plainer law fitted to `own`; empty where it does not refine that law."""
+        more = [name for name in self.units if name not in plain.units]
+        refines = plain.strength and plain.units.items() <= self.units.items() and set(more) <= set(self.strength)
         return {**dict.fromkeys(more, 0.0), **own} if more and refines else {}
 
     def size(self, values: Mapping[str, Any]) -> int:
-        """Free numbers of the law at fitted values."""
+        """Number of free numbers of the law at fitted values."""
         return sum(int(np.sum(~p.fixed)) for p in self.parameters().values())
 
     @classmethod
@@ -185,31 +242,55 @@ class Law:
         return named & {"z", "dz", "t", "x", "u"}
 
     def standing(self, z: float) -> np.ndarray:
-        """States of its own, or its memory, where the signal has stood still at z."""
+        """States or memory after the signal has stood still at z."""
         out = np.zeros(int(getattr(self, "memory", 0)) if hasattr(self, "step") else self.order)
         out[: len(out) if self.shifts else self.follows] = z
         return out
 
     def on_grid(self, h: float) -> Law:
-        """The law for steps of length h, s; most do not care."""
+        """Copy for steps of length h, s; only a delay depends on them."""
         return self
 
     def at(self, values: Mapping[str, Any], limits: Mapping[str, tuple[Any, Any]] | None = None) -> Law:
-        """The law starting at `values` inside `limits`."""
+        """Copy that starts at `values` inside `limits`."""
         return replace(self, values={**self.values, **values}, limits={**self.limits, **(limits or {})})
 
     def parameters(self) -> dict[str, Parameter]:
         """Parameters with start values, limits and units (in w, z, s)."""
+        return dict(self._parameters)
+
+    @cached_property
+    def _parameters(self) -> dict[str, Parameter]:
         out = {}
         for name, unit in self.units.items():
             value = np.asarray(self.values.get(name, 0.0 if name in self.strength else 1.0), dtype=float)
-            low, high = self.limits.get(name, (-np.inf, np.inf))
-            out[name] = Parameter(np.clip(value, low, high), unit=unit, bounds=(low, high))
+            low, high = (np.asarray(end, dtype=float) for end in self.limits.get(name, (-np.inf, np.inf)))
+            value = np.clip(value, low, high)
+            scalar = value.ndim == low.ndim == high.ndim == 0  # with limits that `__post_init__` has checked
+            make = Parameter.trusted if scalar else _checked_parameter
+            out[name] = make(value, unit, low, high)
         return out
 
 
+def _checked_parameter(value: Any, unit: str, lower: Any, upper: Any) -> Parameter:
+    return Parameter(value, unit=unit, bounds=(lower, upper))
+
+
+def _are_numbers(given: Any, count: int) -> bool:
+    """Tell whether `count` numbers or arrays are given: one finite, or two that increase."""
+    try:
+        found = [np.asarray(part, dtype=float) for part in given]
+        return len(found) == count and bool(np.all(found[0] <= found[1]) if count == 2 else np.all(np.isfinite(found)))
+    except (TypeError, ValueError):
+        return False
+
+
+def _multiply(local: Local, scale: str, factor: Any) -> Any:
+    return getattr(local, scale) * factor if scale else factor
+
+
 def readable_unit(unit: str, w: str, z: str) -> str:
-    """A unit in w, z and s with the port's own units put in: ("w/z^3", "N", "m") -> "N/m^3"."""
+    """Put the port's own units into a unit in w, z and s: ("w/z^3", "N", "m") -> "N/m^3"."""
     if unit == "w/z" and w == z:
         return ""
     parts = []
@@ -221,11 +302,11 @@ def readable_unit(unit: str, w: str, z: str) -> str:
 
 
 def beyond(z: Any, g: Any) -> Any:
-    """From 0 to 1 where z passes a gap of g on either side: over a part of it, for a jump would have no slope in g."""
+    """Rise from 0 to 1 where |z| passes a gap g, over a share of the gap, because a jump would have no slope in g."""
     return (1 + ca.tanh((ca.fabs(z) - g) / (EDGE * g))) / 2
 
 
 def grid(**axes: Any) -> Iterator[dict[str, Any]]:
-    """Every combination of the axes' values."""
+    """Generate every combination of the axes' values."""
     for values in itertools.product(*axes.values()):
         yield {k: float(v) for k, v in zip(axes, values, strict=True)}

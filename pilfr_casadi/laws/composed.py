@@ -1,6 +1,6 @@
-"""Laws made of laws: one behind a gap, and one whose strength another signal scales.
+"""Laws made of laws: behind a gap, and with a strength that another signal scales.
 
-Laws beside each other in one port need no more than `Simulator.with_element` twice.
+Two laws in parallel in one port need no class of their own: call `Simulator.with_element` twice.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import casadi as ca
 from .._base import InputError
 from .base import Law, Local, beyond
 
-GAPS = (0.1, 0.3, 0.6)  # of the largest |z|
+GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
 
 
-def _kind(law: Any) -> type[Law]:
+def _parallel_law(law: Any) -> type[Law]:
     if not (isinstance(law, type) and issubclass(law, Law)):
         raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
     if "parallel" not in law.places:
@@ -35,26 +35,26 @@ def _named(name: str) -> inspect.Parameter:
 
 
 def scaled(law: type[Law], by: str) -> type[Law]:
-    """A law whose strength a signal scales: `w = by law(z, dz/dt)`, as a yield force that a coil's voltage sets.
+    """Make a law whose strength a signal scales: `w = by law(z, dz/dt)`, such as a yield force set by a voltage.
 
     Parameters
     ----------
     law : class of Law
-        Any that may stand in a port as a force.
+        Any law that may act in parallel, as a force.
     by : str
-        An input of the simulator; its record is what the strength is multiplied by.
+        An input of the simulator, which multiplies the strength.
 
     Raises
     ------
     InputError
-        If the law is none, or stands in series with a signal.
+        If it is not a law, or acts in series with a signal.
     """
-    base: Any = _kind(law)
+    base: Any = _parallel_law(law)
     kind: type[Law] = _scaled(base, by)
     return kind
 
 
-@functools.cache  # the same class for the same question
+@functools.cache  # the same class for the same arguments
 def _scaled(base: Any, by: str) -> Any:
     strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
 
@@ -73,21 +73,21 @@ def _scaled(base: Any, by: str) -> Any:
 
 
 def behind_gap(law: type[Law]) -> type[Law]:
-    """A law that acts beyond a gap only: on `z' = z - clip(z, -g, g)` and its rate, such as a stop that rubs.
+    """Make a law that acts beyond a gap only: on `z' = z - clip(z, -g, g)` and its rate, such as a stop that rubs.
 
     A force of the rate sets in over a twentieth of the gap, as a contact does.
 
     Parameters
     ----------
     law : class of Law
-        Any that may stand in a port as a force.
+        Any law that may act in parallel, as a force.
 
     Raises
     ------
     InputError
-        If the law is none, or stands in series with a signal, or has states or a gap of its own.
+        If it is not a law, acts in series with a signal, or has states or a gap of its own.
     """
-    base: Any = _kind(law)
+    base: Any = _parallel_law(law)
     if base.order or "g" in base.units:
         raise InputError(f"The law {base.id!r} has {'states' if base.order else 'a gap'} of its own; take another.")
     kind: type[Law] = _behind(base)
@@ -103,23 +103,23 @@ def _behind(base: Any) -> Any:
         form = _form(base, "behind a gap")
         equation = f"{base.equation}  with z - clip(z, -g, g) in place of z"
         sentence = f"{base.sentence}, beyond a gap"
-        units = {**base.units, "g": "z"}  # noqa: RUF012
+        units = {**base.units, "g": "z"}
         places = ("parallel",)
 
         def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-            """Those of the law, and gaps."""
+            """Shapes of the law, each with every gap."""
             for own in super().shapes(local):
                 for share in GAPS:
                     yield {**own, "g": share * local.reach}
 
         def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-            """A gap that is passed."""
+            """Bounds of the law, and a gap that the signal passes."""
             return {**super().bounds(local), "g": (0.01 * local.reach, 0.95 * local.reach)}
 
         if hasattr(base, "step"):
 
             def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0) -> Any:
-                """The law's own, beyond the gap."""
+                """Step of the law, beyond the gap."""
                 past, rate = reached(z, dz, p)
                 more = {"dz": rate} if "dz" in inspect.signature(base.step).parameters else {}
                 return base.step(self, past, s, p, **more)
@@ -127,16 +127,16 @@ def _behind(base: Any) -> Any:
         else:
 
             def force(self, **have: Any) -> Any:
-                """The law's own, beyond the gap."""
+                """Force of the law, beyond the gap."""
                 past, rate = reached(have["z"], have["dz"], have["p"])
                 have |= {"z": past, "dz": rate}
                 return base.force(
                     self, **{k: v for k, v in have.items() if k in inspect.signature(base.force).parameters}
                 )
 
-            asked = tuple(inspect.signature(base.force).parameters)
+            named = tuple(inspect.signature(base.force).parameters)
             force.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-                [_named(name) for name in dict.fromkeys(("self", "z", "dz", *asked))]
+                [_named(name) for name in dict.fromkeys(("self", "z", "dz", *named))]
             )
 
     Behind.__doc__ = f"{base.__doc__}\n\n    It acts beyond a gap."

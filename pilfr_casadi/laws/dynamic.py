@@ -1,7 +1,8 @@
-"""Laws in time: delay, linear relaxations and modes, and trends."""
+"""Laws in time: delay, relaxation, lags and modes, and trends."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -12,8 +13,8 @@ import numpy as np
 from ..models import Parameter
 from .base import Law, Local, grid
 
-SCREENED = 24  # steps of a delay in the screen, which tries none that is longer
-DEAF = 0.707  # damping ratio from which on a second-order response has no peak
+SCREENED = 24  # memory of a delay in the screen, in steps; longer delays are not tried
+DEAF = 0.707  # damping ratio above which a second-order response has no peak
 
 
 @dataclass(frozen=True)
@@ -24,47 +25,45 @@ class Delay(Law):
     equation = "w = u(t - T) - u(t)"
     source = "Ljung (1999), System Identification, sec. 4.2"
     sentence = "a pure delay: the signal arrives later than the simulator has it"
-    units: ClassVar[Mapping[str, str]] = {"T": "s"}
-    places: ClassVar[tuple[str, ...]] = ("series",)
-    shifts: ClassVar[bool] = True
-    substeps: ClassVar[int] = 4  # a held input that is late changes inside a sample
+    units = {"T": "s"}
+    places = ("series",)
+    shifts = True
+    substeps = 4  # a delayed held input changes inside a sample
     h: float = 0.0  # length of a step, s
+    starts = {"T": ("dt", 0.5, 1, 1.5, 2, 3, 4, 6, 8, 11, 15, 20)}
 
     def on_grid(self, h: float) -> Delay:
-        """The law for steps of length h."""
+        """Copy for steps of length h, s."""
         return replace(self, h=h)
 
     @property
     def memory(self) -> int:
-        """Steps that the delay may reach back."""
+        """Largest delay, in steps."""
         most = self.limits.get("T", self._about)[1]
         return int(np.ceil(most / self.h)) if self.h and np.isfinite(most) else SCREENED
 
     @property
     def lacks(self) -> str:
-        """A start value or a limit, without which nothing says how far back it reaches."""
+        """The missing start value or limit, without which the length of the memory is unknown."""
         known = np.isfinite(self.limits.get("T", self._about)[1])
         return "" if known else "give the time that it starts at, as in Delay().at({'T': 0.01}); it may come to double"
 
     @property
     def _about(self) -> tuple[float, float]:
-        """Where nothing limits it: up to twice where it starts."""
+        """Default limits: from zero to twice the start value."""
         return 0.0, 2 * float(np.asarray(self.values.get("T", np.inf)))
 
     def parameters(self) -> dict[str, Parameter]:
-        """The delay, within what its memory holds."""
+        """The delay, within the length of its memory."""
         out = super().parameters()
         return out if "T" in self.limits else {"T": replace(out["T"], bounds=self._about)}
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """A shift register, read between two of its places."""
+        """Shift the register, and read it between two of its entries."""
         line = ca.vertcat(z, s)
         at = p["T"] / self.h
         weight = [ca.fmax(1 - ca.fabs(at - i), 0) for i in range(self.memory + 1)]
         return sum(weight[i] * line[i] for i in range(self.memory + 1)) - z, line[: self.memory]
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(T=local.dt * np.array([0.5, 1, 1.5, 2, 3, 4, 6, 8, 11, 15, 20]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         most = 1.6 * float(np.asarray(self.values["T"])) + 2 * local.dt if "T" in self.values else 24 * local.dt
@@ -72,13 +71,13 @@ class Delay(Law):
 
 
 class Relaxation(Law):
-    """Creep of a support or material: a spring and a damper in series, beside what is there (Maxwell 1867)."""
+    """Creep of a support or material: a spring and a damper in series, in parallel to the rest (Maxwell 1867)."""
 
     id = "creep"
     equation = "w = k_v (z - q),  dq/dt = (z - q) / T"
     source = "Findley, Lai & Onaran (1976), Creep and Relaxation, ch. 5"
     sentence = "creep: under a constant load the deflection goes on slowly"
-    units: ClassVar[Mapping[str, str]] = {"k_v": "w/z", "T": "s"}
+    units = {"k_v": "w/z", "T": "s"}
     strength: ClassVar[tuple[str, ...]] = ("k_v",)
     dissipative = True
     order = follows = 1
@@ -87,7 +86,7 @@ class Relaxation(Law):
         return p.k_v * (z - q)
 
     def flow(self, z: Any, q: Any, p: Any) -> Any:
-        """The damper's travel."""
+        """Rate of the damper's travel."""
         return (z - q) / p.T
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
@@ -97,43 +96,43 @@ class Relaxation(Law):
         return {"T": (5 * local.dt, 2 * local.duration)}
 
 
-class TwoStageRelaxation(Relaxation):
-    """Creep with a fast and a slow part."""
+class _TwoStages(Law):
+    """The common part of creep with a fast and a slow part."""
 
     form = "two-stage"
-    equation = "w = k_1 (z - q_1) + k_2 (z - q_2),  dq_i/dt = (z - q_i) / T_i"
-    units: ClassVar[Mapping[str, str]] = {"k_1": "w/z", "k_2": "w/z", "T_1": "s", "T_2": "s"}
-    strength: ClassVar[tuple[str, ...]] = ("k_1", "k_2")
     order = follows = 2
+    one_stage: ClassVar[type[Law]]
+
+    def flow(self, z: Any, q: Any, p: Any) -> Any:
+        """Rates of both parts."""
+        return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
+
+    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Start as two parts about as fast as the single part, together as strong."""
+        if type(plain) is not self.one_stage:
+            return {}
+        (strength,) = plain.strength
+        return {**dict.fromkeys(self.strength, own[strength] / 2), "T_1": own["T"] / 2, "T_2": own["T"] * 2}
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        times = np.geomspace(20 * local.dt, local.duration / 2, 5)
+        for fast, slow in itertools.combinations(times, 2):
+            yield {"T_1": float(fast), "T_2": float(slow)}
+
+
+class TwoStageRelaxation(_TwoStages, Relaxation):
+    """Creep of a support or material with a fast and a slow part."""
+
+    equation = "w = k_1 (z - q_1) + k_2 (z - q_2),  dq_i/dt = (z - q_i) / T_i"
+    units = {"k_1": "w/z", "k_2": "w/z", "T_1": "s", "T_2": "s"}
+    strength = ("k_1", "k_2")
+    one_stage = Relaxation
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return p.k_1 * (z - q[0]) + p.k_2 * (z - q[1])
 
-    def flow(self, z: Any, q: Any, p: Any) -> Any:
-        """Both dampers."""
-        return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
-
-    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
-        return _in_two(self, own) if type(plain) is Relaxation else {}
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from _two_times(local)
-
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {name: (5 * local.dt, 2 * local.duration) for name in ("T_1", "T_2")}
-
-
-def _two_times(local: Local) -> Iterator[dict[str, Any]]:
-    times = np.geomspace(20 * local.dt, local.duration / 2, 5)
-    for i, fast in enumerate(times):
-        for slow in times[i + 1 :]:
-            yield {"T_1": float(fast), "T_2": float(slow)}
-
-
-def _in_two(law: Law, own: Mapping[str, Any]) -> dict[str, Any]:
-    """Two parts about as fast as the one of a creep fitted to `own`, together as strong."""
-    (strength,) = set(own) - {"T"}
-    return {**dict.fromkeys(law.strength, own[strength] / 2), "T_1": own["T"] / 2, "T_2": own["T"] * 2}
+        return dict.fromkeys(("T_1", "T_2"), super().bounds(local)["T"])
 
 
 class Creep(Relaxation):
@@ -142,44 +141,33 @@ class Creep(Relaxation):
     equation = "w = c q,  dq/dt = (u - q) / T"
     source = "Kuhnen & Janocha (2002), Control and Intelligent Systems 30(1)"
     sentence = "creep: after a step the signal goes on slowly in the same direction"
-    units: ClassVar[Mapping[str, str]] = {"c": "", "T": "s"}
+    units = {"c": "", "T": "s"}
     strength: ClassVar[tuple[str, ...]] = ("c",)
-    places: ClassVar[tuple[str, ...]] = ("series",)
+    places = ("series",)
     dissipative = False
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c * q
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        # what comes back, or parts of opposite signs, would be a filter, nothing that goes on in the same direction
+        # negative parts would make a filter that comes back; creep goes on in the same direction
         return super().bounds(local) | {name: (0.0, np.inf) for name in self.strength}
 
 
-class TwoStageCreep(Creep):
-    """Creep with a fast and a slow part."""
+class TwoStageCreep(_TwoStages, Creep):
+    """Creep of an actuator or a sensor with a fast and a slow part."""
 
-    form = "two-stage"
     equation = "w = c_1 q_1 + c_2 q_2,  dq_i/dt = (u - q_i) / T_i"
-    units: ClassVar[Mapping[str, str]] = {"c_1": "", "c_2": "", "T_1": "s", "T_2": "s"}
-    strength: ClassVar[tuple[str, ...]] = ("c_1", "c_2")
-    order = follows = 2
+    units = {"c_1": "", "c_2": "", "T_1": "s", "T_2": "s"}
+    strength = ("c_1", "c_2")
+    one_stage = Creep
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c_1 * q[0] + p.c_2 * q[1]
 
-    def flow(self, z: Any, q: Any, p: Any) -> Any:
-        """Both parts."""
-        return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
-
-    def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
-        return _in_two(self, own) if type(plain) is Creep else {}
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from _two_times(local)
-
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        most = super().bounds(local)
-        return {name: most["T"] for name in ("T_1", "T_2")} | {name: most[name] for name in self.strength}
+        both = super().bounds(local)
+        return {**dict.fromkeys(("T_1", "T_2"), both["T"]), **{name: both[name] for name in self.strength}}
 
 
 class Lag(Law):
@@ -190,10 +178,11 @@ class Lag(Law):
     equation = "w = q - u,  dq/dt = (u - q) / T"
     source = "Franklin, Powell & Emami-Naeini (2015), sec. 3.3"
     sentence = "an unmodelled lag: the signal follows with a time constant"
-    units: ClassVar[Mapping[str, str]] = {"T": "s"}
-    places: ClassVar[tuple[str, ...]] = ("series",)
+    units = {"T": "s"}
+    places = ("series",)
     order = follows = 1
-    substeps: ClassVar[int] = 4  # a lag shorter than a sample is still one
+    starts = {"T": ("dt", *np.geomspace(0.25, 40, 8))}
+    substeps = 4  # a lag may be shorter than a sample
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return q - z
@@ -201,9 +190,6 @@ class Lag(Law):
     def flow(self, z: Any, q: Any, p: Any) -> Any:
         """First order."""
         return (z - q) / p.T
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(T=local.dt * np.geomspace(0.25, 40, 8))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"T": (0.15 * local.dt, local.duration / 4)}
@@ -217,7 +203,7 @@ class Resonance(Law):
     equation = "w = q_1 - u,  d2q_1/dt2 = W^2 (u - q_1) - 2 D W dq_1/dt"
     source = "Franklin, Powell & Emami-Naeini (2015), sec. 3.3"
     sentence = "an unmodelled resonance in the path of the signal"
-    units: ClassVar[Mapping[str, str]] = {"W": "rad/s", "D": ""}
+    units = {"W": "rad/s", "D": ""}
     places: ClassVar[tuple[str, ...]] = ("series",)
     order, follows = 2, 1
 
@@ -242,18 +228,15 @@ class Mode(Resonance):
     equation = "w = c_1 q_1 + c_2 q_2,  dq_1/dt = W q_2,  dq_2/dt = W (u - q_1) - 2 D W q_2"
     source = "Preumont (2011), Vibration Control of Active Structures, sec. 2.6"
     sentence = "an unmodelled mode that the signal excites"
-    units: ClassVar[Mapping[str, str]] = {"c_1": "w/z", "c_2": "w/z", "W": "rad/s", "D": ""}
-    strength: ClassVar[tuple[str, ...]] = ("c_1", "c_2")
-    places: ClassVar[tuple[str, ...]] = ("parallel", "series")
+    units = {"c_1": "w/z", "c_2": "w/z", "W": "rad/s", "D": ""}
+    strength = ("c_1", "c_2")
+    places = ("parallel", "series")
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c_1 * q[0] + p.c_2 * q[1]
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """So much damping that no frequency stands out: two lags that follow anything linear, no mode.
-
-        Or faster than samples can show.
-        """
+        """Tell whether it has no peak, like two lags that follow anything linear, or is too fast to be seen."""
         return bool(values["D"] > DEAF or values["W"] >= self.parameters()["W"].bounds[1])
 
 
@@ -264,9 +247,9 @@ class Attached(Resonance):
     equation = "w = k_a (z - q) + 2 D k_a / W (dz/dt - dq/dt),  d2q/dt2 = W^2 w / k_a"
     source = "Den Hartog (1956), Mechanical Vibrations, sec. 3.2"
     sentence = "an unmodelled mode: a part on a spring of its own that is carried along"
-    units: ClassVar[Mapping[str, str]] = {"k_a": "w/z", "W": "rad/s", "D": ""}
-    strength: ClassVar[tuple[str, ...]] = ("k_a",)
-    places: ClassVar[tuple[str, ...]] = ("parallel",)
+    units = {"k_a": "w/z", "W": "rad/s", "D": ""}
+    strength = ("k_a",)
+    places = ("parallel",)
     dissipative = True
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
@@ -276,12 +259,12 @@ class Attached(Resonance):
         return p.k_a * _pull(z, dz, q, p)
 
     def flow(self, z: Any, dz: Any, q: Any, p: Any) -> Any:  # type: ignore[override]
-        """Its travel and its speed over W."""
+        """Rates of its travel and of its speed over W."""
         return ca.vertcat(p.W * q[1], p.W * _pull(z, dz, q, p))
 
 
 def _pull(z: Any, dz: Any, q: Any, p: Any) -> Any:
-    """What spring and damper pull with, over the spring's stiffness."""
+    """Force of spring and damper over the spring's stiffness."""
     return z - q[0] + 2 * p.D * (dz / p.W - q[1])
 
 
@@ -292,46 +275,38 @@ class Drift(Law):
     equation = "w = a t + b t^2"
     source = "Ljung (1999), System Identification, sec. 14.1"
     sentence = "a slow trend in time that no input explains"
-    units: ClassVar[Mapping[str, str]] = {"a": "w/s", "b": "w/s^2"}
+    units = {"a": "w/s", "b": "w/s^2"}
     strength: ClassVar[tuple[str, ...]] = ("a", "b")
-    places: ClassVar[tuple[str, ...]] = ("parallel", "series")
+    places = ("parallel", "series")
 
     def force(self, t: Any, p: Any) -> Any:
         return p.a * t + p.b * t**2
 
 
 class Settling(Drift):
-    """A warm-up or a decay that comes to an end, about a level."""
+    """A warm-up or a decay towards a level."""
 
     form = "settling"
     equation = "w = a exp(-t / T) + b"
     source = "Ljung (1999), System Identification, sec. 14.1; Incropera et al. (2007), sec. 5.1"
-    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "T": "s"}
+    units = {"a": "w", "b": "w", "T": "s"}
+    starts = {"T": ("duration", 0.05, 0.15, 0.4, 1.0)}
+    ranges = {"T": ("duration", 0.02, 3)}
 
     def force(self, t: Any, p: Any) -> Any:
         return p.a * ca.exp(-t / p.T) + p.b
 
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(T=local.duration * np.array([0.05, 0.15, 0.4, 1.0]))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"T": (0.02 * local.duration, 3 * local.duration)}
-
 
 class Swing(Drift):
-    """A slow swing to and fro, as of a room's temperature over a day."""
+    """A slow oscillation, such as a room's temperature over a day."""
 
     form = "swing"
     equation = "w = a cos(2 pi t / T) + b sin(2 pi t / T) + c"
-    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "c": "w", "T": "s"}
-    strength: ClassVar[tuple[str, ...]] = ("a", "b", "c")
+    units = {"a": "w", "b": "w", "c": "w", "T": "s"}
+    strength = ("a", "b", "c")
+    starts = {"T": ("duration", 0.4, 0.7, 1.0, 1.5, 2.5)}
+    ranges = {"T": ("duration", 0.25, 4)}
 
     def force(self, t: Any, p: Any) -> Any:
         angle = 2 * np.pi * t / p.T
         return p.a * ca.cos(angle) + p.b * ca.sin(angle) + p.c
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(T=local.duration * np.array([0.4, 0.7, 1.0, 1.5, 2.5]))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"T": (0.25 * local.duration, 4 * local.duration)}

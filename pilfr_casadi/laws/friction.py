@@ -9,15 +9,16 @@ import casadi as ca
 import numpy as np
 
 from ..models import play
-from .base import Law, Local, grid
+from .base import Law, Local
 
-KNEE = 0.15  # of the speed at which friction has fallen, that its reversal may take
-FALL = 0.05  # of dry friction, the least by which it is larger at rest
-SPRINGY = 0.08  # of half the travel, beyond which a contact that springs back is an elasto-plastic part
-MOST = 0.6  # of half the travel, the widest that is tried
-SHARP, SHARPEST = 2e-3, 1e-4  # of the speed, the narrowest reversal that is tried anyhow, and where steps can follow
-STABLE = 2.5  # |λ| h with which a Runge-Kutta step is stable
-WIDE = 0.4  # of the widest reversal that is tried, beyond which it is damping that gives way rather than dry friction
+KNEE = 0.15  # width of the reversal over the speed at which friction has fallen; above it the two cannot be told apart
+FALL = 0.05  # smallest excess of friction at rest over dry friction
+SPRINGY = 0.08  # threshold of presliding over half the travel; above it the element is a stop of a hysteresis
+MOST = 0.6  # largest threshold tried, over half the travel
+SHARP = 2e-3  # narrowest reversal that is tried in any case, over the speed
+SHARPEST = 1e-4  # narrowest reversal that is tried where the steps resolve it, over the speed
+STABLE = 2.5  # |λ| h up to which a Runge-Kutta step is stable
+WIDE = 0.4  # width of the reversal over the widest that is tried; above it the force is damping that saturates
 
 
 class CoulombFriction(Law):
@@ -28,22 +29,20 @@ class CoulombFriction(Law):
     equation = "w = F_c tanh(dz/dt / v_0)"
     source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7)"
     sentence = "dry friction: a force that opposes motion and hardly depends on speed"
-    units: ClassVar[Mapping[str, str]] = {"F_c": "w", "v_0": "z/s"}
+    units = {"F_c": "w", "v_0": "z/s"}
     strength: ClassVar[tuple[str, ...]] = ("F_c",)
     dissipative = True
     knee = "v_0"
+    starts = {"v_0": ("speed", 0.005, 0.02, 0.06, 0.15)}
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.F_c * ca.tanh(dz / p.v_0)
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(v_0=local.speed * np.array([0.005, 0.02, 0.06, 0.15]))
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {"v_0": (_sharpest(self, local), 0.5 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """A reversal over much of the speeds there are: the force depends on speed nearly everywhere."""
+        """Tell whether the reversal is so wide that the force depends on speed nearly everywhere."""
         return bool(values["v_0"] > WIDE * self.parameters()["v_0"].bounds[1])
 
 
@@ -53,7 +52,7 @@ class AsymmetricFriction(CoulombFriction):
     form = "asymmetric"
     equation = "w = F_c tanh(dz/dt / v_0) + F_0"
     sentence = "dry friction that differs between the two directions, or that has a constant load beside it"
-    units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_0": "w", "v_0": "z/s"}
+    units = {"F_c": "w", "F_0": "w", "v_0": "z/s"}
     strength: ClassVar[tuple[str, ...]] = ("F_c", "F_0")
     signed: ClassVar[tuple[str, ...]] = ("F_0",)
 
@@ -69,9 +68,9 @@ class DirectionalFriction(AsymmetricFriction):
     sentence = (
         "dry friction, and friction that grows with speed, both different in the two directions (or a constant load)"
     )
-    units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_0": "w", "c_0": "w*s/z", "v_0": "z/s"}
-    strength: ClassVar[tuple[str, ...]] = ("F_c", "F_0", "c_0")
-    signed: ClassVar[tuple[str, ...]] = ("F_0", "c_0")
+    units = {"F_c": "w", "F_0": "w", "c_0": "w*s/z", "v_0": "z/s"}
+    strength = ("F_c", "F_0", "c_0")
+    signed = ("F_0", "c_0")
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.F_c * ca.tanh(dz / p.v_0) + p.F_0 + p.c_0 * ca.fabs(dz)
@@ -85,24 +84,20 @@ class PreslidingFriction(Law):
     equation = "w = k_t stop_r[z],  F_c = k_t r"
     source = "Jenkins (1962); Al-Bender & Swevers (2008), IEEE Control Syst. 28(6)"
     sentence = "dry friction whose contact springs back a little before it slides"
-    units: ClassVar[Mapping[str, str]] = {"k_t": "w/z", "r": "z"}
+    units = {"k_t": "w/z", "r": "z"}
     strength: ClassVar[tuple[str, ...]] = ("k_t",)
     dissipative = True
     memory = 1
+    starts = {"r": ("half", 0.003, 0.01, 0.03, 0.1, 0.25)}
+    ranges = {"r": ("half", 0.0005, MOST)}
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         """One stop."""
         following = play(z, s, p["r"])
         return p["k_t"] * (z - following), following
 
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(r=local.half * np.array([0.003, 0.01, 0.03, 0.1, 0.25]))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"r": (5e-4 * local.half, MOST * local.half)}
-
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """A contact that springs back over much of the travel: hysteresis, of which this is one stop."""
+        """Tell whether the contact springs back over much of the travel: then it is one stop of a hysteresis."""
         return bool(values["r"] > SPRINGY / MOST * self.parameters()["r"].bounds[1])
 
 
@@ -113,8 +108,8 @@ class StribeckFriction(CoulombFriction):
     form = ""
     equation = "w = (F_c + F_e exp(-(dz/dt / v_s)^2)) tanh(dz/dt / v_0)"
     sentence = "dry friction that is larger at rest than in motion"
-    units: ClassVar[Mapping[str, str]] = {"F_c": "w", "F_e": "w", "v_s": "z/s", "v_0": "z/s"}
-    strength: ClassVar[tuple[str, ...]] = ("F_c", "F_e")
+    units = {"F_c": "w", "F_e": "w", "v_s": "z/s", "v_0": "z/s"}
+    strength = ("F_c", "F_e")
 
     def force(self, dz: Any, p: Any) -> Any:
         return (p.F_c + p.F_e * ca.exp(-((dz / p.v_s) ** 2))) * ca.tanh(dz / p.v_0)
@@ -128,40 +123,36 @@ class StribeckFriction(CoulombFriction):
         return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (_sharpest(self, local), 0.3 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """A knee as wide as the range over which friction falls, or no fall to speak of."""
+        """Tell whether the reversal is as wide as the range of the fall, or the fall is negligible."""
         return bool(values["v_0"] > KNEE * values["v_s"]) or _hardly_falls(self, values)
 
 
 class PreslidingStribeckFriction(PreslidingFriction):
-    """The same where the contact springs back before it slides: an elasto-plastic element of falling strength."""
+    """Falling dry friction whose contact springs back first: an elasto-plastic element of falling strength."""
 
     id = "stribeck_friction"
     equation = "w = (k_t + k_e exp(-(dz/dt / v_s)^2)) stop_r[z],  F_c = k_t r"
     source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7); Jenkins (1962)"
     sentence = "dry friction that is larger at rest than in motion, and whose contact springs back before it slides"
-    units: ClassVar[Mapping[str, str]] = {"k_t": "w/z", "k_e": "w/z", "r": "z", "v_s": "z/s"}
-    strength: ClassVar[tuple[str, ...]] = ("k_t", "k_e")
+    units = {"k_t": "w/z", "k_e": "w/z", "r": "z", "v_s": "z/s"}
+    strength = ("k_t", "k_e")
+    starts = {"r": ("half", 0.003, 0.01, 0.03, 0.1), "v_s": ("speed", 0.05, 0.15, 0.4)}
 
     def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0) -> tuple[Any, Any]:
         """One stop."""
         following = play(z, s, p["r"])
         return (p["k_t"] + p["k_e"] * ca.exp(-((dz / p["v_s"]) ** 2))) * (z - following), following
 
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(
-            r=local.half * np.array([0.003, 0.01, 0.03, 0.1]), v_s=local.speed * np.array([0.05, 0.15, 0.4])
-        )
-
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         return {**super().bounds(local), "v_s": (4e-3 * local.speed, 0.8 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """As without the fall, or no fall to speak of."""
+        """Tell whether the contact springs back over much of the travel, or the fall is negligible."""
         return super().doubtful(values) or _hardly_falls(self, values)
 
 
 def _sharpest(law: Law, local: Local) -> float:
-    """Narrowest reversal, z/s: stuck in a narrower one, a simulation would chatter on its steps."""
+    """Compute the narrowest reversal, z/s; in a narrower one a simulation chatters at rest."""
     force = sum(
         abs(float(law.values.get(name, 0.0))) for name in law.strength if name.startswith("F") and name != "F_0"
     )
@@ -172,19 +163,19 @@ def _sharpest(law: Law, local: Local) -> float:
 
 
 def _hardly_falls(law: Law, values: Mapping[str, Any]) -> bool:
-    """Whether a fall is slight, or goes on over all speeds, or is over at once: no friction is larger at rest then."""
+    """Tell whether the fall is slight, goes on over all speeds, or ends at once: then it is dry friction."""
     (low, high), (dry, more) = law.parameters()["v_s"].bounds, (abs(float(values[k])) for k in law.strength[:2])
     return bool(not low < values["v_s"] < high or more < FALL * dry)
 
 
 class ViscousDamping(Law):
-    """A damper where the simulator has none."""
+    """A damper that the simulator leaves out."""
 
     id = "viscous_damping"
     equation = "w = c_1 dz/dt"
     source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
     sentence = "a viscous damper: a force in proportion to speed"
-    units: ClassVar[Mapping[str, str]] = {"c_1": "w*s/z"}
+    units = {"c_1": "w*s/z"}
     strength: ClassVar[tuple[str, ...]] = ("c_1",)
     dissipative = True
 
@@ -199,9 +190,9 @@ class DirectionalDamping(ViscousDamping):
     equation = "w = c_1 dz/dt + c_0 |dz/dt|"
     source = "Dixon (2007), The Shock Absorber Handbook, ch. 6"
     sentence = "viscous damping that differs between the two directions"
-    units: ClassVar[Mapping[str, str]] = {"c_1": "w*s/z", "c_0": "w*s/z"}
-    strength: ClassVar[tuple[str, ...]] = ("c_1", "c_0")
-    signed: ClassVar[tuple[str, ...]] = ("c_0",)
+    units = {"c_1": "w*s/z", "c_0": "w*s/z"}
+    strength = ("c_1", "c_0")
+    signed = ("c_0",)
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.c_1 * dz + p.c_0 * ca.fabs(dz)
@@ -214,7 +205,7 @@ class QuadraticDrag(Law):
     equation = "w = c_2 dz/dt |dz/dt|"
     source = "White (2011), Fluid Mechanics, sec. 7.6"
     sentence = "a drag that grows with the square of speed"
-    units: ClassVar[Mapping[str, str]] = {"c_2": "w*s^2/z^2"}
+    units = {"c_2": "w*s^2/z^2"}
     strength: ClassVar[tuple[str, ...]] = ("c_2",)
     dissipative = True
 
@@ -228,9 +219,9 @@ class DirectionalDrag(QuadraticDrag):
     form = "directional"
     equation = "w = c_2 dz/dt |dz/dt| + c_0 (dz/dt)^2"
     sentence = "a drag that grows with the square of speed and differs between the two directions"
-    units: ClassVar[Mapping[str, str]] = {"c_2": "w*s^2/z^2", "c_0": "w*s^2/z^2"}
-    strength: ClassVar[tuple[str, ...]] = ("c_2", "c_0")
-    signed: ClassVar[tuple[str, ...]] = ("c_0",)
+    units = {"c_2": "w*s^2/z^2", "c_0": "w*s^2/z^2"}
+    strength = ("c_2", "c_0")
+    signed = ("c_0",)
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.c_2 * dz * ca.fabs(dz) + p.c_0 * dz**2
@@ -243,8 +234,8 @@ class CubicDamping(Law):
     equation = "w = c_3 (dz/dt)^3"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 3.3"
     sentence = "a damping force that grows with the cube of speed"
-    units: ClassVar[Mapping[str, str]] = {"c_3": "w*s^3/z^3"}
-    strength: ClassVar[tuple[str, ...]] = ("c_3",)
+    units = {"c_3": "w*s^3/z^3"}
+    strength = ("c_3",)
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.c_3 * dz**3

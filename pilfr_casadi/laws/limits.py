@@ -1,9 +1,9 @@
-"""Limits of an actuator's or a sensor's range: saturation and dead zone."""
+"""Limits of the range of an actuator or a sensor: saturation and dead zone."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar
+from collections.abc import Iterator
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,17 +19,13 @@ class Saturation(Law):
     equation = "w = clip(u, -L, L) - u"
     source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
     sentence = "saturation: beyond a limit the signal does not follow any more"
-    units: ClassVar[Mapping[str, str]] = {"L": "z"}
-    places: ClassVar[tuple[str, ...]] = ("series",)
+    units = {"L": "z"}
+    places = ("series",)
+    starts = {"L": ("reach", 0.3, 0.45, 0.6, 0.75, 0.9)}
+    ranges = {"L": ("reach", 0.1, 0.995)}
 
     def force(self, z: Any, p: Any) -> Any:
         return ca.fmax(ca.fmin(z, p.L), -p.L) - z
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(L=local.reach * np.array([0.3, 0.45, 0.6, 0.75, 0.9]))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"L": (0.1 * local.reach, 0.995 * local.reach)}
 
 
 class AsymmetricSaturation(Saturation):
@@ -37,7 +33,7 @@ class AsymmetricSaturation(Saturation):
 
     form = "asymmetric"
     equation = "w = clip(u, low, high) - u"
-    units: ClassVar[Mapping[str, str]] = {"low": "z", "high": "z"}
+    units = {"low": "z", "high": "z"}
 
     def force(self, z: Any, p: Any) -> Any:
         return ca.fmax(ca.fmin(z, p.high), p.low) - z
@@ -57,15 +53,11 @@ class SoftSaturation(Saturation):
 
     form = "soft"
     equation = "w = L tanh(u / L) - u"
+    starts = {"L": ("reach", 0.3, 0.6, 1.0, 2.0)}
+    ranges = {"L": ("reach", 0.1, 10)}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.L * ca.tanh(z / p.L) - z
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(L=local.reach * np.array([0.3, 0.6, 1.0, 2.0]))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"L": (0.1 * local.reach, 10 * local.reach)}
 
 
 class GradualSaturation(Saturation):
@@ -73,16 +65,12 @@ class GradualSaturation(Saturation):
 
     form = "gradual"
     equation = "w = u / (1 + |u / L|^n)^(1/n) - u"
-    units: ClassVar[Mapping[str, str]] = {"L": "z", "n": ""}
+    units = {"L": "z", "n": ""}
+    starts = {"L": ("reach", 0.5, 1.0, 2.0), "n": ("", 1.0, 2.0, 5.0)}
+    ranges = {"L": ("reach", 0.1, 20), "n": ("", 0.7, 12.0)}
 
     def force(self, z: Any, p: Any) -> Any:
         return z / (1 + (ca.fabs(z / p.L) + 1e-9) ** p.n) ** (1 / p.n) - z
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(L=local.reach * np.array([0.5, 1.0, 2.0]), n=[1.0, 2.0, 5.0])
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"L": (0.1 * local.reach, 20 * local.reach), "n": (0.7, 12.0)}
 
 
 class SkewSaturation(AsymmetricSaturation):
@@ -90,7 +78,7 @@ class SkewSaturation(AsymmetricSaturation):
 
     form = "soft asymmetric"
     equation = "w = L tanh(u / L) - u,  L = L_1 below zero and L_2 above"
-    units: ClassVar[Mapping[str, str]] = {"L_1": "z", "L_2": "z"}
+    units = {"L_1": "z", "L_2": "z"}
 
     def force(self, z: Any, p: Any) -> Any:
         up, down = ca.fmax(z, 0), ca.fmin(z, 0)
@@ -112,17 +100,13 @@ class DeadZone(Law):
     equation = "w = -clip(u, -g, g)"
     source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
     sentence = "a dead zone: small signals have no effect"
-    units: ClassVar[Mapping[str, str]] = {"g": "z"}
-    places: ClassVar[tuple[str, ...]] = ("series",)
+    units = {"g": "z"}
+    places = ("series",)
+    starts = {"g": ("reach", 0.02, 0.06, 0.12, 0.25, 0.4)}
+    ranges = {"g": ("reach", 0.001, 0.8)}
 
     def force(self, z: Any, p: Any) -> Any:
         return -ca.fmax(ca.fmin(z, p.g), -p.g)
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(g=local.reach * np.array([0.02, 0.06, 0.12, 0.25, 0.4]))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"g": (1e-3 * local.reach, 0.8 * local.reach)}
 
     def applies(self, local: Local) -> str:
         return "" if np.min(np.abs(local.z)) < 0.1 * local.reach else "the signal is never small"
@@ -133,7 +117,8 @@ class AsymmetricDeadZone(DeadZone):
 
     form = "asymmetric"
     equation = "w = -clip(u, -g_1, g_2)"
-    units: ClassVar[Mapping[str, str]] = {"g_1": "z", "g_2": "z"}
+    units = {"g_1": "z", "g_2": "z"}
+    ranges = {"g_1": ("reach", 0.0, 0.8), "g_2": ("reach", 0.0, 0.8)}
 
     def force(self, z: Any, p: Any) -> Any:
         return -ca.fmax(ca.fmin(z, p.g_2), -p.g_1)
@@ -141,9 +126,6 @@ class AsymmetricDeadZone(DeadZone):
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         at = local.reach * np.array([0.02, 0.15, 0.35])
         yield from grid(g_1=at, g_2=at)
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"g_1": (0.0, 0.8 * local.reach), "g_2": (0.0, 0.8 * local.reach)}
 
     def applies(self, local: Local) -> str:
         return "" if local.low < 0 < local.high else "one side is never visited"

@@ -10,7 +10,8 @@ import numpy as np
 
 from .base import Law, Local, grid
 
-FEWEST, SEEN = 1.5, 2.0  # periods within the motion that are tried, and that make a force a periodic one
+FEWEST = 1.5  # smallest number of periods within the motion that is tried
+SEEN = 2.0  # number of periods within the motion from which a force counts as periodic
 
 
 class PeriodicForce(Law):
@@ -20,7 +21,7 @@ class PeriodicForce(Law):
     equation = "w = a sin(2 pi z / L) + b cos(2 pi z / L)"
     source = "Hanselman (2006), Brushless Permanent Magnet Motor Design, sec. 8.3"
     sentence = "a force that repeats with position, as from cogging or the pitch of a screw or gear"
-    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "L": "z"}
+    units = {"a": "w", "b": "w", "L": "z"}
     strength: ClassVar[tuple[str, ...]] = ("a", "b")
 
     def force(self, z: Any, p: Any) -> Any:
@@ -34,7 +35,7 @@ class PeriodicForce(Law):
         return {"L": (2 * local.half / 60, 2 * local.half / FEWEST)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Fewer than two periods within the motion: any other curve."""
+        """Tell whether the motion holds fewer than two periods, which could be any other curve."""
         return bool(values["L"] > FEWEST / SEEN * self.parameters()["L"].bounds[1])
 
 
@@ -43,8 +44,8 @@ class HarmonicForce(PeriodicForce):
 
     form = "harmonics"
     equation = "w = a sin(q) + b cos(q) + a_2 sin(2 q) + b_2 cos(2 q),  q = 2 pi z / L"
-    units: ClassVar[Mapping[str, str]] = {"a": "w", "b": "w", "a_2": "w", "b_2": "w", "L": "z"}
-    strength: ClassVar[tuple[str, ...]] = ("a", "b", "a_2", "b_2")
+    units = {"a": "w", "b": "w", "a_2": "w", "b_2": "w", "L": "z"}
+    strength = ("a", "b", "a_2", "b_2")
 
     def force(self, z: Any, p: Any) -> Any:
         twice = 4 * np.pi * z / p.L
@@ -54,16 +55,16 @@ class HarmonicForce(PeriodicForce):
 class Ripple(PeriodicForce):
     """An error that repeats with the signal itself: an encoder off centre, or its interpolation.
 
-    Fewer than three periods could be any other curve.
+    At least three periods are tried, because fewer could be any other curve.
     """
 
     form = "ripple"
     source = "Heydemann (1981), Applied Optics 20(19)"
     sentence = "an error that repeats with the signal itself, as from an encoder off centre or its interpolation"
-    places: ClassVar[tuple[str, ...]] = ("sensor",)
+    places = ("sensor",)
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Three periods are enough."""
+        """Never: at least three periods are tried."""
         return False
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:

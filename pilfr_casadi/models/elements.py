@@ -474,20 +474,19 @@ class Combined:
 
 
 class _PartValues(Mapping[str, Any]):
-    """The parameters of one part by their own names."""
+    """The values of one part by its own parameter names."""
 
     def __init__(self, p: Mapping[str, Any], part: Part) -> None:
-        self._p, self._names = p, tuple(part.element.parameters())
-        self._prefix = part.name
+        self._p, self._part = p, part
 
     def __getitem__(self, name: str) -> Any:
-        return self._p[f"{self._prefix}_{name}"]
+        return self._p[f"{self._part.name}_{name}"]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
+        return iter(self._part.element.parameters())  # on demand: building the parameters at every step is slow
 
     def __len__(self) -> int:
-        return len(self._names)
+        return len(self._part.element.parameters())
 
 
 def weight_density(r: np.ndarray, w: np.ndarray, grid: np.ndarray, width: float) -> np.ndarray:

@@ -176,6 +176,7 @@ def open_model(
 
     Examples
     --------
+    >>> from pilfr_casadi import Parameter, Play, PrandtlIshlinskii
     >>> lag = open_model(lambda x, u, w, p: (p["a"] * x + u - w, x), lambda x, u, p: x,
     ...                  ParameterSet({"a": Parameter(0.9)}), n_x=1, n_u=1, n_w=1)
     >>> close_loop(lag, PrandtlIshlinskii(Play, 3)).n_state

@@ -95,6 +95,16 @@ class Parameter:
         """Number of entries."""
         return int(self.value.size)
 
+    @classmethod
+    def trusted(cls, value: Any, unit: str, lower: Any, upper: Any) -> Parameter:
+        """Make a free scalar from numbers that have been checked: finite, with `lower <= value <= upper`."""
+        made = object.__new__(cls)
+        value, lower, upper, fixed = np.array(value), np.array(lower), np.array(upper), np.array(False)
+        for array in (value, lower, upper, fixed):
+            array.setflags(write=False)
+        made.__dict__.update(value=value, unit=unit, bounds=(lower, upper), fixed=fixed, prior=None)
+        return made
+
     def _moved_to(self, value: Array) -> Parameter:
         """Copy with another value, which is trusted: finite, inside the bounds, of the same shape, nobody else's."""
         copy = object.__new__(type(self))

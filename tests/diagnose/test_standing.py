@@ -9,7 +9,7 @@ from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.offset import Offset
 from pilfr_casadi.diagnose.standing import standing
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.laws import CATALOGUE, Creep, Delay, Lag, Local, Magnitude, Quadratic, Resonance, TwoStageCreep, trace
+from pilfr_casadi.laws import CATALOGUE, Creep, Delay, Lag, Local, Magnitude, Quadratic, Resonance, TwoStageCreep
 from pilfr_casadi.simulators import discretise
 
 DT, M = 0.05, 1500
@@ -61,7 +61,9 @@ def test_a_law_begins_as_if_the_signal_had_stood_still(kind):
 def test_the_screen_sees_nothing_where_the_signal_stands(kind):
     z = np.full(50, 7.0)
     shapes = list(kind().shapes(Local(z, 0 * z, DT, (50,))))
-    still, sudden = (trace(kind(), Local(z, 0 * z, DT, (50,), from_zero=(begun,)), shapes) for begun in (False, True))
+    still, sudden = (
+        unit_forces(kind(), Local(z, 0 * z, DT, (50,), from_zero=(begun,)), shapes) for begun in (False, True)
+    )
     np.testing.assert_allclose(still, still[:1] + 0 * still, atol=1e-9)
     assert np.ptp(sudden, axis=0).max() > 1
 

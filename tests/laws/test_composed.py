@@ -56,6 +56,7 @@ def simulated(true, r):
     return make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "values", "form"),
     [

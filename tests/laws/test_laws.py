@@ -1,5 +1,7 @@
 """Every law of the catalogue: its derivatives, both engines, its force along a signal, and what it says of itself."""
 
+import doctest
+import importlib
 import inspect
 
 import casadi as ca
@@ -8,12 +10,13 @@ import pytest
 from scipy.optimize import approx_fprime
 
 import pilfr_casadi.laws as laws
-from pilfr_casadi import Parameter, Port, Recording, Simulator
+from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator
 from pilfr_casadi.engine import VirtualMachine, compiler, make_engine
 from pilfr_casadi.laws import (
     CATALOGUE,
     FINER,
     BoucWen,
+    Clearance,
     CubicStiffness,
     Delay,
     GeneralizedHysteresis,
@@ -22,14 +25,16 @@ from pilfr_casadi.laws import (
     PreslidingStribeckFriction,
     StopHysteresis,
     StribeckFriction,
-    columns,
+    behind_gap,
+    count_columns,
     readable_unit,
-    trace,
+    unit_forces,
 )
 from pilfr_casadi.simulators import discretise, led
 
-DT, M = 0.01, 240
+DT, M, RUN = 0.01, 240, 120  # step, samples of the local signals, samples of a simulation
 EVERY = (*CATALOGUE, *(finer for kinds in FINER.values() for finer in kinds))
+COMPILED = (CubicStiffness, StopHysteresis, BoucWen, Delay, StribeckFriction, Mode)  # one of each kind of step
 T = np.arange(M) * DT
 Z = 0.8 * np.sin(2 * np.pi * 1.3 * T) + 0.5 * np.sin(2 * np.pi * 3.1 * T + 1) + 0.05
 LOCAL = Local(Z, np.gradient(Z, DT), DT, (M,), np.inf)
@@ -60,8 +65,8 @@ def dose(kind, number=0):
 @pytest.fixture(scope="module")
 def record():
     rng = np.random.default_rng(3)
-    u = 20 * np.interp(T, T[::6], rng.standard_normal(len(T[::6])))
-    return Recording(u, np.zeros(M), DT, ("force",), ("y",), initial="zero")
+    u = 20 * np.interp(T, T[::6], rng.standard_normal(len(T[::6])))[:RUN]
+    return Recording(u, np.zeros(RUN), DT, ("force",), ("y",), initial="zero")
 
 
 def model_of(kind, hold):
@@ -78,11 +83,11 @@ def test_derivatives_and_engines(kind, record):
     y, jac, *_ = vm.sensitivity(drive, p, state, seed, place)
     assert np.all(np.isfinite(y)) and np.all(np.isfinite(jac))
     assert np.array_equal(y, vm.simulate(drive, p, state)[0])
-    if compiler():
+    if compiler() and kind in COMPILED:
         c = make_engine(model, "c")
         np.testing.assert_allclose(c.simulate(drive, p, state)[0], y, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(c.sensitivity(drive, p, state, seed, place)[1], jac, rtol=1e-7, atol=1e-9)
-    weight = np.random.default_rng(0).standard_normal(M)
+    weight = np.random.default_rng(0).standard_normal(len(y))
 
     def projected(values):
         return float(weight @ vm.simulate(drive, values, state)[0][:, 0])
@@ -114,8 +119,8 @@ def test_slopes_by_way_of_the_stages_where_an_observer_leads_and_columns_are_lef
 def test_the_force_is_linear_in_the_strengths(kind):
     law = dose(kind)
     shapes = list(law.shapes(LOCAL))
-    found = trace(law, LOCAL, shapes)
-    assert found.shape == (M, len(shapes), columns(law))
+    found = unit_forces(law, LOCAL, shapes)
+    assert found.shape == (M, len(shapes), count_columns(law))
     assert np.all(np.isfinite(found))
     assert np.all(np.ptp(found, axis=0).max(axis=1) > 0), "a shape on the grid gives no force that changes"
     same = np.isclose(found, np.roll(found, 1, axis=1)).all(axis=(0, 2))
@@ -219,7 +224,7 @@ def test_more_plays_begin_near_those_that_they_refine(plain):
     few = few.at({k: p.value for k, p in few.parameters().items()})
     (start,) = finer.finer_starts(few.values, LOCAL)
     more = finer().at(start, finer().bounds(LOCAL))
-    one, other = (trace(law, LOCAL, [{}])[:, 0, : law.n] @ law.parameters()["w"].value for law in (few, more))
+    one, other = (unit_forces(law, LOCAL, [{}])[:, 0, : law.n] @ law.parameters()["w"].value for law in (few, more))
     assert all(np.shape(more.parameters()[k].value) == (11,) for k in ("w", "r"))
     assert np.std(one - other) < 0.1 * np.std(one)
 
@@ -233,7 +238,7 @@ def test_friction_that_falls_over_all_speeds_is_hardly_larger_at_rest(kind):
 
 @pytest.mark.parametrize("kind", (laws.PreslidingFriction, PreslidingStribeckFriction))
 def test_friction_that_springs_back_over_much_of_the_travel_is_hardly_friction(kind):
-    law = kind().at({"v_s": 0.1}, kind().bounds(LOCAL))
+    law = kind().at({}, kind().bounds(LOCAL))
     slight, much = (
         {"r": share * LOCAL.half, "v_s": 0.1, **dict.fromkeys(kind.strength, 1.0)} for share in (0.03, 0.14)
     )
@@ -273,3 +278,39 @@ def test_steps_too_long_for_bouc_wen_do_not_run_away():
             k.append(rate(q + share * k[-1]))
         q += (k[0] + 2 * k[1] + 2 * k[2] + k[3]) / 6
     assert 0.5 < q < 8.0
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"values": {"banana": 1}}, "The law 'clearance' has no parameter 'banana'; its parameters are k_g, g."),
+        ({"values": {"k": 1.0}}, "has no parameter 'k'; its parameters are k_g, g"),
+        ({"limits": {"gap": (0, 1)}}, "has no parameter 'gap'; its parameters are k_g, g"),
+        ({"values": {"g": "wide"}}, "values of the law 'clearance' hold g = 'wide'; give finite numbers"),
+        ({"values": {"g": np.nan}}, "hold g = nan; give finite numbers"),
+        ({"values": [1.0]}, r"The values of the law 'clearance' are \[1.0\]; give a dict by parameter name"),
+        ({"limits": {"g": 1.0}}, r"limits of the law 'clearance' hold g = 1.0; give a pair \(lower, upper\)"),
+        ({"limits": {"g": (2.0, 1.0)}}, "give a pair .* of increasing numbers"),
+    ],
+)
+def test_values_that_a_law_cannot_have(given, says):
+    with pytest.raises(InputError, match=says):
+        Clearance(**given)
+
+
+@pytest.mark.parametrize("kind", EVERY, ids=lambda kind: kind.__name__)
+def test_a_wrong_name_is_refused_by_every_law(kind):
+    with pytest.raises(InputError, match=f"'banana'; its parameters are {', '.join(kind.units)}"):
+        kind().at({"banana": 1.0})
+
+
+def test_hysteresis_behind_a_gap_keeps_the_gap():
+    law = behind_gap(StopHysteresis)()
+    assert list(law.at(next(iter(law.shapes(LOCAL)))).parameters()) == ["w", "r", "g"]
+    assert np.all(np.isfinite(unit_forces(law, LOCAL, list(law.shapes(LOCAL))[:1])))
+
+
+def test_the_examples_of_the_base_class_run():
+    module = importlib.import_module("pilfr_casadi.laws.base")
+    assert doctest.testmod(module).attempted > 0
+    assert doctest.testmod(module).failed == 0

@@ -120,6 +120,8 @@ def test_sets_travel_between_processes():
         (lambda: Parameter(1.0, prior=(0.0, 0.0)), "positive standard deviation"),
         (lambda: Parameter(1.0, prior=(np.inf, 1.0)), "finite mean"),
         (lambda: Parameter(1.0, prior=3.0), "give a pair"),
+        (lambda: Parameter(1.0, unit=3), "unit is 3; give plain text"),
+        (lambda: Parameter({"k": 1.0}), "value is {'k': 1.0}; give a number"),
         (lambda: Parameter([1.0, 2.0], prior=(np.zeros(3), 1.0)), "The prior of a parameter has the shape"),
     ],
 )
@@ -140,3 +142,17 @@ def test_what_a_set_does_not_take():
     ):
         with pytest.raises(InputError, match=words):
             call()
+
+
+def test_a_set_at_a_vector_keeps_all_but_the_values_and_checks_nothing_twice(monkeypatch):
+    own = ParameterSet(
+        {"k": Parameter(2.0, "N/m", (1.0, 3.0), prior=(2.0, 1.0)), "A": Parameter(np.eye(2), fixed=True)}
+    )
+    monkeypatch.setattr(Parameter, "__post_init__", lambda self: pytest.fail("a valid parameter was validated again"))
+    moved = own.at(np.array([9.0, 1.0, 2.0, 3.0, 4.0]))
+    assert moved["k"].value == 3.0 and moved["A"].value.tolist() == [[1.0, 3.0], [2.0, 4.0]]
+    assert (moved["k"].unit, moved["k"].bounds, moved["k"].prior) == ("N/m", (1.0, 3.0), (2.0, 1.0))
+    assert moved["A"].fixed.all() and not moved["A"].value.flags.writeable
+    assert own["k"].value == 2.0
+    with pytest.raises(InputError, match="not finite"):
+        own.at(np.full(5, np.nan))

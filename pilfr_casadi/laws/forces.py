@@ -1,4 +1,4 @@
-"""Force of a law along given local signals, for every shape at once: what the screen looks at."""
+"""Forces of a law along given local signals at unit strength, for many shapes at once: the columns of the screen."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ class _Values:
         return self.__dict__[name]
 
 
-def columns(law: Law) -> int:
-    """Columns a shape has: one a strength, or one for a law without."""
+def count_columns(law: Law) -> int:
+    """Count the columns of one shape: one for each strength, or one for a law without strengths."""
     p = law.parameters()
     return max(1, sum(p[name].size for name in law.strength))
 
 
-def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarray:
-    """Force at unit strength for each shape, shape (M, len(shapes), columns).
+def unit_forces(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarray:
+    """Compute the force at unit strength for each shape, shape (M, len(shapes), columns).
 
-    Laws with states or memory start each recording from rest: at zero, or where z stands; see `Local.from_zero`.
+    Laws with states or memory start each recording at rest, at zero or at the first z; see `Local.from_zero`.
     """
     if not shapes:
-        return np.zeros((len(local.z), 0, columns(law)))
+        return np.zeros((len(local.z), 0, count_columns(law)))
     kind: Any = type(law)
     if law.scaled_by:
-        bare = trace(kind.__base__(law.values, law.limits), local, shapes)
+        bare = unit_forces(kind.__base__(law.values, law.limits), local, shapes)
         return np.asarray(bare * local.inputs[law.scaled_by][:, None, None])
-    step = _step(kind, len(shapes), local.dt if law.shifts else 0.0)
+    step = _all_lanes(kind, len(shapes), local.dt if law.shifts else 0.0)
     p = law.at(shapes[0]).parameters()
     names = [name for name in p if name not in law.strength]
     table = [np.ravel(shape.get(n, p[n].value)) for shape in shapes for n in names]
     vector = np.concatenate([*table, [local.dt]])
-    found, at = [], 0
+    found, begin = [], 0
     for i, m in enumerate(local.lengths):
-        zs, dzs = local.z[at : at + m], local.dz[at : at + m]
+        zs, dzs = local.z[begin : begin + m], local.dz[begin : begin + m]
         following = (np.append(values[1:], values[-1]) for values in (zs, dzs))
         rows = np.column_stack([zs, dzs, local.dt * np.arange(m), *following])
-        at += m
+        begin += m
         if step.size1_in(0):
             same = np.broadcast_to(vector, (m, len(vector)))
             first = kind().standing(0.0 if any(local.from_zero[i : i + 1]) else zs[0])
@@ -65,9 +65,9 @@ def trace(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.ndarra
 
 @one_at_a_time
 @functools.lru_cache(maxsize=256)
-def _step(kind: Any, lanes: int, grid: float) -> ca.Function:
-    """`(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`."""
-    lane = _lane(kind, grid)
+def _all_lanes(kind: Any, lanes: int, h: float) -> ca.Function:
+    """Build `(memory, [z, dz, t, z_next, dz_next], [shapes of all lanes, dt]) -> (next memory, forces)`."""
+    lane = _lane(kind, h)
     n, sizes = lane.size1_in(0), lane.size1_in(2)
     memory, signals = ca.SX.sym("memory", n * lanes), ca.SX.sym("signals", 5)
     vector = ca.SX.sym("shapes", sizes * lanes + 1)
@@ -79,34 +79,34 @@ def _step(kind: Any, lanes: int, grid: float) -> ca.Function:
 
 @one_at_a_time
 @functools.lru_cache(maxsize=256)
-def _lane(kind: Any, grid: float) -> ca.Function:
-    """`(memory, [z, dz, t, z_next, dz_next], shape, dt) -> (next memory, forces)` of one shape."""
+def _lane(kind: Any, h: float) -> ca.Function:
+    """Build `(memory, [z, dz, t, z_next, dz_next], shape, dt) -> (next memory, forces)` for one shape."""
     law = kind()
-    law = law.on_grid(grid) if law.shifts else law
+    law = law.on_grid(h) if law.shifts else law
     p = law.parameters()
     names = [name for name in p if name not in law.strength]
     sizes = [p[n].size for n in names]
-    vector, signals, h = ca.SX.sym("shape", sum(sizes)), ca.SX.sym("signals", 5), ca.SX.sym("h")
+    vector, signals, dt = ca.SX.sym("shape", sum(sizes)), ca.SX.sym("signals", 5), ca.SX.sym("dt")
     z, dz, t, following, dz_next = ca.vertsplit(signals)
     n_q, n_s = law.order, int(getattr(law, "memory", 0)) if hasattr(law, "step") else 0
     own = ca.SX.sym("memory", n_q + n_s)
     edges = np.cumsum([0, *sizes])
     shape = {n: vector[int(a) : int(b)] for n, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
     forces = []
-    for strength in _units(law):
+    for strength in _unit_strengths(law):
         values = _Values({**shape, **strength})
         if n_s:
             rate = {"dz": dz} if "dz" in law.reads() else {}
             w, end = law.step(z, own, values, **rate)
         else:
             w = _call(law.force, z=z, dz=dz, q=own, t=t, p=values)
-            end = _advance(law, own, (z, following), (dz, dz_next), t, values, h) if n_q else own
+            end = _advance(law, own, (z, following), (dz, dz_next), t, values, dt) if n_q else own
         forces.append(w)
-    return ca.Function("lane", [own, signals, vector, h], [ca.densify(end), ca.densify(ca.vertcat(*forces))])
+    return ca.Function("lane", [own, signals, vector, dt], [ca.densify(end), ca.densify(ca.vertcat(*forces))])
 
 
-def _units(law: Law) -> list[dict[str, Any]]:
-    """Strengths with one entry at one and the others at zero, in turn."""
+def _unit_strengths(law: Law) -> list[dict[str, Any]]:
+    """List the strengths with one entry at one and the others at zero, in turn."""
     p = law.parameters()
     zero = {name: ca.DM(np.zeros(p[name].value.shape)) for name in law.strength}
     out = []
@@ -128,7 +128,7 @@ def _call(function: Any, **available: Any) -> Any:
 
 
 def _advance(law: Law, q: Any, z: tuple[Any, Any], dz: tuple[Any, Any], t: Any, p: Any, h: Any) -> Any:
-    """One Runge-Kutta step of a law's own states along the chord of z."""
+    """Advance a law's own states by a Runge-Kutta step along the chord of z."""
 
     def flow(state: Any, share: float) -> Any:
         at = {k: a + share * (b - a) for k, (a, b) in {"z": z, "dz": dz}.items()}
