@@ -9,7 +9,18 @@ from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.offset import Offset
 from pilfr_casadi.diagnose.standing import standing
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.laws import CATALOGUE, Creep, Delay, Lag, Local, Magnitude, Quadratic, Resonance, TwoStageCreep
+from pilfr_casadi.laws import (
+    CATALOGUE,
+    Creep,
+    Delay,
+    Lag,
+    Local,
+    Magnitude,
+    Quadratic,
+    Resonance,
+    TwoStageCreep,
+    unit_forces,
+)
 from pilfr_casadi.simulators import discretise
 
 DT, M = 0.05, 1500
