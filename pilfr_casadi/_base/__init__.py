@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     )
     from .progress import Progress as Progress, progress_bar as progress_bar
     from .version import __version__ as __version__
-    from .worker_process import Reply as Reply, close_hands as close_hands, do as do
+    from .worker_process import Reply as Reply, close_workers as close_workers, run_in_worker as run_in_worker
     from .workers import (
         one_at_a_time as one_at_a_time,
         one_blas_thread as one_blas_thread,

@@ -1,9 +1,12 @@
-"""A job in a process of its own: killed when its time is up, and gone without harm when it dies.
+"""A job in a process of its own: killed when its time is up, and its death harms nobody.
 
-`do` is what an executor's workers are given. Each worker (a thread, a process, a Dask worker's thread) keeps one child
-process, its hand, and sends it one job after the other: a job that hangs, in Python or in compiled code, or one that
-the system ends for want of memory takes the hand along, and the worker lives on. The hand ends when its worker does,
-however that happened, because its standard input closes; and after `IDLE` seconds without a job.
+An executor's workers call `run_in_worker`. Each of them (a thread, a process, a Dask worker's thread) keeps one child
+process and sends it one job after the other: a job that hangs, in Python or in compiled code, or that the system ends
+for want of memory takes the child along, and the worker lives on. The child ends when its worker does, however that
+happened, because its standard input closes; and after `IDLE_SECONDS` without a job.
+
+Pools of other packages with killable workers (pebble, loky) start them by `multiprocessing`, which Dask's workers,
+daemons themselves, may not do, and which imports a user's script again in every child; hence a plain subprocess.
 """
 
 from __future__ import annotations
@@ -20,82 +23,81 @@ import threading
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-IDLE = 60.0  # seconds
+IDLE_SECONDS = 60.0  # a child holds some 100 MB
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
 class Reply:
-    """What became of a job: its `result`, or in place of it that its time was up, or how the hand was lost."""
+    """The result of a job; in its place, that its time was up, or how the child process was lost."""
 
     result: Any = None
     timed_out: bool = False
     lost: str = ""
-    begun: bool = True  # whether the job had begun when the hand was lost
+    begun: bool = True  # whether the job had begun when the child was lost
 
 
-def do(shared: bytes, job: bytes, limit: float | None = None) -> Reply:
-    """Call `pickle.loads(shared)(pickle.loads(job))` in this worker's hand.
+def run_in_worker(shared: bytes, job: bytes, limit: float | None = None) -> Reply:
+    """Call `pickle.loads(shared)(pickle.loads(job))` in the child process of this thread.
 
     Parameters
     ----------
     shared, job : bytes
-        Pickles of a function and of its argument. The hand keeps the function from one job to the next.
+        Pickles of a function and of its argument. The child keeps the function from one job to the next.
     limit : float, optional
-        Seconds it may take; starting the hand does not count.
+        Seconds it may take; starting the child does not count.
     """
-    hand: Hand | None = getattr(_mine, "hand", None)
-    if hand is not None and hand.process.poll() is None:
-        reply = hand.ask(shared, job, limit)
+    child: WorkerProcess | None = getattr(_of_this_thread, "child", None)
+    if child is not None and child.process.poll() is None:
+        reply = child.run(shared, job, limit)
         if reply.begun:
             return reply  # else it was idle for too long, just now
-    if hand is not None:
-        hand.close()
-    hand = _mine.hand = Hand()
-    return hand.ask(shared, job, limit)
+    if child is not None:
+        child.close()
+    child = _of_this_thread.child = WorkerProcess()
+    return child.run(shared, job, limit)
 
 
-def close_hands() -> None:
-    """End all hands of this process; jobs in them are lost."""
-    for hand in list(_hands):
-        hand.close()
+def close_workers() -> None:
+    """End all child processes of this process; their jobs are lost."""
+    for child in list(_children):
+        child.close()
 
 
-class Hand:
+class WorkerProcess:
     """The child process, seen from the worker."""
 
     def __init__(self) -> None:
         self.errors = tempfile.TemporaryFile()  # noqa: SIM115
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         self.process = subprocess.Popen(
-            [sys.executable, "-c", "from pilfr_casadi.hand import serve; serve()"],
+            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self.errors,
             env={**os.environ, **ONE_THREAD, "PYTHONPATH": path},
             start_new_session=True,  # Ctrl-C is for the process that waits for the results
         )
-        self.has: bytes | None = None
-        self.begun = False  # whether the latest job has been
-        _hands.add(self)
+        self.function: bytes | None = None  # the one that the child has
+        _children.add(self)
 
-    def ask(self, shared: bytes, job: bytes, limit: float | None) -> Reply:
-        """One job; see `do`."""
+    def run(self, shared: bytes, job: bytes, limit: float | None) -> Reply:
+        """Run one job; see `run_in_worker`."""
         assert self.process.stdin is not None and self.process.stdout is not None
         expired = threading.Event()
 
-        def strike() -> None:
+        def end() -> None:
             expired.set()
             self.process.kill()
 
-        timer = threading.Timer(limit or 0.0, strike)
+        timer = threading.Timer(limit or 0.0, end)
         timer.daemon = True
-        self.begun = False
+        begun = False
         try:
-            _write(self.process.stdin, (None if shared == self.has else shared, job))
-            self.has = shared
+            _write(self.process.stdin, (None if shared == self.function else shared, job))
+            self.function = shared
             _read(self.process.stdout)  # it has everything
-            self.begun = True
+            begun = True
             if limit is not None:
                 timer.start()
             try:
@@ -103,12 +105,11 @@ class Hand:
             finally:
                 timer.cancel()
         except (OSError, EOFError, ValueError):
-            lost = self._end()
+            lost = self._how_it_ended()
             self.close()
-            return Reply(timed_out=True) if expired.is_set() else Reply(lost=lost, begun=self.begun)
+            return Reply(timed_out=True) if expired.is_set() else Reply(lost=lost, begun=begun)
 
-    def _end(self) -> str:
-        """How the process has ended, in words."""
+    def _how_it_ended(self) -> str:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(5)
         code = self.process.poll()
@@ -129,18 +130,18 @@ class Hand:
             with contextlib.suppress(OSError, ValueError):
                 if pipe is not None:
                     pipe.close()
-        _hands.discard(self)
+        _children.discard(self)
 
 
-_mine = threading.local()
-_hands: set[Hand] = set()
-atexit.register(close_hands)
+_of_this_thread = threading.local()
+_children: set[WorkerProcess] = set()
+atexit.register(close_workers)
 
 
 def serve() -> None:
-    """The child process: jobs from standard input, results to standard output, one after the other."""
+    """Do jobs in the child process: they come by standard input, results go to standard output."""
     replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a job prints is no reply
+    os.dup2(2, 1)  # output of a job must not be taken for a reply
     inbox: queue.SimpleQueue[tuple[bytes | None, bytes]] = queue.SimpleQueue()
 
     def listen() -> None:
@@ -154,7 +155,7 @@ def serve() -> None:
     function: Any = None
     try:
         while True:
-            shared, job = inbox.get(timeout=IDLE)
+            shared, job = inbox.get(timeout=IDLE_SECONDS)
             if shared is not None:
                 function = pickle.loads(shared)
             _write(replies, None)
@@ -176,5 +177,4 @@ def _read(pipe: BinaryIO | Any) -> Any:
     size = pipe.read(8)
     if len(size) < 8:
         raise EOFError
-    data = pipe.read(int.from_bytes(size, "big"))
-    return pickle.loads(data)
+    return pickle.loads(pipe.read(int.from_bytes(size, "big")))

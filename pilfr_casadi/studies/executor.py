@@ -1,31 +1,33 @@
 """Jobs side by side over an executor: in the order in which they end, again where a worker has died.
 
-Every job runs in a process of its own (`hand`), whatever the executor is made of. What a job's result is does not
+Every job runs in a process of its own beside its worker, whatever the executor is made of. The result of a job does not
 depend on where, when or how often it ran.
 """
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import pickle
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from typing import Any
 
-from .._base import InputError, Reply, do
-from .jobs import LOST, TIMED_OUT, Batch, Outcome, RunJob, attempt, unfinished
-from .manifest import versions
+from .._base import InputError, Reply, run_in_worker
+from .jobs import LOST, TIMED_OUT, Batch, Outcome, RunJob, attempt, unfinished, versions
 
 AHEAD = 64  # jobs that an executor is given at a time
+SCHEDULER_TIMEOUT = 10.0  # seconds that a Dask scheduler has to answer
 
 
 def check_executor(executor: Any) -> None:
-    """Refuse what no job can be given to.
+    """Refuse an executor without `submit`.
 
     Raises
     ------
     InputError
-        That says what was given.
+        If it has none.
     """
     if executor is not None and not callable(getattr(executor, "submit", None)):
         raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")
@@ -40,12 +42,12 @@ def side_by_side(
     retries: int = 2,
     ahead: int = AHEAD,
 ) -> Iterator[Batch]:
-    """Outcomes as they arrive.
+    """Yield outcomes as they arrive.
 
     Parameters
     ----------
     function : callable
-        What to do with a job; it is pickled.
+        Called with each job; it is pickled.
     executor : concurrent.futures.Executor
         Threads, processes, or a Dask cluster's.
     time_limit : float, optional
@@ -66,7 +68,7 @@ def side_by_side(
         while waiting or running:
             while waiting and len(running) < ahead:
                 job, trial = waiting.popleft()
-                running[executor.submit(do, shared, _pickled(job), time_limit)] = job, trial
+                running[executor.submit(run_in_worker, shared, _pickled(job), time_limit)] = job, trial
             batch: Batch = []
             stop: Exception | None = None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -101,7 +103,7 @@ def side_by_side(
 
 
 def _reply(future: Future[Reply]) -> Reply:
-    """A future's reply; an error of the executor's own counts as a worker lost."""
+    """Return a future's reply; an error of the executor's own counts as a lost worker."""
     try:
         return future.result()
     except (BrokenExecutor, CancelledError):
@@ -124,14 +126,14 @@ def _outcome(reply: Reply, time_limit: float | None) -> Outcome:
     return outcome
 
 
-class Sent:
-    """`attempt` on a run and its recordings, with the versions that it used."""
+class Attempt:
+    """A function that workers call: do a job of a run, and say with which versions."""
 
     def __init__(self, run: Any, recordings: Any) -> None:
         self.run, self.recordings = run, recordings
 
     def __call__(self, job: RunJob) -> tuple[Outcome, dict[str, str]]:
-        """The outcome of a job, and what it was computed with."""
+        """Return the outcome of a job, and the versions it was computed with."""
         return attempt(self.run, self.recordings, job), versions()
 
 
@@ -149,3 +151,38 @@ def _pickled(thing: Any) -> bytes:
             f"The model or a constraint cannot be sent to other processes ({reason}); install "
             "pilfr-casadi[dask], which can send code, or use workers=1 without a time limit."
         ) from None
+
+
+@contextlib.contextmanager
+def dask_executor(address: str) -> Iterator[tuple[Executor, int, int]]:
+    """Yield an executor of a Dask cluster, how many jobs it does at a time, and how many to give it at a time.
+
+    Parameters
+    ----------
+    address : str
+        Of the scheduler, such as `tcp://host:8786`.
+
+    Raises
+    ------
+    InputError
+        If `distributed` is not installed, or no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--dask needs the package distributed; install pilfr-casadi[dask].") from None
+    for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters comes as an error of a job
+    try:
+        client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f"No Dask scheduler can be used at {address} ({reason}); check the address, or start one with "
+            "`dask scheduler` and workers with `dask worker`."
+        ) from None
+    try:
+        threads = sum(client.nthreads().values())
+        yield client.get_executor(pure=False), threads, max(AHEAD, 2 * threads)
+    finally:
+        client.close(timeout=2)

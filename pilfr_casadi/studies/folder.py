@@ -1,51 +1,56 @@
-"""The folder of a run's results: one of its own, so that nothing of anybody else's is written over.
+"""The folder of a run: the manifest, the models and tables, and which jobs are complete.
 
-Everything in it but `times.json` is the same to the last byte in every execution of a run on one machine; how long the
-jobs took is different every time and lies apart.
+The manifest says what was computed from which inputs, with which versions, and the SHA-256 of every file. It carries its
+own digest, so that a manifest that was edited is not taken for the run's; the digests of the files tell the same of
+models and tables. No time is in it: everything in the folder but `times.json` is the same to the last byte in every
+execution of a run on one machine.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import re
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from .._base import InputError, listed
-from ..export import write_atomically
-from .manifest import NAME
+from ..export import digest, write_atomically
+from ..identify import load
+from ..models import Model
+from .jobs import BAD_ENDS, FAILED, LOST, TIMED_OUT, Outcome, Recordings, RunJob, error_of, file_digest, versions
+from .schema import Run
+from .summary import Score, results_table, scored_files
 
+FORMAT, VERSION, MANIFEST = "pilfr_casadi run", 1, "manifest.json"
 TABLE, PAGE, MODEL, TIMES, JOBS, LOCK = "results.csv", "report.html", "model.json", "times.json", "jobs", ".lock"
 SUMMARY, PICTURE = "summary.csv", "spread.png"  # of a campaign
-OWN = (NAME, TABLE, PAGE, MODEL, SUMMARY, PICTURE, TIMES, JOBS)
-
-
-def check_inside(file: Path, out: str) -> str | None:
-    """What is wrong with a folder that a run file names, None where it is a folder below the file's own."""
-    above = file.parent.resolve()
-    try:
-        inside = above in (above / out).resolve().parents
-    except (OSError, RuntimeError, ValueError):
-        inside = False
-    if inside:
-        return None
-    return f"'out' is {out[:60]!r}, which is no folder below that of the run file; give one, or another with --out"
+OWN = (MANIFEST, TABLE, PAGE, MODEL, SUMMARY, PICTURE, TIMES, JOBS)
+TABLE_PAUSE = 1.0  # seconds between two tables of a campaign at work
+ADVICE = "restore it, or give --overwrite to compute everything again"
 
 
 def check_own(folder: Path, file: Path, overwrite: bool) -> None:
-    """Refuse a folder that holds the run file, or what is no run's.
+    """Refuse a folder that holds the run file, or files of somebody else.
 
     Raises
     ------
     InputError
-        That says what was found there.
+        That names what was found there.
     """
-    if folder.resolve() in file.resolve().parents:
+    place = os.path.realpath(folder)
+    if place in map(str, Path(os.path.realpath(file)).parents):
         raise InputError(f"The folder {folder} holds the run file {file.name}; give results a folder of their own.")
-    if not folder.is_dir():
+    if not os.path.isdir(place):
         return
-    found = sorted(p.name for p in folder.iterdir() if p.name != LOCK and not _half_written(p.name))
-    if NAME in found:
+    found = sorted(name for name in os.listdir(place) if name != LOCK and not _is_half_written(name))
+    if MANIFEST in found:
         return
     foreign = [name for name in found if name not in OWN]
     if foreign:
@@ -56,20 +61,37 @@ def check_own(folder: Path, file: Path, overwrite: bool) -> None:
         raise InputError(f"{folder} holds {found[0]} but no manifest of a run; give another --out, or --overwrite.")
 
 
-def sweep(folder: Path) -> None:
-    """Remove what a run that was killed has left half written; the folder's lock is held."""
-    for path in (*folder.iterdir(), *folder.glob(f"{JOBS}/*/.*")):
-        if _half_written(path.name):
-            path.unlink(missing_ok=True)
-
-
-def _half_written(name: str) -> bool:
-    """Whether a file is the beginning of a run's file, as `write_atomically` calls it."""
+def _is_half_written(name: str) -> bool:
+    """Whether a file is the beginning of a run's file, as `write_atomically` names it."""
     return re.fullmatch(rf"\.({'|'.join(map(re.escape, OWN))})\.[0-9a-f]{{8}}\.tmp", name) is not None
 
 
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other runs out of a folder and remove half-written files; the lock ends with the process, however it ends.
+
+    Raises
+    ------
+    InputError
+        If another run is at work there.
+    """
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(ImportError):  # on systems without such locks
+            import fcntl
+
+            lock = stack.enter_context((folder / LOCK).open("w"))
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise InputError(f"Another run is at work in {folder}; wait for it, or give another --out.") from None
+        for path in (*folder.iterdir(), *folder.glob(f"{JOBS}/*/.*")):
+            if _is_half_written(path.name):
+                path.unlink(missing_ok=True)
+        yield
+
+
 def read_times(folder: Path) -> dict[str, float]:
-    """Seconds that each job took, as far as they are known."""
+    """Return the seconds that each job took, as far as they are known."""
     try:
         found = json.loads((folder / TIMES).read_text(encoding="utf-8"))
         return {str(job): float(seconds) for job, seconds in found.items()}
@@ -77,7 +99,192 @@ def read_times(folder: Path) -> dict[str, float]:
         return {}
 
 
-def note_times(folder: Path, seconds: Mapping[str, float]) -> None:
-    """Add the seconds of some jobs to those of the others."""
-    times = {**read_times(folder), **{job: round(value, 3) for job, value in seconds.items()}}
-    write_atomically(folder / TIMES, json.dumps(times, indent=1, sort_keys=True) + "\n")
+class Manifest:
+    """The manifest in a folder, written anew, atomically, after every step."""
+
+    def __init__(self, folder: Path, content: dict[str, Any] | None = None) -> None:
+        tables: dict[str, Any] = {key: {} for key in ("jobs", "scores", "files", "inputs")}
+        self.folder = folder
+        self.content = content or {"format": FORMAT, "version": VERSION, **tables}
+
+    @classmethod
+    def read(cls, folder: Path) -> Manifest:
+        """Read the manifest of an earlier run, an empty one where there is none.
+
+        Raises
+        ------
+        InputError
+            If it is damaged, of another version, or was changed after the run wrote it.
+        """
+        path = folder / MANIFEST
+        if not path.exists():
+            return cls(folder)
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            content = None
+        if not isinstance(content, dict):
+            raise InputError(f"{path} is not a manifest of a run; {ADVICE}.")
+        if content.get("format") != FORMAT or content.get("version") != VERSION:
+            raise InputError(f"{path} is not a manifest that this release writes; {ADVICE}.")
+        if content.pop("sha256", None) != digest(content):
+            raise InputError(f"{path} was changed after the run wrote it; {ADVICE}.")
+        return cls(folder, content)
+
+    def write(self) -> None:
+        """Write it, with its digest."""
+        content = {**self.content, "sha256": digest(self.content)}
+        text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
+        write_atomically(self.folder / MANIFEST, text + "\n")
+
+    def holds(self, name: str) -> bool:
+        """Whether a file of the run is there, as the run wrote it; False where it is missing.
+
+        Raises
+        ------
+        InputError
+            If it was changed.
+        """
+        path = self.folder / name
+        if name not in self.content["files"] or not path.is_file():
+            return False
+        # a run that ended between a file and its manifest has announced the file in the manifest before
+        expected = self.content["files"][name], self.content.get("writing", {}).get(name)
+        if file_digest(path) not in expected:
+            raise InputError(
+                f"{path} was changed after the run wrote it; restore it, remove it, or give --overwrite to compute "
+                "everything again."
+            )
+        return True
+
+    def put(self, name: str, content: str | bytes) -> None:
+        """Write a file of the run and note its digest, in the manifest too where it has changed."""
+        data = content.encode() if isinstance(content, str) else content
+        if self.content["files"].get(name) != digest(data) or not self.holds(name):
+            self.put_all({name: data})
+
+    def put_all(self, contents: Mapping[str, bytes], jobs: Mapping[str, Any] | None = None) -> None:
+        """Announce files of the run, write them, then note their digests and the entries of the jobs they end."""
+        found = {name: digest(data) for name, data in contents.items()}
+        if contents:
+            self.content["writing"] = found
+            self.write()
+        for name, data in contents.items():
+            target = self.folder / name
+            try:
+                target.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(
+                    f"The folder {target.parent} cannot be made ({error.strerror}); give another."
+                ) from None
+            write_atomically(target, data)
+        self.content["files"] |= found
+        self.content["jobs"] |= jobs or {}
+        self.write()
+
+
+class Store:
+    """The results of a run: what it has written, and writes.
+
+    Raises
+    ------
+    InputError
+        If files of the run were changed afterwards; for a campaign also if its results are of other versions.
+    """
+
+    def __init__(
+        self, path: Path, run: Run, inputs: Mapping[str, str], recordings: Recordings, overwrite: bool, campaign: bool
+    ) -> None:
+        self.path, self.run, self.inputs, self.recordings, self.campaign = path, run, inputs, recordings, campaign
+        self.manifest = Manifest(path) if overwrite else Manifest.read(path)
+        for name in (TABLE, MODEL, PAGE, SUMMARY, PICTURE):
+            self.manifest.holds(name)
+        if campaign:
+            _refuse_other_versions(self.manifest)
+        said = {"file": run.file.name, "said": run.said}
+        self.manifest.content |= {"run": said, "versions": versions(), "inputs": dict(inputs)}
+        self.manifest.write()
+        self.written = -np.inf
+
+    @property
+    def entries(self) -> dict[str, Any]:
+        """The entries of the jobs in the manifest."""
+        entries: dict[str, Any] = self.manifest.content["jobs"]
+        return entries
+
+    def complete(self, job: RunJob) -> bool:
+        """Whether a job has been done from the same inputs, and its model is there as it was written."""
+        entry = self.entries.get(job.id, {})
+        if entry.get("key") != job.key or entry["status"] == LOST:
+            return False
+        if entry["status"] == TIMED_OUT:  # given more time, it is tried again
+            return self.campaign and self.run.time_limit is not None and self.run.time_limit <= entry["time_limit"]
+        if entry["status"] == FAILED:
+            return self.campaign
+        return not self.has_model(job) or self.manifest.holds(job.model_file)
+
+    def ended_well(self, job: RunJob) -> bool:
+        """Whether a job gave a model that meets its constraints."""
+        return self.entries[job.id]["status"] not in BAD_ENDS
+
+    def has_model(self, job: RunJob) -> bool:
+        """Whether there is a model of a job."""
+        return job.fold is None and self.ended_well(job)
+
+    def note(self, batch: Sequence[tuple[RunJob, Outcome]]) -> None:
+        """Write the models of jobs that have been done, then their entries in the manifest."""
+        entries = {job.id: {**job.parameters, "key": job.key, **found.entry} for job, found in batch}
+        models = {job.model_file: found.model.encode() for job, found in batch if found.model is not None}
+        for job, found in batch:
+            for name, error in found.errors.items():
+                self.manifest.content["scores"][self._score_key(digest(models[job.model_file]), name)] = error
+        times = read_times(self.path) | {job.id: round(found.seconds, 3) for job, found in batch}
+        write_atomically(self.path / TIMES, json.dumps(times, indent=1, sort_keys=True) + "\n")
+        self.manifest.put_all(models, entries)
+
+    def scores(self, jobs: Sequence[RunJob], last: bool = False) -> list[Score]:
+        """Return the errors of the jobs' models, from the manifest where it has them; `last` drops all others there."""
+        out, used, known = [], set(), self.manifest.content["scores"]
+        for job in (j for j in jobs if self.ended_well(j)):
+            if job.fold is not None:
+                entry, name = self.entries[job.id], f"fold {job.fold}"
+                out += [Score(job.id, "train", name, entry["train"]), Score(job.id, "held", name, entry["held"])]
+                continue
+            fit = None
+            for role, name, recording in scored_files(self.run, self.recordings):
+                key = self._score_key(self.manifest.content["files"][job.model_file], name)
+                if key not in known:
+                    fit = fit or self.load(job)
+                    known[key] = error_of(replace(fit, engine=self.run.engine), recording)
+                used.add(key)
+                out.append(Score(job.id, role, name, np.nan if known[key] is None else float(known[key])))
+        if last:
+            self.manifest.content["scores"] = {key: error for key, error in known.items() if key in used}
+        return out
+
+    def load(self, job: RunJob) -> Any:
+        """Load the model of a job."""
+        own = self.run.cells[job.cell].model
+        return load(self.path / job.model_file, model=own if isinstance(own, Model) else None)
+
+    def _score_key(self, model: str, name: str) -> str:
+        reading = {k: str(v) for k, v in self.run.reading.items()}
+        return digest({"model": model, "data": self.inputs[name], "reading": reading})
+
+    def write_table(self, jobs: Sequence[RunJob], last: bool = False) -> None:
+        """Write the errors so far, for readers of a campaign that is at work; not too often, but for the last time."""
+        if not self.campaign or (not last and time.monotonic() < self.written + TABLE_PAUSE) or not jobs:
+            return
+        self.manifest.put(TABLE, results_table(self.scores(jobs), jobs, self.entries, ""))
+        self.written = time.monotonic()
+
+
+def _refuse_other_versions(manifest: Manifest) -> None:
+    """Refuse to mix results of different versions in one campaign, which is there to compare them."""
+    before, now = manifest.content.get("versions", {}), versions()
+    for name in now:
+        if manifest.content["jobs"] and before.get(name) != now[name]:
+            raise InputError(
+                f"{manifest.folder / MANIFEST} has results of {name} {before.get(name)}, and this is {now[name]}; give "
+                "another --out, or --overwrite to compute everything again."
+            )

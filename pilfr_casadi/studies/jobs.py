@@ -1,33 +1,41 @@
-"""The jobs of a run: independent identifications with ids that stay, and keys that say what each depends on.
+"""The jobs of a run: independent identifications with ids that stay, and keys that tell when one must be done again.
 
 The id of a job names what sets it apart from the others (`seed-0`). Its key is the SHA-256 of everything that its model
 depends on: the contents of the recordings it reads, how they are read, model, solver, constraints, seed, versions, and
-in a cross-validation what its fold is fitted to and held out. A job whose key is known and whose model is there has
+in a cross-validation which samples its fold fits and holds out. A job whose key is known and whose model is there has
 been done.
+
+In a cross-validation the training recordings are in parts, each held out once. With at least as many different inputs
+as folds, whole recordings are dealt out in turn, those of one input together. With fewer, every recording is cut into as
+many blocks as there are folds; the state after a cut is estimated, and in a block held out the samples it is estimated
+from are not scored (`Fit.scored_from`). Blocks of an input that repeats, as in steady periods, are refused: they would
+hold out what the rest shows.
 """
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress
-from ..data import NOTHING_SENTENCE, Recording, explains_nothing, fingerprint
+from .._base import InputError, Progress, __version__
+from ..data import NOTHING_SENTENCE, Recording, explains_nothing, fingerprint, group_by_input, repeats_itself
 from ..export import digest, model_text
 from ..identify import Fit, fit as identify, operators_used, prune, regularization_path
 from ..models import Model
 from ..optimise import Solution, Status
-from .described import Run
-from .folds import fold
-from .manifest import file_digest, versions
+from .schema import Run
 
 Recordings = Mapping[str, tuple[Recording, ...]]
 # how a job of a campaign may end besides a solver's status
 FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"
+BAD_ENDS = (FAILED, TIMED_OUT, LOST, Status.INFEASIBLE.name)  # without a model
+FEWEST_SAMPLES = 20  # of a block of a cross-validation; fewer are not enough to estimate its initial state
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,23 +48,23 @@ class RunJob:
 
     @property
     def id(self) -> str:
-        """A name that is the same in every execution of the run."""
+        """The name, the same in every execution of the run."""
         return "_".join(f"{name}-{value}" for name, value in self.parameters.items())
 
     @property
     def fold(self) -> int | None:
-        """Which part of the training it holds out; None where none."""
+        """The part of the training that it holds out; None for none."""
         return self.parameters.get("fold")
 
     @property
     def model_file(self) -> str:
-        """Its model, below the folder of the run."""
+        """The file of its model, below the folder of the run."""
         return f"jobs/{self.id}/model.json"
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a job amounts to: its line of the manifest, the time it took, its model file, its NRMSE by recording."""
+    """The result of a job: its entry in the manifest, the time it took, its model file, its NRMSE by recording."""
 
     entry: dict[str, Any]
     seconds: float = 0.0
@@ -67,13 +75,42 @@ class Outcome:
 Batch = list[tuple[RunJob, Outcome]]  # jobs that ended together
 
 
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        return digest(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); check its name and permissions.") from None
+
+
+def versions() -> dict[str, str]:
+    """Return what the numbers of a run depend on besides its inputs."""
+    import casadi
+    import scipy
+
+    return {
+        "pilfr_casadi": __version__,
+        "casadi": casadi.__version__,
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+    }
+
+
 def input_digests(run: Run) -> dict[str, str]:
-    """SHA-256 of every recording by its name in the run file."""
+    """Return the SHA-256 of every recording by its name in the run file."""
     return {name: file_digest(run.located(name)) for names in run.files.values() for name in names}
 
 
 def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | None = None) -> tuple[RunJob, ...]:
-    """One job a cell and seed.
+    """Return one job a cell and seed.
 
     Parameters
     ----------
@@ -107,8 +144,41 @@ def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | No
 
 
 def _contents(parts: Sequence[Sequence[Recording]]) -> list[list[tuple[str, int]]]:
-    """What recordings of several roles hold, in short."""
+    """Return fingerprints of recordings."""
     return [[(fingerprint(r), r.skip) for r in part] for part in parts]
+
+
+def fold(recordings: Sequence[Recording], k: int, folds: int) -> tuple[tuple[Recording, ...], tuple[Recording, ...]]:
+    """Return the recordings that are fitted and those that are held out in fold k of `folds`.
+
+    Raises
+    ------
+    InputError
+        If the recordings are too short to be cut, or a block of one has the same input as its other blocks.
+    """
+    groups = group_by_input(recordings)
+    if len(groups) >= folds:
+        out = {i for number, group in enumerate(groups) if number % folds == k for i in group}
+        dealt = list(enumerate(recordings))
+        return tuple(r for i, r in dealt if i not in out), tuple(r for i, r in dealt if i in out)
+    train: list[Recording] = []
+    held: list[Recording] = []
+    for r in recordings:
+        first, last = (r.skip + round(share * (len(r) - r.skip) / folds) for share in (k, k + 1))
+        if last - first < FEWEST_SAMPLES:
+            raise InputError(f"{r.label} has {len(r)} samples, too few for {folds} folds; give fewer folds.")
+        if repeats_itself(r):
+            fewer = f"folds = {len(groups)}, " if len(groups) > 1 else ""
+            raise InputError(
+                f"folds = {folds} was given and the input of {r.label} repeats, so whatever block is held out has the "
+                f"input of what is fitted and proves nothing; give {fewer}other realizations, or validation data."
+            )
+        held.append(r.slice(first, last))
+        if k > 0:
+            train.append(r.slice(0, first))
+        if k < folds - 1:
+            train.append(r.slice(last))
+    return tuple(train), tuple(held)
 
 
 def outcome(
@@ -128,7 +198,7 @@ def outcome(
     KeyboardInterrupt
         On Ctrl-C.
     """
-    fit = timeless(found := _identified(run, recordings, job, executor, progress))
+    fit = _without_times(found := _identify(run, recordings, job, executor, progress))
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     missed = [str(limit) for limit in fit.limits if not limit.met]
@@ -153,7 +223,7 @@ def outcome(
 
 
 def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:
-    """A job of a campaign: `outcome`, where one that cannot be done is an outcome too."""
+    """Do a job of a campaign; one that cannot be done has an outcome too."""
     try:
         return outcome(run, recordings, job)
     except Exception as error:
@@ -163,12 +233,12 @@ def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:
 
 
 def unfinished(status: str, sentence: str, **more: Any) -> Outcome:
-    """The outcome of a job without a model."""
+    """Make the outcome of a job without a model."""
     return Outcome({"status": status, "sentence": sentence, "operators_used": "", **more})
 
 
 def error_of(fit: Fit, recording: Recording) -> float | None:
-    """NRMSE (Krikelis et al. 2024, Eq. 27) on a recording; None where it cannot be told."""
+    """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) on a recording; None where it cannot be computed."""
     try:
         error = fit.nrmse(recording)
     except InputError:
@@ -176,10 +246,10 @@ def error_of(fit: Fit, recording: Recording) -> float | None:
     return error if np.isfinite(error) else None
 
 
-def _identified(
+def _identify(
     run: Run, recordings: Recordings, job: RunJob, executor: Executor | None, progress: Progress | None
 ) -> Fit:
-    """The model of a job: nothing but its training recordings and, for a path, the validation is looked at."""
+    """Identify the model of a job from its training recordings and, for a path, the validation; nothing else is read."""
     options: dict[str, Any] = {
         "solver": run.solver,
         "stable": run.stable,
@@ -212,15 +282,15 @@ def _identified(
     return found
 
 
-def timeless(fit: Fit) -> Fit:
-    """The fit without the times it took, which no second execution would repeat."""
+def _without_times(fit: Fit) -> Fit:
+    """Drop the times a fit took, which no second execution would repeat."""
     return replace(
         fit,
         seconds=0.0,
-        solution=_timeless(fit.solution),
-        candidates=tuple(replace(c, solution=_timeless(c.solution)) for c in fit.candidates),
+        solution=_solution_without_times(fit.solution),
+        candidates=tuple(replace(c, solution=_solution_without_times(c.solution)) for c in fit.candidates),
     )
 
 
-def _timeless(solution: Solution) -> Solution:
+def _solution_without_times(solution: Solution) -> Solution:
     return replace(solution, seconds=0.0, history=tuple(replace(h, seconds=0.0) for h in solution.history))

@@ -22,3 +22,4 @@ LARGEST_SIZE = {
     "workers": 1_024,  # processes: each takes 100 MB and more
 }
 MOST_JOBS = 100_000  # of a run: the manifest names each, about 300 bytes a job, and is written after every one
+MOST_SAMPLES = 10**9  # of a period, or left out: 8 GB a channel

@@ -1,25 +1,85 @@
-"""What a study shows: quartiles and failures of every cell on every recording, as a table and as box plots.
+r"""The errors of a run in tables and box plots, the model that is chosen, and the structure that is recommended.
 
 The box plots are those of Krikelis et al. (2024), Fig. 11.
+
+A structure is selected by cross-validation, or by a validation recording, with the rule of `order_selection`: with
+:math:`e(c)` the error of a cell on recordings it has not been fitted to, take the cell of the fewest free parameters
+among :math:`\{c : e(c) \le (1 + m) \min_k e(k)\}`. In each fold the seed of the smallest training error stands for its
+cell, and :math:`e(c)` is the mean over the folds: the part held out judges, and has no part in what it judges.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from .described import Run
-from .grid import Cell, grid_keys
-from .jobs import RunJob
-from .results import Score
+from .._base import InputError
+from ..data import Recording
+from ..models import Model
+from .jobs import Recordings, RunJob
+from .schema import ROLES, Cell, Run, grid_keys
 
 QUARTILES = ("smallest", "lower_quartile", "median", "upper_quartile", "largest")
 FOLDS = "folds"
+SELECTION_MARGIN = 0.05  # share of the smallest error that a smaller structure may cost; convention, as order_selection
+
+
+@dataclass(frozen=True)
+class Score:
+    """NRMSE (Krikelis et al. 2024, Eq. 27) of a job's model on a recording; nan where it cannot be computed."""
+
+    job: str
+    role: str
+    recording: str
+    nrmse: float
+
+
+def scored_files(run: Run, recordings: Recordings) -> Iterator[tuple[str, str, Recording]]:
+    """Yield role, name and recording of every file of a run."""
+    for role in ROLES:
+        for name, recording in zip(run.files[role], recordings[role], strict=True):
+            yield role, name, recording
+
+
+def choose_job(scores: Sequence[Score], jobs: Sequence[str]) -> str:
+    """Return the job of the smallest validation error; without validation recordings, of the smallest training error."""
+    judge = "validation" if any(s.role == "validation" for s in scores) else "train"
+    errors: dict[str, list[float]] = {}
+    for s in scores:
+        if s.role == judge and s.job in jobs:
+            errors.setdefault(s.job, []).append(s.nrmse if np.isfinite(s.nrmse) else np.inf)
+    return min(errors, key=lambda job: (float(np.mean(errors[job])), list(errors).index(job)))
+
+
+def results_table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapping[str, Any], best: str) -> str:
+    """Write results.csv: one row a job and recording, numbers to the last digit; one row for a job without a model."""
+    keys = grid_keys(job.parameters for job in jobs) + ["fold"] * any(job.fold is not None for job in jobs)
+    by_job: dict[str, list[Score]] = {}
+    for s in scores:
+        by_job.setdefault(s.job, []).append(s)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["job", "seed", "chosen", *keys, "status", "operators_used", "role", "recording", "nrmse"])
+    for job in jobs:
+        entry = entries[job.id]
+        about = [job.id, job.parameters["seed"], int(job.id == best), *(job.parameters.get(k, "") for k in keys)]
+        for s in by_job.get(job.id, [Score(job.id, "", "", np.nan)]):
+            writer.writerow([*about, entry["status"], entry["operators_used"], s.role, s.recording, repr(s.nrmse)])
+    return text.getvalue()
+
+
+def reasons(entries: Mapping[str, Mapping[str, Any]], ids: Sequence[str]) -> list[str]:
+    """Say why jobs have no model: a line for every distinct reason, with the first job that has it."""
+    found: dict[str, list[str]] = {}
+    for job in ids:
+        found.setdefault(entries[job]["sentence"], []).append(job)
+    more = {text: f" and {len(jobs) - 1} more" if len(jobs) > 1 else "" for text, jobs in found.items()}
+    return [f"{jobs[0]}{more[text]}: {text}" for text, jobs in found.items()]
 
 
 @dataclass(frozen=True)
@@ -58,7 +118,7 @@ class CellSummary:
 def errors_by_cell(
     run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]
 ) -> dict[tuple[str, str], dict[int, dict[str, float]]]:
-    """(Role, recording) -> number of the cell -> job -> NRMSE, infinite where the job has none."""
+    """Map (role, recording) -> number of the cell -> job -> NRMSE, infinite where the job has none."""
     known = {(s.job, s.role, FOLDS if s.recording.startswith("fold ") else s.recording): s.nrmse for s in scores}
     whole = [(role, name) for role, names in run.files.items() for name in names]
     pairs = [(p, False) for p in whole] + [((role, FOLDS), True) for role in ("train", "held") if run.folds]
@@ -71,14 +131,14 @@ def errors_by_cell(
     return out
 
 
-def summarised(
+def summarise(
     run: Run,
     jobs: Sequence[RunJob],
     scores: Sequence[Score],
     times: Mapping[str, float],
     entries: Mapping[str, Mapping[str, Any]],
 ) -> tuple[CellSummary, ...]:
-    """One summary a recording and cell."""
+    """Summarise each cell on each recording."""
     out = []
     for (role, name), cells in errors_by_cell(run, jobs, scores).items():
         for number, errors in cells.items():
@@ -93,7 +153,7 @@ def summarised(
 
 
 def summary_table(run: Run, summary: Sequence[CellSummary]) -> str:
-    """summary.csv: one row a recording and cell, numbers to the last digit."""
+    """Write summary.csv: one row a recording and cell, numbers to the last digit."""
     keys = grid_keys(cell.values for cell in run.cells)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -105,7 +165,7 @@ def summary_table(run: Run, summary: Sequence[CellSummary]) -> str:
 
 
 def box_plots(run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]) -> bytes:
-    """Box plots of all cells, one picture a recording, as PNG."""
+    """Draw box plots of all cells, one picture a recording, as PNG."""
     from ..plots import compared_spread
 
     cells = [cell.values for cell in run.cells]
@@ -124,3 +184,86 @@ def box_plots(run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]) -> byte
 
 def _label(cell: Cell, keys: Sequence[str]) -> str:
     return "\n".join(str(cell.values.get(k, "-")) for k in keys) or "all jobs"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Selection:
+    """Errors of the structures on recordings they have not been fitted to, and the structure to take.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The cells by their values.
+    parameters : tuple of int
+        Free parameters of each.
+    errors : tuple of float
+        NRMSE held out; infinite where no job of the cell, or of one of its folds, gave a model.
+    cell : int
+        Number of the cell recommended.
+    margin : float
+        How much worse than the best it may be, as a share.
+    judge : str
+        The recordings that were held out.
+    """
+
+    names: tuple[str, ...]
+    parameters: tuple[int, ...]
+    errors: tuple[float, ...]
+    cell: int
+    margin: float
+    judge: str
+
+    def __repr__(self) -> str:
+        width = max(len(name) for name in (*self.names, "structure"))
+        rows = [f"{'structure':<{width}}  parameters       NRMSE"]
+        for k, (name, n, e) in enumerate(zip(self.names, self.parameters, self.errors, strict=True)):
+            rows.append(f"{name:<{width}}  {n:>10}  {e:>10.4f}{'  <- recommended' if k == self.cell else ''}")
+        return "\n".join([*rows, f"fewest parameters within {100 * self.margin:g} % of the best on the {self.judge}"])
+
+
+def select(
+    run: Run,
+    jobs: Sequence[RunJob],
+    scores: Sequence[Score],
+    entries: Mapping[str, Mapping[str, Any]],
+    recording: Recording,
+) -> Selection:
+    """Compare the cells of a run.
+
+    Parameters
+    ----------
+    run : Run
+    jobs : sequence of RunJob
+        Those of the cross-validation, or with models to judge on the validation recordings.
+    scores : sequence of Score
+    entries : mapping
+        Of the jobs, in the manifest.
+    recording : Recording
+        Any of the run, for the number of inputs and outputs.
+
+    Raises
+    ------
+    InputError
+        If no cell can be judged.
+    """
+    counts, errors = [], []
+    judged: dict[str, list[float]] = {}
+    for s in scores:
+        if s.role == ("held" if run.folds else "validation"):
+            judged.setdefault(s.job, []).append(s.nrmse if np.isfinite(s.nrmse) else np.inf)
+    for number, cell in enumerate(run.cells):
+        own = cell.model
+        model = own if isinstance(own, Model) else own.model(recording.n_u, recording.n_y)
+        counts.append(int(model.parameters.free.sum()))
+        parts: dict[int | None, list[RunJob]] = {k: [] for k in (range(run.folds) if run.folds else (None,))}
+        for job in (j for j in jobs if j.cell == number and j.id in judged):
+            parts[job.fold].append(job)
+        best = [min(p, key=lambda j: entries[j.id]["train"]) if p else None for p in parts.values()]
+        errors.append(float(np.mean([np.inf if j is None else np.mean(judged[j.id]) for j in best])))
+    if not np.isfinite(min(errors)):
+        raise InputError(f"{run.file}: no structure can be judged; {jobs[0].id}: {entries[jobs[0].id]['sentence']}")
+    enough = [k for k, e in enumerate(errors) if e <= (1 + SELECTION_MARGIN) * min(errors)]
+    names = tuple(cell.name or "the model" for cell in run.cells)
+    judge = f"{run.folds} folds" if run.folds else "validation recordings"
+    take = min(enough, key=lambda k: (counts[k], errors[k]))
+    return Selection(names, tuple(counts), tuple(errors), take, SELECTION_MARGIN, judge)

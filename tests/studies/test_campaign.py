@@ -17,14 +17,13 @@ from command_line import write_csv
 from run_files import PYTHON, changed, command, contents, prepared
 
 import pilfr_casadi as pilfr
-from pilfr_casadi._base import Clock, InputError, time_limit, worker_process as hand
-from pilfr_casadi.cli.app import main
-from pilfr_casadi.studies import RunInterrupted
-from pilfr_casadi.studies.manifest import Manifest
+from pilfr_casadi._base import Clock, InputError, close_workers, time_limit, worker_process
+from pilfr_casadi.cli import main
+from pilfr_casadi.studies import Manifest, RunInterrupted
 
 SLOW = """
 import os, pathlib, time, tomllib
-from pilfr_casadi.multistart import POLISH
+from pilfr_casadi.identify import POLISH
 
 class Slow:
     def __init__(self, folder):
@@ -89,7 +88,7 @@ def test_the_numbers_do_not_depend_on_the_executor(folder, serial, cluster):
         found["pool"] = pilfr.campaign(folder / "rig.toml", out=folder / "c", executor=pool).folder
     with cluster.get_client() as client:
         found["dask"] = pilfr.campaign(folder / "rig.toml", out=folder / "d", executor=client.get_executor()).folder
-    hand.close_hands()
+    close_workers()
     for name, out in found.items():
         assert compared(out) == serial, name
         assert contents(out) == contents(found["processes"]), name
@@ -190,7 +189,7 @@ def test_ctrl_c_after_the_jobs_says_that_they_are_done(folder, monkeypatch, caps
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.execute"), "summarised", interrupted)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.execution"), "summarise", interrupted)
     assert main(["campaign", str(folder / "rig.toml")]) == 130
     assert "8 of 8 jobs are done" in capsys.readouterr().err
     assert len({r["job"] for r in rows(folder / "rig-campaign")}) == 8
@@ -198,7 +197,7 @@ def test_ctrl_c_after_the_jobs_says_that_they_are_done(folder, monkeypatch, caps
 
 @pytest.mark.usefixtures("heard")
 def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
-    begin, ended = hand.Hand.__init__, threading.Event()
+    begin, ended = worker_process.WorkerProcess.__init__, threading.Event()
 
     def late(self):
         assert ended.wait(60)
@@ -208,13 +207,13 @@ def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
         close()
         ended.set()
 
-    close = hand.close_hands
-    monkeypatch.setattr(hand.Hand, "__init__", late)
-    monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.campaigns"), "close_hands", ends)
+    close = worker_process.close_workers
+    monkeypatch.setattr(worker_process.WorkerProcess, "__init__", late)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.execution"), "close_workers", ends)
     (folder / "mine.py").write_text(SLOW.replace("TROUBLE", "time.sleep(600)").replace("FOLDER", str(folder)))
     with pytest.raises(RunInterrupted), time_limit(0.5, Clock()):
         pilfr.campaign(folder / "mine.py")
-    assert ended.is_set() and not hand._hands
+    assert ended.is_set() and not worker_process._children
     assert not [t for t in threading.enumerate() if t.name.startswith("ThreadPoolExecutor")]  # nor can one begin later
 
 
@@ -242,7 +241,7 @@ def test_a_job_that_hangs_dies_or_fails_does_not_stop_the_others(folder, what, s
 def test_more_time_or_another_worker_tries_again(folder):
     few = ("count = 4", "count = 2")
     first = pilfr.campaign(changed(folder, few))
-    manifest = Manifest.found(first.folder)
+    manifest = Manifest.read(first.folder)
     entries = manifest.content["jobs"]
     a, b = first.done[:2]
     entries[a] |= {"status": "TIMED_OUT", "time_limit": 20.0}

@@ -10,11 +10,10 @@ from command_line import refused
 from run_files import changed, prepared
 
 import pilfr_casadi as pilfr
-from pilfr_casadi._base import InputError, worker_process as hand
-from pilfr_casadi.cli.app import main
+from pilfr_casadi._base import InputError, worker_process
+from pilfr_casadi.cli import main
 from pilfr_casadi.models import named_structure
-from pilfr_casadi.studies import Cell, cluster, reasons, seeds_advice, side_by_side
-from pilfr_casadi.studies.manifest import Manifest
+from pilfr_casadi.studies import Cell, Manifest, executor, reasons, seeds_advice
 
 
 @pytest.fixture
@@ -37,7 +36,7 @@ def folder(tmp_path):
         ("[grid]", "[campaign]\ntime_limit = -3\n[grid]", "'time_limit' in [campaign] is -3"),
         ("report = false", "folds = 1", "'folds' is 1"),
         ("report = false", "folds = 90", "too few for 90 folds"),
-        ('"plain"', '"grid"', "4 seeds with starts = 1 would give one model"),
+        ('"plain"', '"grid"', "4 seeds were given, but no start is random, so every seed gives the same model"),
         ("nx = 1", "nx = 1\nfix = { A = 0.5 }\nbounds = { A = [0.6, 0.7] }", ("no job gave a model", "outside")),
     ],
 )
@@ -55,7 +54,7 @@ def test_bad_workers_get_one_sentence(folder):
 
 def test_bad_folders_and_places_get_one_sentence(capsys, folder, monkeypatch):
     path = folder / "rig.toml"
-    monkeypatch.setattr(cluster, "PATIENCE", 2.0)
+    monkeypatch.setattr(executor, "SCHEDULER_TIMEOUT", 2.0)
     refused(capsys, "campaign", path, "--out", folder / "train.csv", says="train.csv")
     refused(capsys, "campaign", path, "--out", "/proc/nowhere", says="cannot be written")
     refused(capsys, "campaign", path, "--dask", "tcp://127.0.0.1:1", says=("No Dask scheduler", "127.0.0.1:1"))
@@ -68,7 +67,7 @@ def test_bad_folders_and_places_get_one_sentence(capsys, folder, monkeypatch):
 
 def test_results_of_another_version_get_one_sentence(capsys, folder):
     out = pilfr.campaign(changed(folder, ("count = 4", "count = 1"))).folder
-    manifest = Manifest.found(out)
+    manifest = Manifest.read(out)
     manifest.content["versions"]["pilfr_casadi"] = "0.0.1"
     manifest.write()
     refused(capsys, "campaign", folder / "rig.toml", says=("results of pilfr_casadi 0.0.1", "--overwrite"))
@@ -82,11 +81,11 @@ def test_unfit_workers_get_one_sentence(folder, monkeypatch):
         pool.submit(os._exit, 1).result()
     with pytest.raises(InputError, match="The executor has stopped"):
         pilfr.campaign(folder / "rig.toml", executor=pool)
-    real = side_by_side.versions
-    monkeypatch.setattr(side_by_side, "versions", lambda: {**real(), "casadi": "9.9"})
+    real = executor.versions
+    monkeypatch.setattr(executor, "versions", lambda: {**real(), "casadi": "9.9"})
     with pytest.raises(InputError, match=r"A worker has casadi 3.* and this process 9\.9"):
         pilfr.campaign(folder / "rig.toml")
-    monkeypatch.setattr(hand.sys, "executable", "/bin/false")
+    monkeypatch.setattr(worker_process.sys, "executable", "/bin/false")
     with pytest.raises(InputError, match="The workers cannot begin a job"):
         pilfr.campaign(folder / "rig.toml")
 
@@ -112,8 +111,12 @@ def test_reasons_are_grouped():
     "structure, starts, says",
     [
         ("lfr", 4, ""),
-        ("lfr", 2, "every seed gives the same model; use one seed, or 3 starts or more"),
-        ("hammerstein", 1, "every seed gives the same model; use one seed, or 2 starts or more"),
+        ("lfr", 2, "every seed gives the same model; use one seed, start = 'paper' in [solver], or 3 starts or more"),
+        (
+            "hammerstein",
+            1,
+            "every seed gives the same model; use one seed, start = 'paper' in [solver], or 2 starts or more",
+        ),
         ("hammerstein", 2, ""),
         ("ssnn", 1, ""),
     ],

@@ -8,8 +8,7 @@ from run_files import changed, prepared
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import repeats_itself, same_input
-from pilfr_casadi.studies import jobs
-from pilfr_casadi.studies.folds import fold
+from pilfr_casadi.studies import fold, jobs
 
 
 @pytest.fixture

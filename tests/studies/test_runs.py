@@ -15,10 +15,9 @@ from run_files import PYTHON, RUN, command, contents
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.cli.app import main
+from pilfr_casadi.cli import main
 from pilfr_casadi.optimise import Status
-from pilfr_casadi.studies import jobs_of, read_run
-from pilfr_casadi.studies.jobs import input_digests
+from pilfr_casadi.studies import input_digests, jobs_of, read_run
 
 
 @pytest.fixture
@@ -96,7 +95,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(folder, kind):
 
 
 def test_ending_between_a_file_and_its_manifest_is_no_tampering(folder, monkeypatch):
-    from pilfr_casadi.studies import manifest as module
+    from pilfr_casadi.studies import folder as module
 
     changed(folder, "[0, 1, 2]", "[0]")
     out, real, calls = folder / "rig-run", module.Manifest.write, []
@@ -314,10 +313,10 @@ def test_times_that_are_damaged_do_not_matter(folder):
 
 
 def test_two_runs_do_not_share_a_folder(capsys, folder):
-    from pilfr_casadi.studies.manifest import alone
+    from pilfr_casadi.studies import locked
 
     (folder / "rig-run").mkdir()
-    with alone(folder / "rig-run"):
+    with locked(folder / "rig-run"):
         refused(capsys, "run", folder / "rig.toml", says="Another run is at work")
 
 
@@ -380,6 +379,6 @@ def test_a_manifest_that_is_none_gets_one_sentence(folder, content, optimised):
     place = folder / "rig-run"
     place.mkdir()
     (place / "manifest.json").write_text(content)
-    code = "from pathlib import Path; from pilfr_casadi.runs.manifest import Manifest; Manifest.found(Path('rig-run'))"
+    code = "from pathlib import Path; from pilfr_casadi.studies import Manifest; Manifest.read(Path('rig-run'))"
     done = subprocess.run([sys.executable, *optimised, "-c", code], cwd=folder, capture_output=True, text=True)
     assert "InputError: " in done.stderr and "manifest.json is not a manifest of a run; restore it" in done.stderr
