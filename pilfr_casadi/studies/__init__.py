@@ -26,7 +26,16 @@ if TYPE_CHECKING:
     )
     from .jobs import fold as fold, input_digests as input_digests, jobs_of as jobs_of
     from .limits import LARGEST_SIZE as LARGEST_SIZE
-    from .schema import ROLES as ROLES, Cell as Cell, Run as Run, grid_keys as grid_keys, read_run as read_run
+    from .schema import (
+        ROLES as ROLES,
+        Cell as Cell,
+        ModelTable as ModelTable,
+        Run as Run,
+        RunTable as RunTable,
+        SolverTable as SolverTable,
+        grid_keys as grid_keys,
+        read_run as read_run,
+    )
     from .summary import reasons as reasons
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

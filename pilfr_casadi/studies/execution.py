@@ -5,8 +5,8 @@ power cut, the next one goes on with the first job that is not complete, and the
 never interrupted. Executed twice on a machine, a run gives the same bytes in every file but `times.json`.
 
 `run` does the jobs one after the other. `campaign` does them side by side, over processes, a cluster, or any other
-executor; a job that fails, takes too long or loses its worker has an outcome too, the table of errors can be read at any
-time, and a summary with box plots ends it.
+executor; a job that fails, takes too long or loses its worker has an outcome too, the table of errors can be read at
+any time, and a summary with box plots ends it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from ..optimise import Status
 from .executor import AHEAD, Attempt, check_executor, side_by_side
 from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, locked, read_times
 from .jobs import Batch, Recordings, RunJob, attempt, fold, input_digests, jobs_of, outcome
-from .limits import LARGEST_SIZE
 from .schema import ROLES, Cell, Run, read_run
 from .summary import (
     CellSummary,
@@ -211,7 +210,7 @@ def campaign(
     """
     given = path if isinstance(path, Run) else read_run(path, "campaign")
     if workers is not None:
-        given = replace(given, workers=whole(workers, "workers", 1, LARGEST_SIZE["workers"]))
+        given = replace(given, workers=whole(workers, "workers", 1))
     check_executor(executor)
     for cell in given.cells if len(given.seeds) > 1 else ():
         advice = seeds_advice(cell)

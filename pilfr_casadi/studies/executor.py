@@ -74,18 +74,11 @@ def side_by_side(
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, trial = running.pop(future)
                 try:
-                    reply = _reply(future)
-                    if not reply.lost:
-                        batch.append((job, _outcome(reply, time_limit)))
-                    elif trial <= retries:
+                    outcome = _outcome(future, trial > retries, time_limit)
+                    if outcome is None:
                         waiting.appendleft((job, trial + 1))
-                    elif not reply.begun:
-                        raise InputError(
-                            f"The workers cannot begin a job ({reply.lost}); see that they run this package."
-                        )
                     else:
-                        text = f"Failed: its worker was lost {trial} times, lastly {reply.lost}."
-                        batch.append((job, unfinished(LOST, text)))
+                        batch.append((job, outcome))
                 except (InputError, BrokenExecutor, CancelledError) as error:
                     stop = error
             if batch:
@@ -102,20 +95,23 @@ def side_by_side(
             future.cancel()
 
 
-def _reply(future: Future[Reply]) -> Reply:
-    """Return a future's reply; an error of the executor's own counts as a lost worker."""
+def _outcome(future: Future[Reply], last: bool, time_limit: float | None) -> Outcome | None:
+    """Return the outcome of a job; None where its worker was lost and it was not the last trial."""
     try:
-        return future.result()
+        reply = future.result()
     except (BrokenExecutor, CancelledError):
         raise
     except Exception as error:  # a Dask worker was killed, or has not got the package
         name = type(error).__name__
-        return Reply(lost=f"{name}: {error}".splitlines()[0], begun=name == "KilledWorker")
-
-
-def _outcome(reply: Reply, time_limit: float | None) -> Outcome:
+        reply = Reply(lost=f"{name}: {error}".splitlines()[0], begun=name == "KilledWorker")
     if reply.timed_out:
         return unfinished(TIMED_OUT, f"Failed: ended after its time limit of {time_limit:g} s.", time_limit=time_limit)
+    if reply.lost:
+        if not last:
+            return None
+        if not reply.begun:
+            raise InputError(f"The workers cannot begin a job ({reply.lost}); see that they run this package.")
+        return unfinished(LOST, f"Failed: its worker was lost in every trial, lastly {reply.lost}.")
     outcome, used = reply.result
     for name, version in versions().items():
         if used.get(name) != version:

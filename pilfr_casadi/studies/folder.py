@@ -1,7 +1,7 @@
 """The folder of a run: the manifest, the models and tables, and which jobs are complete.
 
-The manifest says what was computed from which inputs, with which versions, and the SHA-256 of every file. It carries its
-own digest, so that a manifest that was edited is not taken for the run's; the digests of the files tell the same of
+The manifest says what was computed from which inputs, with which versions, and the SHA-256 of every file. It carries
+its own digest, so that a manifest that was edited is not taken for the run's; the digests of the files tell the same of
 models and tables. No time is in it: everything in the folder but `times.json` is the same to the last byte in every
 execution of a run on one machine.
 """

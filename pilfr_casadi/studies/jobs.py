@@ -6,10 +6,10 @@ in a cross-validation which samples its fold fits and holds out. A job whose key
 been done.
 
 In a cross-validation the training recordings are in parts, each held out once. With at least as many different inputs
-as folds, whole recordings are dealt out in turn, those of one input together. With fewer, every recording is cut into as
-many blocks as there are folds; the state after a cut is estimated, and in a block held out the samples it is estimated
-from are not scored (`Fit.scored_from`). Blocks of an input that repeats, as in steady periods, are refused: they would
-hold out what the rest shows.
+as folds, whole recordings are dealt out in turn, those of one input together. With fewer, every recording is cut into
+as many blocks as there are folds; the state after a cut is estimated, and in a block held out the samples that it is
+estimated from are not scored (`Fit.scored_from`). Blocks of an input that repeats, as in steady periods, are refused:
+the rest would show them.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ def error_of(fit: Fit, recording: Recording) -> float | None:
 def _identify(
     run: Run, recordings: Recordings, job: RunJob, executor: Executor | None, progress: Progress | None
 ) -> Fit:
-    """Identify the model of a job from its training recordings and, for a path, the validation; nothing else is read."""
+    """Identify the model of a job from its training recordings and, for a path, the validation; it sees no others."""
     options: dict[str, Any] = {
         "solver": run.solver,
         "stable": run.stable,

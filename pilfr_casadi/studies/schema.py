@@ -325,7 +325,7 @@ def _sentence(error: ValidationError, kind: type[Table], content: Any, name: str
         return str(own)
     for key in map(str, first["loc"]):
         if key not in kind.model_fields:
-            near = difflib.get_close_matches(key, kind.model_fields, 1)
+            near = difflib.get_close_matches(key.lower(), kind.model_fields, 1)
             place = f"[{name}]" if name else "the run"
             known = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(kind.model_fields)}."
             return f"{place} has an unknown key {key!r}; {known}"

@@ -47,7 +47,7 @@ def scored_files(run: Run, recordings: Recordings) -> Iterator[tuple[str, str, R
 
 
 def choose_job(scores: Sequence[Score], jobs: Sequence[str]) -> str:
-    """Return the job of the smallest validation error; without validation recordings, of the smallest training error."""
+    """Return the job of the smallest validation error; without validation recordings, smallest training error."""
     judge = "validation" if any(s.role == "validation" for s in scores) else "train"
     errors: dict[str, list[float]] = {}
     for s in scores:

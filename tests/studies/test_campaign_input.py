@@ -27,6 +27,11 @@ def folder(tmp_path):
         ("[grid]", "[grid]\nnodes = [1, 2]", ("unknown key 'nodes'", "operators")),
         ("[1, 3]", "3", "'operators' in [grid] is 3; give a list of different values"),
         ("[1, 3]", "[3, 3]", "different values"),
+        ("count = 4", "count = 1e9", "'count' in [seeds] is 1000000000.0; give a whole number from 1 to 100000"),
+        ("count = 4", "count = 1000000000", "'count' in [seeds] is 1000000000; give a whole number from 1 to 100000"),
+        ("count = 4", "count = 60000", "grid, seeds and folds make 120000 jobs; give at most 100000"),
+        ("count = 4", f"count = {'9' * 5000}", "is not a TOML file"),
+        ("[1, 3]", "[3, 999999999]", "'operators' in [model] is 999999999; give a whole number from 0 to 10000"),
         ("[1, 3]", "[3, 'many']", "'operators' in [model] is 'many'"),
         ("[1, 3]", "[]", "list of different values"),
         ('structure = "hammerstein"', 'structure = "lti"', "for a linear model give 'lfr' with operators = 0"),
@@ -48,7 +53,7 @@ def test_bad_workers_get_one_sentence(folder):
     for call in (pilfr.campaign, pilfr.run):
         with pytest.raises(InputError, match="executor = 5 was given"):
             call(folder / "rig.toml", executor=5)
-    with pytest.raises(InputError, match="workers = True was given"):
+    with pytest.raises(InputError, match="workers is True; give a whole number"):
         pilfr.campaign(folder / "rig.toml", workers=True)
 
 

@@ -1,6 +1,7 @@
 """Run files: the same numbers again, nothing done twice, interrupted runs go on, changes are noticed."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -16,8 +17,9 @@ from run_files import PYTHON, RUN, command, contents
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.cli import main
+from pilfr_casadi.cli.studies import EVERY_KEY
 from pilfr_casadi.optimise import Status
-from pilfr_casadi.studies import input_digests, jobs_of, read_run
+from pilfr_casadi.studies import ModelTable, RunTable, SolverTable, input_digests, jobs_of, read_run
 
 
 @pytest.fixture
@@ -181,8 +183,9 @@ def test_a_missing_model_is_made_again(folder):
 @pytest.mark.parametrize(
     "old, new, says",
     [
-        ("nx = 1", "nX = 1", "'nx' in [model] is missing"),
-        ("starts = 3", "stars = 3", ("unknown key 'stars'", "starts")),
+        ("nx = 1", "nX = 1", "[model] has an unknown key 'nX'; did you mean 'nx'?"),
+        ("nx = 1", "", "'nx' in [model] is missing; give the number of states"),
+        ("starts = 3", "stars = 3", "[solver] has an unknown key 'stars'; did you mean 'starts'?"),
         ("nx = 1", "nx = 'one'", ("'nx' in [model] is 'one'", "whole number")),
         ("operators = 3", "operators = -3", "-3"),
         ("operators = 3", "operators = true", "True"),
@@ -191,7 +194,7 @@ def test_a_missing_model_is_made_again(folder):
         ("seeds = [0, 1, 2]", "seeds = [0, 0]", "different whole numbers"),
         ("seeds = [0, 1, 2]", "seeds = [0, 0.5]", "different whole numbers"),
         ("seeds = [0, 1, 2]", "seeds = [0", "is not a TOML file"),
-        ("seeds = [0, 1, 2]", "sedes = 3", "unknown key 'sedes'"),
+        ("seeds = [0, 1, 2]", "sedes = 3", "the run has an unknown key 'sedes'; did you mean 'seeds'?"),
         ('"hammerstein"', '"hamerstein"', "'hammerstein'"),
         ('outputs = "y"', 'outputs = "z"', "z"),
         ('outputs = "y"', "outputs = 3", "a name, or a list of names"),
@@ -204,7 +207,13 @@ def test_a_missing_model_is_made_again(folder):
         ("[solver]", "[constraints]\nown = [1]\n[solver]", "'own'"),
         ("[solver]", "[regularization]\nl1 = -1\n[solver]", "'l1'"),
         ("[solver]", "[regularization]\nprune = true\n[solver]", "'prune' in [regularization] goes with 'l1'"),
-        ("nx = 1", "nx = 5000", "at least"),
+        ("nx = 1", "nx = 500", "at least"),
+        ("nx = 1", "nx = 5000", "'nx' in [model] is 5000; give a whole number from 0 to 1000"),
+        ("nx = 1", f"nx = {'9' * 400}", "'nx' in [model] is 999"),
+        ("starts = 3", "starts = 1000000000000", "'starts' in [solver] is 1000000000000; give a whole number"),
+        ('initial = "zero"', f"skip = {10**30}", "'skip' in [data] is 1000"),
+        ("report = false", "report = 0", "'report' is 0; give true or false"),
+        ("report = false", "workers = 99999999", "'workers' is 99999999; give a whole number from 1 to 1024"),
         ("[solver]", "[regularization]\npath = 3\n[solver]", "'path'"),
         ("[solver]", "[regularization]\npath = [true]\n[solver]", "'path' in [regularization] is [True]"),
         ("[solver]", "[regularization]\npath = [0.0]\n[solver]", "strengths above zero"),
@@ -222,6 +231,20 @@ def test_a_missing_model_is_made_again(folder):
 def test_bad_input_gets_one_sentence(capsys, folder, old, new, says):
     refused(capsys, "run", changed(folder, old, new), says=says)
     assert not (folder / "rig-run" / "results.csv").exists()
+
+
+def test_the_example_of_a_run_file_has_every_key():
+    """Each key of the schema stands in its table of every_key.toml, commented out where it excludes another."""
+    text = EVERY_KEY.read_text()
+    assert max(map(len, text.splitlines())) <= 120
+    tables = {name: field.annotation for name, field in RunTable.model_fields.items()}
+    tables = {name: kind for name, kind in tables.items() if hasattr(kind, "model_fields") and name != "grid"}
+    tables |= {"": RunTable, "model": ModelTable, "solver": SolverTable}
+    assert len(tables) == 7
+    for name, kind in tables.items():
+        part = text.split(f"[{name}]")[1].partition("\n[")[0] if name else text
+        for key in kind.model_fields:
+            assert re.search(rf"^(# )?{key} = |^(# )?\[{key}\]", part, re.M), (name, key)
 
 
 def test_constraints_that_cannot_be_met_get_one_sentence(capsys, folder):
