@@ -13,7 +13,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from command_line import fit_arguments, refused, run, write_csv
+from command_line import fit_arguments, refused, run, sentence, write_csv
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.cli import main
@@ -253,7 +253,7 @@ def test_a_period_without_an_initial_state_is_refused(capsys, tmp_path, train, m
 def test_version_and_help(capsys):
     assert run(capsys, "--version") == (0, f"pilfr {pilfr.__version__}\n", "")
     status, out, err = run(capsys, "--help")
-    assert status == 0 and err == ""
+    assert status == 0 and "pilfr: " not in err
     for name in ("fit", "diagnose", "simulate", "export", "run", "campaign", "demo"):
         assert f"\n  {name} " in out
         assert run(capsys, name, "--help")[0] == 0
@@ -401,7 +401,6 @@ def test_a_model_that_misses_its_constraints_is_no_usable_result(capsys, tmp_pat
     refused(capsys, *data, "--bound", "A=1.01:2", says=("bounds of A, 1.01 to 2, allow no", "widen the bounds of A"))
     loop = [option for name in ("B_w", "C_z", "w") for option in ("--bound", f"{name}=0.4:2")]
     status, _, err = run(capsys, *data, "--bound", "A=0.9:0.95", *loop)
-    assert status == 1 and err.startswith("pilfr: The model does not meet its constraints: spectral radius with the"), (
-        err
-    )
-    assert err.count("\n") == 1 and "off by" in err
+    assert status == 1
+    assert sentence(err).startswith("pilfr: The model does not meet its constraints: spectral radius with the")
+    assert "off by" in err
