@@ -68,7 +68,7 @@ def read_csv(
         If a file, a column or a cell cannot be used.
     """
     request = Request(inputs, outputs, columns, dt, time_tolerance, recording_options)
-    return _read_each(path, request, lambda p: read_csv_table(p, request.count_columns))
+    return _read_each(path, request, lambda p: read_csv_table(p, request.wanted))
 
 
 @overload
@@ -113,7 +113,7 @@ def read(
     Parameters, returned values and errors are those of :func:`read_csv`; files of different kinds may be mixed.
     """
     request = Request.from_options(inputs, outputs, options)
-    return _read_each(path, request, lambda p: _open_table(p, request.count_columns))
+    return _read_each(path, request, lambda p: _open_table(p, request.wanted))
 
 
 def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
@@ -124,7 +124,7 @@ def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
     InputError
         If the file cannot be read.
     """
-    return _open_table(Path(path), lambda names: sum(n in names for n in wanted)).names
+    return _open_table(Path(path), wanted).names
 
 
 def written_times(path: PathLike, columns: Mapping[str, str] | None = None) -> list[str] | None:
@@ -137,7 +137,7 @@ def written_times(path: PathLike, columns: Mapping[str, str] | None = None) -> l
     """
     columns = columns or {}
     chosen = next((columns[name] for name in TIME_NAMES if name in columns), None)
-    table = _open_table(Path(path), lambda names: (chosen or "t") in names)
+    table = _open_table(Path(path), [chosen or "t"])
     time = time_column(table.names, chosen, str(path))
     return table.texts(time) if time else None
 
@@ -186,15 +186,16 @@ class Request:
         """Return the column of an input, an output or the time."""
         return (self.columns or {}).get(name, name)
 
-    def count_columns(self, names: Sequence[str]) -> int:
-        """Count the wanted columns among the names."""
-        return sum(self.column(name) in names for name in (*self.inputs, *self.outputs))
+    @property
+    def wanted(self) -> list[str]:
+        """The columns of the inputs and outputs."""
+        return [self.column(name) for name in (*self.inputs, *self.outputs)]
 
     def locate(self, names: Sequence[str], source: str) -> tuple[str | None, list[str]]:
         """Return the time column, if any, and those of the inputs and outputs."""
         mapped = [column for name, column in (self.columns or {}).items() if name in TIME_NAMES]
         time = time_column(names, mapped[0] if mapped else None, source)
-        wanted = [self.column(name) for name in (*self.inputs, *self.outputs)]
+        wanted = self.wanted
         both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
         if both:
             raise InputError(f"{source}: column {both[0]!r} is taken both for an input and for an output; correct one.")
@@ -250,11 +251,11 @@ def _read_each(
     return tuple(request.recording(open_table(Path(p))) for p in paths)
 
 
-def _open_table(path: Path, count_columns: Callable[[Sequence[str]], int]) -> Table:
+def _open_table(path: Path, wanted: Sequence[str]) -> Table:
     """Open a file by its suffix."""
     suffix = path.suffix.lower()
     if suffix in CSV_SUFFIXES:
-        return read_csv_table(path, count_columns)
+        return read_csv_table(path, wanted)
     if suffix == ".mat":
         return read_mat_table(path)
     if suffix == ".npz":

@@ -6,7 +6,7 @@ as an editor does, so the header is line 1. No code in a ``.mat`` or ``.npz`` fi
 """
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -189,15 +189,8 @@ class ArrayTable:
         return column
 
 
-def read_csv_table(path: Path, score: Callable[[Sequence[str]], int]) -> CsvTable:
-    """Open a CSV file and read its header.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    score : callable
-        Counts how many of the wanted columns a header has; this decides the delimiter.
+def read_csv_table(path: Path, wanted: Sequence[str]) -> CsvTable:
+    """Open a CSV file and read its header; the delimiter is the one that yields most of the `wanted` columns.
 
     Raises
     ------
@@ -209,7 +202,7 @@ def read_csv_table(path: Path, score: Callable[[Sequence[str]], int]) -> CsvTabl
     if top is None:
         raise InputError(f"{path} is empty; give a CSV file with a header row and one row for each sample.")
     headers = {d: _cells(lines[top], d, f"{path}: line {top + 1}") for d in DELIMITERS}
-    delimiter = max(DELIMITERS, key=lambda d: (score(headers[d]), len(headers[d]), d == ","))
+    delimiter = max(DELIMITERS, key=lambda d: (sum(n in headers[d] for n in wanted), len(headers[d]), d == ","))
     names = headers[delimiter]
     if all(_number(name) is not None for name in names):
         raise InputError(
