@@ -18,11 +18,11 @@ if TYPE_CHECKING:
         ordered_digest as ordered_digest,
         write_atomically as write_atomically,
     )
-    from .loading import read_model_file as read_model_file
-    from .saving import (
+    from .model_file import (
         FitContent as FitContent,
         SavedStart as SavedStart,
         model_text as model_text,
+        read_model_file as read_model_file,
         write_model_file as write_model_file,
     )
     from .smoothing import enclosed as enclosed, smoothed as smoothed, with_sides as with_sides

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import casadi as ca
@@ -65,6 +67,13 @@ def test_a_saved_model_simulates_to_the_last_digit(case, tmp_path):
     assert np.array_equal(after.initial["0123456789abcdef"], before.initial["0123456789abcdef"])
     save(after, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "model.json").read_bytes()
+
+
+def test_pydantic_is_loaded_only_to_read_a_model():
+    code = (
+        "import sys, pilfr_casadi as pilfr; pilfr.fit, pilfr.load, pilfr.exported; sys.exit('pydantic' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_a_real_fit_comes_back(real_fit, tmp_path):
@@ -463,11 +472,15 @@ UNKNOWN = {
     ("model", "inputs", 0): "unknown key 'more' in model.inputs.0",
 }
 WRONG = {
-    ("written_by", "casadi"): (3, "written_by.casadi is not a text"),
+    ("written_by", "casadi"): (3, "written_by.casadi is not a text but 3"),
     ("written_by", "pilfr_casadi"): (None, "written_by.pilfr_casadi is not a text"),
-    ("model", "states", 0): (1.5, "model.states.0 is not a text"),
-    ("parameters", "A", "unit"): ({}, "parameters.A.unit is not a text"),
+    ("model", "states", 0): (1.5, "model.states.0 is not a text but 1.5"),
+    ("parameters", "A", "unit"): ({}, "parameters.A.unit is not a text but a table"),
     ("training", "sentence"): (0, "training.sentence is not a text"),
+    ("model", "memory"): ([3], "model.memory is not a whole number but a list"),
+    ("structure", "bounds", "w"): ([0.0], "structure.bounds.w is not a pair but a list"),
+    ("training", "seconds"): (None, "training.seconds is not a finite number but null"),
+    ("structure", "element", "rounded"): (0, "structure.element.rounded is not true or false but 0"),
     ("training", "multipliers"): ([0.0], r"it has 1 multipliers of \d+ variables and constraints"),
     ("training", "variables"): ({}, "multipliers of 0 variables"),
 }
