@@ -25,7 +25,7 @@ from pilfr_casadi.optimise import (
     stable,
 )
 from pilfr_casadi.optimise.constraints import BeyondRadius
-from pilfr_casadi.optimise.tightening import _unsolved
+from pilfr_casadi.optimise.spectral_radius import unsolved
 from problems.constrained import infeasible_sentences, radius, slowest_pole, sparse_plays, stability_table, three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)
@@ -147,7 +147,7 @@ def test_at_a_kink_multipliers_are_not_known(record, tmp_path):
 def test_where_no_solver_has_been_multipliers_are_not_known(record):
     fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, stable=0.7)
     problem = Problem(fit.model, record, constraints=stability_limits(fit.structure, 0.7))
-    scaled = _unsolved(problem, fit.solution.theta, Status.RESTORED)
+    scaled = unsolved(problem, fit.solution.theta, Status.RESTORED)
     limits = limits_of(problem, scaled)
     held = [limit for limit in limits if limit.kind == "constraint" and limit.active]
     assert held and all(np.isnan(limit.multiplier) for limit in held)

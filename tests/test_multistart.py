@@ -14,7 +14,7 @@ from pilfr_casadi.identify.multistart import Search, explore, polish, search_sta
 from pilfr_casadi.identify.start import grid_start, paper_start, unit_states
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import GaussNewton, Solution, Status
-from pilfr_casadi.optimise.stability import stability
+from pilfr_casadi.optimise.spectral_radius import stability
 
 
 @dataclass

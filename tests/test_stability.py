@@ -11,7 +11,7 @@ from random_models import coupled_plays
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.optimise import unbounded_sentence
-from pilfr_casadi.optimise.stability import least_radius, stability
+from pilfr_casadi.optimise.spectral_radius import least_radius, stability
 from problems.constrained import three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)

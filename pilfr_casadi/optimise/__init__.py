@@ -14,7 +14,7 @@ if TYPE_CHECKING:
         ordered as ordered,
         stable as stable,
     )
-    from .exactness import beyond as beyond, exactly as exactly
+    from .exact_constraints import beyond as beyond, exactly as exactly
     from .gauss_newton import GaussNewton as GaussNewton, unconstrained as unconstrained
     from .initial_state import first_state as first_state, samples_for_state as samples_for_state
     from .ipopt import Ipopt as Ipopt
@@ -28,11 +28,13 @@ if TYPE_CHECKING:
         limits_of as limits_of,
         unknown_multipliers as unknown_multipliers,
     )
-    from .stability import (
+    from .spectral_radius import (
+        STEP as STEP,
         check_room as check_room,
+        held_at_bounds as held_at_bounds,
         stability_limits as stability_limits,
         unbounded_sentence as unbounded_sentence,
+        within_bounds as within_bounds,
     )
-    from .tightening import STEP as STEP, held_at_bounds as held_at_bounds, within_bounds as within_bounds
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -4,15 +4,15 @@ Each step solves the quadratic program
 
     minimise  1/2 d'(H + λ D)d + g'd   subject to  lower <= θ + d <= upper,  lower_g <= g(θ) + ∇g d <= upper_g,
 
-with `H` the Gauss-Newton Hessian and `D` the largest diagonal of `H` seen so far (Marquardt 1963; Moré 1978), rounding
-left out (`damping.without_rounding`): at the usual start (`B_w = 0`) whole columns of the Jacobian vanish and a state
-space is over-parametrised, so damping is needed and has to know the scales. Trial points are judged by simulation
-alone; λ follows the gain ratio (Nielsen 1999). General constraints, in units of their own
-(`Problem.constraint_units`), enter an exact penalty `μ Σ violation`, with a second-order correction when a step along
-their tangent violates them.
+with `H` the Gauss-Newton Hessian and `D` the largest diagonal of `H` seen so far (Marquardt 1963; Moré 1978), in which
+`without_rounding` replaces entries that are rounding. At the usual start (`B_w = 0`) whole columns of the Jacobian
+vanish and a state space is over-parametrised, so damping is needed and has to know the scales. Trial points are judged
+by simulation alone. `Damping` holds λ and the rule by which it follows the gain ratio (Nielsen 1999).
 
-A run may stray to where violating the constraints pays and linear steps do not lead back: one that ends worse than the
-cheapest feasible point goes on from there, with more damping and under a larger penalty (`feasible`).
+General constraints enter an exact penalty `μ Σ violation` (`ExactPenalty`), with a second-order correction when a step
+along their tangent violates them. A run may stray to where violating the constraints pays and linear steps do not lead
+back. A run that ends worse than its cheapest feasible point (`BestFeasible`) goes on from there, with more damping and
+a larger penalty.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -31,23 +32,93 @@ import numpy as np
 from .._base import InputError
 from ..models import Neighbours
 from .constraints import TOLERATED
-from .lifted import Lifted
-from .problem import Problem
 from .solution import Iteration, Progress, Solution, Status
+
+FEASIBLE = 1e-9  # violation, in units of the constraints, that counts as none
+RETURNS = 4  # times that a run which has strayed goes on from its best feasible point
+ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # the run got as far as it can
+KINK = 1e-3  # share of the cost promised in vain from which the point is a kink and multipliers mean nothing
+NOTHING = 1e-24  # cost that is rounding: outputs are off by 1e-12 of their size
+ROUNDING = 1e-20  # squared column norm, next to the largest of its matrix, that is rounding
+NONE = 1e-100  # size of a variable that was driven to zero
+SHRUNK = 1e-2  # share of its first unit below which the unit of a constraint is taken anew
+Watch = Callable[[np.ndarray], bool]
+
+
+class Minimisation(Protocol):
+    """Problem as the solver sees it: a `Problem`, or one with extra unknowns (`spectral_radius.SchurProblem`)."""
+
+    labels: tuple[str, ...]
+    start: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    g_lower: np.ndarray
+    g_upper: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """Number of variables n."""
+
+    def cost(self, theta: np.ndarray, /) -> float:
+        """Return the objective; infinite where the simulation diverges."""
+
+    def normal(self, theta: np.ndarray, /) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return objective, gradient (n,) and Gauss-Newton Hessian (n, n)."""
+
+    def constraint(self, theta: np.ndarray, /) -> np.ndarray:
+        """Return the general constraints (n_g,)."""
+
+    def constraint_jacobian(self, theta: np.ndarray, /) -> np.ndarray:
+        """Return their Jacobian (n_g, n)."""
+
+    def constraint_units(self, theta: np.ndarray, squares: np.ndarray | None = None, /) -> np.ndarray:
+        """Return a change of each general constraint that counts (n_g,)."""
+
+
+@dataclass(frozen=True)
+class Damping:
+    """Levenberg-Marquardt λ with the factor by which the next rejected step raises it (Nielsen 1999)."""
+
+    value: float
+    growth: float = 2.0
+
+    def after_success(self, ratio: float) -> Damping:
+        """Lower λ by up to a third, or raise it by up to two, as the gain ratio (actual over predicted) says."""
+        return Damping(self.value * max(1 / 3, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3))
+
+    def after_failure(self) -> Damping:
+        """Raise λ, faster with every rejected step."""
+        return Damping(self.value * self.growth, 2.0 * self.growth)
+
+    def within(self, low: float, high: float) -> Damping:
+        """Clip λ."""
+        return Damping(min(max(self.value, low), high), self.growth)
+
+
+def without_rounding(squares: np.ndarray, theta: np.ndarray, neighbours: Neighbours) -> np.ndarray:
+    """Replace squared column norms (n,) that are zero or rounding.
+
+    A column is rounding if it is so next to the others of its matrix and if changing its variable by its own size
+    changes the outputs by nothing, as for a state that nothing excites. It gets the norm with which that change would
+    change the outputs by their own size, so that steps along rounding are damped away.
+    """
+    size = neighbours.sizes(theta)
+    idle = (squares <= ROUNDING * neighbours.largest(squares)) & (squares * size**2 <= ROUNDING)
+    return np.asarray(np.where(idle, 1.0 / np.where(size > NONE, size, 1.0) ** 2, squares))
 
 
 class QuadraticProgram:
-    """Dense QP; solves for a step inside limits.
+    """Dense quadratic program for a step inside limits.
 
-    Where the unconstrained step lies inside all of them it is the solution, for the price of a Cholesky factorisation.
-    Else `ca.conic`, built when it is first needed, finds out which limits hold it.
+    If the unconstrained step lies inside all limits it is the solution, at the price of a Cholesky factorisation. Only
+    otherwise `ca.conic` is built and finds the active limits.
     """
 
     def __init__(self, n: int, n_g: int, plugin: str) -> None:
         self._size, self._plugin = (n, n_g), plugin
 
     @cached_property
-    def _solve(self) -> ca.Function:
+    def _solver(self) -> ca.Function:
         (n, n_g), plugin = self._size, self._plugin
         structure = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(n_g, n)}
         quiet = {"daqp": {}, "qrqp": {"print_iter": False, "print_header": False, "print_info": False}}.get(plugin, {})
@@ -63,10 +134,10 @@ class QuadraticProgram:
         lba: np.ndarray,
         uba: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Minimise `1/2 d'h d + g'd` over `lbx <= d <= ubx, lba <= a d <= uba`: d, multipliers, whether found.
+        """Minimise `1/2 d'h d + g'd` over `lbx <= d <= ubx, lba <= a d <= uba`; return d, multipliers and success.
 
-        h has a positive diagonal. A solver's tolerances are absolute: it gets unit diagonal and rows, and the step in
-        units of the steepest slope or, where there is none, of what the rows lack at d = 0.
+        h has a positive diagonal. Solvers have absolute tolerances, so they get unit diagonal and unit rows, and the
+        step in units of the steepest slope or, where there is none, of the violation of the rows at d = 0.
         """
         unit = 1.0 / np.sqrt(np.diag(h))
         a, g = a * unit, g * unit
@@ -76,13 +147,13 @@ class QuadraticProgram:
         size = float(np.max(np.abs(g))) or float(np.max(np.maximum(low, -high), initial=0.0))
         size = max(size, 1e-300)
         rows = a / row[:, None], low / size, high / size
-        d, multipliers, good = self._solved(
+        d, multipliers, good = self._solve(
             h * unit * unit[:, None], g / size, lbx / unit / size, ubx / unit / size, *rows
         )
         return d * size * unit, size * multipliers / np.concatenate([unit, row]), good
 
-    def _solved(self, h: np.ndarray, g: np.ndarray, *limits: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        """The same as it stands."""
+    def _solve(self, h: np.ndarray, g: np.ndarray, *limits: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Solve the scaled program."""
         lbx, ubx, a, lba, uba = limits
         d = unconstrained(h, g)
         if d is not None and np.all((lbx <= d) & (d <= ubx)):
@@ -90,16 +161,16 @@ class QuadraticProgram:
             if np.all((lba <= slack) & (slack <= uba)):
                 return d, np.zeros(len(d) + len(slack)), True
         low, high = np.concatenate([lbx, lba]), np.concatenate([ubx, uba])
-        if not np.all((low < np.inf) & (high > -np.inf)):  # too far away for numbers, or none: a plugin would raise
+        if not np.all((low < np.inf) & (high > -np.inf)):  # an overflow or NaN, for which a plugin would raise
             return np.zeros(len(g)), np.zeros(len(g) + len(a)), False
-        out = self._solve(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
+        out = self._solver(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
         d = np.asarray(out["x"]).ravel()
         multipliers = np.concatenate([np.asarray(out["lam_x"]).ravel(), np.asarray(out["lam_a"]).ravel()])
-        return d, multipliers, bool(self._solve.stats()["success"]) and bool(np.all(np.isfinite(d)))
+        return d, multipliers, bool(self._solver.stats()["success"]) and bool(np.all(np.isfinite(d)))
 
 
 def unconstrained(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
-    """`-h⁻¹ g` for a positive definite h, else None."""
+    """Return `-h⁻¹ g` for a positive definite h, else None."""
     from scipy.linalg import cho_factor, cho_solve
 
     try:
@@ -109,64 +180,34 @@ def unconstrained(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
     return d if np.all(np.isfinite(d)) else None
 
 
-ROUNDING = 1e-20  # squares of columns that are rounding
-NONE = 1e-100  # size of a variable that is none: what is left of one that was driven to zero
-
-
-def without_rounding(squares: np.ndarray, theta: np.ndarray, neighbours: Neighbours) -> np.ndarray:
-    """Squared column norms (n,) in which those that are zero or rounding are replaced.
-
-    A column is rounding where it is so next to the others of its matrix, and a change of its variable by the variable's
-    size changes the outputs by nothing: a state that nothing excites. It gets the norm with which that change would
-    change the outputs by their own size; what rounding says about the variable is then damped away.
-    """
-    size = neighbours.sizes(theta)
-    idle = (squares <= ROUNDING * neighbours.largest(squares)) & (squares * size**2 <= ROUNDING)
-    return np.asarray(np.where(idle, 1.0 / np.where(size > NONE, size, 1.0) ** 2, squares))
-
-
-@contextlib.contextmanager
-def handled_interrupt(handle: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C calls `handle` in place of raising KeyboardInterrupt; in the main thread, where nobody else handles it."""
-    ours = threading.current_thread() is threading.main_thread()
-    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if ours:
-        signal.signal(signal.SIGINT, lambda *_: handle())
-    try:
-        yield
-    finally:
-        if ours:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-SHRUNK = 1e-2  # share of its first unit below which a constraint's unit is taken anew
-
-
 class ExactPenalty:
-    """The constraints of a problem, measured where each first has a slope, and where a run ends (`shrink`).
+    """General constraints in their units, and the exact penalty `μ Σ violation` by which steps are judged.
+
+    The weight μ follows the multipliers by Powell's rule (1978): 1.5 times the largest, or half-way down to that from
+    its last value. A weight that only grows keeps what multipliers far from the solution required, and crawls.
 
     Attributes
     ----------
     unit : numpy.ndarray
-        Shape (n_g,), see `Problem.constraint_units`.
+        Shape (n_g,), see `Problem.constraint_units`; taken where a constraint first has a slope.
     weight, least : float
-        μ, and what it never falls below.
+        μ and its lower bound.
     """
 
-    def __init__(self, problem: Problem | Lifted) -> None:
+    def __init__(self, problem: Minimisation) -> None:
         self.problem, n_g = problem, len(problem.g_lower)
         self.unit, self._known = np.ones(n_g), np.zeros(n_g, dtype=bool)
         self.weight, self.least = 0.0, 0.0
 
     def measure(self, theta: np.ndarray, squares: np.ndarray) -> None:
-        """Take the units of what has a slope at θ and had none before."""
+        """Take the units of constraints that have a slope at θ and had none before."""
         if not np.all(self._known):
             unit = self.problem.constraint_units(theta, squares)
             first = ~self._known & (unit > 0)
             self.unit[first], self._known[first] = unit[first], True
 
     def shrink(self, theta: np.ndarray) -> bool:
-        """Take units at θ that are far smaller than they were; whether these alone tell of a violation.
+        """Adopt units at θ that are far smaller than before; return whether only these reveal a violation.
 
         Where a constraint has a pole nearby, such as a gain beside an integrator, its first unit may be immense.
         """
@@ -178,19 +219,19 @@ class ExactPenalty:
         return bool(np.any((before <= TOLERATED) & (self.violations(theta) > TOLERATED)))
 
     def values(self, theta: np.ndarray) -> np.ndarray:
-        """The constraints in their units, shape (n_g,)."""
+        """Return the constraints in their units, shape (n_g,)."""
         return self.problem.constraint(theta) / self.unit if len(self.unit) else np.zeros(0)
 
     def slope(self, theta: np.ndarray) -> np.ndarray:
-        """Their Jacobian, shape (n_g, n)."""
+        """Return their Jacobian, shape (n_g, n)."""
         return self.problem.constraint_jacobian(theta) / self.unit[:, None]
 
     def room(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far it is from values to the lower limits and to the upper ones, (n_g,) each."""
+        """Return the distances from values to the lower and to the upper limits, (n_g,) each."""
         return self.problem.g_lower / self.unit - values, self.problem.g_upper / self.unit - values
 
     def violations(self, theta: np.ndarray) -> np.ndarray:
-        """Violation of each constraint in its unit, shape (n_g,); infinite where it has no value."""
+        """Return the violation of each constraint in its unit, shape (n_g,); infinite where it has no value."""
         if not len(self.unit):
             return np.zeros(0)
         low, high = self.room(self.values(theta))
@@ -198,7 +239,7 @@ class ExactPenalty:
         return np.where(np.isnan(over), np.inf, over)
 
     def violation(self, theta: np.ndarray) -> float:
-        """Their sum."""
+        """Return the summed violation."""
         return float(self.violations(theta).sum())
 
     def follow(self, multipliers: np.ndarray) -> None:
@@ -208,17 +249,21 @@ class ExactPenalty:
             self.weight = max(needed, 0.5 * (self.weight + needed), self.least)
 
     def raise_to(self, weight: float) -> None:
-        """Set the weight, and let it never fall below; at least twice what that was."""
+        """Set the weight and its lower bound, which at least doubles."""
         self.weight = self.least = max(weight, 2.0 * self.least)
 
 
-class Feasible:
-    """Remembers the feasible point of the smallest cost, and how much straying would pay.
+class BestFeasible:
+    """Cheapest feasible point of a run, and the penalty under which straying from it would not have paid.
+
+    No infeasible point is better than the best feasible one for a penalty of
+
+        μ > max (cost of the best - cost) / violation.
 
     Parameters
     ----------
     tolerance : float
-        Share of its cost by which another feasible point has to be dearer to be worse.
+        Share of its cost by which another feasible point must be dearer to count as worse.
     """
 
     def __init__(self, tolerance: float) -> None:
@@ -226,7 +271,7 @@ class Feasible:
         self.theta = self.multipliers = np.zeros(0)
 
     def see(self, cost: float, violation: float, theta: np.ndarray, multipliers: np.ndarray) -> None:
-        """Remember a point, its summed violation in units of the constraints."""
+        """Take note of a point with its summed violation."""
         if violation > TOLERATED:
             self.tempting = max(self.tempting, (self.cost - cost) / violation if np.isfinite(self.cost) else 0.0)
         elif cost < self.cost:
@@ -237,12 +282,21 @@ class Feasible:
         return bool(np.isfinite(self.cost)) and (violation > TOLERATED or cost > self.cost * (1.0 + self.tolerance))
 
 
-FEASIBLE = 1e-9  # violation, in units of the constraints, that is none
-RETURNS = 4  # times that a run which has strayed goes on from the best feasible point
-ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # as far as a run gets
-Watch = Callable[[np.ndarray], bool]
-KINK = 1e-3  # share of the cost that a step promises in vain, from which multipliers mean nothing
-NOTHING = 1e-24  # a cost that is rounding: outputs are off by 1e-12 of their size
+@contextlib.contextmanager
+def handled_interrupt(handle: Callable[[], None]) -> Iterator[None]:
+    """Let Ctrl-C call `handle` in place of raising KeyboardInterrupt, which CasADi may swallow.
+
+    Has no effect outside the main thread, or where somebody else handles Ctrl-C.
+    """
+    ours = threading.current_thread() is threading.main_thread()
+    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if ours:
+        signal.signal(signal.SIGINT, lambda *_: handle())
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @dataclass(frozen=True)
@@ -252,21 +306,22 @@ class GaussNewton:
     Parameters
     ----------
     max_iterations : int
-        Steps, the rejected ones too.
+        Steps, rejected ones included.
     tolerance : float
         Stop when the cost improved by less than this share over `patience` iterations, or the model predicts less.
+    patience : int
+        Iterations over which the improvement is measured.
     damping : float
-        First λ.
+        First Levenberg-Marquardt λ (see `Damping`); larger values give shorter first steps.
     time_limit : float
-        Seconds of a solve, at a bound on a spectral radius with all its repetitions (`tightening`). A fit makes several
-        solves.
+        Seconds of a solve; at a bound on a spectral radius of all its repetitions. A fit makes several solves.
     qp : str
         CasADi conic plugin.
 
     Raises
     ------
     InputError
-        If there is no such plugin.
+        If CasADi has no such plugin.
     """
 
     max_iterations: int = 200
@@ -282,7 +337,7 @@ class GaussNewton:
 
     def solve(
         self,
-        problem: Problem | Lifted,
+        problem: Minimisation,
         start: np.ndarray | None = None,
         progress: Progress | None = None,
         watch: Watch | None = None,
@@ -290,8 +345,8 @@ class GaussNewton:
     ) -> Solution:
         """Minimise from `start` (n,), by default the problem's own.
 
-        `watch` is given every point and may end it. What a limit ends is the best feasible point, or, `unfinished`,
-        where the run is, feasible or not, from which another one can go on.
+        `watch` receives every accepted point and ends the run by returning True. A run that a limit ends returns its
+        best feasible point or, with `unfinished`, its last point, feasible or not, from which another run can go on.
         """
         return _Run(self, problem, problem.start if start is None else start, progress, watch).run(unfinished)
 
@@ -306,66 +361,68 @@ class _Step:
 
 
 class _Run:
-    """One solve: the point, its derivatives and the damping; constraints, limits and multipliers of them are scaled."""
+    """One solve: the point, its derivatives and the damping; constraints and their multipliers are in units."""
 
     def __init__(
         self,
         options: GaussNewton,
-        problem: Problem | Lifted,
+        problem: Minimisation,
         start: np.ndarray,
         progress: Progress | None,
         watch: Watch | None = None,
     ) -> None:
         self.options, self.problem, self.progress, self.watch = options, problem, progress, watch
         self.theta = np.clip(np.asarray(start, dtype=float), problem.lower, problem.upper)
-        self.penalty, self.best = ExactPenalty(problem), Feasible(options.tolerance)
+        self.penalty, self.best = ExactPenalty(problem), BestFeasible(options.tolerance)
         self.n_g = len(problem.g_lower)
         self.qp = QuadraticProgram(problem.size, self.n_g, options.qp)
-        self.damping, self.growth, self.tried = options.damping, 2.0, 0
+        self.damping, self.tried = Damping(options.damping), 0
         self.multipliers = np.zeros(problem.size + self.n_g)
         self.history: list[Iteration] = []
         self.interrupted = False
         self.began = time.perf_counter()
 
     def run(self, unfinished: bool) -> Solution:
+        """Iterate, return to the best feasible point where the run strays, and collect the solution."""
         status = Status.MAX_ITERATIONS
         self.cost = self.problem.cost(self.theta)
         if not np.isfinite(self.cost):
             return self._finish(Status.DIVERGED_START)
         try:
-            with handled_interrupt(self._interrupt):  # casadi may swallow a KeyboardInterrupt
+            with handled_interrupt(self._interrupt):
                 status = self._iterate()
                 for k in range(RETURNS):
                     if status in ENDED and self.penalty.shrink(self.theta):
-                        self.best = Feasible(self.options.tolerance)
+                        self.best = BestFeasible(self.options.tolerance)
                     elif self._strayed(status):
-                        self._back()
+                        self._go_back()
                         self.penalty.raise_to(2.0 * self.best.tempting)
                     else:
                         break
-                    self.damping, self.growth = self.options.damping * 10.0**k, 2.0
+                    self.damping = Damping(self.options.damping * 10.0**k)
                     status = self._iterate()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
         goes_on = unfinished and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
         if not goes_on and self.best.better(self.cost, self.penalty.violation(self.theta)):
             status = Status.SOLVER_FAILED if self._strayed(status) else status
-            self._back()
+            self._go_back()
         self.penalty.shrink(self.theta)
         if status in ENDED and np.any(self.penalty.violations(self.theta) > TOLERATED):
             status = Status.INFEASIBLE
         return self._finish(status)
 
     def _strayed(self, status: Status) -> bool:
-        """Whether it ended of itself, and worse than a feasible point that it has seen."""
+        """Whether the run ended by itself, and worse than a feasible point that it has seen."""
         return status in (*ENDED, Status.INFEASIBLE) and self.best.better(self.cost, self.penalty.violation(self.theta))
 
-    def _back(self) -> None:
+    def _go_back(self) -> None:
         self.cost, self.theta, self.multipliers = self.best.cost, self.best.theta, self.best.multipliers
-        self._accepted(0.0)
+        self._record(0.0)
 
-    def _accepted(self, length: float) -> None:
-        self.history.append(Iteration(self.tried, self.cost, time.perf_counter() - self.began, length, self.damping))
+    def _record(self, length: float) -> None:
+        seconds = time.perf_counter() - self.began
+        self.history.append(Iteration(self.tried, self.cost, seconds, length, self.damping.value))
 
     def _interrupt(self) -> None:
         self.interrupted = True
@@ -393,34 +450,32 @@ class _Run:
                     self.progress(self.history[-1] if self.history else Iteration(0, self.cost, 0.0))
                 if self.watch and self.watch(self.theta):
                     return Status.STOPPED_EARLY
-                if self._calm(recent):
+                if self._settled(recent):
                     return Status.CONVERGED if violation <= FEASIBLE else Status.INFEASIBLE
-            step = self._step(hessian + self.damping * np.diag(floor), gradient, slope)
+            damped = hessian + self.damping.value * np.diag(floor)
+            step = self._step(damped, gradient, slope)
             if step.good:
                 self.multipliers = step.multipliers
                 self.penalty.follow(step.multipliers[problem.size :])
             predicted = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d)
-            trial, cost, improvement = self._judge(step, hessian + self.damping * np.diag(floor), gradient, slope)
+            trial, cost, improvement = self._judge(step, damped, gradient, slope)
             expected = predicted + self.penalty.weight * violation
             fresh = bool(step.good and improvement > 1e-4 * expected and improvement > 0)
             length = float(np.max(np.abs(step.d) * np.sqrt(floor))) if step.good else 0.0
             if fresh:
-                ratio = min(improvement / max(expected, 1e-300), 2.0)  # a cube of it follows
                 self.theta, self.cost = trial, cost
-                self.damping = max(self.damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 1e-12)
-                self.growth = 2.0
-                self._accepted(length)
-            else:
-                if step.good and expected < 1e-3 * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
-                    return self._stalled(hessian, floor, gradient, slope)
-                self.damping *= self.growth
-                self.growth *= 2.0
-                if self.damping > 1e12:
-                    stalled = self._stalled(hessian, floor, gradient, slope)
-                    return Status.INFEASIBLE if violation > TOLERATED else stalled
+                self.damping = self.damping.after_success(improvement / max(expected, 1e-300)).within(1e-12, np.inf)
+                self._record(length)
+                continue
+            if step.good and expected < 1e-3 * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
+                return self._stalled(hessian, floor, gradient, slope)
+            self.damping = self.damping.after_failure()
+            if self.damping.value > 1e12:
+                stalled = self._stalled(hessian, floor, gradient, slope)
+                return Status.INFEASIBLE if violation > TOLERATED else stalled
         return Status.MAX_ITERATIONS
 
-    def _calm(self, recent: list[tuple[float, float]]) -> bool:
+    def _settled(self, recent: list[tuple[float, float]]) -> bool:
         """Whether the last few steps changed next to nothing, all feasible or all as infeasible as the last."""
         options = self.options
         if self.cost <= NOTHING and recent[-1][1] <= FEASIBLE:
@@ -435,11 +490,11 @@ class _Run:
         return max(violation, left) <= FEASIBLE and cost - now < options.tolerance * abs(now)
 
     def _stalled(self, hessian: np.ndarray, floor: np.ndarray, gradient: np.ndarray, slope: np.ndarray) -> Status:
-        """What it means that a step promises nothing: a minimum, unless only its damping makes it so small.
+        """Judge a step that promises nothing: a minimum, unless only its damping makes it so small.
 
-        Multipliers are those of a step with little damping, and none at a kink, where it promises much in vain.
+        Multipliers are taken from a step with little damping; at a kink, where it promises much in vain, they are NaN.
         """
-        step = self._step(hessian + min(self.damping, self.options.damping) * np.diag(floor), gradient, slope)
+        step = self._step(hessian + min(self.damping.value, self.options.damping) * np.diag(floor), gradient, slope)
         promised = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d) if step.good else np.inf
         self.multipliers = step.multipliers * (1.0 if promised < KINK * abs(self.cost) else np.nan)
         return Status.CONVERGED if promised < self.options.tolerance * abs(self.cost) else Status.SMALL_STEP
@@ -447,9 +502,10 @@ class _Run:
     def _step(
         self, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray, correction: np.ndarray | None = None
     ) -> _Step:
+        """Solve the quadratic program, removing less of the violation where it is infeasible."""
         problem = self.problem
         low, high = self.penalty.room(self.penalty.values(self.theta) if correction is None else correction)
-        for share in (1.0, 0.5, 0.1, 0.01, 0.0) if self.n_g else (1.0,):  # of the violation that the step has to remove
+        for share in (1.0, 0.5, 0.1, 0.01, 0.0) if self.n_g else (1.0,):
             d, multipliers, good = self.qp(
                 damped,
                 gradient,
@@ -466,23 +522,23 @@ class _Run:
     def _judge(
         self, step: _Step, damped: np.ndarray, gradient: np.ndarray, slope: np.ndarray
     ) -> tuple[np.ndarray, float, float]:
-        """Trial point, its cost and the improvement of the penalised cost it brings."""
+        """Return the trial point, its cost and its improvement of the penalised cost."""
         if not step.good:
             return self.theta, self.cost, -np.inf
         problem, here = self.problem, self.penalty.violation(self.theta)
-        trial = self._inside(step)
+        trial = self._end_of(step)
         there = self.penalty.violation(trial)
         if self.n_g and there > max(here, 1e-12):
             corrected = self._step(damped, gradient, slope, self.penalty.values(trial) - slope @ step.d)
             if corrected.good:
-                candidate = self._inside(corrected)
+                candidate = self._end_of(corrected)
                 if self.penalty.violation(candidate) < there:
                     trial, there = candidate, self.penalty.violation(candidate)
         cost = problem.cost(trial)
         return trial, cost, self.cost - cost + self.penalty.weight * (here - there)
 
-    def _inside(self, step: _Step) -> np.ndarray:
-        """The end of a step: exactly on the bounds that its quadratic program holds active, and inside the others."""
+    def _end_of(self, step: _Step) -> np.ndarray:
+        """Return the end of a step: exactly on its active bounds, and inside the others."""
         problem, force, theta = self.problem, step.multipliers[: self.problem.size], self.theta + step.d
         theta = np.where((force < 0) & np.isfinite(problem.lower), problem.lower, theta)
         theta = np.where((force > 0) & np.isfinite(problem.upper), problem.upper, theta)

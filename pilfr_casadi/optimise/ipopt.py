@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError
-from .gauss_newton import ROUNDING, handled_interrupt
+from .gauss_newton import ROUNDING, Damping, handled_interrupt
 from .problem import Problem
 from .solution import Iteration, Progress, Solution, Status
 
@@ -144,8 +144,13 @@ class Point:
     slope: np.ndarray
 
 
-class Damping:
-    """λ, and what is needed to judge the next step.
+class DampedHessian:
+    """Hessian for IPOPT: `H + λ D`, with D the largest diagonal of H so far (Marquardt 1963; Moré 1978).
+
+    With λ = 0 a state space, which is over-parametrised, takes useless steps, and columns that vanish make H singular.
+    λ follows how well the last step was predicted (`Damping`). The Hessian predicts the Lagrangian, so the curvature of
+    constraints, which H leaves out, counts as a miss and raises λ as well; without this, iterates cycle along curved
+    constraints. Where the line search had to shorten a step, λ grows.
 
     Parameters
     ----------
@@ -156,37 +161,40 @@ class Damping:
     """
 
     def __init__(self, first: float, size: int) -> None:
-        self.value, self.growth, self.largest = first, 2.0, np.zeros(size)
+        self.damping, self.largest = Damping(first), np.zeros(size)
         self.before: Point | None = None
         self.damped = np.zeros((size, size))
 
-    def hessian(self, point: Point, multipliers: np.ndarray, trials: int) -> np.ndarray:
-        """`H + λ D` at a new iterate, reached after `trials` evaluations; multipliers (n_g,) of the constraints."""
+    @property
+    def value(self) -> float:
+        """Present λ."""
+        return self.damping.value
+
+    def at(self, point: Point, multipliers: np.ndarray, trials: int) -> np.ndarray:
+        """Return `H + λ D` at a new iterate, reached after `trials` evaluations; multipliers (n_g,)."""
         if self.before is not None and np.any(point.x != self.before.x):
             if trials > 1:
-                self.value *= min(4.0 ** (trials - 1), 100.0)
+                raised = self.damping.value * min(4.0 ** (trials - 1), 100.0)
+                self.damping = Damping(raised, self.damping.growth)
             else:
-                self._follow(self._ratio(self.before, point, multipliers))
-            self.value = min(max(self.value, 1e-12), 1e12)
+                ratio = self._ratio(self.before, point, multipliers)
+                poor = ratio < 1e-4
+                self.damping = self.damping.after_failure() if poor else self.damping.after_success(ratio)
+            self.damping = self.damping.within(1e-12, 1e12)
         self.largest = np.maximum(self.largest, np.diag(point.hessian))
-        # the variables are scaled: next to 1, what is less has been zero or rounding so far
-        self.damped = point.hessian + self.value * np.diag(np.where(self.largest > ROUNDING, self.largest, 1.0))
+        # the variables are scaled to order 1: smaller entries have been zero or rounding so far
+        diagonal = np.where(self.largest > ROUNDING, self.largest, 1.0)
+        self.damped = point.hessian + self.damping.value * np.diag(diagonal)
         self.before = point
         return self.damped
 
     def _ratio(self, before: Point, after: Point, multipliers: np.ndarray) -> float:
-        """1 + (gain - foretold gain) / scale; the gain ratio, where bounds and constraints do not bend the step."""
+        """Return 1 + (gain - predicted gain) / scale: the gain ratio where no bound or constraint bends the step."""
         d = after.x - before.x
         curvature = 0.5 * float(d @ before.hessian @ d)
-        foretold = float((before.gradient + multipliers @ before.slope) @ d) + curvature
+        predicted = float((before.gradient + multipliers @ before.slope) @ d) + curvature
         change = after.value - before.value + float(multipliers @ (after.constraints - before.constraints))
-        return 1.0 + (foretold - change) / max(float(d @ self.damped @ d) - curvature, 1e-300)
-
-    def _follow(self, ratio: float) -> None:
-        if ratio < 1e-4:
-            self.value, self.growth = self.value * self.growth, 2.0 * self.growth
-        else:
-            self.value, self.growth = self.value * max(1 / 3, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3), 2.0
+        return 1.0 + (predicted - change) / max(float(d @ self.damped @ d) - curvature, 1e-300)
 
 
 class Scaled:
@@ -370,7 +378,7 @@ class _Run:
                 status = self._ending(message, *before)
                 if status is not None:
                     break
-                damping = 100.0 * max(self.damping.value, 1e-2)
+                damping = 100.0 * max(self.hessian.value, 1e-2)
             if self.error is None:
                 self._onto_bounds()
         except KeyboardInterrupt as interrupt:
@@ -396,7 +404,7 @@ class _Run:
     def _nlpsol(self, damping: float) -> str:
         """One run of IPOPT from the best point; returns its own word for how it ended."""
         scaled, n, n_g, dense = self.scaled, self.problem.size, len(self.problem.g_lower), ca.Sparsity.dense
-        self.damping, self.trials = Damping(damping, n), 0
+        self.hessian, self.trials = DampedHessian(damping, n), 0
         x, g, one = dense(n, 1), dense(n_g, 1), dense(1, 1)
         first, last = {"x": x, "p": ca.Sparsity(0, 0)}, {"lam_f": one, "lam_g": g}
         iterate = {"x": x, "f": one, "g": g, "lam_x": x, "lam_g": g, "lam_p": dense(0, 1)}
@@ -461,7 +469,7 @@ class _Run:
 
     def _hessian(self, x: np.ndarray, _: Any, weight: np.ndarray, multipliers: np.ndarray) -> Sequence[Any]:
         if weight[0]:
-            h = weight[0] * self.damping.hessian(self._point(x), multipliers / weight[0], self.trials)
+            h = weight[0] * self.hessian.at(self._point(x), multipliers / weight[0], self.trials)
             self.trials = 0
         else:  # IPOPT restores feasibility
             h = self.scaled.curvature(x, multipliers)
@@ -474,7 +482,7 @@ class _Run:
         step = float(np.max(np.abs(x - self.x)) * np.sqrt(scaled.unit)) if self.history else 0.0
         self.x = x
         seconds = time.perf_counter() - self.began
-        self.history.append(Iteration(len(self.history), cost, seconds, step, self.damping.value))
+        self.history.append(Iteration(len(self.history), cost, seconds, step, self.hessian.value))
         if self.progress:
             self.progress(self.history[-1])
         value, multipliers = np.concatenate([x, g]), np.concatenate([lam_x, lam_g])
