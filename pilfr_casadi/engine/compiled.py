@@ -200,7 +200,6 @@ FLAGS = (("-march=native", *COMMON), COMMON)  # the second where the first is no
 # it is wanted, and to thread thousands of such jumps takes GCC minutes
 PLAIN, LOOPS = ("-O1", "-fno-thread-jumps"), ("-O2",)
 KEPT = 40  # libraries in each of the cache's 256 folders: some hundred megabytes
-WRITTEN = 64  # states with memory up to which slopes written out fit the nearest cache
 PATIENCE = 600.0  # seconds for one compilation
 _failures: dict[str, str] = {}  # what did not compile is not tried again by this process
 
@@ -343,7 +342,7 @@ class Compiled:
     """Generated C behind the `Engine` protocol; it keeps nothing between calls, so threads may share it."""
 
     def __init__(self, model: Model) -> None:
-        self.linear = linearize(model, staged=model.n_state <= WRITTEN)
+        self.linear = linearize(model)
         self.loops = _loops(cache_directory())
         self.library = _loaded(build(source_code(self.linear)))
         self.model = ctypes.byref(ctypes.c_char.in_dll(self.library, "pilfr_model"))

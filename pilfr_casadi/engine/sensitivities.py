@@ -34,6 +34,7 @@ TARGETS = {
     "x": ("x", "w", "c", "p"),
     "y": ("x", "w", "p"),
 }
+WRITTEN = 64  # states with memory up to which slopes by way of intermediate values fit the nearest cache
 BLOCKS = tuple((target, source) for target, sources in TARGETS.items() for source in sources)
 
 
@@ -69,13 +70,13 @@ class Linearization:
 
 
 @one_at_a_time
-def linearize(model: Model, staged: bool = False) -> Linearization:
-    """Differentiate one step of a closed model symbolically, `staged` by way of its intermediate values, if any."""
+def linearize(model: Model) -> Linearization:
+    """Differentiate one step of a closed model symbolically, by way of its intermediate values if it has any."""
     x, s, u, p = model.symbols()
     z_now = model.port(x, u, p)
     w_now, s_now = model.memory(z_now, s, p)
     x_now, y_now = model.step(x, u, w_now, p)
-    stages = model.stages if staged else None
+    stages = model.stages if model.n_state <= WRITTEN else None
     c = ca.SX.sym("c", stages.size1_in(4) if stages else 0)
     c_now = stages(x, u, w_now, p, c)[0] if stages else c
     outputs = ca.cse([x_now, s_now, y_now, z_now, w_now, c_now])
@@ -115,6 +116,30 @@ class Engine(Protocol):
         seed (n_x + n_s, n_c) is the state's derivative, columns (n_p,) gives each parameter's own column or -1
         -> y, J (M, n_y, n_c), next state, next seed; all are the caller's to change.
         """
+
+
+def _advance(slope: dict[str, Any], block: dict[tuple[str, str], Any], target: str) -> Any:
+    """Return the transposed slopes of a target, summed in the order of the generated C so that all bits agree."""
+    direct = block[target, "p"]
+    total = ca.MX.zeros(*direct.shape)
+    for source in TARGETS[target][:-1]:
+        if (target, source) != ("c", "c") and block[target, source].nnz():
+            total = ca.mac(slope[source], block[target, source], total)
+    if target == "c":
+        return _stages(total, block["c", "c"], direct)
+    return total + ca.densify(direct) if direct.nnz() else total
+
+
+def _stages(total: Any, by_stages: Any, direct: Any) -> Any:
+    """Complete the transposed slopes of the intermediate values one after the other: each needs those before it."""
+    columns = ca.horzsplit(total) if total.shape[1] else []
+    for i in range(len(columns)):
+        before = by_stages[:, i]
+        for k, j in enumerate(before.sparsity().row()):
+            columns[i] = columns[i] + before.nz[k] * columns[j]
+        if direct[:, i].nnz():
+            columns[i] = columns[i] + ca.densify(direct[:, i])
+    return ca.horzcat(total[:, :0], *columns)
 
 
 class VirtualMachine:
@@ -158,12 +183,8 @@ class VirtualMachine:
             for k in range(length * stride):
                 x, s, y_k, *found = linear(x, s, u[:, k], p)
                 block, following = dict(zip(BLOCKS, found, strict=True)), dict[str, Any]()
-                for target, sources in TARGETS.items():
-                    total = ca.densify(block[target, "p"])
-                    for source in sources[:-1]:
-                        if block[target, source].nnz():
-                            total = ca.mac(slope[source], block[target, source], total)
-                    (slope if target in ("z", "w", "c") else following)[target] = total
+                for target in TARGETS:
+                    (slope if target in ("z", "w", "c") else following)[target] = _advance(slope, block, target)
                 slope = following
                 if k % stride == 0:
                     y.append(y_k)
