@@ -245,7 +245,7 @@ def test_a_step_inside_its_limits_is_that_of_the_quadratic_program():
         ours, qrqp = QuadraticProgram(n, n_g, "daqp"), QuadraticProgram(n, n_g, "qrqp")
         d, multipliers, good = ours(h, g, *limits)
         expected = np.asarray(
-            qrqp._solve(h=h, g=g, lbx=limits[0], ubx=limits[1], a=a, lba=limits[3], uba=limits[4])["x"]
+            qrqp._solver(h=h, g=g, lbx=limits[0], ubx=limits[1], a=a, lba=limits[3], uba=limits[4])["x"]
         ).ravel()
         assert good, case
         np.testing.assert_allclose(d, expected, atol=1e-7 * max(1.0, np.max(np.abs(expected))))
