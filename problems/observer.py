@@ -17,8 +17,7 @@ import casadi as ca
 import numpy as np
 
 from pilfr_casadi.cli.demo import demo_recordings
-from pilfr_casadi.control import kalman_filter
-from pilfr_casadi.control.kalman import ekf_step
+from pilfr_casadi.control import ekf_step, kalman_filter
 from pilfr_casadi.identify import fit
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 

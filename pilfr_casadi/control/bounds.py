@@ -1,13 +1,13 @@
 r"""A guarantee that a fitted model's response stays bounded, whatever the input does within its limits.
 
-Of a PI-LFR (Krikelis et al. 2024, Eq. 15-17) whose element gives bounded forces `|w| <= w_max` for every signal, the
-rest is a linear model, so with impulse responses `h`
+If the element of a PI-LFR (Krikelis et al. 2024, Eq. 15-17) gives bounded forces `|w| <= w_max` for every signal, the
+rest is a linear model, and with its impulse responses `h`
 
 .. math:: |y_i| <= \sum_j \|h_{ij}^u\|_1 \max|u_j| + \sum_j \|h_{ij}^w\|_1 w_{j,\max} + |y_{0,i}|
 
 whenever the spectral radius of A is below one: no feedback through the element can make it grow. Stops, envelopes and
-products are bounded for every signal; plays where the inputs alone drive them. The memory at the start is zero. The
-bound says that nothing diverges, not how large responses are: it is far above them where modes are hardly damped.
+products are bounded for every signal, plays only if the inputs alone drive them. The memory at the start is zero. The
+bound shows that nothing diverges; it is far above the actual responses if modes are hardly damped.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from ..identify import Fit
 from ..models import element_bound
 
 Array = np.ndarray
-STEPS = 200_000  # of the impulse response
-LEFT = 1e-6  # share of the impulse response that is left out, and added by its decay
+STEPS = 200_000  # longest impulse response, samples: enough for a pole at 0.9999, within a second
+TAIL = 1e-6  # share of the impulse response that is bounded by its decay instead of summed
 
 
 @dataclass(frozen=True, eq=False)
 class ResponseBound:
-    """What is guaranteed of a model's response.
+    """Guaranteed bound of a model's response.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class ResponseBound:
 
     @property
     def guaranteed(self) -> bool:
-        """Whether every bounded input gives a bounded output."""
+        """Tell whether every bounded input gives a bounded output."""
         return bool(np.all(np.isfinite(self.outputs)))
 
     def __str__(self) -> str:
@@ -68,7 +68,7 @@ def response_bound(fit: Fit, largest_input: Any) -> ResponseBound:
     Parameters
     ----------
     fit : Fit
-        Of a PI-LFR with any element, or of a linear model.
+        Fit of a PI-LFR with any element, or of a linear model.
     largest_input : float or array, (n_u,)
         Largest |u|, in the inputs' units.
 
@@ -99,7 +99,7 @@ def response_bound(fit: Fit, largest_input: Any) -> ResponseBound:
 
 
 def _absolute_sum(A: Array, B: Array, C: Array) -> Array:
-    """`Σ_k |C A^k B|`, or a little more: what many steps leave is bounded in modal coordinates."""
+    """`Σ_k |C A^k B|`, or a little more: the tail is bounded in modal coordinates."""
     if not len(A):
         return np.zeros((len(C), B.shape[1]))
     values, V = np.linalg.eig(A)
@@ -110,6 +110,6 @@ def _absolute_sum(A: Array, B: Array, C: Array) -> Array:
         total += np.abs(C @ state)
         state = A @ state
         rest = (left * (size**k / (1 - size))) @ right
-        if np.all(rest <= LEFT * whole):
+        if np.all(rest <= TAIL * whole):
             break
     return np.asarray(total + rest)

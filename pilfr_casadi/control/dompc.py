@@ -1,7 +1,8 @@
 """A fitted model in do-mpc (Fiedler et al. 2023, Control Engineering Practice 140), which is an optional extra.
 
-The same problem as `PredictiveController`, states in, multiple shooting by IPOPT; where no output limit has to be given
-up the problem is the same. IPOPT is handed the model with its kinks, and may stop at one.
+It solves the problem of `PredictiveController` by multiple shooting and IPOPT, with the states as variables. The two
+problems are the same as long as no output limit has to be violated. IPOPT gets the model with its kinks and may stop at
+one.
 """
 
 from __future__ import annotations
@@ -19,14 +20,8 @@ Array = np.ndarray
 MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
 
 
-def imported() -> Any:
-    """The package do_mpc.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
+def _import_do_mpc() -> Any:
+    """Import do-mpc, or say how to install it."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it warns about each of its own optional parts
@@ -37,12 +32,12 @@ def imported() -> Any:
 
 
 def do_mpc_model(function: Any) -> Any:
-    """A discrete `do_mpc.model.Model` of `F(x, u) -> (x_next, y)`: state x, input u, expression y, reference r.
+    """Build a discrete `do_mpc.model.Model` of `F(x, u) -> (x_next, y)`: state x, input u, expression y, reference r.
 
     Parameters
     ----------
     function : casadi.Function, Fit, KalmanFilter or Exported
-        What `PredictiveController` takes.
+        A model as for `PredictiveController`.
 
     Returns
     -------
@@ -55,7 +50,7 @@ def do_mpc_model(function: Any) -> Any:
         If do-mpc is not installed, or there is no such function.
     """
     function = step_function(function)
-    model = imported().model.Model("discrete", "SX")
+    model = _import_do_mpc().model.Model("discrete", "SX")
     x = model.set_variable("_x", "x", (function.size1_in(0), 1))
     u = model.set_variable("_u", "u", (function.size1_in(1), 1))
     model.set_variable("_tvp", "r", (function.size1_out(1), 1))
@@ -77,20 +72,20 @@ def do_mpc_controller(
     y_scale: Any = None,
     u_scale: Any = None,
 ) -> Any:
-    """A `do_mpc.controller.MPC` that follows a reference; the arguments are those of `PredictiveController`.
+    """Build a `do_mpc.controller.MPC` that follows a reference, with the arguments of `PredictiveController`.
 
     Limits and scales are numbers or one for each signal.
 
     Parameters
     ----------
     reference : array, shape (M, n_y)
-        The whole path, a row a sample; behind its end the last row is wanted.
+        The whole path, one row per sample; after its end the last row holds.
 
     Returns
     -------
     do_mpc.controller.MPC
-        Set up; set `x0` and `u0`, call `set_initial_guess()`, then `make_step(x)` at each sample. The sample number is
-        do-mpc's own time.
+        Ready for use: set `x0` and `u0`, call `set_initial_guess()`, then `make_step(x)` at each sample. do-mpc's time
+        is the sample number.
 
     Raises
     ------
@@ -105,7 +100,7 @@ def do_mpc_controller(
         raise InputError(f"The reference has the shape {path.shape}; give (samples, {n_y}), a row a sample.")
     low, high, u_size = (_constant(v, horizon) for v in (task.low, task.high, task.u_scale))
     low_y, high_y, y_size = (_constant(v, horizon) for v in (task.low_y, task.high_y, task.y_scale))
-    do_mpc = imported()
+    do_mpc = _import_do_mpc()
     model = do_mpc_model(function)
     mpc = do_mpc.controller.MPC(model)
     quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.tol": 1e-9}
@@ -117,9 +112,9 @@ def do_mpc_controller(
     price = limit_price(np.maximum(low_y - path, path - high_y) / y_size)
     soft = {"ub": 0, "soft_constraint": True, "penalty_term_cons": price}
     for name, side, limit in (("above", 1, high_y), ("below", -1, low_y)):
-        held = np.flatnonzero(np.abs(limit) < NO_LIMIT)
-        if len(held):
-            mpc.set_nl_cons(name, side * (model.aux["y"] - limit)[held] / y_size[held], **soft)
+        limited = np.flatnonzero(np.abs(limit) < NO_LIMIT)
+        if len(limited):
+            mpc.set_nl_cons(name, side * (model.aux["y"] - limit)[limited] / y_size[limited], **soft)
     template = mpc.get_tvp_template()
 
     def wanted(now: float) -> Any:
@@ -133,7 +128,7 @@ def do_mpc_controller(
 
 
 def _constant(values: Array, samples: int) -> Array:
-    """One value for each signal, of values over the horizon."""
+    """Return the one value of each signal that holds over the horizon."""
     each = values.reshape(samples, -1)
     if np.any(each != each[0]):
         raise InputError(

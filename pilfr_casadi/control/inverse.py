@@ -1,127 +1,434 @@
-"""The exact inverse of a Prandtl-Ishlinskii element, which is one itself.
+"""The input for a wanted output: a fitted model inverted one look-ahead at a time.
 
-For plays with `0 = r_0 < r_1 < ... < r_n` and weights `w_0 > 0` (the linear part), all partial sums positive, Krejčí &
-Kuhnen (2001), IEE Proc. Control Theory Appl. 148, give the inverse in closed form:
+**Method.** With `F(x, u) = (f, h)`, a delay of n samples and a look-ahead of d >= n samples, the input u of a sample
+solves
 
-    r'_i = Σ_{j≤i} w_j (r_i - r_j),   w'_0 = 1 / w_0,
-    w'_i = -w_i / ((w_0 + ... + w_i) (w_0 + ... + w_{i-1})),
-    q'_i = Σ_{j≤i} w_j q_i + Σ_{j>i} w_j q_j.
+    y_{k+d}(x_k, u_{k+i} = u + min(i, d - n) (u - u_{k-1})) = wanted_{k+d}:
 
-r' are the values of the virgin loading curve at the kinks, and w' the changes of slope of its inverse function; q' are
-the memories, which follow from those of the plays at the moment when play i slipped last. Stops are turned into plays
-by `S_r[z] = z - P_r[z]`: `Σ w_j S_rj = (Σ w_j) z - Σ w_j P_rj`. A sum of stops alone saturates and has no inverse; one
-with a spring of stiffness `gain` beside it has. Where all partial sums are negative, so that the output falls as the
-input rises, the formulas hold with -r' for r', since plays are odd: `P_r[-z] = -P_r[z]` from the negative memory.
+the input continues its change since the sample before, as long as it still reaches the output. The equation is scalar,
+piecewise linear and increasing for plays (decreasing where the gain is negative). Newton steps inside a shrinking
+bracket solve it in a fixed number of steps. For d = n, a model without response before n samples and one solution, this
+is the exact inverse. Sampled machines often have zeros outside the unit circle (Åström, Hagander & Sternby 1984,
+Automatica 20), which make the exact inverse unstable. Then a longer look-ahead is taken, under which
+
+    x⁺ = A x + B u,   u = -(g_x x + g_before u_before) / g_u,   g = ∂y_{k+d},
+
+is stable wherever the model has been driven. That inverse is approximate, and the result says so.
+
+**Delay and zeros.** Linearised at a state of the recording, `A, B, C, D`, the output after j samples follows the input
+by the Markov parameter `m_0 = D, m_j = C A^{j-1} B`. A pure delay of n samples is `m_0 = ... = m_{n-1} = 0`. In a fit
+these are small instead of zero, so values within four standard errors, or a thousandth of the largest, count as zero.
+Standard errors follow from the covariance of the fit's parameters by the delta method. The zeros are the eigenvalues of
+`A - B C A^n / m_n` (`A - B C / D` for n = 0), the poles of the exact inverse; n of them are zero, those of the delay.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers
-from ..models import Play, Stop, play
+from ..data import Recording
+from ..identify import Fit, covariance, variance
+from ..optimise import Problem
+from .estimation import KalmanFilter, ModelSource, Rollout, function_of_observer, roll_out
 
 Array = np.ndarray
+FARTHEST = 12  # samples of look-ahead beyond the delay that are tried; longer ones gain nothing on the benchmarks
+LONGEST = 1000  # samples of look-ahead that may be asked for: each unrolls the model once
+STABLE = 0.999  # spectral radius of an accepted inverse: disturbances fade within some thousand samples
+FAINT = 0.02  # of the largest gain over the look-aheads and along the recording: smaller gains are model error
+STEPS = 40  # Newton or bisection steps: bisection alone then reaches 1e-12 of the bracket
+NOTHING = 1e-9  # of the largest response: an earlier one below this is rounding
+INPUTS = 31  # inputs between the limits at which the sign of the gain is looked at
+POINTS = 60  # states along the recording at which the model is linearised
+SAMPLES = 100  # length of the response that is looked at
+ERRORS = 4.0  # standard errors from which on a Markov parameter counts
+SMALL, UNKNOWN = 1e-3, 0.02  # of the largest Markov parameter: none counts below; the second where errors are unknown
 
 
 @dataclass(frozen=True, eq=False)
-class Inverse:
-    """The inverse of `gain z + Σ w_j H_rj[z]`: plays again, the first with threshold 0.
+class Feedforward:
+    """An inverse of a model.
 
     Attributes
     ----------
     step : casadi.Function
-        `(memory, wanted) -> (memory_next, u)`: the u for which the element gives what is wanted.
-    r, w : array, shape (n + 1,)
-        Thresholds (in units of the element's output) and weights, for a `PrandtlIshlinskii(Play, n + 1)`.
+        `(x, u_before, wanted) -> (x_next, u)`: the input for which the output is the wanted one `ahead` samples later,
+        and the model's state after it. In feedback, x is the observer's state and x_next is not used.
+    ahead : int
+        Look-ahead (preview): number of samples that the wanted path must be known in advance.
+    limits : tuple of float
+        Smallest and largest input; a wanted output out of reach gets one of them.
+    delay : int
+        Samples after which an input reaches the output at the earliest.
+    zeros : array of complex
+        Zeros of the linearised model on or outside the unit circle, which forbid the exact inverse.
+    note : str
+        Sentence that says whether the inverse is exact, or approximate and why.
     """
 
     step: ca.Function
-    r: Array
-    w: Array
-    _sorted: tuple[Array, Array, Array]
+    ahead: int
+    limits: tuple[float, float]
+    delay: int = 0
+    zeros: Array = field(default_factory=lambda: np.zeros(0))
+    note: str = ""
 
     def __str__(self) -> str:
-        r = ", ".join(f"{v:.4g}" for v in self.r)
-        w = ", ".join(f"{v:.4g}" for v in self.w)
-        return f"inverse element of {len(self.r)} plays, u from what is wanted\nthresholds: {r}\nweights: {w}"
+        return self.note
 
-    __repr__ = __str__
+    def inputs(self, wanted: Array, x0: Array | None = None) -> Array:
+        """Inputs (M, 1) for a whole wanted path (M,), from the state x0 (at rest by default), without feedback."""
+        path = numbers(wanted, "The wanted path")
+        if path.size < 1 or path.size != max(path.shape, default=0):
+            raise InputError(f"A path of the shape {path.shape} was given; give one output over at least one sample.")
+        path = path.ravel()
+        n = int(self.step.size1_in(0))
+        start = np.zeros(n) if x0 is None else numbers(x0, "The state").ravel()
+        if len(start) != n:
+            raise InputError(
+                f"A state of {len(start)} numbers was given to the compensator; give {n}, memory included."
+            )
+        shifted = np.concatenate([path[self.ahead :], np.full(min(self.ahead, len(path)), path[-1])])
+        x, before, wanted_then = ca.MX.sym("x", len(start)), ca.MX.sym("before"), ca.MX.sym("wanted")
+        following, u = self.step(x, before, wanted_then)
+        both = ca.Function("both", [ca.vertcat(x, before), wanted_then], [ca.vertcat(following, u), u])
+        begin = np.append(start, np.clip(0.0, *self.limits))
+        return np.asarray(both.mapaccum("path", len(path))(begin, shifted[None, :])[1]).T
 
-    def memory(self, s: Array | None = None) -> Array:
-        """The inverse's memory that belongs to the element's memory s, shape (n,); at rest by default.
 
-        s are play states, for stops too, in the order of the thresholds that were given. They have to be such as an
-        input can bring about.
-        """
-        order, _, w = self._sorted
-        q = np.zeros(len(order)) if s is None else numbers(s, "The memory").ravel()
-        if len(q) != len(order):
-            raise InputError(f"{len(q)} memories were given for {len(order)} operators; give one each.")
-        q = np.concatenate([[0.0], q[order]])
-        own = np.cumsum(w) * q + np.sum(w * q) - np.cumsum(w * q)
-        own[0] = 0.0  # the play of threshold 0 forgets at once
-        return np.asarray(own)
-
-
-def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, name: str = "inverse") -> Inverse:
-    """Invert one channel of a Prandtl-Ishlinskii element, `v = gain z + Σ w_j H_rj[z]`.
+def feedforward(
+    fit: ModelSource,
+    recording: Recording,
+    *,
+    limits: tuple[float, float] | None = None,
+    ahead: int | None = None,
+    observer: KalmanFilter | None = None,
+) -> Feedforward:
+    """Design a compensator that inverts a whole model, dynamics and hysteresis: the input for a wanted output.
 
     Parameters
     ----------
-    r, w : array, shape (n,)
-        Thresholds (not negative, any order) and weights of the operators.
-    gain : float
-        Linear part beside them; it joins the weights of operators with threshold 0.
-    operator : Play or Stop
-        What the operators are.
-    name : str
-        Name of the CasADi Function.
+    fit : Fit, Diagnosis, Simulator or Exported
+        A model of one input, held between samples, and one output; of a diagnosis its corrected simulator.
+    recording : Recording
+        Where the model works; the inverse has to be stable along it. Usually the training recording.
+    limits : (low, high), optional
+        Smallest and largest input; by default those of the recording.
+    ahead : int, optional
+        Look-ahead in samples; by default the shortest under which the inverse is stable. A look-ahead beyond the delay
+        makes the inverse approximate, and so does a small response before the delay, or an output that several inputs
+        give; the printed result says so.
+    observer : KalmanFilter, optional
+        The observer whose state the compensator works on, disturbances included.
 
     Returns
     -------
-    Inverse
+    Feedforward
 
     Raises
     ------
     InputError
-        If the element has no inverse: its slope right after a reversal or along its loading curve is zero or
-        changes its sign.
+        If the observer is one of another model, or the model cannot be inverted: it has several inputs or outputs, the
+        input does not reach the output within the look-ahead, or no inverse is stable.
     """
-    kind = operator() if isinstance(operator, type) else operator
-    r, w = numbers(r, "The thresholds").ravel(), numbers(w, "The weights").ravel()
-    gain = float(numbers(gain, "gain", ()))
-    if not isinstance(name, str) or not ca.Function.check_name(name):
-        raise InputError(f"The function name {name!r} cannot be used; give letters, digits and single underscores.")
-    if not isinstance(kind, Play | Stop):
-        raise InputError(f"The inverse of {operator!r} is not known in closed form; give Play or Stop.")
-    if len(r) != len(w):
-        raise InputError(f"{len(r)} thresholds and {len(w)} weights were given; give one weight for each threshold.")
-    if np.any(r < 0):
-        raise InputError(f"A threshold is {np.min(r):.4g}; thresholds are half-widths, give zero or more.")
-    if isinstance(kind, Stop):
-        gain, w = gain + float(np.sum(w)), -w
-    order = np.argsort(r, kind="stable")
-    r, w = np.concatenate([[0.0], r[order]]), np.concatenate([[float(gain)], w[order]])
-    slope = np.cumsum(w)
-    first = int(np.sum(r == 0))  # operators without width belong to the linear part
-    sign = 1.0 if slope[first - 1] > 0 else -1.0
-    if np.any(sign * slope[first - 1 :] <= 1e-12 * np.max(np.abs(slope))):
+    run = roll_out(fit, recording, "feedforward")
+    _check_ports(run, recording)
+    ends = _input_limits(limits, recording)
+    planned = run.function if observer is None else function_of_observer(observer, run.function, recording)
+    response = analyse_response(fit, run, recording)
+    found, why = _choose_look_ahead(run, recording, response, ahead)
+    delay = response.delay or 0
+    if found == delay and _gain_changes_sign(run, recording, response, ends):
+        why = "within the limits the output rises with the input in places and falls in others, so that it is not the "
+        why += "output of one input alone"
+    elif found == delay and response.early > NOTHING:
+        why = f"it has {_percent(response.early)} of its largest response before, which counts as an error of the model"
+    step = inverse_step(planned, found, ends, delay)
+    return Feedforward(step, found, ends, delay, _unstable_zeros(response), _note(found, delay, why))
+
+
+def _check_ports(run: Rollout, recording: Recording) -> None:
+    """Refuse models of several inputs or outputs, or with interpolated inputs."""
+    n_u, n_y = recording.n_u, run.y.shape[1]
+    if n_y > n_u:
         raise InputError(
-            f"This element has no inverse: its slope is {slope[first - 1]:.4g} right after a reversal and "
-            f"{slope[-1]:.4g} once everything slips, and all slopes must be above zero, or all below; add a linear "
-            "part with gain=."
+            f"The model has {n_y} outputs and {n_u} input(s), which cannot make all of them follow wanted "
+            "paths; fit a model of one output, or use predictive control."
         )
-    own = np.zeros(len(r))
-    own[0] = 1 / slope[first - 1]
-    own[first:] = -w[first:] / (slope[first:] * slope[first - 1 : -1])
-    low = sign * np.array([np.sum(w[: i + 1] * (r[i] - r[: i + 1])) for i in range(len(r))])
-    q, v = ca.SX.sym("memory", len(r)), ca.SX.sym("wanted")
-    following = ca.vertcat(*[play(v, q[i], low[i]) for i in range(len(r))])
-    names = ["memory", "wanted"], ["memory_next", "u"]
-    step = ca.Function(name, [q, v], [following, ca.dot(ca.DM(own), following)], *names)
-    return Inverse(step, low, own, (order, r, w))
+    if n_u != 1 or n_y != 1:
+        raise InputError(
+            f"The model has {n_u} inputs and {n_y} output(s); the compensator inverts models of one input "
+            "and one output, so fit such a one, or use predictive control."
+        )
+    if len(run.names) > 1:
+        raise InputError(
+            "The model's input is interpolated between samples, so that a step takes two, and the compensator holds "
+            "its own; give exported(simulator, dt=..., hold='zero', start=...), of a diagnosis with its `corrected`."
+        )
+
+
+def _input_limits(limits: tuple[float, float] | None, recording: Recording) -> tuple[float, float]:
+    """Smallest and largest input, by default those of the recording."""
+    try:
+        low, high = (np.min(recording.u), np.max(recording.u)) if limits is None else map(float, limits)
+    except (TypeError, ValueError):
+        low = high = np.nan
+    if not (low < high and np.isfinite(high - low)):
+        given = "none, and the recording's input is constant" if limits is None else repr(limits)
+        raise InputError(
+            f"Limits of the input of {given[:60]} were given; give (low, high), finite, with low below high."
+        )
+    return float(low), float(high)
+
+
+def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float], delay: int = 0) -> ca.Function:
+    """Invert any scalar `F(x, u)` by a step `(x, u_before, wanted) -> (x_next, u)`; see `feedforward`."""
+    n, reached = function.size1_in(0), _output_ahead(function, ahead, delay)
+    # the bracket (u, low, high) moves; x, u_before, wanted and the sign of the gain are passed on beside it
+    whole = ca.MX.sym("whole", n + 6)
+    u, low, high, x = whole[0], whole[1], whole[2], whole[3 : 3 + n]
+    before, wanted, sign = whole[3 + n], whole[4 + n], whole[5 + n]
+    value, _, _, slope = reached(x, before, u)
+    error = sign * (value - wanted)
+    below, above = ca.if_else(error < 0, u, low), ca.if_else(error < 0, high, u)
+    newton = u - error / (sign * slope)
+    inside = ca.logic_and(newton >= below, newton <= above)  # false for nan
+    following = ca.vertcat(ca.if_else(inside, newton, (below + above) / 2), below, above, whole[3:])
+    narrowed = ca.Function("narrowed", [whole], [following]).fold(STEPS)
+    x, before, wanted = ca.MX.sym("x", n), ca.MX.sym("u_before"), ca.MX.sym("wanted")
+    ends = [reached(x, before, limit)[0] for limit in limits]
+    begin = ca.vertcat(ca.fmin(ca.fmax(before, limits[0]), limits[1]), *limits)
+    found = narrowed(ca.vertcat(begin, x, before, wanted, ca.if_else(ends[1] > ends[0], 1.0, -1.0)))[0]
+    names = ["x", "u_before", "wanted"], ["x_next", "u"]
+    return ca.Function("feedforward", [x, before, wanted], [function(x, found)[0], found], *names)
+
+
+def _output_ahead(function: ca.Function, ahead: int, delay: int) -> ca.Function:
+    """Output after `ahead` samples of a continued input, with slopes: `(x, u_before, u) -> (y, y_x, y_before, y_u)`."""
+    x, before, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("before"), ca.SX.sym("u")
+    state = x
+    for i in range(ahead):
+        state = function(state, u + min(i, ahead - delay) * (u - before))[0]
+    y = function(state, u + (ahead - delay) * (u - before))[1]
+    slopes = [ca.densify(ca.jacobian(y, v)) for v in (x, before, u)]
+    return ca.Function("reached", [x, before, u], [y, *slopes])
+
+
+def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, ahead: int | None) -> tuple[int, str]:
+    """Check the look-ahead, or find the shortest stable one; also why its inverse is not the exact one."""
+    whole = isinstance(ahead, int | np.integer) and not isinstance(ahead, bool)
+    if ahead is not None and not (whole and 0 <= ahead <= LONGEST):
+        raise InputError(f"A look-ahead of {ahead!r} samples was given; give a whole number from 0 to {LONGEST}.")
+    n = response.delay
+    if n is None:
+        raise InputError(
+            "The input reaches the output nowhere along the recording (no direct feedthrough, no path through the "
+            "states), so there is nothing to invert; give a model and a recording in which it does."
+        )
+    if ahead is not None and ahead < n:
+        raise InputError(
+            f"The look-ahead is {ahead} samples, but the input reaches the output only after {n} (a delay; what "
+            f"the model has before is no larger than its errors, {_percent(response.early)} of its largest response); "
+            f"know the wanted path {n} samples ahead and give ahead={n} or more, or leave it out."
+        )
+    tried = range(n, n + FARTHEST + 1) if ahead is None else sorted({n, ahead})
+    found = {d: _gain_and_radius(run, recording, response, d) for d in tried}
+    largest, limit = max(h for _, h, _ in found.values()), _stability_limit(response)
+    usable = [d for d, (gain, _, radius) in found.items() if gain > FAINT * largest and radius < limit]
+    if usable and ahead in (None, usable[-1]):
+        taken, why = usable[0] if ahead is None else ahead, ""
+        if taken == n:
+            return int(n), why
+        if found[n][2] >= limit:
+            why = f"the exact inverse would be unstable ({_reason(response, found[n][2])})"
+        elif n in usable:
+            why = "a longer look-ahead was asked for"
+        else:
+            why = f"only by less than {100 * FAINT:g} % of what follows"
+        return int(taken), why
+    which = f"{ahead}" if ahead is not None else f"{n} to {tried[-1]}"
+    smallest = min(radius for d, (_, _, radius) in found.items() if ahead in (None, d))
+    raise InputError(
+        f"The model has no stable inverse with a look-ahead of {which} samples (non-minimum phase: "
+        f"{_reason(response, smallest)}); use predictive control."
+    )
+
+
+def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: int) -> tuple[float, float, float]:
+    """Usual gain of a look-ahead, gain of a constant input, and largest spectral radius along the recording."""
+    n = len(response.linear[0][0])
+    reached, poles, constant = _output_ahead(run.function, d, response.delay or 0), [], []
+    for k, (a, b, _, _) in zip(response.at, response.linear, strict=True):
+        slopes = reached(response.states[:, k], recording.u[max(k - 1, 0)], recording.u[k])
+        _, g_x, g_before, g_u = (np.asarray(v) for v in slopes)
+        gain = float(g_u.item())
+        constant.append(abs(gain + float(g_before.item())))
+        if gain:
+            feedback = -np.hstack([g_x[:, run.linear], g_before]) / gain
+            inverse = np.vstack([np.hstack([a, np.zeros((n, 1))]) + b @ feedback, feedback])
+            poles.append((abs(gain), float(np.max(np.abs(np.linalg.eigvals(inverse))))))
+    # where a play sticks the gain may vanish, as in a dead zone; there the input jumps and stays in its bracket
+    usual = float(np.median([g for g, _ in poles] + [0.0] * (len(response.at) - len(poles))))
+    radius = max((radius for g, radius in poles if g > FAINT * usual), default=0.0)
+    return usual, float(np.median(constant)), radius
+
+
+def _gain_changes_sign(run: Rollout, recording: Recording, response: Response, ends: tuple[float, float]) -> bool:
+    """Tell whether the output rises with the input in places and falls in others."""
+    n = response.delay or 0
+    reached, grid = _output_ahead(run.function, n, n), np.linspace(*ends, INPUTS)
+    of = [reached(run.states[:, k], recording.u[max(k - 1, 0)], grid[None, :])[3] for k in response.at]
+    gains = np.ravel([np.asarray(gain) for gain in of])
+    counted = FAINT * float(np.median(np.abs(gains[gains != 0]))) if np.any(gains) else 0.0
+    return bool(np.min(gains) < -counted and np.max(gains) > counted)
+
+
+def _unstable_zeros(response: Response) -> Array:
+    zeros = response.zeros()
+    return zeros[np.argsort(-np.abs(zeros))][: int(np.sum(np.abs(zeros) >= _stability_limit(response)))]
+
+
+def _stability_limit(response: Response) -> float:
+    """Largest spectral radius of a stable inverse; slow poles that zeros nearly cancel do not count against a fit."""
+    slowest = max(float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a, *_ in response.linear)
+    return max(STABLE, 1 - (1 - min(slowest, 1.0)) / 10)
+
+
+def _reason(response: Response, radius: float) -> str:
+    zeros = _unstable_zeros(response)
+    if len(zeros):
+        return f"zeros on or outside the unit circle at {_list_zeros(zeros)}"
+    return (
+        f"along the recording its inverse has a pole of magnitude {radius:.4g}, beyond {_stability_limit(response):.4g}"
+    )
+
+
+def _list_zeros(zeros: Array) -> str:
+    """Zeros in words, one of each conjugate pair, at most five."""
+    upper = zeros[zeros.imag >= 0]
+    named = [f"{z.real:.4g}" + (f" ± {z.imag:.4g}i" if z.imag else "") for z in upper[:5]]
+    return ", ".join(named) + (f" and {len(upper) - 5} more" if len(upper) > 5 else "")
+
+
+def _note(ahead: int, delay: int, why: str) -> str:
+    delayed, known = (f"{n} sample" + "s" * (n != 1) for n in (delay, ahead))
+    begin = f"An input reaches the output after {delayed}"
+    if not why:
+        return f"{begin}: the exact inverse, for a path that is known {known} ahead."
+    return f"{begin}, but {why}: an approximate inverse, for a path that is known {known} ahead."
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1g} %" if share < 0.1 else f"{100 * share:.0f} %"
+
+
+# --- delay and zeros
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """A model linearised at states along a recording.
+
+    Attributes
+    ----------
+    at : array, shape (points,)
+        Samples of the recording.
+    states : array, shape (n_x + n_s, samples + 1)
+        States of the model before each sample and after the last.
+    linear : tuple
+        `(A, B, C, D)` of the linear states at each point, with the memory constant.
+    markov, errors : array, shape (SAMPLES,)
+        Median magnitudes of the Markov parameters over the points, and their standard errors (nan where unknown).
+    delay : int or None
+        Samples after which the input reaches the output; None where it never does.
+    early : float
+        Largest Markov parameter before the delay at any of the points, over the largest median.
+    """
+
+    at: Array
+    states: Array
+    linear: tuple[tuple[Array, ...], ...]
+    markov: Array
+    errors: Array
+    delay: int | None
+    early: float = 0.0
+
+    def zeros(self) -> Array:
+        """Return the zeros at the point of the median gain, including those of the delay."""
+        if self.delay is None:
+            return np.zeros(0)
+        gains = [_markov(point, self.delay + 1)[-1] for point in self.linear]
+        k = int(np.argmin(np.abs(np.abs(gains) - np.median(np.abs(gains)))))
+        (a, b, c, d), n = self.linear[k], self.delay
+        if not gains[k]:
+            return np.zeros(0)
+        inverse = a - b @ c / d if n == 0 else a - b @ c @ np.linalg.matrix_power(a, n) / gains[k]
+        return np.asarray(np.linalg.eigvals(inverse))
+
+
+def analyse_response(given: Any, run: Rollout, recording: Recording) -> Response:
+    """Linearise a model of one input and one output along its run of a recording."""
+    function, states = run.function, run.states
+    at = np.unique(np.linspace(min(1, len(recording) - 1), len(recording) - 1, POINTS).astype(int))
+    x, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("u")
+    slopes = _linearisation("slopes", [x, u], x, u, *function(x, u))
+    linear = tuple(_linear_blocks(slopes(states[:, k], recording.u[k]), run.linear) for k in at)
+    each = np.array([_markov(point, SAMPLES) for point in linear])
+    markov = np.median(np.abs(each), axis=0)
+    typical = int(np.argmin(np.sum(np.abs(np.abs(each) - markov), axis=1)))
+    point = states[:, at[typical]], recording.u[at[typical]]
+    errors = _markov_errors(given, recording, *point) if isinstance(given, Fit) else np.full(SAMPLES, np.nan)
+    largest = np.max(markov)
+    counts = markov > np.where(np.isnan(errors), UNKNOWN * largest, np.maximum(ERRORS * errors, SMALL * largest))
+    reached = largest > 1e-12 * np.ptp(recording.y) / max(float(np.ptp(recording.u)), 1e-300) and np.any(counts)
+    delay = int(np.argmax(counts)) if reached else None
+    early = float(np.max(np.abs(each[:, :delay]), initial=0.0) / largest) if reached else 0.0
+    return Response(at, states, linear, markov, errors, delay, early)
+
+
+def _linearisation(name: str, arguments: list[ca.SX], x: ca.SX, u: ca.SX, following: ca.SX, y: ca.SX) -> ca.Function:
+    blocks = [ca.densify(ca.jacobian(f, v)) for f in (following, y) for v in (x, u)]
+    return ca.Function(name, arguments, blocks)
+
+
+def _linear_blocks(blocks: Any, linear: Array) -> tuple[Array, ...]:
+    a, b, c, d = (np.asarray(v) for v in blocks)
+    return a[np.ix_(linear, linear)], b[linear], c[:, linear], d
+
+
+def _markov(point: tuple[Array, ...], samples: int) -> Array:
+    """`D, C B, C A B, ...` of one linear model."""
+    a, b, c, d = point
+    out, carried = [d.item()], b
+    for _ in range(samples - 1):
+        out.append((c @ carried).item())
+        carried = a @ carried
+    return np.array(out)
+
+
+def _markov_errors(fit: Fit, recording: Recording, state: Array, drive: Array) -> Array:
+    """Standard errors of the Markov parameters at a state; nan where the recording says nothing about them."""
+    model = fit.model
+    parameters = model.parameters
+    known = recording.with_(initial=fit.initial_state(recording) if model.n_state else "zero", period=None)
+    try:
+        problem = Problem(model, known, engine=fit.engine)
+    except InputError:  # everything is fixed
+        return np.full(SAMPLES, np.nan)
+    x, u, p = ca.SX.sym("x", model.n_state), ca.SX.sym("u"), ca.SX.sym("p", parameters.size)
+    slopes = _linearisation("slopes", [x, u, p], x, u, *model.closed(x, u, p))
+    derivatives = []
+    for i in np.flatnonzero(parameters.free):
+        step = 1e-6 * max(abs(parameters.start[i]), 1e-3 * np.max(np.abs(parameters.start)))
+        moved = [parameters.start + sign * step * (np.arange(parameters.size) == i) for sign in (1, -1)]
+        up, down = (
+            _markov(_linear_blocks(slopes(state, drive, value), np.arange(model.n_x)), SAMPLES) for value in moved
+        )
+        derivatives.append((up - down) / (2 * step))
+    spread = np.diag(variance(covariance(problem, problem.start, fit.structure), np.array(derivatives).T))
+    return np.sqrt(np.where(np.isfinite(spread), np.maximum(spread, 0.0), np.nan))

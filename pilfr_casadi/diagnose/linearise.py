@@ -22,7 +22,7 @@ import numpy as np
 from .._base import one_at_a_time
 from ..laws import Law, Local
 from ..models import Model, map_points
-from ..simulators import Simulator, discretise, kalman_gain, led, signals, states_along
+from ..simulators import Simulator, discretise, signals, states_along, steady_state_gain, with_output_injection
 from .workbench import FINER, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps
@@ -159,7 +159,7 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
     if gain is None:
         states = states_along(model, drive, p, x)
     else:
-        seen = led(model, gain)
+        seen = with_output_injection(model, gain)
         states = states_along(seen, seen.drive(r), np.append(p, 1.0), x)
     kept: list[np.ndarray] = []
     means = []
@@ -226,7 +226,7 @@ def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarra
                 x = a @ x
         if total > 0 and np.isfinite(total):
             q += np.outer(column, column) / total
-    gain = kalman_gain(a, c, q, np.diag(np.maximum(noise, 0.05 * error) ** 2))
+    gain = steady_state_gain(a, c, q, np.diag(np.maximum(noise, 0.05 * error) ** 2))
     gain[probe.n_x :] = 0.0  # laws' own states follow
     return gain
 

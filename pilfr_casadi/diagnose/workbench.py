@@ -14,7 +14,7 @@ from ..engine import Engine, make_engine
 from ..models import Model, ParameterSet
 from ..optimise import GaussNewton, Problem, Status
 from ..simulators import (
-    GAMMA,
+    INJECTION,
     MOST,
     REACH,
     Simulator,
@@ -23,8 +23,8 @@ from ..simulators import (
     discretise,
     fastest,
     growth,
-    led,
     wanted_substeps,
+    with_output_injection,
 )
 from .arranged import arranged
 from .standing import standing, stands
@@ -133,7 +133,7 @@ class Workbench:
     def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
         """The simulator as a model, with output injection where a gain is given."""
         model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
-        return model if gain is None else led(model, gain)
+        return model if gain is None else with_output_injection(model, gain)
 
     def _substeps(self, simulator: Simulator) -> int:
         """More where a law is fast, up to a limit: a stiff start of a law is not worth a fine grid."""
@@ -198,7 +198,7 @@ class Workbench:
             )
         _, theta, problem = best
         values = model.parameters.unpack(problem.parameters(theta))
-        values.pop(GAMMA, None)
+        values.pop(INJECTION, None)
         return self.result(simulator, values, problem.first_states(theta), engine, model)
 
     def _lost(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
@@ -259,8 +259,8 @@ class Workbench:
         problem: Problem | None = None
         for gamma in (*path, 0.0):
             at = parameters.at(vector)
-            if GAMMA in parameters:
-                at = at.change(**{GAMMA: {"value": gamma}})
+            if INJECTION in parameters:
+                at = at.change(**{INJECTION: {"value": gamma}})
             problem = self.problem(model.with_parameters(at), engine)
             n_free = int(problem.free.sum())
             theta = problem.start.copy()

@@ -25,6 +25,6 @@ if TYPE_CHECKING:
         read_model_file as read_model_file,
         write_model_file as write_model_file,
     )
-    from .smoothing import enclosed as enclosed, smoothed as smoothed, with_sides as with_sides
+    from .smoothing import enclosed as enclosed, smoothed as smoothed
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

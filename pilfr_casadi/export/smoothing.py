@@ -1,6 +1,6 @@
-"""Steps without kinks: rounded, with a bound on the error, or split into the pieces between their kinks.
+"""Steps without kinks: rounded, with a bound on the error.
 
-**Rounded.** Every max, min and |·| of a step becomes smooth,
+Every max, min and |·| of a step becomes smooth,
 
     max(a, b) -> (a + b + sqrt((a - b)² + eps²)) / 2,   min(a, b) = -max(-a, -b),   |a| = max(a, -a),
 
@@ -15,13 +15,6 @@ The bound holds for one step from the same x and u. Over many steps a rounded pl
 eps²/4d a sample at the distance d from its edges, and so forgets; use it over the horizon of a controller, not for a
 long simulation. (`models.fmax` rounds within a narrow band instead: it keeps the memory of long records, as a fit
 needs, but its second derivative jumps, which Newton-type solvers do not take.)
-
-**Pieces.** Each max, min and |·| is told which side it is on,
-
-    max(a, b) -> s a + (1 - s) b,  gap a - b;   min(a, b) -> s a + (1 - s) b,  gap b - a;   |a| -> (2 s - 1) a,  gap a.
-
-A side s is 1 where its gap is not negative, else 0. With the sides held a step has no kinks; its equations are those of
-one piece, which ends where a gap changes its sign (Griewank 2013, on piecewise linear models).
 """
 
 from __future__ import annotations
@@ -37,7 +30,6 @@ from .._base import InputError
 
 Interval = tuple[float, float]
 EVERYTHING = (-math.inf, math.inf)
-KINKS = ("FMAX", "FMIN", "FABS")
 _NAMES = {getattr(ca, k): k[3:] for k in sorted(dir(ca)) if k.startswith("OP_")}
 _RISING: dict[str, Callable[[float], float]] = {
     "EXP": np.exp,
@@ -75,32 +67,6 @@ def smoothed(function: ca.Function, eps: float) -> ca.Function:
 
     results = [ca.vertcat(ca.SX(0, 1), *row) for row in _walk(function, _entries(arguments), apply, ca.SX)]
     return ca.Function(function.name(), arguments, results, function.name_in(), function.name_out())
-
-
-def with_sides(function: ca.Function, *, held: bool) -> ca.Function:
-    """Return `(x, u, s) -> (x_next, y, gaps)` of `(x, u) -> (x_next, y)`; without `held`, x and u decide, not s.
-
-    Raises
-    ------
-    InputError
-        If the function holds an operation that cannot be run on other values.
-    """
-    arguments = _symbols(function)
-    sides: list[Any] = []
-    gaps: list[Any] = []
-
-    def apply(op: str, code: int, a: Any, b: Any = None) -> Any:
-        if op in KINKS:
-            sides.append(ca.SX.sym(f"s{len(sides)}"))
-            gaps.append(a if op == "FABS" else a - b if op == "FMAX" else b - a)
-            if held:
-                return (2 * sides[-1] - 1) * a if op == "FABS" else sides[-1] * a + (1 - sides[-1]) * b
-        return _same(code, a, b)
-
-    found = _walk(function, _entries(arguments), apply, ca.SX)
-    none = ca.SX(0, 1)
-    results = [ca.vertcat(none, *row) for row in (*found, gaps)]
-    return ca.Function(function.name(), [*arguments, ca.vertcat(none, *sides)], results)
 
 
 def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) -> list[list[Interval]]:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..diagnose import over_samples
+from ..simulators import measurement_update
 
 LOUDER = (1.0, 3.0, 9.0)  # factors on the noise
 TRIED = np.logspace(-4.0, 0.5, 10)  # random steps of the force, in units of what the residual calls for
@@ -87,16 +88,14 @@ class UnknownForce:
         """Minus twice the log likelihood, and predicted and filtered means and covariances."""
         n = len(self.unit)
         s, p = np.zeros(n), np.diag(np.append(np.full(n - 1, 0.01), 25.0))
-        cost, eye = 0.0, np.eye(n)
+        cost = 0.0
         kept: list[tuple[Any, ...]] = []
         for k in range(length):
             h = self.h[k]
-            v = h @ p @ h.T + r**2 * np.eye(len(h))
-            gain = np.linalg.solve(v, h @ p).T
+            v, gain, p_at = measurement_update(p, h, r**2 * np.eye(len(h)))
             innovation = self.e[k] - h @ s
             cost += float(innovation @ np.linalg.solve(v, innovation)) + float(np.linalg.slogdet(v)[1])
             s_at = s + gain @ innovation
-            p_at = (eye - gain @ h) @ p
             p_at = (p_at + p_at.T) / 2
             kept.append((s, p, s_at, p_at))
             f = self.f[k]

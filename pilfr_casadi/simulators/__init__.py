@@ -15,7 +15,12 @@ if TYPE_CHECKING:
         signals as signals,
         states_along as states_along,
     )
-    from .observer import GAMMA as GAMMA, kalman_gain as kalman_gain, led as led
+    from .observer import (
+        INJECTION as INJECTION,
+        measurement_update as measurement_update,
+        steady_state_gain as steady_state_gain,
+        with_output_injection as with_output_injection,
+    )
     from .simulator import Placed as Placed, Port as Port, Simulator as Simulator, in_series as in_series
     from .simulator_files import (
         load_simulator as load_simulator,

@@ -30,7 +30,7 @@ from pilfr_casadi.laws import (
     readable_unit,
     unit_forces,
 )
-from pilfr_casadi.simulators import discretise, led
+from pilfr_casadi.simulators import discretise, with_output_injection
 
 DT, M, RUN = 0.01, 240, 120  # step, samples of the local signals, samples of a simulation
 EVERY = (*CATALOGUE, *(finer for kinds in FINER.values() for finer in kinds))
@@ -102,7 +102,7 @@ def test_derivatives_and_engines(kind, record):
 @pytest.mark.parametrize("kind", (CubicStiffness, StopHysteresis, BoucWen, Delay))
 @pytest.mark.parametrize("hold", ["zero", "linear"])
 def test_slopes_by_way_of_the_stages_where_an_observer_leads_and_columns_are_left_out(kind, hold, record):
-    model = led(model_of(kind, hold), np.array([[0.3], [2.0]]))
+    model = with_output_injection(model_of(kind, hold), np.array([[0.3], [2.0]]))
     drive, rng = model.drive(record.with_(y=0.1 * record.u)), np.random.default_rng(4)
     p = np.where(model.parameters.start == 0, 0.7, model.parameters.start)
     place = np.append(-1, np.arange(len(p) - 1))[rng.permutation(len(p))]

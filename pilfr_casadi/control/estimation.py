@@ -1,0 +1,527 @@
+"""State estimation of a fitted model: an extended Kalman filter, and the memory that the outputs do not show.
+
+With `F(x, u) = (f, h)`, `C = ∂h/∂x` at the prediction and `A = ∂f/∂x` at the corrected state, the filter is
+
+    x̂ = x + K (y - h(x, u)),   x⁺ = f(x̂, u),   P⁺ = A P̂ A' + Q,
+
+with the gain K and the covariance P̂ of `simulators.measurement_update`. The Jacobian of min and max is that of the
+active branch, so the filter switches with the operators: a play that sticks keeps the variance of its memory, one that
+slips takes over the variance of the signal that drives it. Memory has process noise, because a filter that has become
+sure of it would stop correcting it. Anderson & Moore (1979), Optimal Filtering, Sec. 8.2. An unscented filter predicts
+as well, within three percent, at four times the work (`python -m problems.observer`).
+
+Whether the outputs of a window show a memory follows from their sensitivity `δY = O δx` to the state at its beginning.
+With noise of variance R and a state known to within its usual spread S, the covariance after the window is
+
+    P = (S⁻² + O' R⁻¹ O)⁻¹,
+
+and a memory is hidden if its standard deviation `sqrt(P_jj)` stays near `S_j`. The columns of O tell why: a zero column
+belongs to a memory that is wiped out before it leaves a trace, or that no output depends on; several operators that
+stick throughout act as one, by their weighted sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+
+from .._base import LARGEST, InputError, numbers
+from ..data import Recording
+from ..export import Exported, exported
+from ..identify import Fit
+from ..models import PrandtlIshlinskii
+from ..simulators import Simulator, measurement_update
+
+Array = np.ndarray
+SAME_STEP = 1e-4  # relative difference up to which two sampling intervals are the same
+SMALLEST_SPREAD = 1e-6  # of the largest: keeps the covariance of a state that never moves from being singular
+DISTURBANCE = 0.1  # of an output's standard deviation: least size of a disturbance, above any model error worth one
+SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # process noise per step over the states' spread, from which one is chosen
+JUDGED = 2048  # samples on which the shares of process noise are compared
+PROBES = 5  # states and inputs at which an observer's model is compared with a fit
+HIDDEN = 0.5  # of the spread, left after the window: from here on the outputs halve the uncertainty at best
+TRACE = 1e-9  # of the largest column of O, below which a column is rounding
+
+
+class Diagnosed(Protocol):
+    """The part of a diagnosis that is used here."""
+
+    @property
+    def corrected(self) -> Simulator:
+        """The corrected simulator."""
+
+    def export(self, **options: Any) -> Any:
+        """Its step."""
+
+
+ModelSource = Fit | Diagnosed | Simulator | Exported
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A model and its free run along a recording.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        `(x, u) -> (x_next, y)`.
+    names : tuple of str
+        Names of the entries of u; where inputs are interpolated, those of the next sample follow.
+    u, y : array, shape (M, n_u), (M, n_y)
+        Inputs of the steps, and the outputs.
+    states : array, shape (n, M + 1)
+        States before each sample and after the last.
+    linear : array of int
+        Entries of x that are neither memory of operators nor the time.
+    clock : array of int
+        The entry that is the time, if there is one.
+    first_scored : int
+        First sample of the recording that counts.
+    """
+
+    function: ca.Function
+    names: tuple[str, ...]
+    u: Array
+    y: Array
+    states: Array
+    linear: Array
+    clock: Array
+    first_scored: int
+
+
+def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
+    """Run the step of a fit, a diagnosis, a simulator or an export along a recording.
+
+    Raises
+    ------
+    InputError
+        If it is none of these, does not fit the recording, or diverges; `verb` names the caller.
+    """
+    model = _export_for(source, recording, verb)
+    u = recording.u
+    if len(model.inputs) > recording.n_u:
+        u = np.hstack([u, np.vstack([u[1:], u[-1:]])])
+    start = model.x0()
+    following, y = (np.asarray(v) for v in model.step.mapaccum("rollout", len(u))(start, u.T))
+    first = source.scored_from(recording) if isinstance(source, Fit) else recording.skip
+    if not (np.all(np.abs(following) < LARGEST) and np.all(np.abs(y[:, first:]) < LARGEST)):
+        raise InputError(
+            f"The model diverges along the recording, so {verb} can make nothing of it; give one that is stable."
+        )
+    memory = {model.states[name] for name in model.sampled.held}
+    clock = len(model.states) - 1 if model.sampled.timed else -1
+    linear = [i for i in range(len(model.states)) if i not in memory and i != clock]
+    return Rollout(
+        function=model.step,
+        names=model.inputs,
+        u=u,
+        y=y.T,
+        states=np.column_stack([start, following]),
+        linear=np.array(linear, dtype=int),
+        clock=np.array([clock] if clock >= 0 else [], dtype=int),
+        first_scored=first,
+    )
+
+
+def _export_for(source: Any, recording: Recording, verb: str) -> Exported:
+    """The step of a model that begins where the recording begins."""
+    diagnosed = not isinstance(source, type) and isinstance(getattr(source, "corrected", None), Simulator)
+    if not (isinstance(source, Fit | Simulator | Exported) or diagnosed):
+        raise InputError(
+            f"A {type(source).__name__} was given to {verb}; give a Fit, a Diagnosis, a Simulator or an export."
+        )
+    if not isinstance(recording, Recording) or not len(recording):
+        raise InputError(f"A {type(recording).__name__} was given to {verb}; give a Recording of the machine.")
+    if isinstance(source, Exported):
+        inputs, same_step = source.inputs[: recording.n_u], abs(source.dt / recording.dt - 1) <= SAME_STEP
+        if (inputs, source.outputs) != (recording.inputs, recording.outputs) or not same_step:
+            raise InputError(
+                f"The export steps by {source.dt:g} s from {', '.join(source.inputs)} to {', '.join(source.outputs)}, "
+                f"the recording by {recording.dt:g} s from {', '.join(recording.inputs)} to "
+                f"{', '.join(recording.outputs)}; they must be the same."
+            )
+        return source
+    if isinstance(source, Simulator):
+        return exported(source, dt=recording.dt, hold=recording.hold, start=recording)
+    return exported(source, start=recording)
+
+
+# --- extended Kalman filter
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanFilter:
+    """An observer with its noise levels and its start.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        The observed model `(x, u) -> (x_next, y)`; with `disturbance=True` the disturbances of the outputs follow its
+        state.
+    step : casadi.Function
+        `(x, P, u, y) -> (x_next, P_next, y_pred)`. x and y_pred are predictions from earlier samples only.
+    x0, P0 : array, shape (n,), (n, n)
+        State at rest, and the covariance of an unknown state.
+    Q, R : array, shape (n, n), (n_y, n_y)
+        Covariances of process and measurement noise.
+    spread : array, shape (n,)
+        Root mean square of each state over the recording that the noise levels come from.
+    """
+
+    function: ca.Function
+    step: ca.Function
+    x0: Array
+    P0: Array
+    Q: Array
+    R: Array
+    spread: Array
+
+    def __str__(self) -> str:
+        share = np.sqrt(np.diag(self.Q)[0]) / self.spread[0] if len(self.spread) and self.spread[0] else 0.0
+        noise = ", ".join(f"{v:.3g}" for v in np.sqrt(np.diag(self.R)))
+        return (
+            f"extended Kalman filter of {len(self.x0)} states (memory included), {self.step.size1_in(2)} inputs and "
+            f"{self.step.size1_in(3)} outputs\nnoise of the outputs, std: {noise}; process noise a step: {share:.2g} "
+            "of each state's size"
+        )
+
+    __repr__ = __str__
+
+    def run(self, u: Array, y: Array, x0: Array | None = None, P0: Array | None = None) -> tuple[Array, Array, Array]:
+        """Filter a whole recording.
+
+        Parameters
+        ----------
+        u, y : array, shape (M, n_u), (M, n_y)
+            Inputs and measured outputs.
+        x0, P0 : array, optional
+            State at the start and its covariance; unknown by default. For a known start give `P0=filter.Q`.
+
+        Returns
+        -------
+        states : array, shape (M + 1, n)
+            Before each sample and after the last.
+        predictions : array, shape (M, n_y)
+        P : array, shape (n, n)
+            Covariance after the last sample.
+
+        Raises
+        ------
+        InputError
+            If u, y, x0 or P0 do not fit the model.
+        """
+        n = len(self.x0)
+        u, y = (numbers(v, name) for v, name in ((u, "u"), (y, "y")))
+        if not u.size or not y.size or not u.ndim or not y.ndim:
+            raise InputError("There are no samples to filter; give at least one.")
+        u, y = u.reshape(len(u), -1), y.reshape(len(y), -1)
+        P = self.P0 if P0 is None else numbers(P0, "P0")
+        if P.shape != (n, n) or not np.allclose(P, P.T) or not _is_semidefinite(P):
+            raise InputError(
+                f"P0 of the shape {P.shape} was given; give a covariance, ({n}, {n}), symmetric and with no negative "
+                "eigenvalue."
+            )
+        x = self.x0 if x0 is None else numbers(x0, "The state").ravel()
+        n_u, n_y = int(self.step.size1_in(2)), int(self.step.size1_in(3))
+        if len(u) != len(y) or u.shape[1] != n_u or y.shape[1] != n_y or len(x) != n:
+            raise InputError(
+                f"u {u.shape}, y {y.shape} and a state of {len(x)} numbers were given to the filter; give (samples, "
+                f"{n_u}), (samples, {n_y}) and {n} numbers."
+            )
+        steps = self.step.mapaccum("run", len(u), 2)
+        xs, ps, predicted = (np.asarray(v) for v in steps(x, P, u.T, y.T))
+        return np.vstack([x, xs.T]), predicted.T, ps[:, -n:]
+
+
+def kalman_filter(
+    fit: ModelSource, recording: Recording, *, disturbance: bool = False, share: float | None = None
+) -> KalmanFilter:
+    """Design an extended Kalman filter of a model, with noise levels from a recording.
+
+    The measurement noise has the variance of the residual of the free simulation. The process noise of each state and
+    each memory is a share of its root mean square over the recording.
+
+    Parameters
+    ----------
+    fit : Fit, Diagnosis, Simulator or Exported
+        The model: of a diagnosis its corrected simulator; an export with `start=` the recording. Where inputs are
+        interpolated, the filter's u are those of a sample and of the next one, as in the export.
+    recording : Recording
+        Usually the training recording.
+    disturbance : bool
+        Observe a slow disturbance of each output as well, `y = h(x, u) + d, d⁺ = d`, which takes up what the model
+        leaves out and makes control free of offset. Its usual size is that of the residual, and at least a tenth of the
+        output's standard deviation.
+    share : float, optional
+        Standard deviation of the process noise per step over the root mean square of the state. By default the share
+        that makes the one-step predictions of the recording most likely.
+
+    Returns
+    -------
+    KalmanFilter
+
+    Raises
+    ------
+    InputError
+        If the recording does not fit the model, or the share is not positive.
+    """
+    if share is not None and not (isinstance(share, int | float | np.number) and 0 < share < np.inf):
+        raise InputError(f"The share of process noise is {share!r}; give a number above 0, such as 1e-3.")
+    run = roll_out(fit, recording, "kalman_filter")
+    function, start = run.function, run.states[:, 0]
+    if not len(start) and not disturbance:
+        raise InputError("The model has neither states nor memory to observe; ask for disturbance=True.")
+    residual = (recording.y - run.y)[run.first_scored :]
+    spread = np.sqrt(np.mean(run.states[:, 1:] ** 2, axis=1))
+    spread[run.clock] = 0.0  # the time is known
+    spread = np.maximum(spread, SMALLEST_SPREAD * np.max(spread, initial=1e-300))
+    spread[run.clock] = 0.0
+    level = np.mean(residual**2, axis=0)
+    if disturbance:
+        function = add_disturbances(function)
+        size = np.maximum(np.sqrt(level), DISTURBANCE * np.std(recording.y, axis=0))
+        start, spread = np.concatenate([start, np.zeros(len(level))]), np.concatenate([spread, size])
+    noise = np.diag(np.maximum(level, 1e-16 * np.mean(recording.y**2, axis=0) + 1e-300))
+    filters = [_filter(function, spread, noise, s) for s in (SHARES if share is None else [share])]
+    if len(filters) == 1:
+        return filters[0]
+    return min(filters, key=lambda f: _prediction_cost(f, run.u, recording.y, start))
+
+
+def ekf_step(function: ca.Function, Q: Array, R: Array) -> ca.Function:
+    """One step `(x, P, u, y) -> (x_next, P_next, y_pred)` of the extended Kalman filter around any `F(x, u)`.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        `(x, u) -> (x_next, y)`.
+    Q, R : array, shape (n, n), (n_y, n_y)
+        Covariances of process and measurement noise.
+    """
+    n, n_u, n_y = function.size1_in(0), function.size1_in(1), function.size1_out(1)
+    x, u, y, p = (ca.MX.sym(k, *size) for k, size in (("x", (n,)), ("u", (n_u,)), ("y", (n_y,)), ("P", (n, n))))
+    symbols = ca.SX.sym("x", n), ca.SX.sym("u", n_u)
+    following, output = function(*symbols)
+    slopes = ca.Function("slopes", symbols, [ca.jacobian(following, symbols[0]), ca.jacobian(output, symbols[0])])
+    _, predicted = function(x, u)
+    _, gain, certain = measurement_update(p, ca.densify(slopes(x, u)[1]), ca.DM(R))
+    corrected = x + gain @ (y - predicted)
+    a = ca.densify(slopes(corrected, u)[0])
+    covariance = a @ certain @ a.T + Q
+    covariance = (covariance + covariance.T) / 2
+    names = ["x", "P", "u", "y"], ["x_next", "P_next", "y_pred"]
+    return ca.Function("observer", [x, p, u, y], [function(corrected, u)[0], covariance, predicted], *names)
+
+
+def add_disturbances(function: ca.Function) -> ca.Function:
+    """Append a constant disturbance of each output to the state of `F(x, u)`."""
+    n, n_u, n_y = function.size1_in(0), function.size1_in(1), function.size1_out(1)
+    x, d, u = (ca.SX.sym(k, m) for k, m in (("x", n), ("d", n_y), ("u", n_u)))
+    following, y = function(x, u)
+    names = ["x", "u"], ["x_next", "y"]
+    return ca.Function("disturbed", [ca.vertcat(x, d), u], [ca.vertcat(following, d), y + d], *names)
+
+
+def function_of_observer(observer: Any, function: ca.Function, recording: Recording) -> ca.Function:
+    """Return the function of an observer after checking that it observes this model, with or without disturbances.
+
+    Raises
+    ------
+    InputError
+        If it is no observer, or one of another model.
+    """
+    if not isinstance(observer, KalmanFilter):
+        raise InputError(f"A {type(observer).__name__} was given as the observer; give a kalman_filter of this fit.")
+    theirs, n = observer.function, function.size1_in(0)
+    extra = theirs.size1_in(0) - n
+    same = extra in (0, function.size1_out(1)) and theirs.size1_in(1) == function.size1_in(1)
+    rng, size = np.random.default_rng(0), float(np.max(np.abs(recording.u)))
+    for _ in range(PROBES if same else 0):
+        x, u = size * rng.standard_normal(n), size * rng.standard_normal(function.size1_in(1))
+        own, other = function(x, u), theirs(np.append(x, np.zeros(extra)), u)
+        pairs = (own[0], other[0][:n]), (own[1], other[1])
+        same = same and all(np.allclose(np.asarray(a), np.asarray(b), rtol=1e-9, atol=0.0) for a, b in pairs)
+    if not same:
+        raise InputError("The observer is one of another model; give a kalman_filter of the same fit.")
+    return theirs
+
+
+def _filter(function: ca.Function, spread: Array, noise: Array, share: float) -> KalmanFilter:
+    process = np.diag((share * spread) ** 2)
+    step = ekf_step(function, process, noise)
+    return KalmanFilter(function, step, np.zeros(len(spread)), np.diag(spread**2), process, noise, spread)
+
+
+def _prediction_cost(observer: KalmanFilter, u: Array, y: Array, start: Array) -> float:
+    """Minus twice the mean log-likelihood of one-step predictions with errors of their own size, up to a constant."""
+    u, y = u[:JUDGED], y[:JUDGED]
+    _, predicted, _ = observer.run(u, y, start, observer.Q + 1e-6 * observer.P0)
+    error = (y - predicted)[len(y) // 10 :]
+    size = np.mean(error**2, axis=0)
+    return float(np.sum(np.log(size))) if np.all(np.isfinite(size)) else np.inf
+
+
+def _is_semidefinite(P: Array) -> bool:
+    """Tell whether no direction has a negative variance, in each state's own unit, as states differ by decades."""
+    size = np.sqrt(np.maximum(np.diag(P), 0.0))
+    if np.any(np.diag(P) < 0) or np.any(P[size == 0] != 0):
+        return False
+    size = np.where(size > 0, size, 1.0)
+    return bool(np.min(np.linalg.eigvalsh(P / np.outer(size, size)), initial=0.0) >= -1e-9)
+
+
+# --- visibility of memory
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """How well the outputs of a window show the state at its beginning.
+
+    Attributes
+    ----------
+    left : array, shape (n,)
+        Standard deviation of each state and memory once the outputs are known, over its usual spread; 0 is seen
+        exactly, 1 not at all.
+    unseen : tuple of int
+        Entries of the state, counted from 0, that are memory and keep half their spread or more.
+    sentences : tuple of str
+        One sentence for each kind of reason.
+    rank : int
+        Number of directions of the state that the outputs show better than it was known.
+    """
+
+    left: Array
+    unseen: tuple[int, ...]
+    sentences: tuple[str, ...]
+    rank: int
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences)
+
+
+def visibility(fit: Fit | Diagnosed | Exported, observer: KalmanFilter, x: Array, u: Array) -> Visibility:
+    """Find the memory that the outputs show when the inputs u are applied from the state x on.
+
+    Parameters
+    ----------
+    fit : Fit, Diagnosis or Exported
+        The model.
+    observer : KalmanFilter
+        Its filter, for the noise and the usual spread.
+    x : array, shape (n,)
+        State of the observer at the window's beginning.
+    u : array, shape (samples, n_u)
+        Inputs of the window, as the observer takes them.
+
+    Returns
+    -------
+    Visibility
+        `print` it for the sentences.
+
+    Raises
+    ------
+    InputError
+        If x or u do not fit the model.
+    """
+    usable = isinstance(fit, Exported) or (callable(getattr(fit, "export", None)) and not isinstance(fit, type))
+    if not usable or not isinstance(observer, KalmanFilter):
+        raise InputError(
+            f"A {type(fit).__name__} and a {type(observer).__name__} were given; give a Fit and its kalman_filter."
+        )
+    model, n = fit if isinstance(fit, Exported) else exported(fit), len(observer.x0)
+    if n < len(model.states):
+        raise InputError(
+            f"The observer has {n} states and the model {len(model.states)}; give the model's own observer."
+        )
+    x, u = numbers(x, "The state").ravel(), numbers(u, "u")
+    u = u[:, None] if u.ndim == 1 else u
+    if len(x) != n or u.ndim != 2 or u.shape[1] != len(model.inputs) or not len(u):
+        raise InputError(
+            f"A state of {len(x)} numbers and inputs {u.shape} were given; give {n} numbers and "
+            f"(samples, {len(model.inputs)})."
+        )
+    traces, slip = _sensitivities(observer, x, u)
+    information = np.linalg.eigvalsh(traces.T @ traces)
+    left = np.sqrt(np.clip(np.diag(np.linalg.inv(np.eye(n) + traces.T @ traces)), 0, 1))
+    kind, names = _memory_names(fit, model)
+    unseen = [j for j in names if left[j] > HIDDEN]
+    sentences = _reasons(kind, names, unseen, np.linalg.norm(traces, axis=0), slip, len(u))
+    return Visibility(left, tuple(unseen), tuple(sentences), int(np.sum(information > 1)))
+
+
+def _sensitivities(observer: KalmanFilter, x: Array, u: Array) -> tuple[Array, Array]:
+    """Outputs of a window by the state at its beginning, in units of noise and spread; sample of each first slip."""
+    n = len(x)
+    state, drive = ca.SX.sym("x", n), ca.SX.sym("u", u.shape[1])
+    following, output = observer.function(state, drive)
+    slopes = ca.Function(
+        "slopes", [state, drive], [following, ca.jacobian(following, state), ca.jacobian(output, state)]
+    )
+    root = 1 / np.sqrt(np.diag(observer.R))
+    carried, rows, slip = np.eye(n), [], np.full(n, -1)
+    for k, value in enumerate(u):
+        out: Any = slopes(x, value)
+        x, a, c = np.asarray(out[0]).ravel(), np.asarray(out[1]), np.asarray(out[2])
+        rows.append(root[:, None] * (c @ carried))
+        carried = a @ carried
+        slip[np.flatnonzero((slip < 0) & (np.diag(a) == 0))] = k
+    return np.vstack(rows) * observer.spread, slip
+
+
+def _reasons(kind: str, names: dict[int, str], unseen: list[int], size: Array, slip: Array, samples: int) -> list[str]:
+    """A sentence for each reason why memory is hidden."""
+
+    def listed(entries: list[int]) -> str:
+        return f"{kind} " + ", ".join(names[j] for j in entries)
+
+    if not names:
+        return ["The model has no memory to see."]
+    tiny = TRACE * np.max(size, initial=0.0)
+    wiped = [j for j in unseen if size[j] <= tiny and slip[j] >= 0]
+    idle = [j for j in unseen if size[j] <= tiny and slip[j] < 0]
+    rest = [j for j in unseen if size[j] > tiny]
+    joint, faint = ([j for j in rest if slip[j] < 0], [j for j in rest if slip[j] >= 0])
+    out = []
+    if not unseen:
+        out.append(f"The outputs of {samples} samples see all {len(names)} memories.")
+    if wiped:
+        out.append(f"{listed(wiped)}: wiped out before a trace reaches an output; its value does not matter.")
+    if idle:
+        out.append(f"{listed(idle)}: no output depends on it, because its weight is zero.")
+    if len(joint) > 1:
+        out.append(
+            f"{listed(joint)}: stick over all {samples} samples, so the outputs show only their weighted sum; an "
+            "excursion that makes them slip one after the other tells them apart."
+        )
+    elif joint:
+        out.append(
+            f"{listed(joint)}: sticks over all {samples} samples, and its effect on the outputs drowns in noise or "
+            "looks like that of others; an excursion that makes it slip settles it."
+        )
+    if faint:
+        verb = "slip" if len(faint) > 1 else "slips"
+        out.append(
+            f"{listed(faint)}: {verb} within the window, and the trace left before drowns in noise or looks like "
+            "that of others; from then on the signal that drives the operator determines its memory."
+        )
+    return out
+
+
+def _memory_names(fit: Any, model: Exported) -> tuple[str, dict[int, str]]:
+    """Kind of the memory, and the name and threshold of each entry of the state that is memory."""
+    places = {model.states[name]: name for name in model.sampled.held}
+    element = fit.model.element if isinstance(fit, Fit) else None
+    if isinstance(fit, Fit) and not isinstance(element, PrandtlIshlinskii):
+        return "Memory", {place: str(k + 1) for k, place in enumerate(places)}
+    out = {}
+    for k, (place, name) in enumerate(places.items()):
+        r, shown = model.thresholds.get(name), name
+        if isinstance(element, PrandtlIshlinskii):
+            channel, i = divmod(k, element.n)
+            shown = f"{i + 1}{f' of channel {channel + 1}' if element.channels > 1 else ''}"
+        out[place] = shown if r is None else f"{shown} (r = {r:.3g})"
+    kind = element.operator.name.replace("_", " ") if isinstance(element, PrandtlIshlinskii) else "memory"
+    return f"{kind[0].upper()}{kind[1:]}", out
