@@ -125,7 +125,7 @@ def test_progress_tells_every_stage(record):
 def test_the_choice_of_an_order_reports_orders(record):
     seen = []
     select_order(record, range(1, 5), progress=lambda *report: seen.append(report))
-    assert {stage for stage, *_ in seen} == {"orders"}
+    assert {stage for stage, *_ in seen} == {"choosing the order"}
     assert [done for _, done, *_ in seen] == sorted(done for _, done, *_ in seen)
     assert seen[-1][1:3] == (4, 4)
 

@@ -191,8 +191,8 @@ def _structure(options: FitOptions, train: Sequence[Recording], progress: Progre
     if "nx" in TAKES[structure]:
         nx, how = options.nx, "as given"
         if nx is None:
-            progress("choosing the order", 0, 0, np.nan)
-            nx, how = int(select_order(train, range(1, 9), offset=True).recommended), "chosen on the training data"
+            choice = select_order(train, range(1, 9), offset=True, progress=progress)
+            nx, how = int(choice.recommended), "chosen on the training data"
         print(f"order: {nx}, {how}", flush=True)
         given |= {"nx": nx, "bounds": _bounds(options.bound), "fix": numbers_of(options.fix, "--fix")}
     return named_structure(structure, **{k: v for k, v in given.items() if v is not None})

@@ -78,7 +78,7 @@ def select_order(
     offset : bool
         For recordings: as for :func:`time_subspace`.
     progress : callable, optional
-        Called with ("orders", done, total, smallest training error so far).
+        Called with ("choosing the order", done, total, nan).
 
     Returns
     -------

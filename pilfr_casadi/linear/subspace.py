@@ -234,30 +234,37 @@ class SubspaceProblem:
         return [first, *steps[:1], *(r for r in steps[1:] if r <= self.affordable_rows)]
 
     def solve(self, orders: list[int], block_rows: int | None, progress: Progress | None = None) -> list[Matrices]:
-        """Return the best model of each order; `progress` is called with (stage, done, total, smallest error)."""
+        """Return the best model of each order; report block rows tried for one order, or orders done for several."""
         spaces: dict[int, RangeSpace] = {}
+        if len(orders) == 1:
+            return [self._solve_order(orders[0], block_rows, spaces, progress)]
         models: list[Matrices] = []
-        errors: list[float] = []
         for nx in orders:
-            trials: list[tuple[Matrices, float]] = []
-            steps = self.ladder(nx, block_rows)
-            for k, r in enumerate(steps):
-                if progress:
-                    done, total = (k, len(steps)) if len(orders) == 1 else (len(models), len(orders))
-                    stage = "subspace" if len(orders) == 1 else "orders"
-                    progress(stage, done, total, min((*errors, *(e for _, e in trials)), default=np.nan))
-                if r not in spaces:
-                    spaces[r] = self.range_space(r)
-                rows, shifted, C = (x[:, :nx] for x in spaces[r][:3])
-                A = np.linalg.lstsq(rows, shifted, rcond=None)[0]
-                trials.append(self.complete(reflect_poles(A), C))
-            best = min(trials, key=lambda trial: trial[1])
-            models.append(best[0])
-            errors.append(best[1])
-        if progress and orders:
-            total = len(orders) if len(orders) > 1 else len(steps)
-            progress("orders" if len(orders) > 1 else "subspace", total, total, min(errors))
+            if progress:
+                progress("choosing the order", len(models), len(orders), np.nan)
+            models.append(self._solve_order(nx, block_rows, spaces))
+        if progress:
+            progress("choosing the order", len(orders), len(orders), np.nan)
         return models
+
+    def _solve_order(
+        self, nx: int, block_rows: int | None, spaces: dict[int, RangeSpace], progress: Progress | None = None
+    ) -> Matrices:
+        """Return the best model of one order over the numbers of block rows; `spaces` keeps their range spaces."""
+        trials: list[tuple[Matrices, float]] = []
+        steps = self.ladder(nx, block_rows)
+        for k, r in enumerate(steps):
+            if progress:
+                progress("subspace", k, len(steps), min((error for _, error in trials), default=np.nan))
+            if r not in spaces:
+                spaces[r] = self.range_space(r)
+            rows, shifted, C = (x[:, :nx] for x in spaces[r][:3])
+            A = np.linalg.lstsq(rows, shifted, rcond=None)[0]
+            trials.append(self.complete(reflect_poles(A), C))
+        best, error = min(trials, key=lambda trial: trial[1])
+        if progress:
+            progress("subspace", len(steps), len(steps), error)
+        return best
 
     def complete(self, A: Array, C: Array) -> tuple[Matrices, float]:
         """Add the best `B` and `D` to `A` and scaled `C`; return the model and its relative error.
