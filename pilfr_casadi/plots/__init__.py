@@ -18,7 +18,9 @@ if TYPE_CHECKING:
         mismatch_time as mismatch_time,
         port_law_map as port_law_map,
     )
-    from .diagnosis_proof import (
+    from .law import loading_curve as loading_curve, loop as loop, virgin_curve as virgin_curve, weights as weights
+    from .overview import convergence as convergence, plot_fit as plot_fit
+    from .proof import (
         Simulated as Simulated,
         compared_residuals as compared_residuals,
         compared_spectra as compared_spectra,
@@ -27,16 +29,6 @@ if TYPE_CHECKING:
         force_left as force_left,
         force_time as force_time,
     )
-    from .law import loading_curve as loading_curve, loop as loop, virgin_curve as virgin_curve, weights as weights
-    from .measured import (
-        best_linear_approximation as best_linear_approximation,
-        compared_spread as compared_spread,
-        frequency_response as frequency_response,
-        loops as loops,
-        operators_demo as operators_demo,
-        spread as spread,
-    )
-    from .overview import convergence as convergence, plot_fit as plot_fit
     from .signals import (
         amplitude_density as amplitude_density,
         as_scored as as_scored,
@@ -46,6 +38,14 @@ if TYPE_CHECKING:
         spectrum as spectrum,
         time as time,
         traces as traces,
+    )
+    from .studies import (
+        best_linear_approximation as best_linear_approximation,
+        compared_spread as compared_spread,
+        frequency_response as frequency_response,
+        loops as loops,
+        operators_demo as operators_demo,
+        spread as spread,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

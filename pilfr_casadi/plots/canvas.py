@@ -1,6 +1,6 @@
-"""What all figures share: a canvas without global state, colours, decibels, and lines that stay small in long records.
+"""Shared parts of all figures: a canvas without global state, colours, decibels, and lines thinned in long records.
 
-Colours are those of Okabe & Ito (2008), told apart by every kind of colour vision. Figures are made with matplotlib's
+Colours are those of Okabe & Ito (2008), distinct for every kind of colour vision. Figures are made with matplotlib's
 object interface: no pyplot, no change of settings, so they work in scripts, notebooks and servers alike.
 """
 
@@ -15,29 +15,30 @@ from matplotlib.textpath import TextPath
 
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 SKY, ORANGE, INK, GREY = "#56B4E9", "#E69F00", "#222222", "#7A7A7A"
-FONT = 10.5
-MOST = 3000  # points of a line before it is thinned
-LONGEST = 46  # letters of a title
-DEEPEST = 200.0  # dB below the largest value that are still drawn
+FONT = 10.5  # points
+MOST_POINTS = 3000  # of a line before it is thinned: more than a page has pixels
+LONGEST_TITLE = 46  # letters that fit above a figure of the usual width
+DEPTH = 200.0  # dB below the largest value that are still drawn; rounding errors lie deeper
+RUNAWAY = 1e3  # times the span of the measured signal from which a simulation is not drawn
 
 
 def new_figure(width: float = 5.2, height: float = 3.5) -> Figure:
-    """An empty figure of a size in inches, laid out so that nothing overlaps or is cut off."""
+    """Make an empty figure of a size in inches, laid out so that nothing overlaps or is cut off."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
-    """The axes given, or those of a new figure; `axes.figure` leads back to it."""
+    """Return the axes given, or those of a new figure; `axes.figure` leads back to it."""
     return new_figure().add_subplot() if ax is None else ax
 
 
 def finish(
     ax: Axes, x: str, y: str, title: str = "", columns: int = 2, *, beside: Axes | None = None, legend: bool = True
 ) -> Axes:
-    """Labels, a light grid, and above the axes the title with a legend of what has a label here or on `beside`."""
+    """Add labels, a light grid, and above the axes a title and a legend of the labelled lines here and on `beside`."""
     ax.set_xlabel(plain(x), fontsize=FONT)
     ax.set_ylabel(plain(y), fontsize=FONT)
-    title = plain(title if len(title) <= LONGEST else title[: LONGEST - 1] + "…")
+    title = plain(title if len(title) <= LONGEST_TITLE else title[: LONGEST_TITLE - 1] + "…")
     ax.tick_params(labelsize=FONT - 1)
     ax.grid(True, color="#DDDDDD", linewidth=0.6)
     ax.set_axisbelow(True)
@@ -68,7 +69,7 @@ def finish(
 
 
 def _columns_that_fit(ax: Axes, labels: list[str], most: int) -> int:
-    """Columns of a legend that is not wider than its axes will be."""
+    """Choose the columns of a legend so that it is not wider than its axes."""
     em = (FONT - 1) / 72
     room = 1.1 * ax.get_position().width * ax.figure.bbox.width / ax.figure.dpi
     widths = [TextPath((0, 0), label, size=FONT - 1).get_extents().width / 72 + 2.4 * em for label in labels]
@@ -80,17 +81,17 @@ def _columns_that_fit(ax: Axes, labels: list[str], most: int) -> int:
 
 
 def plain(text: str) -> str:
-    """The text as it stands: a dollar sign in a name is not the beginning of a formula."""
+    """Escape a text: a dollar sign in a name does not begin a formula."""
     return str(text).replace("$", r"\$")
 
 
 def with_unit(name: str, unit: str = "") -> str:
-    """`name [unit]`, or the name alone where the unit is not known."""
+    """Return `name [unit]`, or the name alone where the unit is not known."""
     return f"{name} [{unit}]" if unit else name
 
 
 def scaled(values: np.ndarray, unit: str = "") -> tuple[float, str]:
-    """A power of a thousand that brings the values near one, and the unit with it: (1e-3, "10⁻³ m")."""
+    """Choose a power of a thousand that brings the values near one; return it with the unit: (1e-3, "10⁻³ m")."""
     size = float(np.max(np.abs(values), initial=0.0))
     if not np.isfinite(size) or size == 0 or 0.02 <= size < 5000:
         return 1.0, unit
@@ -99,15 +100,15 @@ def scaled(values: np.ndarray, unit: str = "") -> tuple[float, str]:
     return 10.0**exponent, f"{power} {unit}".strip()
 
 
-def thin(x: np.ndarray, y: np.ndarray, most: int = MOST) -> tuple[np.ndarray, np.ndarray]:
-    """At most about `most` points that draw the same picture: the smallest and largest of each stretch, in their order.
+def thin(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
+    """Keep about `most` points that draw the same picture: the smallest and largest of each stretch, in their order.
 
     Parameters
     ----------
     x, y : array, (M,)
         A line with increasing x.
     most : int
-        Points to keep; shorter lines come back unchanged. Gaps (nan) stay gaps as long as a stretch has nothing else.
+        Points to keep; shorter lines come back unchanged. A stretch of gaps (nan) stays a gap.
     """
     if len(y) <= most:
         return x, y
@@ -122,27 +123,33 @@ def thin(x: np.ndarray, y: np.ndarray, most: int = MOST) -> tuple[np.ndarray, np
 
 
 def drawable(values: np.ndarray, span: float) -> np.ndarray:
-    """The values with gaps where a simulation runs away, a thousand times beyond the span of the measured signal."""
+    """Leave gaps where a simulation runs away, far beyond the span of the measured signal."""
     with np.errstate(invalid="ignore"):
-        return np.where(np.abs(values) <= 1e3 * span, values, np.nan)
+        return np.where(np.abs(values) <= RUNAWAY * span, values, np.nan)
 
 
 def line(ax: Axes, x: np.ndarray, y: np.ndarray, label: str, colour: str, **style: Any) -> None:
-    """Draw a line, thinned where it is dense; a line with nothing to show says so in the legend."""
+    """Draw a line, thinned where it is dense; the legend says so where a line has nothing to draw."""
     if not np.any(np.isfinite(y)):
         label = f"{label}: nothing to draw"
     ax.plot(*thin(np.asarray(x), np.asarray(y)), label=plain(label), color=colour, **{"linewidth": 1.2, **style})
 
 
 def decibel(power: np.ndarray) -> np.ndarray:
-    """`10 log10` of a power, (any shape); nan (a gap in the line) where it is zero or not finite."""
+    """Return `10 log10` of a power of any shape; nan (a gap in the line) where it is zero or not finite."""
     power = np.asarray(power, dtype=float)
     usable = np.isfinite(power) & (power > 0)
     return np.where(usable, 10 * np.log10(np.where(usable, power, 1.0)), np.nan)
 
 
 def limit_depth(ax: Axes, *curves: np.ndarray) -> None:
-    """Keep an axis in decibels readable: rounding errors hundreds of decibels down do not stretch it."""
+    """Keep an axis in decibels readable: rounding errors hundreds of decibels down must not stretch it."""
     values = np.concatenate([c[np.isfinite(c)] for c in curves] or [np.zeros(0)])
-    if len(values) and np.min(values) < np.max(values) - DEEPEST:
-        ax.set_ylim(np.max(values) - DEEPEST, np.max(values) + 0.05 * DEEPEST)
+    if len(values) and np.min(values) < np.max(values) - DEPTH:
+        ax.set_ylim(np.max(values) - DEPTH, np.max(values) + 0.05 * DEPTH)
+
+
+def noise_line(ax: Axes, level: float, label: str = "noise floor") -> None:
+    """Draw the noise level as a dashed line, where there is one."""
+    if level > 0:
+        ax.axhline(level, color=GREEN, linestyle="--", linewidth=1.4, label=label)

@@ -1,4 +1,4 @@
-"""Figures of a mismatch: over frequency and amplitude, over time, and which port and law takes it away."""
+"""Figures of a mismatch: over frequency, amplitude and time, and the error that each port and law leaves."""
 
 from __future__ import annotations
 
@@ -10,16 +10,30 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
-from .canvas import BLUE, FONT, GREEN, GREY, INK, VERMILLION, axes_or_new, finish, new_figure, plain, scaled, with_unit
+from .canvas import (
+    BLUE,
+    FONT,
+    GREEN,
+    GREY,
+    INK,
+    VERMILLION,
+    axes_or_new,
+    finish,
+    new_figure,
+    noise_line,
+    plain,
+    scaled,
+    with_unit,
+)
 
-SHADES = "cividis"  # told apart by every kind of colour vision, and in grey
+SHADES = "cividis"  # distinct for every kind of colour vision, and in grey
 
 
 def mismatch_map(found: Mapping[str, Any], unit: str = "", *, ax: Axes | None = None) -> Axes:
-    """Residual over frequency and amplitude, as `diagnose.mismatch` gives it; shares of the outputs' deviation in %."""
+    """Draw the residual over frequency and amplitude (`diagnose.mismatch`), in % of the outputs' deviation."""
     ax = axes_or_new(ax)
     data, (size, label) = found["map"], _size(found, unit)
-    edges, rms = np.asarray(data["edges"]) * size, 100 * _array(data["rms"])
+    edges, rms = np.asarray(data["edges"]) * size, 100 * _with_gaps(data["rms"])
     top = max(float(np.nanmax(rms, initial=0.0)), 1e-12)
     rows = _rows(data, np.nanmax(np.nan_to_num(rms), axis=1) > 1e-3 * top)
     y = np.append(np.asarray(data["low"])[rows], data["high"][rows.stop - 1])
@@ -38,13 +52,13 @@ def mismatch_map(found: Mapping[str, Any], unit: str = "", *, ax: Axes | None = 
 
 
 def _rows(data: Mapping[str, Any], wanted: np.ndarray) -> slice:
-    """The bands from the first to the last with something in it."""
+    """Select the bands from the first to the last with a residual in it."""
     where = np.flatnonzero(wanted)
     return slice(int(where[0]), int(where[-1]) + 1) if len(where) else slice(0, len(data["low"]))
 
 
 def _size(found: Mapping[str, Any], unit: str, kind: str = "amplitude") -> tuple[float, str]:
-    """Factor and label of an axis of amplitudes or rates: in the output's own unit where there is one output."""
+    """Choose factor and label of an axis of amplitudes or rates: in the output's own unit where there is one output."""
     per = "/s" if kind == "rate" else ""
     if len(found["scale"]) != 1:
         return 1.0, f"{kind} of the outputs [deviations{per}]"
@@ -53,12 +67,13 @@ def _size(found: Mapping[str, Any], unit: str, kind: str = "amplitude") -> tuple
     return scale / factor, with_unit(f"{kind} of {name}", label)
 
 
-def _array(rows: Sequence[Any]) -> np.ndarray:
-    return np.array([[np.nan if v is None else v for v in row] for row in rows], dtype=float)
+def _with_gaps(values: Any) -> np.ndarray:
+    """Convert nested lists to an array, None to nan."""
+    return np.array(values, dtype=float)
 
 
 def mismatch_bands(found: Mapping[str, Any], *, ax: Axes | None = None) -> Axes:
-    """Residual in each band of frequency beside the noise floor; the bands that hold most of it are filled."""
+    """Draw the residual in each band of frequency beside the noise floor; bands that hold most of it are filled."""
     ax = axes_or_new(ax)
     data = found["frequency"]
     low, high = np.asarray(data["low"], dtype=float), np.asarray(data["high"])
@@ -82,19 +97,18 @@ def mismatch_bands(found: Mapping[str, Any], *, ax: Axes | None = None) -> Axes:
 def mismatch_growth(
     found: Mapping[str, Any], unit: str = "", *, kind: str = "amplitude", ax: Axes | None = None
 ) -> Axes:
-    """Residual over the `amplitude` or the `rate` of the output, with what an error in proportion would be."""
+    """Draw the residual over the `amplitude` or the `rate` of the output, beside an error in proportion."""
     ax = axes_or_new(ax)
     data, (size, label) = found[kind], _size(found, unit, kind)
     edges = np.asarray(data["edges"])
     middle = (edges[1:] + edges[:-1]) / 2
-    rms = 100 * np.array([np.nan if v is None else v for v in data["rms"]], dtype=float)
+    rms = 100 * _with_gaps(data["rms"])
     ax.plot(middle * size, rms, "o-", color=VERMILLION, linewidth=1.8, label="residual")
     known = np.isfinite(rms) & (rms > 0)
     if np.any(known):
         k = int(np.flatnonzero(known)[len(np.flatnonzero(known)) // 2])
         ax.plot(middle * size, rms[k] * middle / middle[k], ":", color=GREY, linewidth=1.4, label="in proportion")
-    if found["floor"] > 0:
-        ax.axhline(100 * found["floor"], color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
+    noise_line(ax, 100 * found["floor"])
     ax.set_xlim(left=0)
     ax.set_yscale("log")
     _readable_log(ax.yaxis, *ax.get_ylim())
@@ -102,22 +116,21 @@ def mismatch_growth(
 
 
 def mismatch_level(found: Mapping[str, Any], unit: str = "", *, ax: Axes | None = None) -> Axes:
-    """Residual over the value of the output that shows most of it: whether one side is worse."""
+    """Draw the residual over the value of the output that shows most of it: one side may be worse."""
     ax = axes_or_new(ax)
     data = found["level"]
     scale = found["scale"][data["output"]]
     size, label = scaled(scale * np.asarray(data["edges"]), unit)
-    rms = 100 * np.array([np.nan if v is None else v for v in data["rms"]], dtype=float)
+    rms = 100 * _with_gaps(data["rms"])
     ax.stairs(
         rms, scale * np.asarray(data["edges"]) / size, color=VERMILLION, linewidth=1.8, label="residual", baseline=None
     )
-    if found["floor"] > 0:
-        ax.axhline(100 * found["floor"], color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
+    noise_line(ax, 100 * found["floor"])
     return finish(ax, with_unit(data["output"], label), "residual [% of deviation]", "over level")
 
 
 def mismatch_time(found: Mapping[str, Any], *, ax: Axes | None = None) -> Axes:
-    """Residual and motion over the time of each recording, one after the other."""
+    """Draw residual and motion over the time of each recording, one after the other."""
     ax = axes_or_new(ax)
     at = 0.0
     for k, part in enumerate(found["time"]):
@@ -136,8 +149,7 @@ def mismatch_time(found: Mapping[str, Any], *, ax: Axes | None = None) -> Axes:
             ax.annotate(plain(part["name"][:24]), (edges[0], 1), (4, -4), xycoords=("data", "axes fraction"),
                         textcoords="offset points", va="top", fontsize=FONT - 2, color=INK)  # fmt: skip
         at = edges[-1]
-    if found["floor"] > 0:
-        ax.axhline(100 * found["floor"], color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
+    noise_line(ax, 100 * found["floor"])
     ax.set_yscale("log")
     _readable_log(ax.yaxis, *ax.get_ylim())
     ax.margins(x=0.01)
@@ -150,15 +162,16 @@ def port_law_map(
     without: float | None = None,
     floor: float | None = None,
 ) -> Axes:
-    """Error on data not fitted of every port and law; blank where the quick test left a pair out.
+    """Draw the error on data that was not fitted, of every port and law; grey where no fit was made.
 
     Parameters
     ----------
     rows : sequence of (port, law, error)
+        Validation errors; of several forms of a law the smallest is drawn.
     best : sequence of (port, law)
         Pairs that are framed.
     without, floor : float, optional
-        Error of the simulator without any law, and of noise alone: the ends of the scale.
+        Validation error of the simulator without any law, and error of noise alone: the ends of the scale.
     """
     ports = list(dict.fromkeys(p for p, _, _ in rows))
     smallest: dict[tuple[str, str], float] = {}
@@ -200,7 +213,7 @@ def port_law_map(
 
 
 def _wrapped(name: str, most: int = 12, lines: int = 3) -> str:
-    """A name broken after colons, hyphens and underscores where it is long, and shortened where it is longer."""
+    """Break a long name after colons, hyphens and underscores, and shorten a longer one."""
     rows = [""]
     for piece in re.findall(r"[^:_-]*[:_-]*", name):
         if rows[-1] and len(rows[-1] + piece) > most:
@@ -211,7 +224,7 @@ def _wrapped(name: str, most: int = 12, lines: int = 3) -> str:
 
 
 def _readable_log(axis: Any, low: float, high: float) -> None:
-    """Ticks of a logarithmic axis as plain numbers, few enough to be read."""
+    """Write the ticks of a logarithmic axis as plain numbers, few enough to be read."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     subs = (1.0,) if high > 300 * low else (1.0, 2.0, 5.0) if high > 3 * low else tuple(np.arange(1.0, 10.0))

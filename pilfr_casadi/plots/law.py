@@ -17,15 +17,15 @@ from .canvas import BLUE, INK, SKY, VERMILLION, axes_or_new, finish, with_unit
 from .signals import PlottedFit, as_scored
 
 Curve = Callable[[np.ndarray], np.ndarray]
-FEWEST = 4  # operators whose weights make up a density
+FEWEST_FOR_DENSITY = 4  # operators in use; the weights of fewer do not sample a density
 
 
 def loop(
     fit: PlottedFit, recording: Recording, *, channel: int = 0, bare: bool = False, ax: Axes | None = None
 ) -> Axes:
-    """The identified hysteresis: the element's output w over its input z along a recording, as Fig. 15.
+    """Draw the identified hysteresis: the element's output w over its input z along a recording, as Fig. 15.
 
-    With `bare` the line through the origin that fits w best is taken off, so that the hysteresis alone is seen.
+    `bare` takes off the line through the origin that fits w best, which leaves the hysteresis alone.
     """
     _check_channel(fit, channel)
     signals, index = fit.signals(recording), _index(fit, channel)
@@ -50,7 +50,7 @@ def loading_curve(
     reference: Curve | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """The element's response to z growing from rest (virgin curve); the range that the recordings visit is shaded.
+    """Draw the element's response to z growing from rest (virgin curve), the range of the recordings shaded.
 
     `reference` is a curve to compare with, from z (G,) to w (G,), in the scale of the model.
     """
@@ -67,7 +67,7 @@ def loading_curve(
 
 
 def virgin_curve(fit: PlottedFit, z: np.ndarray, channel: int = 0) -> np.ndarray:
-    """w (G,) while one channel's z runs through the values given (G,), from empty memory."""
+    """Return w (G,) while one channel's z runs through the values given (G,), from empty memory."""
     model, p = fit.model, fit.model.parameters.start
     memory, out = np.zeros(model.n_s), np.empty(len(z))
     for k, value in enumerate(z):
@@ -84,10 +84,10 @@ def weights(
     reference: Curve | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Weight over threshold of every operator, and the density of weights over thresholds that they stand for.
+    """Draw the weight over threshold of every operator, and the density of weights over thresholds.
 
-    Fewer than four operators in use stand for themselves: no density is drawn of them. `reference` is a density to
-    compare with, from r (G,) to weight per unit of r (G,), in the scale of the model.
+    No density is drawn of fewer than four operators in use. `reference` is a density to compare with, from r (G,) to
+    weight per unit of r (G,), in the scale of the model.
     """
     _check_channel(fit, channel)
     values = fit.parameters
@@ -103,7 +103,7 @@ def weights(
     errors = fit.errors.get("w")
     spread = None if errors is None else np.nan_to_num(errors[channel][order], posinf=0.0)
     grid, right = np.linspace(0.0, limit, 300), None
-    smooth = np.count_nonzero(w) >= FEWEST
+    smooth = np.count_nonzero(w) >= FEWEST_FOR_DENSITY
     two = smooth or reference is not None
     label = "weights w (left)" if two else "weights w"
     ax.errorbar(r, w, yerr=spread, fmt="o", markersize=4, color=BLUE, elinewidth=1, label=label)
@@ -137,7 +137,7 @@ def _index(fit: PlottedFit, channel: int) -> str:
 
 
 def _label(fit: PlottedFit, signal: str, channel: int, name: str = "") -> str:
-    """Axis label of an element's signal: in units where it is an input or output of the model, else in its scale."""
+    """Label an axis of an element's signal: with the unit where it is an input or output, else in the model's scale."""
     index = _index(fit, channel)
     reads, writes = (("C_z", "D_zu"), fit.model.inputs), (("C_y", "D_yu", "D_yw"), fit.model.outputs)
     blocks, names = reads if signal == "z" else writes
@@ -159,7 +159,7 @@ def _reach(fit: PlottedFit, recordings: Recording | Sequence[Recording] | None, 
 
 
 def _range(fit: PlottedFit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:
-    """Up to where an element is drawn: what is visited, and the thresholds where they lie not far beyond."""
+    """Choose how far an element is drawn: the visited range, and thresholds that lie not far beyond."""
     reach, r = _reach(fit, recordings, channel), fit.parameters.get("r")
     far = 0.0 if r is None else float(np.max(r[channel]))
     limit = 1.05 * (max(reach, min(far, 1.5 * reach)) if reach else far)

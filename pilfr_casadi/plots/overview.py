@@ -1,4 +1,4 @@
-"""One figure of a whole fit, and the way that led to it."""
+"""One figure of a whole fit, and the convergence of its search."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from .signals import PlottedFit, spectrum, time
 def plot_fit(
     fit: PlottedFit, recordings: Recording | Sequence[Recording], *, steady: Sequence[Recording] | None = None
 ) -> Figure:
-    """One figure: time and spectrum of every output; loop and loading curve of every channel, and a layer's weights.
+    """Draw a fit in one figure: time and spectrum of every output, loop, loading curve and weights of every channel.
 
-    Without hysteresis, the way to the fit, beside the curve of an element of one channel.
+    Without hysteresis: convergence, beside the curve of an element of one channel.
 
     Parameters
     ----------
     fit : Fit
         The fitted model.
     recordings : Recording or sequence of Recording
-        What to simulate and compare.
+        Recordings to simulate and compare with.
     steady : sequence of Recording, optional
-        Periodic recordings that noise and distortion levels are taken from; see `spectrum`.
+        Periodic recordings from which noise and distortion levels are estimated; see `spectrum`.
 
     Returns
     -------
@@ -63,13 +63,13 @@ def plot_fit(
 
 
 def convergence(fit: PlottedFit, *, ax: Axes | None = None) -> Axes:
-    """Training error over iterations, of every start and of the solve that won."""
+    """Draw the training error over iterations, of every start and of the winning solve."""
     ax = axes_or_new(ax)
     histories = [c.solution.history for c in fit.candidates if c.solution.history]
     for k, history in enumerate(histories):
         ax.plot(
             [h.number for h in history],
-            _error(history),
+            _training_error(history),
             color=GREY,
             linewidth=0.9,
             alpha=0.7,
@@ -78,7 +78,7 @@ def convergence(fit: PlottedFit, *, ax: Axes | None = None) -> Axes:
     if fit.solution.history:
         ax.plot(
             [h.number for h in fit.solution.history],
-            _error(fit.solution.history),
+            _training_error(fit.solution.history),
             color=VERMILLION,
             linewidth=2.0,
             label="last solve of the best",
@@ -87,5 +87,5 @@ def convergence(fit: PlottedFit, *, ax: Axes | None = None) -> Axes:
     return finish(ax, "iteration", "training error √(2 · cost)", "convergence")
 
 
-def _error(history: Sequence[Iteration]) -> np.ndarray:
+def _training_error(history: Sequence[Iteration]) -> np.ndarray:
     return np.sqrt(2 * np.maximum([h.cost for h in history], 0.0))

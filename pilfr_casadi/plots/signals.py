@@ -82,7 +82,7 @@ class PlottedFit(FittedModel, Protocol):
 
 
 def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
-    """Measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
+    """Draw the measured output with the residuals of the linear model and of the fit over time, as Fig. 9 (left)."""
     recording = as_scored(fit, recording)
     ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
     level = _level(y[recording.skip :])
@@ -91,7 +91,7 @@ def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | N
     what = "measured output" + (f" less its mean {level:.6g} {plain_unit}".rstrip() if level else "")
     line(ax, t, (y - level) / size, what, BLUE, linewidth=0.9)
     for label, residual, colour in _residuals(fit, recording, output):
-        drawn, note = _moved(drawable(residual, np.ptp(y)), np.ptp(y), plain_unit)
+        drawn, note = _without_offset(drawable(residual, np.ptp(y)), np.ptp(y), plain_unit)
         line(ax, t, drawn / size, label + note, colour, linewidth=1.1)
     return _over_time(ax, recording, with_unit(recording.outputs[output], unit))
 
@@ -104,7 +104,7 @@ def traces(
     between: tuple[float, float] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Measured and simulated output over a stretch of time in s, by default a few swings around the largest one."""
+    """Draw measured and simulated output over a stretch of time in s, by default a few swings around the largest."""
     ax, y = axes_or_new(ax), _column(recording.y, output, "output")
     begin, end = between or busiest(y - np.mean(y), recording)
     part = slice(*np.clip(np.round(np.array([begin, end]) / recording.dt).astype(int), 0, len(y)))
@@ -119,14 +119,14 @@ def traces(
     if _compares(fit):
         models.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
     for label, simulated, colour in models:
-        error, note = _moved(drawable((simulated[:, output] - y), np.ptp(y)), np.ptp(y), plain_unit)
+        error, note = _without_offset(drawable((simulated[:, output] - y), np.ptp(y)), np.ptp(y), plain_unit)
         line(ax, recording.t[part], (y + error)[part] / size, label + note, colour)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", with_unit(recording.outputs[output], unit), recording.name, 3)
 
 
 def busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
-    """Start and end of a stretch around the largest excursion with about eight swings; small ripple is not counted."""
+    """Find start and end, s, of about eight swings around the largest excursion; small ripple is not counted."""
     peak = int(np.argmax(np.abs(y)))
     large = np.flatnonzero(np.abs(y) >= 0.2 * np.abs(y[peak]))
     swings = large[1:][np.diff(np.signbit(y[large]))]
@@ -137,7 +137,7 @@ def busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
 
 
 def remains(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | None = None) -> Axes:
-    """What the fit leaves over, alone over time and in its own scale."""
+    """Draw the residual of the fit alone over time, in its own scale."""
     recording = as_scored(fit, recording)
     ax, y = axes_or_new(ax), _column(recording.y, output, "output")
     residual = drawable(fit.simulate(recording)[:, output] - y, np.ptp(y))
@@ -157,12 +157,12 @@ def remains(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes 
 def output_over_input(
     fit: PlottedFit, recording: Recording, *, input: int = 0, output: int = 0, ax: Axes | None = None
 ) -> Axes:
-    """Measured and simulated output over an input, where scored: the nested loops of a quasi-static device."""
+    """Draw measured and simulated output over an input, where scored: the nested loops of a quasi-static device."""
     ax, u, y = axes_or_new(ax), _column(recording.u, input, "input"), _column(recording.y, output, "output")
     name, simulated = recording.outputs[output], fit.simulate(recording)[:, output]
     u, y, simulated = (column[as_scored(fit, recording).skip :] for column in (u, y, simulated))
     size, unit = scaled(y, _unit(fit, recording, name))
-    error, note = _moved(drawable(simulated - y, np.ptp(y)), np.ptp(y), _unit(fit, recording, name))
+    error, note = _without_offset(drawable(simulated - y, np.ptp(y)), np.ptp(y), _unit(fit, recording, name))
     ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
     ax.plot(u, (y + error) / size, color=INK, linewidth=0.5, label=plain(f"this model{note}"), rasterized=True)
     across = recording.inputs[input]
@@ -177,7 +177,7 @@ def spectrum(
     steady: Sequence[Recording] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Amplitude densities of output and residuals over frequency, with noise and total distortion, as Fig. 9 (right).
+    """Draw amplitude densities of output and residuals, with noise and total distortion, as Fig. 9 (right).
 
     All lines are densities (per root hertz) of the signals as recorded, so records of any length and levels from
     periods can be compared: a residual that lies on the noise line cannot be improved.
@@ -215,7 +215,7 @@ def spectrum(
 
 
 def amplitude_density(x: np.ndarray, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (F,) above zero in Hz and one-sided power density (F,) of a signal (M,) sampled as the recording."""
+    """Return frequencies (F,) above zero, Hz, and one-sided power density (F,) of a signal (M,) of the recording."""
     x, period = x[recording.skip :], recording.period
     if not np.all(np.isfinite(x)):
         x = np.full(len(x), np.nan)
@@ -230,12 +230,12 @@ def amplitude_density(x: np.ndarray, recording: Recording) -> tuple[np.ndarray, 
 
 
 def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.ndarray, np.ndarray, str]]:
-    """(label, frequency, power density, colour) of noise and total distortion, as in a single period."""
+    """List (label, frequency, power density, colour) of noise and total distortion, as in a single period."""
     if not periodic:
         return []
     try:
         levels = output_spectra(periodic)
-    except InputError:  # too few periods or experiments to tell a level: the line is left out
+    except InputError:  # too few periods or experiments for a level: leave the line out
         return []
     period = periodic[0].period or 2
     averaged = (len(periodic[0]) - periodic[0].skip) // period
@@ -252,7 +252,7 @@ def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.nd
 
 
 def linear_simulation(fit: PlottedFit, recording: Recording) -> np.ndarray:
-    """Outputs (M, n_y) of the linear model that the fit began with, from its own initial state.
+    """Simulate the linear model that the fit began with from its own initial state: outputs (M, n_y).
 
     Raises
     ------
@@ -267,15 +267,15 @@ def linear_simulation(fit: PlottedFit, recording: Recording) -> np.ndarray:
 
 
 def as_scored(fit: PlottedFit, recording: Recording) -> Recording:
-    """The recording with `skip` at the first sample that is scored: behind those that its state was fitted to."""
+    """Set `skip` of a recording to the first sample that is scored, behind those that its state was fitted to."""
     try:
         return recording.with_(skip=fit.scored_from(recording))
-    except InputError:  # it is no longer than that
+    except InputError:  # the recording is too short to leave a scored sample
         return recording
 
 
 def _over_time(ax: Axes, recording: Recording, label: str) -> Axes:
-    """Finish a picture over time; what is not scored is grey."""
+    """Finish a picture over time; samples that are not scored are grey."""
     if recording.skip:
         ax.axvspan(0, recording.skip * recording.dt, color="#EEEEEE", label="not scored")
     ax.margins(x=0.01)
@@ -283,13 +283,13 @@ def _over_time(ax: Axes, recording: Recording, label: str) -> Axes:
 
 
 def _level(y: np.ndarray) -> float:
-    """What to take off a signal (M,) so that its swings can be seen beside residuals around zero: its mean, or 0."""
+    """Choose the level to take off a signal (M,) so that its swings show beside residuals around zero: mean or 0."""
     mean = float(np.mean(y))
     return mean if abs(mean) > np.ptp(y) > 0 else 0.0
 
 
-def _moved(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
-    """An error (M,), less its offset where that is beyond the measured span and nearly all of it, and a note of it."""
+def _without_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
+    """Take the offset off an error (M,) where it exceeds the measured span and nearly is the error; return a note."""
     known = error[np.isfinite(error)]
     if not known.size or abs(np.mean(known)) <= span or np.ptp(known) > 3 * span or not span:
         return error, ""
@@ -309,14 +309,14 @@ def _column(values: np.ndarray, index: int, role: str) -> np.ndarray:
 
 
 def _residuals(fit: PlottedFit, recording: Recording, output: int) -> list[tuple[str, np.ndarray, str]]:
-    """(label, residual, colour) of the linear model, where the fit has one, and of the fit."""
-    out = [(*_named("this model", recording, fit.simulate(recording), output), INK)]
+    """List (label, residual, colour) of the linear model, where the fit has one, and of the fit."""
+    out = [(*_labelled_residual("this model", recording, fit.simulate(recording), output), INK)]
     if _compares(fit):
-        out.insert(0, (*_named("linear", recording, linear_simulation(fit, recording), output), VERMILLION))
+        out.insert(0, (*_labelled_residual("linear", recording, linear_simulation(fit, recording), output), VERMILLION))
     return out
 
 
-def _named(model: str, recording: Recording, simulated: np.ndarray, output: int) -> tuple[str, np.ndarray]:
+def _labelled_residual(model: str, recording: Recording, simulated: np.ndarray, output: int) -> tuple[str, np.ndarray]:
     y, y_hat = recording.y[:, output], simulated[:, output]
     try:
         share = f" {100 * nrmse(y, y_hat, recording.skip):.3g} %"

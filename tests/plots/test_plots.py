@@ -112,7 +112,7 @@ def some_bla():
 
 
 @pytest.mark.parametrize("name", SINGLE)
-def test_every_picture_has_labelled_axes_and_something_on_them(name, fitted, data):
+def test_every_picture_has_labelled_axes_something_on_them_and_no_text_on_text(name, fitted, data):
     ax = SINGLE[name](fitted, data, None)
     assert ax.get_xlabel() or name == "spread"
     assert ax.get_ylabel()
@@ -122,19 +122,13 @@ def test_every_picture_has_labelled_axes_and_something_on_them(name, fitted, dat
     assert len(np.unique(image.reshape(-1, 4), axis=0)) > 20
     border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
     assert np.all(border == 255), "something is cut off at the edge"
-    given = Figure().add_subplot()
-    assert SINGLE[name](fitted, data, given) is given
-
-
-@pytest.mark.parametrize("name", SINGLE)
-def test_text_does_not_overlap(name, fitted, data):
-    ax = SINGLE[name](fitted, data, None)
-    pixels(ax.figure)
     boxes = [t.get_window_extent() for t in (ax.xaxis.label, ax.yaxis.label, ax.title) if t.get_text()]
     boxes += [ax.get_legend().get_window_extent()] if ax.get_legend() else []
     for i, a in enumerate(boxes):
         assert not any(a.overlaps(b) for b in boxes[i + 1 :])
         assert not a.shrunk(0.9, 0.9).overlaps(ax.get_window_extent())
+    given = Figure().add_subplot()
+    assert SINGLE[name](fitted, data, given) is given
 
 
 def test_no_screen_no_pyplot_no_settings_changed(tmp_path):
@@ -143,7 +137,7 @@ import json, sys
 sys.path.insert(0, {str(tmp_path)!r})
 import matplotlib
 before = {{k: matplotlib.rcParams[k] for k in matplotlib.rcParams if k != "backend"}}
-sys.path[:0] = ["tests"]
+sys.path[:0] = ["tests/plots"]
 from test_plots import example, record
 f = example(); figure = f.plot(record(f, 0.01)); figure.savefig({str(tmp_path / "fit.svg")!r})
 same = all(matplotlib.rcParams[k] == v for k, v in before.items())
@@ -284,7 +278,7 @@ def test_decibels_of_nothing_are_gaps():
     )
     ax = canvas.axes_or_new(None)
     canvas.limit_depth(ax, np.array([-900.0, 10.0]), np.array([np.nan]))
-    assert ax.get_ylim()[0] == 10 - canvas.DEEPEST
+    assert ax.get_ylim()[0] == 10 - canvas.DEPTH
 
 
 def test_densities_are_those_of_the_signals():
@@ -339,8 +333,7 @@ def test_the_bare_loop_has_no_slope_left(fitted, data):
 
 
 def test_frequency_response_against_scipy(fitted):
-    from types import SimpleNamespace
-
+    import control
     from scipy.signal import dfreqresp
 
     f = np.array([0.0, 1.0, 17.0, 50.0])
@@ -350,8 +343,7 @@ def test_frequency_response_against_scipy(fitted):
     ours = plots.frequency_response(linear, f, 0.01)
     assert ours.shape == (4, 1, 1)
     assert ours[:, 0, 0] == pytest.approx(expected, rel=1e-12)
-    state_space = SimpleNamespace(**dict(zip("ABCD", p.values(), strict=True)))
-    assert np.array_equal(plots.frequency_response(state_space, f, 0.01), ours)
+    assert np.array_equal(plots.frequency_response(control.ss(*p.values(), 0.01), f, 0.01), ours)
     assert plots.frequency_response(ours, f, 0.01) is ours
     with pytest.raises(InputError, match="without an element"):
         plots.frequency_response(fitted.model, f, 0.01)
@@ -415,3 +407,20 @@ def test_studies(fitted):
 def test_what_cannot_be_drawn_is_one_sentence(draw, words, fitted, data):
     with pytest.raises(InputError, match=words):
         draw(fitted, data)
+
+
+def test_the_map_of_ports_and_laws_shows_the_errors_it_is_given():
+    rows = [("ground", "hysteresis", 0.02), ("ground", "hysteresis", 0.5), ("sensor:x", "hysteresis", 0.3)]
+    rows += [("ground", "drift", 0.25), ("sensor:x", "drift", np.inf)]
+    ax = plots.port_law_map(rows, best=[("ground", "hysteresis")], without=0.4, floor=0.01)
+    ports = [t.get_text().replace("\n", "") for t in ax.get_xticklabels()]
+    laws = [t.get_text() for t in ax.get_yticklabels()]
+    shown = {(ports[int(t.get_position()[0])], laws[int(t.get_position()[1])]): t for t in ax.texts}
+    assert {key: float(t.get_text()) for key, t in shown.items()} == {
+        ("ground", "hysteresis"): 2.0,  # of two forms the better one, in %
+        ("sensor:x", "hysteresis"): 30.0,
+        ("ground", "drift"): 25.0,
+    }
+    assert [key for key, t in shown.items() if t.get_fontweight() == "bold"] == [("ground", "hysteresis")]
+    assert ax.figure.axes[1].get_ylabel() == "error on data not fitted [%]"
+    pixels(ax.figure)

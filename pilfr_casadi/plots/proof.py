@@ -26,7 +26,7 @@ from .canvas import (
 )
 from .signals import amplitude_density, busiest
 
-DOTS = 2500  # points of a cloud
+CLOUD_POINTS = 2500  # as many as can be told apart in a figure
 
 
 def force_cloud(
@@ -43,20 +43,20 @@ def force_cloud(
     name: str = "fitted law",
     ax: Axes | None = None,
 ) -> Axes:
-    """A recovered force over a local signal as points, the law along the simulation as a line.
+    """Draw a recovered force over a local signal as points, and the law along the simulation as a line.
 
     Parameters
     ----------
     x, force : array, (K,)
-        Recovered.
+        Local signal and recovered force.
     law_x, law : array, (M,)
-        Of the law; may be empty.
+        Local signal and force of the law; may be empty.
     across, label, title, name : str
-        What is drawn; units in `across_unit` and `unit`.
+        Names of the local signal, the force, the figure and the law; units in `across_unit` and `unit`.
     """
     ax = axes_or_new(ax)
     (sx, ux), (sy, uy) = scaled(x, across_unit), scaled(force, unit)
-    every = max(len(x) // DOTS, 1)
+    every = max(len(x) // CLOUD_POINTS, 1)
     ax.plot(x[::every] / sx, force[::every] / sy, ".", color=BLUE, markersize=2.6, alpha=0.55,
             label="recovered from the recording", rasterized=True)  # fmt: skip
     if len(law):
@@ -68,7 +68,7 @@ def force_cloud(
 def force_time(
     t: np.ndarray, force: np.ndarray, std: np.ndarray, law: np.ndarray, *, label: str, unit: str = "", name: str = "law"
 ) -> Axes:
-    """A recovered force over time with its uncertainty, around its largest value, and the law's."""
+    """Draw a recovered force over time with its uncertainty, around its largest value, and the law's force."""
     ax = axes_or_new(None)
     size, unit = scaled(force, unit)
     window = max(min(len(force), 400), len(force) // 12)
@@ -88,10 +88,10 @@ def force_time(
 def force_left(
     x: np.ndarray, left: np.ndarray, std: np.ndarray, *, across: str, label: str, unit: str = "", across_unit: str = ""
 ) -> Axes:
-    """What a law leaves of a recovered force, as points over the local coordinate, with the mean along it."""
+    """Draw the part of a recovered force that a law leaves, as points over the local coordinate, with the mean."""
     ax = axes_or_new(None)
     (sx, ux), (sy, uy) = scaled(x, across_unit), scaled(left, unit)
-    every = max(len(x) // DOTS, 1)
+    every = max(len(x) // CLOUD_POINTS, 1)
     ax.plot(x[::every] / sx, left[::every] / sy, ".", color=BLUE, markersize=2.6, alpha=0.4, rasterized=True)
     edges = np.quantile(x, np.linspace(0, 1, 21))
     index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, 19)
@@ -108,7 +108,7 @@ def force_left(
 
 
 def _span(values: np.ndarray, law: np.ndarray | None = None) -> tuple[float, float]:
-    """Limits that a few stray points do not stretch; the law is seen whole."""
+    """Choose limits that a few stray points do not stretch, and that show the law whole."""
     low, high = np.quantile(values[np.isfinite(values)], [0.001, 0.999])
     if law is not None and np.any(np.isfinite(law)):
         low, high = min(low, np.nanmin(law)), max(high, np.nanmax(law))
@@ -123,7 +123,7 @@ COLOURS = (ORANGE, INK)
 def compared_traces(
     r: Recording, simulated: Simulated, output: int = 0, unit: str = "", *, quiet: bool = False, ax: Axes | None = None
 ) -> Axes:
-    """Measured output and simulations, a few swings around the largest one, or a stretch where it is `quiet`."""
+    """Draw measured output and simulations, a few swings around the largest one, or in a `quiet` stretch."""
     ax = axes_or_new(ax)
     y = r.y[:, output]
     begin, end = busiest(y - np.mean(y), r)
@@ -140,7 +140,7 @@ def compared_traces(
 
 
 def _quiet(y: np.ndarray, length: int, skip: int) -> slice:
-    """A stretch with less motion than three quarters of all."""
+    """Select a stretch with less motion than three quarters of all."""
     length = min(length, max((len(y) - skip) // 6, 2))
     starts = np.arange(skip, len(y) - length + 1, max(length // 4, 1))
     motion = np.array([np.std(y[a : a + length]) for a in starts])
@@ -151,7 +151,7 @@ def _quiet(y: np.ndarray, length: int, skip: int) -> slice:
 def compared_residuals(
     r: Recording, simulated: Simulated, output: int, unit: str, floor: float, ax: Axes | None = None
 ) -> Axes:
-    """What the simulations leave over the whole recording; `floor` is the deviation of the noise."""
+    """Draw the residuals of simulations over the whole recording; `floor` is the deviation of the noise."""
     ax = axes_or_new(ax)
     y = r.y[:, output]
     kept: list[tuple[str, np.ndarray, Any]] = [
@@ -170,7 +170,7 @@ def compared_residuals(
 
 
 def compared_spectra(r: Recording, simulated: Simulated, output: int, unit: str, floor: float) -> Axes:
-    """Amplitude densities of the output, of what each simulation leaves, and of white noise of deviation `floor`."""
+    """Draw amplitude densities of the output, of each residual, and of white noise of deviation `floor`."""
     ax = axes_or_new(None)
     y, curves = r.y[:, output], []
     signals = [("measured", y, BLUE)]

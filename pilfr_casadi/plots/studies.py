@@ -1,4 +1,4 @@
-"""Figures of data and of studies: best linear approximation, loops at several frequencies, operators, spread of fits.
+"""Figures of data and studies: best linear approximation, loops at several frequencies, operators, spread of fits.
 
 Krikelis et al. (2024), Fig. 3 (operators), 7 (loops), 8 and 13 (best linear approximation), 11 (spread over starts).
 """
@@ -29,6 +29,7 @@ from .canvas import (
     limit_depth,
     line,
     new_figure,
+    noise_line,
     plain,
 )
 
@@ -36,13 +37,13 @@ from .canvas import (
 def best_linear_approximation(
     bla: BLA, model: Any = None, *, output: int = 0, input: int = 0, unit: str = "", ax: Axes | None = None
 ) -> Axes:
-    """Magnitude of the BLA with a parametric model, the error between them, and the estimate's deviations, as Fig. 8.
+    """Draw magnitudes of the BLA and a model, their difference, and the estimate's deviations, as Fig. 8.
 
     Parameters
     ----------
     bla : BLA
-        From `robust_bla` or `plain_bla`. Its deviations are those of the mean over realizations: an error of the model
-        that lies on the total deviation is within what the data can tell.
+        From `robust_bla` or `plain_bla`. Its deviations are those of the mean over realizations: a model whose error is
+        the total deviation is as good as the data can show.
     model : Model, control.StateSpace or complex array (F, n_y, n_u), optional
         A linear model (without an element), or its response at `bla.frequency`.
     output, input : int
@@ -72,7 +73,7 @@ def best_linear_approximation(
 
 
 def frequency_response(model: Any, frequency: np.ndarray, dt: float) -> np.ndarray:
-    """Response `C (e^{jω dt} I - A)⁻¹ B + D` of a discrete-time linear model at frequencies (F,) in Hz, (F, n_y, n_u).
+    """Return the response `C (e^{jω dt} I - A)⁻¹ B + D` of a discrete-time linear model, (F, n_y, n_u), at (F,) Hz.
 
     Raises
     ------
@@ -98,7 +99,7 @@ def frequency_response(model: Any, frequency: np.ndarray, dt: float) -> np.ndarr
 def loops(
     curves: Mapping[str, tuple[np.ndarray, np.ndarray]], x: str, y: str, *, title: str = "", ax: Axes | None = None
 ) -> Axes:
-    """Loops of one signal over another, for example at several frequencies, dark to light as given, as Fig. 7.
+    """Draw loops of one signal over another, for example at several frequencies, dark to light, as Fig. 7.
 
     Parameters
     ----------
@@ -129,7 +130,7 @@ def spread(
     x: str = "",
     ax: Axes | None = None,
 ) -> Axes:
-    """Box plots of the errors of many fits, as Fig. 11: median, quartiles, whiskers to 1.5 box heights, then crosses.
+    """Draw box plots of the errors of many fits, as Fig. 11: median, quartiles, whiskers to 1.5 box heights, crosses.
 
     Parameters
     ----------
@@ -167,8 +168,7 @@ def spread(
             markersize=6,
             label=plain(source),
         )
-    if floor is not None:
-        ax.axhline(floor, color=GREEN, linestyle="--", linewidth=1.4, label="noise floor")
+    noise_line(ax, floor or 0.0)
     ax.set_yscale("log")
     ax.set_xticks(range(len(groups)), [plain(name) for name in errors])
     if _crowded(errors):
@@ -186,13 +186,13 @@ def spread(
 
 
 def _crowded(labels: Iterable[str]) -> bool:
-    """Whether labels side by side, half an inch each, would overlap."""
+    """Tell whether labels side by side, half an inch each, would overlap."""
     longest = [max(map(len, label.split("\n"))) for label in labels]
     return len(longest) > 3 and max(longest, default=0) > 6
 
 
 def operators_demo(r: float = 1.0, amplitude: float = 4.0, samples: int = 2000) -> Figure:
-    """Stop, play and generalized play of threshold r from zero memory, over a fading swing of the input, as Fig. 3."""
+    """Draw stop, play and generalized play of threshold r from zero memory, over a fading swing, as Fig. 3."""
     t = np.linspace(0.0, 1.0, samples)
     u = amplitude * (1 - 0.75 * t) * np.sin(6 * np.pi * t)
 
@@ -227,7 +227,7 @@ def compared_spread(
     x: str = "",
     y: str = "NRMSE",
 ) -> Figure:
-    """Box plots of several data sets on one scale, one `spread` each; keys are titles, then groups."""
+    """Draw box plots of several data sets on one scale, one `spread` each; keys are titles, then groups."""
     widest = max((len(groups) for groups in sets.values()), default=0)
     upright = max((len(label) for groups in sets.values() if _crowded(groups) for label in groups), default=0)
     figure = new_figure(max(3.6, 0.5 * widest) * max(len(sets), 1) + 0.6, 4.0 + 0.08 * upright)
