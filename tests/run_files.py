@@ -28,7 +28,8 @@ nx = 1
 operators = 3
 
 [solver]
-starts = 3
+start = "plain"
+starts = 1
 """
 DATA = """
 [data]

@@ -7,9 +7,9 @@ import math
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
 import typer
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 DONE, NO_RESULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer's own name for it has moved between releases
 MOST_SAMPLES = 10**9  # of a period or of samples left out: 8 GB a channel
-MOST_WORKERS = 1024  # processes; each takes 100 MB and more
 
 
 def say(sentence: str, status: int) -> int:
@@ -34,13 +33,13 @@ def say(sentence: str, status: int) -> int:
 def takes_options(function: Callable[[Any], int]) -> Callable[..., int]:
     """Turn a function of one dataclass into a command: every field of the dataclass is an option or an argument."""
     (kind,) = (hint for name, hint in get_type_hints(function).items() if name != "return")
-    hints = get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind)
 
     def command(**given: Any) -> int:
         return function(kind(**given))
 
     parameters = [
-        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=_default(f), annotation=hints[f.name])
+        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
         for f in fields(kind)
     ]
     vars(command)["__signature__"] = inspect.Signature(parameters)
@@ -48,13 +47,7 @@ def takes_options(function: Callable[[Any], int]) -> Callable[..., int]:
     return command
 
 
-def _default(given: Field[Any]) -> Any:
-    if given.default_factory is not MISSING:
-        return given.default_factory()
-    return inspect.Parameter.empty if given.default is MISSING else given.default
-
-
-def whole(least: int, most: int, text: str, *names: str, metavar: str = "N") -> Any:
+def whole(text: str, least: int, most: int, default: int | None = None, metavar: str = "N") -> Any:
     """Make an option that takes a whole number."""
 
     def parse(given: str) -> int:
@@ -66,10 +59,10 @@ def whole(least: int, most: int, text: str, *names: str, metavar: str = "N") -> 
             raise typer.BadParameter(f"{given} was given; give a whole number from {least} to {most}.")
         return value
 
-    return typer.Option(*names, parser=parse, metavar=metavar, help=text, show_default=False)
+    return typer.Option(default, parser=parse, metavar=metavar, help=text, show_default=False)
 
 
-def seconds(text: str, *names: str) -> Any:
+def seconds(text: str) -> Any:
     """Make an option that takes a time above zero."""
 
     def parse(given: str) -> float:
@@ -81,52 +74,36 @@ def seconds(text: str, *names: str) -> Any:
             raise typer.BadParameter(f"{given} was given; give a number of seconds above zero.")
         return value
 
-    return typer.Option(*names, parser=parse, metavar="SECONDS", help=text, show_default=False)
+    return typer.Option(None, parser=parse, metavar="SECONDS", help=text, show_default=False)
 
 
-def option(text: str, *names: str, metavar: str | None = None) -> Any:
-    """Make an option of any other type."""
-    return typer.Option(*names, metavar=metavar, help=text, show_default=False)
+def option(text: str, metavar: str | None = None, default: Any = None, name: str | None = None) -> Any:
+    """Make an option of any other type; its name is that of the field, unless it is given."""
+    return typer.Option(default, *([name] if name else []), metavar=metavar, help=text, show_default=False)
 
 
-WORKERS = whole(1, MOST_WORKERS, "Processes; the numbers do not depend on it (default: 1).")
-TESTS = option("Recording to report on, never fitted (repeatable).", "--test", metavar="FILE")
+def flag(text: str, name: str) -> Any:
+    """Make an option that takes no value."""
+    return option(text, default=False, name=name)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DataOptions:
     """How recordings are read."""
 
-    inputs: Annotated[
-        str | None, option("Names of the inputs (default: the model's or simulator's).", metavar="NAME[,NAME]")
-    ] = None
-    outputs: Annotated[
-        str | None, option("Names of the outputs (default: the model's or simulator's).", metavar="NAME[,NAME]")
-    ] = None
-    column: Annotated[
-        list[str],
-        option("Column of a name, or of the time t, where it differs (repeatable).", metavar="NAME=COLUMN"),
-    ] = field(default_factory=list)
-    initial: Annotated[
-        Literal["estimate", "zero", "periodic"] | None,
-        option("State at the first sample (default: estimate; zero where no outputs were measured)."),
-    ] = None
-    period: Annotated[
-        int | None,
-        whole(0, MOST_SAMPLES, "Samples a period; goes with --initial.", metavar="SAMPLES"),
-    ] = None
-    hold: Annotated[Literal["zero", "linear"] | None, option("What the input does between samples.")] = None
-    skip: Annotated[
-        int, whole(0, MOST_SAMPLES, "Leading samples that are simulated, not scored.", metavar="SAMPLES")
-    ] = 0
-    dt: Annotated[float | None, option("Step, where the file has no time column.", metavar="SECONDS")] = None
-    time_tolerance: Annotated[
-        float | None,
-        option(
-            "How far samples may lie off a uniform grid (default: 1e-4 steps, beyond rounding).",
-            metavar="STEPS",
-        ),
-    ] = None
+    inputs: str | None = option("Names of the inputs (default: the model's or simulator's).", "NAME[,NAME]")
+    outputs: str | None = option("Names of the outputs (default: the model's or simulator's).", "NAME[,NAME]")
+    column: list[str] = option("Column of a name, or of the time t, if it differs (repeatable).", "NAME=COLUMN", [])
+    initial: Literal["estimate", "zero", "periodic"] | None = option(
+        "State at the first sample (default: estimate; zero where no outputs were measured)."
+    )
+    period: int | None = whole("Samples a period; goes with --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
+    hold: Literal["zero", "linear"] | None = option("Course of the inputs between samples.")
+    skip: int = whole("Leading samples that are simulated, not scored.", 0, MOST_SAMPLES, 0, "SAMPLES")
+    dt: float | None = option("Step, where the file has no time column.", "SECONDS")
+    time_tolerance: float | None = option(
+        "How far samples may lie off a uniform grid (default: 1e-4 steps, beyond rounding).", "STEPS"
+    )
 
     def __post_init__(self) -> None:
         if self.period is not None and self.initial is None:
@@ -140,15 +117,7 @@ class DataOptions:
         return pairs(self.column, "--column")
 
     def read(self, path: str, inputs: tuple[str, ...], outputs: tuple[str, ...], only_these: bool = False) -> Recording:
-        """Read a recording.
-
-        Parameters
-        ----------
-        path : str
-        inputs, outputs : tuple of str
-        only_these : bool
-            Allow `--column` to name channels that are not among these.
-        """
+        """Read a recording; `only_these` allows `--column` to name channels that are not among these."""
         from ..data import TIME_NAMES, read  # here, so that `pilfr --help` is quick
 
         columns = self.columns(path)
@@ -159,13 +128,7 @@ class DataOptions:
 
 
 def name_list(text: str, option: str) -> tuple[str, ...]:
-    """Split names at commas.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """Split names at commas."""
     names = tuple(part.strip() for part in text.split(",") if part.strip())
     if not names:
         raise InputError(f"{option} {text!r} holds no name; write {option} NAME, or several separated by commas.")
@@ -173,13 +136,7 @@ def name_list(text: str, option: str) -> tuple[str, ...]:
 
 
 def pairs(texts: Sequence[str], option: str) -> dict[str, str]:
-    """Split each `NAME=VALUE`.
-
-    Raises
-    ------
-    InputError
-        If one is not of this form, or a name is given twice.
-    """
+    """Split each `NAME=VALUE`."""
     out: dict[str, str] = {}
     for text in texts:
         name, sign, value = text.partition("=")
@@ -192,24 +149,12 @@ def pairs(texts: Sequence[str], option: str) -> dict[str, str]:
 
 
 def numbers_of(texts: Sequence[str], option: str) -> dict[str, float]:
-    """Split each `NAME=NUMBER`.
-
-    Raises
-    ------
-    InputError
-        If one is not of this form.
-    """
+    """Split each `NAME=NUMBER`."""
     return {name: number(value, f"{option} {name}={value}") for name, value in pairs(texts, option).items()}
 
 
 def number(text: str, given: str) -> float:
-    """Read a number; `given` begins the sentence where it is none.
-
-    Raises
-    ------
-    InputError
-        If it is none.
-    """
+    """Read a number; `given` begins the sentence where it is none."""
     try:
         return float(text)
     except ValueError:
@@ -217,25 +162,13 @@ def number(text: str, given: str) -> float:
 
 
 def check_given_once(paths: Sequence[str]) -> None:
-    """Refuse a file that is given twice.
-
-    Raises
-    ------
-    InputError
-        If one is.
-    """
+    """Refuse a file that is given twice."""
     if len({os.path.realpath(path) for path in paths}) < len(paths):
         raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
 
 
 def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> None:
-    """Refuse names that are not the model's in its order: swapped ones would be simulated silently.
-
-    Raises
-    ------
-    InputError
-        If they differ.
-    """
+    """Refuse names that are not the model's in its order: swapped ones would be simulated silently."""
     for role, names, own in (("inputs", inputs, fitted.model.inputs), ("outputs", outputs, fitted.model.outputs)):
         if tuple(names) != tuple(own):
             raise InputError(
@@ -251,13 +184,7 @@ def describe(kind: str, path: str, recording: Recording) -> str:
 
 
 def new_file(folder: str, name: str, overwrite: bool) -> Path:
-    """Return the path of a result.
-
-    Raises
-    ------
-    InputError
-        If it exists and may not be replaced.
-    """
+    """Return the path of a result."""
     target = Path(folder) / name
     if target.exists() and not overwrite:
         raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")
@@ -265,13 +192,7 @@ def new_file(folder: str, name: str, overwrite: bool) -> Path:
 
 
 def make_folder(path: str) -> Path:
-    """Make the folder of the results before any long work, so that a bad one is reported at once.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made or written to.
-    """
+    """Make the folder of the results before any long work, so that a bad one is reported at once."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from .._base import deferred_interrupt, processors, progress_bar, worker_pool
 from ..data import Recording, read_csv
@@ -20,7 +20,9 @@ from ..identify import Fit, fit
 from ..models import PILFR, Play, PrandtlIshlinskii
 from ..optimise import Status
 from ..simulators import load_simulator
-from ._common import DONE, INTERRUPTED, MOST_WORKERS, NO_RESULT, make_folder, option, takes_options, whole
+from ..studies import LARGEST_SIZE
+from ._common import DONE, INTERRUPTED, NO_RESULT, make_folder, option, say, takes_options, whole
+from .diagnose import write_diagnosis
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -66,8 +68,8 @@ def structure(n: int) -> PILFR:
 class DemoOptions:
     """The options of `pilfr demo`."""
 
-    out: Annotated[str, option("Folder for the reports (default: runs/demo).", metavar="DIR")] = "runs/demo"
-    workers: Annotated[int | None, whole(1, MOST_WORKERS, "Processes (default: one a processor, at most four).")] = None
+    out: str = option("Folder for the reports (default: runs/demo).", "DIR", "runs/demo")
+    workers: int | None = whole("Processes (default: one a processor, at most four).", 1, LARGEST_SIZE["workers"])
 
 
 @takes_options
@@ -81,7 +83,7 @@ def demo_command(options: DemoOptions) -> int:
     if status == INTERRUPTED:
         return status
     console.print()
-    return max(status, diagnose_rig(folder / "diagnosis", workers, console))
+    return max(status, diagnose_rig(folder / "diagnosis", workers))
 
 
 def identify_rig(folder: Path, workers: int, console: Console) -> int:
@@ -139,32 +141,19 @@ def _table(found: Sequence[Fit], recordings: Mapping[str, Recording]) -> Table:
     return table
 
 
-def diagnose_rig(folder: Path, workers: int, console: Console) -> int:
-    """Find what a simulator leaves out, say where, what and how sure, write the report; return the exit status."""
+def diagnose_rig(folder: Path, workers: int) -> int:
+    """Find what a simulator leaves out, print and write it; return the exit status."""
     from ..diagnose import diagnose
-    from ..report import diagnosis_report
 
     with as_file(files(__package__) / "demo_data" / "rig.py") as path:
         simulator = load_simulator(path)
     recordings = rig_recordings()
-    console.print("Another rig, with a simulator: two masses, linear springs and dampers. What does it leave out?")
+    print("Another rig, with a simulator: two masses, linear springs and dampers. What does it leave out?", flush=True)
     try:
         with progress_bar() as progress:
             found = diagnose(
                 simulator, recordings["train"], test=recordings["test"], effects=1, workers=workers, progress=progress
             )
-        page = diagnosis_report(found, folder)
     except KeyboardInterrupt:
-        console.print("Interrupted; the diagnosis was not written.")
-        return INTERRUPTED
-    console.print(found.sentence, soft_wrap=True, style="bold")
-    for effect in found.effects:
-        console.print(f"where     {effect.port}")
-        console.print(f"what      {effect.law.replace('_', ' ')}: {effect.sentence}", soft_wrap=True)
-        console.print(f"how sure  {effect.confidence:.2f}")
-    errors = found.errors["test"]
-    assert errors is not None
-    shown = f"{errors['before']:.4f} -> {errors['after']:.4f} -> noise floor {found.floor['nrmse']:.4f}"
-    console.print(f"NRMSE on the test recording, refitted without -> with: {shown}", soft_wrap=True)
-    console.print(f"{found.seconds:.1f} s. For the pictures open {page} in a browser.", soft_wrap=True)
-    return DONE if found.effects else NO_RESULT
+        return say("Interrupted; the diagnosis was not written.", INTERRUPTED)
+    return max(write_diagnosis(found, make_folder(str(folder))), DONE if found.effects else NO_RESULT)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
@@ -16,15 +16,15 @@ from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
 from ..export import write_atomically
 from ..identify import load
 from ..simulators import Simulator, as_simulator, simulator_variable
+from ..studies import LARGEST_SIZE
 from ._common import (
     DONE,
     INTERRUPTED,
-    MOST_WORKERS,
     NO_RESULT,
-    TESTS,
     DataOptions,
     check_given_once,
     describe,
+    flag,
     make_folder,
     name_list,
     new_file,
@@ -45,32 +45,23 @@ TABLES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npz", ".npy")
 class DiagnoseOptions(DataOptions):
     """The options of `pilfr diagnose`."""
 
-    files: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="[SIMULATOR] TRAIN",
-            help="A Python file that sets `simulator` (or a model.json), then training recordings (.csv, .mat, .npz).",
-        ),
-    ]
-    simulated: Annotated[
-        str | None,
-        option("Inputs and outputs of the simulation itself, in place of the simulator file.", metavar="SIM"),
-    ] = None
-    test: Annotated[list[str], TESTS] = field(default_factory=list)
-    limit: Annotated[
-        list[str],
-        option(
-            "Largest amplitude of an input in the experiment that is proposed next (repeatable; default: as recorded).",
-            metavar="INPUT=AMPLITUDE",
-        ),
-    ] = field(default_factory=list)
-    workers: Annotated[
-        int | None, whole(1, MOST_WORKERS, "Fits side by side (default: one a processor, at most four).")
-    ] = None
-    out: Annotated[str, option("Folder for diagnosis.json and report.html (default: diagnosis).", metavar="DIR")] = (
-        "diagnosis"
+    files: list[str] = typer.Argument(
+        ...,
+        metavar="[SIMULATOR] TRAIN",
+        help="A Python file that sets `simulator` (or a model.json), then training recordings (.csv, .mat, .npz).",
     )
-    overwrite: Annotated[bool, option("Replace a diagnosis that is in that folder already.", "--overwrite")] = False
+    simulated: str | None = option("Inputs and outputs of the simulation, in place of the simulator file.", "SIM")
+    test: list[str] = option("Recording to judge on, never fitted (repeatable).", "FILE", [])
+    limit: list[str] = option(
+        "Largest amplitude of an input in the experiment that is proposed next (repeatable; default: as recorded).",
+        "INPUT=AMPLITUDE",
+        [],
+    )
+    workers: int | None = whole(
+        "Fits side by side (default: one a processor, at most four).", 1, LARGEST_SIZE["workers"]
+    )
+    out: str = option("Folder for diagnosis.json and report.html (default: diagnosis).", "DIR", "diagnosis")
+    overwrite: bool = flag("Replace a diagnosis that is in that folder already.", "--overwrite")
 
     @property
     def source(self) -> str | None:
@@ -140,10 +131,10 @@ def diagnose_command(options: DiagnoseOptions) -> int:
             )
     except KeyboardInterrupt:
         return say("Interrupted before there was a diagnosis; nothing was written.", INTERRUPTED)
-    return _write(diagnosis, folder)
+    return write_diagnosis(diagnosis, folder)
 
 
-def _write(diagnosis: Diagnosis, folder: Path) -> int:
+def write_diagnosis(diagnosis: Diagnosis, folder: Path) -> int:
     """Write diagnosis.json, then the page; print the diagnosis and where it is; return the exit status."""
     target = folder / "diagnosis.json"
     content = json.dumps(diagnosis.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"

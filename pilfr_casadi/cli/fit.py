@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import typer
@@ -23,12 +23,11 @@ from ._common import (
     DONE,
     INTERRUPTED,
     NO_RESULT,
-    TESTS,
-    WORKERS,
     DataOptions,
     check_given_once,
     check_names,
     describe,
+    flag,
     make_folder,
     name_list,
     new_file,
@@ -51,57 +50,36 @@ STRUCTURE_NAMES = {"bound": "bounds"}  # options that the structures call otherw
 class FitOptions(DataOptions):
     """The options of `pilfr fit`; those of a search have no default, to see which ones were given."""
 
-    train: Annotated[list[str], typer.Argument(help="Training recordings (.csv, .mat, .npz).", metavar="TRAIN")]
-    inputs: Annotated[str, option("Names of the inputs.", metavar="NAME[,NAME]")]
-    outputs: Annotated[str, option("Names of the outputs.", metavar="NAME[,NAME]")]
-    test: Annotated[list[str], TESTS] = field(default_factory=list)
-    nx: Annotated[
-        int | None,
-        whole(0, LARGEST_SIZE["nx"], "States of the linear part (default: chosen on the training data)."),
-    ] = None
-    operators: Annotated[
-        int | None,
-        whole(
-            0,
-            LARGEST_SIZE["operators"],
-            "Hysteresis operators a channel (default: 20); 0 for a linear model.",
-        ),
-    ] = None
-    operator: Annotated[
-        Literal["play", "stop", "generalized_play"] | None, option("Kind of operator (default: play).")
-    ] = None
-    channels: Annotated[int | None, whole(1, LARGEST_SIZE["channels"], "Channels of the element (default: 1).")] = None
-    structure: Annotated[
-        Literal["lfr", "hammerstein", "wiener", "ssnn", "network_lfr", "narx", "noe"] | None,
-        option("Where the element sits (default: lfr), or a network to compare with."),
-    ] = None
-    hidden: Annotated[
-        int | None,
-        whole(1, LARGEST_SIZE["hidden"], "Neurons of a network (default: 15; 10 of narx and noe)."),
-    ] = None
-    lags: Annotated[int | None, whole(1, LARGEST_SIZE["lags"], "Past outputs and inputs of narx and noe.")] = None
-    bound: Annotated[list[str], option("Bounds of a parameter (repeatable).", metavar="NAME=LOW:HIGH")] = field(
-        default_factory=list
+    train: list[str] = typer.Argument(..., help="Training recordings (.csv, .mat, .npz).", metavar="TRAIN")
+    inputs: str = option("Names of the inputs.", "NAME[,NAME]", ...)
+    outputs: str = option("Names of the outputs.", "NAME[,NAME]", ...)
+    test: list[str] = option("Recording to report on, never fitted (repeatable).", "FILE", [])
+    nx: int | None = whole("States of the linear part (default: chosen on the training data).", 0, LARGEST_SIZE["nx"])
+    operators: int | None = whole(
+        "Hysteresis operators a channel (default: 20); 0 for a linear model.", 0, LARGEST_SIZE["operators"]
     )
-    fix: Annotated[list[str], option("Hold a block of parameters at a value (repeatable).", metavar="NAME=VALUE")] = (
-        field(default_factory=list)
+    operator: Literal["play", "stop", "generalized_play"] | None = option("Kind of operator (default: play).")
+    channels: int | None = whole("Channels of the element (default: 1).", 1, LARGEST_SIZE["channels"])
+    structure: Literal["lfr", "hammerstein", "wiener", "ssnn", "network_lfr", "narx", "noe"] | None = option(
+        "Where the element sits (default: lfr), or a network to compare with."
     )
-    starts: Annotated[int | None, whole(1, LARGEST_SIZE["starts"], "Random starts (default: 8).")] = None
-    seed: Annotated[int | None, whole(0, LARGEST_SIZE["seed"], "Seed of all starts (default: 0).")] = None
-    start_from: Annotated[
-        str | None, option("Start from a saved model instead of searching.", "--from", metavar="MODEL.json")
-    ] = None
-    solver: Annotated[
-        Literal["gauss-newton", "ipopt"], option("Solver of the final problem (default: gauss-newton).")
-    ] = "gauss-newton"
-    workers: Annotated[int, WORKERS] = 1
-    engine: Annotated[
-        Literal["auto", "c", "vm"],
-        option("Generated C or CasADi's virtual machine (default: C where there is a compiler)."),
-    ] = "auto"
-    time_limit: Annotated[float | None, seconds("Stop then and keep the best so far (default: no limit).")] = None
-    out: Annotated[str, option("Folder for model.json and report.html (default: fit).", metavar="DIR")] = "fit"
-    overwrite: Annotated[bool, option("Replace a model that is in that folder already.", "--overwrite")] = False
+    hidden: int | None = whole("Neurons of a network (default: 15; 10 of narx and noe).", 1, LARGEST_SIZE["hidden"])
+    lags: int | None = whole("Past outputs and inputs of narx and noe.", 1, LARGEST_SIZE["lags"])
+    bound: list[str] = option("Bounds of a parameter (repeatable).", "NAME=LOW:HIGH", [])
+    fix: list[str] = option("Hold a block of parameters at a value (repeatable).", "NAME=VALUE", [])
+    starts: int | None = whole("Random starts (default: 8).", 1, LARGEST_SIZE["starts"])
+    seed: int | None = whole("Seed of all starts (default: 0).", 0, LARGEST_SIZE["seed"])
+    start_from: str | None = option("Start from a saved model instead of searching.", "MODEL.json", name="--from")
+    solver: Literal["gauss-newton", "ipopt"] = option(
+        "Solver of the final problem (default: gauss-newton).", default="gauss-newton"
+    )
+    workers: int = whole("Processes; the numbers do not depend on it (default: 1).", 1, LARGEST_SIZE["workers"], 1)
+    engine: Literal["auto", "c", "vm"] = option(
+        "Generated C or CasADi's virtual machine (default: C where there is a compiler).", default="auto"
+    )
+    time_limit: float | None = seconds("Stop then and keep the best so far (default: no limit).")
+    out: str = option("Folder for model.json and report.html (default: fit).", "DIR", "fit")
+    overwrite: bool = flag("Replace a model that is in that folder already.", "--overwrite")
 
     @property
     def search(self) -> list[str]:

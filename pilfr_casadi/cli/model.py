@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import typer
@@ -17,7 +17,7 @@ from ..data import Recording, column_names, nrmse, read_stack, written_times
 from ..export import NAMES, exported, write_atomically
 from ..identify import Fit, load
 from ..simulators import load_simulator
-from ._common import DONE, NO_RESULT, DataOptions, check_names, name_list, option, pairs, say, takes_options
+from ._common import DONE, NO_RESULT, DataOptions, check_names, flag, name_list, option, pairs, say, takes_options
 from .fit import announced_engine
 
 ARRAYS = (".npz", ".npy")
@@ -27,14 +27,11 @@ ARRAYS = (".npz", ".npy")
 class SimulateOptions(DataOptions):
     """The options of `pilfr simulate`."""
 
-    model: Annotated[str, typer.Argument(help="A saved model, model.json.")]
-    data: Annotated[
-        str,
-        typer.Argument(
-            help="A recording (.csv, .mat, .npz), or several in one array (.npz, .npy: samples, channels, ...)."
-        ),
-    ]
-    out: Annotated[str, option("CSV file; of several records also .npz or .npy.", metavar="FILE")]
+    model: str = typer.Argument(..., help="A saved model, model.json.")
+    data: str = typer.Argument(
+        ..., help="A recording (.csv, .mat, .npz), or several in one array (.npz, .npy: samples, channels, ...)."
+    )
+    out: str = option("CSV file; of several records also .npz or .npy.", "FILE", ...)
 
 
 @takes_options
@@ -168,14 +165,14 @@ def _error_line(fitted: Fit, recording: Recording, y: np.ndarray) -> str:
 class ExportOptions:
     """The options of `pilfr export`."""
 
-    model: Annotated[str, typer.Argument(help="A model.json, or a Python file that sets `simulator`.")]
-    out: Annotated[str, option("The file; with --c the folder for both files.", metavar="FILE")]
-    casadi: Annotated[bool, option("A file for casadi.Function.load, and its names (default).", "--casadi")] = False
-    c: Annotated[bool, option("C source and header that need no library.", "--c")] = False
-    name: Annotated[str, option("Name of the function (default: model).")] = "model"
-    smooth: Annotated[float, option("Round min and max by this much (default: exact).", metavar="EPS")] = 0.0
-    dt: Annotated[float | None, option("Step of a simulator, which has none.", metavar="SECONDS")] = None
-    hold: Annotated[Literal["zero", "linear"] | None, option("What a simulator's inputs do between samples.")] = None
+    model: str = typer.Argument(..., help="A model.json, or a Python file that sets `simulator`.")
+    out: str = option("The file; with --c the folder for both files.", "FILE", ...)
+    casadi: bool = flag("A file for casadi.Function.load, and its names (default).", "--casadi")
+    c: bool = flag("C source and header that need no library.", "--c")
+    name: str = option("Name of the function (default: model).", default="model")
+    smooth: float = option("Round min and max by this much (default: exact).", "EPS", 0.0)
+    dt: float | None = option("Step of a simulator, which has none.", "SECONDS")
+    hold: Literal["zero", "linear"] | None = option("Course of a simulator's inputs between samples.")
 
 
 @takes_options

@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -34,7 +33,7 @@ from ..studies import (
     run,
     seeds_advice,
 )
-from ._common import DONE, INTERRUPTED, NO_RESULT, make_folder, option, say, seconds, takes_options, whole
+from ._common import DONE, INTERRUPTED, NO_RESULT, flag, make_folder, option, say, seconds, takes_options, whole
 
 LINE_WIDTH = 10_000  # characters: tables are never folded or cut off, since a number that is cut off is a wrong number
 EVERY_KEY = Path(__file__).parent / "demo_data" / "every_key.toml"
@@ -44,15 +43,12 @@ EVERY_KEY = Path(__file__).parent / "demo_data" / "every_key.toml"
 class RunOptions:
     """The options of `pilfr run`."""
 
-    run_file: Annotated[str, typer.Argument(metavar="RUN.toml", help="What to do (.toml, or .py that sets `run`).")]
-    out: Annotated[
-        str | None, option("Folder of the results (default: as the file says, else RUN-run).", metavar="DIR")
-    ] = None
-    workers: Annotated[
-        int | None,
-        whole(1, LARGEST_SIZE["workers"], "Processes; the numbers do not depend on it (default: as the file says)."),
-    ] = None
-    overwrite: Annotated[bool, option("Compute everything again, whatever is in the folder.", "--overwrite")] = False
+    run_file: str = typer.Argument(..., metavar="RUN.toml", help="The run file (.toml, or .py that sets `run`).")
+    out: str | None = option("Folder of the results (default: as the file says, else RUN-run).", "DIR")
+    workers: int | None = whole(
+        "Processes; the numbers do not depend on it (default: as the file says).", 1, LARGEST_SIZE["workers"]
+    )
+    overwrite: bool = flag("Compute everything again, whatever is in the folder.", "--overwrite")
 
     def read(self, kind: str) -> Run:
         """Read the run file; folder and workers of the command line go before those of the file."""
@@ -67,10 +63,8 @@ class RunOptions:
 class CampaignOptions(RunOptions):
     """The options of `pilfr campaign`."""
 
-    dask: Annotated[str | None, option("Run the jobs on the Dask cluster of this scheduler.", metavar="ADDRESS")] = None
-    time_limit: Annotated[
-        float | None, seconds("End a job after this time (default: as the file says, else no limit).")
-    ] = None
+    dask: str | None = option("Run the jobs on the Dask cluster of this scheduler.", "ADDRESS")
+    time_limit: float | None = seconds("End a job after this time (default: as the file says, else no limit).")
 
 
 @takes_options

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
 from .._base import InputError, is_number
 from ..identify import BLA, POLISH, STARTS
@@ -66,7 +66,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run, checked.
+    """A run, checked; fields that the run file has too are described in `demo_data/every_key.toml`.
 
     Attributes
     ----------
@@ -81,21 +81,12 @@ class Run:
         How they are read: `inputs`, `outputs`, `columns` and fields of `Recording`.
     cells : tuple of Cell
         The models of the grid with their searches; one where there is no grid.
-    solver : GaussNewton or Ipopt, or one of the user's own
-    stable : bool or float
-    constraints : tuple of Constraint
-    l1, prune, path, margin
-        Of the regularization: a weight, whether to fit again after pruning, strengths of a path (None: no path; empty:
-        the usual ones).
-    seeds : tuple of int
+    path : tuple of float, optional
+        Strengths of the L1 regularization to choose from; empty for the usual ones.
     folds : int
         Of the cross-validation that chooses among the cells; 0 for none.
-    time_limit, retries
-        Seconds a job of a campaign may take (None: no limit), and how often one whose worker has died is tried again.
-    workers : int
-    engine : str
-    report : bool
-        Whether to write a page about the job that is chosen.
+    time_limit : float, optional
+        Seconds that a job of a campaign may take.
     """
 
     file: Path
@@ -178,7 +169,8 @@ def _as_axis(values: Any) -> list[Any]:
 
 
 Names = Annotated[tuple[str, ...], BeforeValidator(_as_names)]
-Axis = Annotated[list[Any], BeforeValidator(_as_axis)]
+Axis = Annotated[list[Any] | None, BeforeValidator(_as_axis)]
+AXIS: Any = Field(None, description="a list of different values")
 NAMES = "a name, or a list of names"
 
 
@@ -260,20 +252,11 @@ class CampaignTable(Table):
     retries: int = _whole("retries", 0, 2)
 
 
-class GridTable(Table):
-    """`[grid]`: lists of values of [model] and [solver]; every combination is a cell."""
-
-    structure: Axis | None = Field(None, description="a list of different values")
-    nx: Axis | None = structure
-    operator: Axis | None = structure
-    operators: Axis | None = structure
-    channels: Axis | None = structure
-    neurons: Axis | None = structure
-    hidden: Axis | None = structure
-    lags: Axis | None = structure
-    start: Axis | None = structure
-    starts: Axis | None = structure
-    linear: Axis | None = structure
+def _as_axes(content: Any) -> dict[str, list[Any]]:
+    """Check `[grid]`: lists of different values of keys of [model] and [solver], in their order there."""
+    fields: dict[str, Any] = {key: (Axis, AXIS) for key in (*MODEL_KEYS, *SOLVER_KEYS)}
+    kind: type[Table] = create_model("GridTable", __base__=Table, **fields)
+    return {key: values for key, values in validate(kind, content, "grid") if values}
 
 
 def _table(kind: str) -> Any:
@@ -293,7 +276,7 @@ class RunTable(Table):
     folds: int = _whole("folds", 0, 0)
     data: DataTable = _table("data")
     model: Any = Field({}, description="a table [model]")
-    grid: GridTable = _table("grid")
+    grid: Annotated[dict[str, list[Any]], BeforeValidator(_as_axes)] = Field({}, description="a table [grid]")
     solver: Any = Field({}, description="a table [solver]")
     constraints: ConstraintsTable = _table("constraints")
     regularization: RegularizationTable = _table("regularization")
@@ -398,11 +381,10 @@ def _checked(file: Path, content: Any, kind: str) -> Run:
     reading |= {key: content["data"][key] for key in READING if getattr(table.data, key) is not None}
     if table.folds == 1:
         raise InputError("'folds' is 1; give 2 or more, or leave it out.")
-    axes = {key: getattr(table.grid, key) for key in (*MODEL_KEYS, *SOLVER_KEYS) if getattr(table.grid, key)}
-    count = math.prod(map(len, axes.values())) * len(table.seeds) * max(table.folds, 1)
+    count = math.prod(map(len, table.grid.values())) * len(table.seeds) * max(table.folds, 1)
     if count > MOST_JOBS:
         raise InputError(f"grid, seeds and folds make {count} jobs; give at most {MOST_JOBS}.")
-    cells, solver = _cells(table, axes)
+    cells, solver = _cells(table)
     if "period" not in reading and any("linear" in cell.search for cell in cells):
         raise InputError(
             "linear = 'bla' is for periodic training recordings; give their 'period' in [data], in samples."
@@ -453,13 +435,13 @@ def _check_files(file: Path, files: Mapping[str, tuple[str, ...]]) -> None:
             seen[path] = role
 
 
-def _cells(table: RunTable, axes: Mapping[str, list[Any]]) -> tuple[tuple[Cell, ...], Any]:
+def _cells(table: RunTable) -> tuple[tuple[Cell, ...], Any]:
     """Return the cells, in the order of the grid's keys with the last varying fastest, and the solver of all.
 
     A cell has the keys that matter to its model (a NARX has lags and no operators); combinations that differ in
     nothing else are one cell.
     """
-    model, solver = table.model, table.solver
+    model, solver, axes = table.model, table.solver, table.grid
     if isinstance(model, PILFR | Lagged | Model):
         if axes:
             raise InputError("[grid] varies a [model] table, and the model is an object; leave one of them out.")

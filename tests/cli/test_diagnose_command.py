@@ -15,6 +15,7 @@ from command_line import refused, run
 from scipy.integrate import solve_ivp
 
 from pilfr_casadi import multisine
+from pilfr_casadi.cli.demo import diagnose_rig
 from pilfr_casadi.laws import CubicStiffness, Saturation
 
 RIG = """
@@ -309,18 +310,14 @@ def test_a_saved_model_is_diagnosed_like_a_simulator(capsys, files, monkeypatch)
     refused(capsys, *given, "--column", "u=force", "--column", "y=position", says=("0.05 s", "0.02 s"))
 
 
-def test_the_demonstration_finds_what_its_rig_hides(tmp_path):
-    from rich.console import Console
-
-    from pilfr_casadi.cli.demo import diagnose_rig
-
-    with (tmp_path / "out.txt").open("w") as file:
-        assert diagnose_rig(tmp_path, 1, Console(file=file, width=120)) == 0
-    out = (tmp_path / "out.txt").read_text()
-    assert "where     ground-m2" in out and "what      coulomb friction" in out
-    before, after, floor = re.search(r"(0\.\d+) -> (0\.\d+) -> noise floor (0\.\d+)", out).groups()
-    assert float(after) < 0.05 * float(before) and float(after) < 2 * float(floor)
-    assert (tmp_path / "report.html").exists() and json.loads((tmp_path / "diagnosis.json").read_text())["effects"]
+def test_the_demonstration_finds_what_its_rig_hides(capsys, tmp_path):
+    assert diagnose_rig(tmp_path / "diagnosis", 1) == 0
+    assert "coulomb friction at ground-m2" in capsys.readouterr().out
+    found = json.loads((tmp_path / "diagnosis" / "diagnosis.json").read_text())
+    assert [(e["port"], e["law"]) for e in found["effects"]] == [("ground-m2", "coulomb_friction")]
+    test = found["fit"]["test"]
+    assert test["after"] < 0.05 * test["before"] and test["after"] < 2 * found["fit"]["noise_floor"]
+    assert (tmp_path / "diagnosis" / "report.html").exists()
 
 
 def test_an_interrupted_diagnosis_says_so(files):
