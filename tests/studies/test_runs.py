@@ -4,8 +4,6 @@ import json
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -63,7 +61,8 @@ def test_a_run_gives_the_same_bytes_twice_and_skips_what_is_done(folder):
     assert {k: v for k, v in contents(none.folder).items() if k != "manifest.json"} == models
 
 
-def test_what_is_written(folder):
+def test_what_is_written(done):
+    folder = done
     result = pilfr.run(changed(folder, "report = false", "report = true"))
     manifest = json.loads((result.folder / "manifest.json").read_text())
     assert set(manifest["inputs"]) == {"train.csv", "held.csv", "test.csv"}
@@ -413,11 +412,7 @@ def test_regularization_in_a_run(folder):
 
 
 @pytest.mark.parametrize("content", ["[]", "3", "null", "{", '"text"'])
-@pytest.mark.parametrize("optimised", [[], ["-O"]])
-def test_a_manifest_that_is_none_gets_one_sentence(folder, content, optimised):
-    place = folder / "rig-run"
-    place.mkdir()
-    (place / "manifest.json").write_text(content)
-    code = "from pathlib import Path; from pilfr_casadi.studies import Manifest; Manifest.read(Path('rig-run'))"
-    done = subprocess.run([sys.executable, *optimised, "-c", code], cwd=folder, capture_output=True, text=True)
-    assert "InputError: " in done.stderr and "manifest.json is not a manifest of a run; restore it" in done.stderr
+def test_a_manifest_that_is_none_gets_one_sentence(capsys, folder, content):
+    (folder / "rig-run").mkdir()
+    (folder / "rig-run" / "manifest.json").write_text(content)
+    refused(capsys, "run", folder / "rig.toml", says="manifest.json is not a manifest of a run; restore it")
