@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base import InputError
-from ..simulators import MOST
+from ..simulators import MOST_SUBSTEPS
 from .floor import white_part
 from .knees import FINEST
 from .workbench import FINER, THOROUGH, Fitted, Workbench
@@ -23,7 +23,7 @@ QUIET = 3e-4  # of the outputs' deviation: noise below which nothing is to be se
 def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
     """The bench on steps whose error is less than the noise, whatever else is missing, and the fit there."""
     noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), QUIET**2)
-    most, steps = min(FINEST * bench.chosen, MOST), fitted.model.substeps
+    most, steps = min(FINEST * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
     while FINER * steps <= most and not fitted.simulator.discrete:
         steps = FINER * steps
         tried = replace(bench, substeps=steps)

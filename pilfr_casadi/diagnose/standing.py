@@ -13,7 +13,7 @@ import numpy as np
 
 from .._base import one_at_a_time
 from ..models import ParameterSet, map_points
-from ..simulators import Equations, Instant, Simulator, on_grid
+from ..simulators import ClosedEquations, Instant, Simulator, on_grid
 
 
 def stands(simulator: Simulator) -> list[int]:
@@ -37,7 +37,7 @@ def standing(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, 
     """
     simulator = on_grid(simulator, h)
     p = ca.SX.sym("p", ParameterSet(dict(simulator.parameters)).size)
-    equations, n_x, moved = Equations(simulator, p), len(simulator.states), stands(simulator)
+    equations, n_x, moved = ClosedEquations(simulator, p), len(simulator.states), stands(simulator)
     n_q, n_s = equations.n_q, equations.n_s
     n_xq = n_x + sum(n_q)
     state = np.append(x[:n_x], np.zeros(sum(n_q) + sum(n_s)))

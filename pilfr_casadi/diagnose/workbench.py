@@ -15,15 +15,15 @@ from ..models import Model, ParameterSet
 from ..optimise import GaussNewton, Problem, Status
 from ..simulators import (
     INJECTION,
-    MOST,
-    REACH,
+    LARGEST_STEP,
+    MOST_SUBSTEPS,
     Simulator,
-    at_begin,
     choose_substeps,
     discretise,
-    fastest,
-    growth,
-    wanted_substeps,
+    fastest_rates,
+    growth_rate,
+    needed_substeps,
+    rate_at_start,
     with_output_injection,
 )
 from .arranged import arranged
@@ -139,15 +139,15 @@ class Workbench:
         """More where a law is fast, up to a limit: a stiff start of a law is not worth a fine grid."""
         if not simulator.elements:
             return self.substeps
-        wanted = wanted_substeps(simulator, self.recordings)[0]
-        wanted = wanted if wanted <= MOST else 0
+        wanted = needed_substeps(simulator, self.recordings)[0]
+        wanted = wanted if wanted <= MOST_SUBSTEPS else 0
         if any(getattr(e.law, "knee", "") for e in simulator.elements):  # passed at every reversal, if not stood on
-            wanted = max(wanted, int(np.ceil(at_begin(simulator, self.recordings[0]) * self.dt / REACH)))
+            wanted = max(wanted, int(np.ceil(rate_at_start(simulator, self.recordings[0]) * self.dt / LARGEST_STEP)))
         if self.typical is not None:  # a contact is not felt at rest
             p = ParameterSet(dict(simulator.parameters)).start
-            rates = fastest(simulator, *self.typical, p)
+            rates = fastest_rates(simulator, *self.typical, p)
             if np.any(np.isfinite(rates)):
-                wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / REACH)))
+                wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / LARGEST_STEP)))
         least = max(self.substeps, self.at_least, *(getattr(e.law, "substeps", 1) for e in simulator.elements))
         if any(getattr(e.law, "shifts", False) for e in simulator.elements):  # its memory has a place for every step
             least = min(least, FINER * self.chosen)
@@ -222,7 +222,7 @@ class Workbench:
 
     def _unstable(self, simulator: Simulator) -> str:
         """What to do about a simulator that no recording of a controlled machine can be followed with, or nothing."""
-        rate = growth(simulator, self.recordings[0])
+        rate = growth_rate(simulator, self.recordings[0])
         if rate * max(len(r) for r in self.recordings) * self.dt < BEYOND:
             return ""
         return (

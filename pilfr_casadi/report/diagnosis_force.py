@@ -15,7 +15,7 @@ import numpy as np
 from ..data import Recording
 from ..diagnose import Constant, Fitted, Workbench
 from ..models import ParameterSet, map_points
-from ..simulators import Equations, Instant, Simulator, discretise, on_grid, signals, states_along
+from ..simulators import ClosedEquations, Instant, Simulator, discretise, on_grid, signals, states_along
 from .smoother import UnknownForce
 
 MOST = 4000  # samples smoothed
@@ -96,7 +96,7 @@ def _law_signals(
     simulator = on_grid(fitted.simulator, bench.dt / fitted.model.substeps)
     own = ParameterSet(dict(simulator.parameters))
     vector = ca.SX.sym("p", own.size)
-    equations = Equations(simulator, vector)
+    equations = ClosedEquations(simulator, vector)
     n_s, n_u = sum(equations.n_s), len(simulator.inputs)
     n_x = states.shape[1] - n_s
     x, s, u, v, t = (ca.SX.sym(k, m) for k, m in (("x", n_x), ("s", n_s), ("u", n_u), ("v", n_u), ("t", 1)))
@@ -116,7 +116,7 @@ def _without(fitted: Fitted, number: int | None, start: np.ndarray, h: float) ->
     if number is None:
         return simulator, start
     own = ParameterSet(dict(simulator.parameters))
-    equations = Equations(on_grid(simulator, h), ca.SX.sym("p", own.size))
+    equations = ClosedEquations(on_grid(simulator, h), ca.SX.sym("p", own.size))
     at_q = np.cumsum([len(simulator.states), *equations.n_q])
     at_s = np.cumsum([at_q[-1], *equations.n_s])
     dropped = [*range(at_q[number], at_q[number + 1]), *range(at_s[number], at_s[number + 1])]

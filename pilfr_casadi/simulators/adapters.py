@@ -1,39 +1,51 @@
-"""What `diagnose` accepts in place of a `Simulator`: a `control.StateSpace`, and a fitted PI-LFR.
+"""Simulators from other sources: a user's Python file, a `control.StateSpace`, and a fitted PI-LFR.
 
 A state space becomes equations whose matrix entries are parameters: entries that are exactly 0, 1 or -1 are structure
-and stay, the others may move within a factor of two. A fitted model runs in discrete time as it is, with its memory
-among the states and its parameters held: it has been fitted already, what is asked is what it lacks. Only a gain near
-one and an offset of each output are free.
+and stay fixed, the others may move within a factor of two. A fitted model runs in discrete time as it is, with its
+memory among the states and its parameters fixed, because it has been fitted already; only a gain near one and an offset
+of each output are free.
+
+A Python file is the user's own program and runs as such, in a namespace of its own. It leaves neither bytecode files
+nor modules of its folder in `sys.modules`, and its errors become one sentence with the line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+import sys
+import traceback
+import types
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, listed
 from ..data import Recording
 from ..models import Model, Parameter
-from .expressions import Named
+from .equations import Named
 from .simulator import Simulator
 
-FACTOR = 2.0
-GAIN = (0.7, 1.3)
-SAME_STEP = 1e-3
+FACTOR = 2.0  # by which an entry of a state space may move
+GAIN = (0.7, 1.3)  # bounds of the gain of a fitted model's output
+SAME_STEP = 1e-3  # largest relative difference of two sampling intervals that count as equal
+LONGEST = 240  # characters shown of another program's message
+VARIABLE = "simulator"  # name of the variable that a simulator file sets
 
 
 def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
-    """A simulator from what stands for one.
+    """Make a simulator from an object that can stand for one.
 
     Parameters
     ----------
     thing : Simulator, control.StateSpace, control.TransferFunction, Fit or Model
-        Signals that were given no names there get the recordings'.
+        Signals without names get those of the recordings.
     recordings : sequence of Recording
-        Their step is compared with that of a discrete-time system.
+        Their step is compared with the step of a discrete-time system.
 
     Returns
     -------
@@ -42,19 +54,19 @@ def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
     Raises
     ------
     InputError
-        If it is something else, or its step or number of signals is not the recordings'.
+        If it is something else, or its step or number of signals differs from the recordings'.
     """
     if isinstance(thing, Simulator):
         return thing
     if isinstance(thing, Model):
-        return _of_model(thing, recordings)
+        return _from_model(thing, recordings)
     if isinstance(getattr(thing, "model", None), Model):  # a Fit
         _check_step(float(thing.dt), recordings)
-        return _of_model(thing.model, recordings, getattr(thing, "units", {}))
+        return _from_model(thing.model, recordings, getattr(thing, "units", {}))
     if type(thing).__module__.partition(".")[0] == "control" and hasattr(thing, "ninputs"):
-        return _of_system(thing, recordings)
-    what = "a class" if isinstance(thing, type) else f"a {type(thing).__name__}"
-    raise InputError(f"{what} was given; give a Simulator, a control.StateSpace, or a fitted PI-LFR.")
+        return _from_system(thing, recordings)
+    given = "a class" if isinstance(thing, type) else f"a {type(thing).__name__}"
+    raise InputError(f"{given} was given; give a Simulator, a control.StateSpace, or a fitted PI-LFR.")
 
 
 def _check_step(dt: float, recordings: Sequence[Recording]) -> None:
@@ -63,7 +75,9 @@ def _check_step(dt: float, recordings: Sequence[Recording]) -> None:
             raise InputError(f"The model's step is {dt:g} s, that of {r.label} {r.dt:g} s; resample the recording.")
 
 
-def _of_model(model: Model, recordings: Sequence[Recording] = (), units: Mapping[str, str] | None = None) -> Simulator:
+def _from_model(
+    model: Model, recordings: Sequence[Recording] = (), units: Mapping[str, str] | None = None
+) -> Simulator:
     if model.n_w and model.element is None:
         raise InputError("The model has an open port; close it with close_loop first.")
     if model.reads != ("u",) or model.substeps != 1:
@@ -93,7 +107,7 @@ def _of_model(model: Model, recordings: Sequence[Recording] = (), units: Mapping
     return Simulator(dynamics, outputs, states, model.inputs, parameters, discrete=True, hold="zero", units=units)
 
 
-def _of_system(system: Any, recordings: Sequence[Recording]) -> Simulator:
+def _from_system(system: Any, recordings: Sequence[Recording]) -> Simulator:
     import control
 
     try:
@@ -122,7 +136,7 @@ def linear_simulator(
     outputs: tuple[str, ...],
     discrete: bool = False,
 ) -> Simulator:
-    """`ẋ = A x + B u, y = C x + D u` (or `x⁺`) with a parameter for every entry that is not 0, 1 or -1.
+    """Make `ẋ = A x + B u, y = C x + D u` (or `x⁺`) with a parameter for every entry that is not 0, 1 or -1.
 
     Parameters
     ----------
@@ -140,7 +154,7 @@ def linear_simulator(
                     entries[letter][i].append(float(value))
                     continue
                 name = f"{letter}{i + 1}{j + 1}" if max(matrix.shape) < 10 else f"{letter}{i + 1}_{j + 1}"
-                parameters[name] = Parameter(value, bounds=_around(float(value), letter == "A" and discrete))
+                parameters[name] = Parameter(value, bounds=_bounds_around(float(value), letter == "A" and discrete))
                 entries[letter][i].append(name)
 
     def product(letter: str, i: int, symbols: list[Any], p: Named) -> Any:
@@ -161,8 +175,8 @@ def linear_simulator(
     return Simulator(dynamics, outputs_of, states, inputs, parameters, discrete=discrete, hold=hold)
 
 
-def _around(value: float, pole: bool) -> tuple[float, float]:
-    """Within a factor of two; entries of a discrete A, where a pole sits near one, within half their distance to it."""
+def _bounds_around(value: float, pole: bool) -> tuple[float, float]:
+    """Bound an entry by a factor of two; an entry of a discrete A also by half its distance to one."""
     if pole and abs(value) < 1:
         reach = min(abs(value) * (FACTOR - 1), max(0.5 * (1 - abs(value)), 1e-3))
         return value - reach, value + reach
@@ -171,10 +185,169 @@ def _around(value: float, pole: bool) -> tuple[float, float]:
 
 
 def _names(labels: Sequence[str], letter: str, recorded: tuple[str, ...]) -> tuple[str, ...]:
-    """The system's own names; where it has only u[0], u[1], ... those of the recordings, else u or u1, u2, ..."""
+    """Give the system's own names; instead of u[0], u[1], ... those of the recordings, else u or u1, u2, ..."""
     own = tuple(str(label) for label in labels)
     if own != tuple(f"{letter}[{i}]" for i in range(len(own))):
         return own
     if len(recorded) == len(own) and recorded:
         return recorded
     return (letter,) if len(own) == 1 else tuple(f"{letter}{i + 1}" for i in range(len(own)))
+
+
+def load_simulator(path: str | os.PathLike[str]) -> Simulator:
+    """Run a simulator file and return its variable `simulator` as a `Simulator`.
+
+    Parameters
+    ----------
+    path : path
+        A Python file that sets the variable `simulator` to a `Simulator` (or to what `as_simulator` accepts). It may
+        import modules that lie beside it.
+
+    Returns
+    -------
+    Simulator
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, does not run, or defines no simulator; with the line where there is one.
+    """
+    return as_simulator(simulator_variable(path))
+
+
+def simulator_variable(path: str | os.PathLike[str]) -> Any:
+    """Run a simulator file and return its variable `simulator` as it is; see `load_simulator`.
+
+    Raises
+    ------
+    InputError
+        As `load_simulator`.
+    """
+
+    def checked(path: Path, module: types.ModuleType) -> None:
+        names = [n for n, v in vars(module).items() if isinstance(v, Simulator) and not n.startswith("_")]
+        if VARIABLE not in vars(module):
+            there = f"it calls a Simulator {names[0]!r}; rename it" if names else "end with simulator = Simulator(...)"
+            raise InputError(f"{path} does not set the variable {VARIABLE!r}: {there}.")
+        try:
+            as_simulator(vars(module)[VARIABLE])
+        except InputError as error:
+            raise InputError(f"In {path}, the variable {VARIABLE!r}: {error}") from error
+
+    return user_variable(path, VARIABLE, "the simulator", checked)
+
+
+def user_variable(
+    path: str | os.PathLike[str],
+    name: str,
+    what: str,
+    check: Callable[[Path, types.ModuleType], None] | None = None,
+) -> Any:
+    """Run a user's Python file and return its variable `name`; messages call it `what`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, does not run, does not set the variable, or `check` refuses it.
+    """
+    path = Path(path)
+    code = _compile(path, _read(path, what), what)
+    module = types.ModuleType(f"_{name}_{''.join(c if c.isalnum() else '_' for c in path.stem)}")
+    module.__file__ = str(path)
+    with _own_imports(path.resolve().parent, module):
+        try:
+            exec(code, module.__dict__)
+        except (Exception, SystemExit) as error:
+            raise InputError(_sentence(path, error, what)) from error
+        if check is not None:
+            check(path, module)
+        if name not in vars(module):
+            raise InputError(f"{path} does not set the variable {name!r}; end with {name} = ...")
+    return vars(module)[name]
+
+
+def _read(path: Path, what: str) -> bytes:
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give {what}'s Python file.")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"The {what.removeprefix('the ')} file {path} cannot be read ({error.strerror}); check its name."
+        ) from None
+
+
+def _compile(path: Path, source: bytes, what: str) -> Any:
+    try:
+        return compile(source, str(path), "exec", dont_inherit=True)
+    except SyntaxError as error:
+        place = f"{path}, line {error.lineno}" if error.lineno else str(path)
+        shown = f" in `{error.text.strip()}`" if error.text and error.text.strip() else ""
+        raise InputError(f"{place}: {_tidy(error.msg)}{shown}; correct it.") from None
+    except (ValueError, RecursionError, MemoryError) as error:  # null bytes, too deep
+        raise InputError(f"{path} is not a Python file ({_tidy(str(error))}); give {what}'s.") from None
+
+
+@contextmanager
+def _own_imports(folder: Path, module: types.ModuleType) -> Iterator[None]:
+    """Allow imports from the file's folder, and remove its modules afterwards."""
+    before, wrote, where = set(sys.modules), sys.dont_write_bytecode, str(folder)
+    sys.dont_write_bytecode = True
+    sys.path.insert(0, where)
+    sys.modules[module.__name__] = module
+    try:
+        with warnings.catch_warnings():  # np.sin(symbol) works; casadi's remark would confuse the user
+            warnings.filterwarnings("ignore", category=FutureWarning, module="casadi")
+            yield
+    finally:
+        sys.dont_write_bytecode = wrote
+        if where in sys.path:
+            sys.path.remove(where)
+        for name in set(sys.modules) - before:
+            origin = getattr(sys.modules[name], "__file__", None)
+            if origin and Path(origin).resolve().is_relative_to(folder) and not _installed(Path(origin)):
+                del sys.modules[name]
+
+
+def _installed(path: Path) -> bool:
+    """Tell whether a module belongs to an environment below the file's folder, or to this package."""
+    package = Path(__file__).resolve().parents[1]
+    return "site-packages" in path.parts or path.resolve().is_relative_to(package)
+
+
+def _sentence(path: Path, error: BaseException, what: str) -> str:
+    """Describe the error with the deepest line of the user's file."""
+    line = _line(path, error)
+    place = f"{path}, line {line}" if line else str(path)
+    if isinstance(error, InputError):
+        return f"{place}: {_tidy(str(error))}"
+    if isinstance(error, SystemExit):
+        return f"{place}: the file ends the program; let it only define {what}."
+    if isinstance(error, SyntaxError):  # in a module that the file imports
+        return f"{place}: {Path(error.filename or '').name}, line {error.lineno}: {_tidy(error.msg)}; correct it."
+    said = _tidy(str(error)).rstrip(".")
+    return f"{place}: {type(error).__name__}{f': {said}' if said else ''}; correct the file."
+
+
+def _line(path: Path, error: BaseException) -> int | None:
+    """Find the deepest line of the file in the traceback of an error, or of its first cause."""
+    found, seen = None, set[int]()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        lines = [number for frame, number in traceback.walk_tb(error.__traceback__) if _inside(frame, path)]
+        found = lines[-1] if lines else found
+        following = error.__cause__ or error.__context__
+        if following is None:
+            break
+        error = following
+    return found
+
+
+def _inside(frame: Any, path: Path) -> bool:
+    return bool(frame.f_code.co_filename == str(path))
+
+
+def _tidy(text: str) -> str:
+    """Shorten a message to one line of at most `LONGEST` characters."""
+    text = " ".join(text.split())
+    return text if len(text) <= LONGEST else listed([text[:LONGEST].rsplit(" ", 1)[0]]) + " ..."

@@ -5,29 +5,44 @@ Within a sub-step of length h the inputs are held or follow their chord, and
     k₁ = f(x, u₀), k₂ = f(x + h k₁/2, u_½), k₃ = f(x + h k₂/2, u_½), k₄ = f(x + h k₃, u₁),
     x⁺ = x + h (k₁ + 2 k₂ + 2 k₃ + k₄) / 6.
 
-Laws are evaluated inside every stage; one with memory (`step(z, s, p)`, such as a play) from its memory at the
-sub-step's begin, moved on once by the signal there (moving it again by the same signal must change nothing). A law with
-differential equations of its own (`flow`) adds states. The model's state is [x; laws' states; laws' memory].
+Laws are evaluated inside every stage. A law with memory (`step(z, s, p)`, such as a play) starts from its memory at the
+beginning of the sub-step, moved on once by the signal there (moving it again by the same signal must change nothing). A
+law with differential equations of its own (`flow`) adds states. The model's state is [x; laws' states; laws' memory].
+
+The number of sub-steps keeps |λ| h below `LARGEST_STEP` for every eigenvalue λ of ∂f/∂x where a recording begins; where
+these are very fast, along a run from there.
 """
 
 from __future__ import annotations
 
 import inspect
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
 
-from ..models import Model, ParameterSet, StepExpressions, accumulate_steps, from_expressions
-from .expressions import Named, call
-from .simulator import Placed, Simulator, in_series
+from .._base import InputError
+from ..data import Recording
+from ..models import Model, StepExpressions, accumulate_steps, from_expressions
+from .equations import Equations, Named, Placed, call, in_series
+
+LARGEST_STEP = 0.25  # largest |λ| h: a phase error of (λh)⁴/120 = 3e-5 of the angle of a cycle
+MOST_SUBSTEPS = 200  # per sample
+VERY_FAST = 8 * LARGEST_STEP  # |λ| times the sampling interval above which a run is looked at
+INFINITE = 1e12  # rate that stands for an infinite one, rad/s
+ENDLESS = 1e100  # size of a state above which it has diverged
+FINE = 20  # sub-steps per sample of the run that looks for the rates
+SHOWN = 8  # values named in a message
+
+E = TypeVar("E", bound=Equations)
 
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """What is known at one instant inside a sub-step."""
+    """The signals at one instant inside a sub-step."""
 
     x: Any  # simulator's states and laws' states
     s: Any  # laws' memory
@@ -36,13 +51,12 @@ class Instant:
     t: Any
 
 
-class Equations:
-    """The closed equations of a simulator with its laws, on symbols."""
+class ClosedEquations:
+    """The equations of a simulator closed with its laws, on symbols."""
 
-    def __init__(self, simulator: Simulator, vector: Any) -> None:
+    def __init__(self, simulator: Equations, vector: Any) -> None:
         self.simulator = simulator
-        parameters = ParameterSet(dict(simulator.parameters))
-        self.values = parameters.symbols(vector)
+        self.values = simulator.parameter_set.symbols(vector)
         self.p = Named("parameter", self.values)
         laws = [e.law for e in simulator.elements]
         self.n_q = [int(getattr(law, "order", 0)) for law in laws]
@@ -63,7 +77,7 @@ class Equations:
         return q, memory, x[:n_x]
 
     def evaluate(self, v: Instant) -> tuple[Any, Any, Any, dict[int, tuple[Any, Any, Any]]]:
-        """Derivatives of [x; q], outputs, next memory, and each element's (z, dz, w)."""
+        """Evaluate the derivatives of [x; q], outputs, next memory, and each element's (z, dz, w)."""
         simulator, p, t = self.simulator, self.p, v.t
         q, s, x_only = self._parts(v.x, v.s)
         x = Named("state", dict(zip(simulator.states, ca.vertsplit(x_only) if simulator.states else [], strict=True)))
@@ -117,7 +131,7 @@ class Equations:
         return ca.vertcat(f, *flow), ca.vertcat(*y.values()), ca.vertcat(ca.SX(0, 1), *memory), signals
 
     def memory(self, z: Any, s: Any) -> Any:
-        """Next memory of all laws from the local signal of each of its entries."""
+        """Evaluate the next memory of all laws from the local signal of each of its entries."""
         _, parts, _ = self._parts(ca.SX(len(self.simulator.states) + sum(self.n_q), 1), s)
         at, out = 0, [ca.SX(0, 1)]
         for element, part, n in zip(self.simulator.elements, parts, self.n_s, strict=True):
@@ -126,14 +140,14 @@ class Equations:
         return ca.vertcat(*out)
 
 
-def on_grid(simulator: Simulator, h: float) -> Simulator:
-    """The simulator with its laws made for steps of length h, s."""
+def on_grid(simulator: E, h: float) -> E:
+    """Copy with the laws made for steps of length h, s."""
     placed = (replace(e, law=e.law.on_grid(h)) if hasattr(e.law, "on_grid") else e for e in simulator.elements)
-    return replace(simulator, elements=tuple(placed))
+    return simulator.with_elements(tuple(placed))
 
 
-def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: int = 1) -> Model:
-    """The simulator with its laws as a closed discrete-time model.
+def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: int = 1) -> Model:
+    """Make the simulator with its laws a closed discrete-time model.
 
     Parameters
     ----------
@@ -143,75 +157,33 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     hold : {"zero", "linear"}
         Inputs between samples.
     substeps : int
-        Runge-Kutta steps a sample; see `substeps.choose_substeps`.
+        Runge-Kutta steps per sample; see `choose_substeps`.
     """
     simulator = on_grid(simulator, dt / substeps)
-    own = ParameterSet(dict(simulator.parameters))
-    vector = ca.SX.sym("p", own.size)
-    equations = Equations(simulator, vector)
-    n_x, n_u = len(simulator.states) + sum(equations.n_q), len(simulator.inputs)
-    x, s = ca.SX.sym("x", n_x), ca.SX.sym("s", sum(equations.n_s))
-    u0, u1, t = ca.SX.sym("u", n_u), ca.SX.sym("next", n_u), ca.SX.sym("t")
-    h = dt / substeps
-    end, slope = (u1, (u1 - u0) / h) if hold == "linear" else (u0, ca.SX.zeros(n_u))
-    middle = (u0 + end) / 2
-
-    sizes = (("x", n_x), ("s", s.numel()), ("u", n_u), ("t", 1))
-    now = {name: ca.SX.sym(name, n) for name, n in sizes}
-    f, y, after, local = equations.evaluate(Instant(**now, slope=slope))
-    z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
-    at = ca.Function("at", [*now.values(), u0, u1, vector], [f, y, after, z])  # written out once, called at every stage
-
-    def k(state: Any, u: Any, c: float) -> Any:
-        return at(state, seen + c * later, u, t + c * h, u0, u1, vector)[0]
-
-    _, _, begun, z = at(x, s, u0, t, u0, u1, vector)
-    # a shift register takes in the signal at the step's begin, where it is measured; others have moved on with it when
-    # the step begins
-    moved = ca.SX.sym("moved", s.numel())
-    shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
-    seen = ca.vertcat(ca.SX(0, 1), *(s[i] if shift else moved[i] for i, shift in enumerate(shifts)))
-    # within the step what a register holds stays where inputs are held, and moves on with inputs that do
-    later = (moved - seen) * (hold == "linear")
-    k1, y, _, _ = at(x, seen, u0, t, u0, u1, vector)
-    n_own = len(simulator.states)
-    stages: tuple[Any, ...] | None = None
-    if simulator.discrete:  # laws' own states move with z held over the sample
-        x_next = ca.vertcat(k1[:n_own], x[n_own:] + h * k1[n_own:])
-    else:
-        c2 = x + h / 2 * k1
-        k2 = k(c2, middle, 0.5)
-        c3 = x + h / 2 * k2
-        k3 = k(c3, middle, 0.5)
-        c4 = x + h * k3
-        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k(c4, end, 1.0))
-        if n_x:  # the same by way of the three states at which the stages are evaluated
-            c = ca.SX.sym("c", 3 * n_x)
-            s2, s3, s4 = ca.vertsplit(c, n_x)
-            by_c = ca.vertcat(c2, x + h / 2 * k(s2, middle, 0.5), x + h * k(s3, middle, 0.5))
-            stages = c, ca.vertcat(c2, c3, c4), by_c, (s2 + 2 * s3 + s4 - x) / 3 + h / 6 * k(s4, end, 1.0)
+    step = _SubStep(simulator, dt / substeps, hold)
+    x, s, u0, u1, t, moved = step.x, step.s, step.u0, step.u1, step.t, step.moved
+    x_next, y, stages = step.advance()
+    begun, z = step.begun, step.z
     reads, columns = ["u"], [u0]
     if hold == "linear":
         reads, columns = [*reads, "next"], [*columns, u1]
     if ca.depends_on(ca.vertcat(x_next, y, begun), t):
         reads, columns = [*reads, "t"], [*columns, t]
     x_next, y = ca.cse([x_next, y])
-    state, following, port = (x, s), (x_next, begun), None
-    if s.numel() and not any(shifts) and not ca.depends_on(z, s):
+    port = None
+    if s.numel() and not step.shifts.any() and not ca.depends_on(z, s):
         # memory that is moved by a port of its own makes the derivatives sparse
         channels = ca.SX.sym("z", s.numel())
         port = z, channels, moved
-        following = x_next, equations.memory(channels, s)
+        s_next = step.equations.memory(channels, s)
     else:
         x_next, y, *staged = ca.substitute([x_next, y, *(stages or ())[1:]], [moved], [begun])
-        empty = ca.SX(0, 1)
-        state, following = (ca.vertcat(x, s), empty), (ca.vertcat(x_next, begun), empty)
+        x, s, x_next, s_next = ca.vertcat(x, s), ca.SX(0, 1), ca.vertcat(x_next, begun), ca.SX(0, 1)
         if stages is not None:
             stages = stages[0], staged[0], staged[1], ca.vertcat(staged[2], begun)
-    (x, s), (x_next, s_next) = state, following
     return from_expressions(
-        StepExpressions(x, s, ca.vertcat(*columns), vector, x_next, s_next, y, port, stages),
-        own,
+        StepExpressions(x, s, ca.vertcat(*columns), step.vector, x_next, s_next, y, port, stages),
+        simulator.parameter_set,
         states=simulator.states,
         inputs=simulator.inputs,
         outputs=simulator.output_names,
@@ -220,22 +192,79 @@ def discretise(simulator: Simulator, dt: float, hold: str = "zero", substeps: in
     )
 
 
+class _SubStep:
+    """The symbols of one sub-step of length h, and the closed equations as a function that every stage calls."""
+
+    def __init__(self, simulator: Equations, h: float, hold: str) -> None:
+        own = simulator.parameter_set
+        self.simulator, self.h, self.hold = simulator, h, hold
+        self.vector = ca.SX.sym("p", own.size)
+        self.equations = equations = ClosedEquations(simulator, self.vector)
+        n_x, n_u = len(simulator.states) + sum(equations.n_q), len(simulator.inputs)
+        self.x, self.s = ca.SX.sym("x", n_x), ca.SX.sym("s", sum(equations.n_s))
+        self.u0, self.u1, self.t = ca.SX.sym("u", n_u), ca.SX.sym("next", n_u), ca.SX.sym("t")
+        self.end, slope = (self.u1, (self.u1 - self.u0) / h) if hold == "linear" else (self.u0, ca.SX.zeros(n_u))
+        sizes = (("x", n_x), ("s", self.s.numel()), ("u", n_u), ("t", 1))
+        now = {name: ca.SX.sym(name, n) for name, n in sizes}
+        f, y, after, local = equations.evaluate(Instant(**now, slope=slope))
+        z = ca.vertcat(ca.SX(0, 1), *(ca.repmat(local[i][0], n) for i, n in enumerate(equations.n_s) if n))
+        self.at = ca.Function("at", [*now.values(), self.u0, self.u1, self.vector], [f, y, after, z])
+        _, _, self.begun, self.z = self._at(self.x, self.s, self.u0, self.t)
+        # a shift register takes in the signal at the beginning of the step, where it is measured; other memory has
+        # already moved on with it
+        self.moved = ca.SX.sym("moved", self.s.numel())
+        self.shifts = np.repeat([getattr(e.law, "shifts", False) for e in simulator.elements], equations.n_s)
+        read = (self.s[i] if shift else self.moved[i] for i, shift in enumerate(self.shifts))
+        self.memory = ca.vertcat(ca.SX(0, 1), *read)
+        # within the step the content of a register stays where inputs are held, and moves on with interpolated inputs
+        self.drift = (self.moved - self.memory) * (hold == "linear")
+
+    def _at(self, x: Any, s: Any, u: Any, t: Any) -> Any:
+        return self.at(x, s, u, t, self.u0, self.u1, self.vector)
+
+    def _slope(self, x: Any, u: Any, share: float) -> Any:
+        """Evaluate the derivatives at a share of the step."""
+        return self._at(x, self.memory + share * self.drift, u, self.t + share * self.h)[0]
+
+    def advance(self) -> tuple[Any, Any, tuple[Any, ...] | None]:
+        """Make the next states, the outputs, and the stages of `Model`, from the moved memory."""
+        x, h, own = self.x, self.h, len(self.simulator.states)
+        k1, y, _, _ = self._at(x, self.memory, self.u0, self.t)
+        if self.simulator.discrete:  # the laws' own states move with z held over the sample
+            return ca.vertcat(k1[:own], x[own:] + h * k1[own:]), y, None
+        middle, end = (self.u0 + self.end) / 2, self.end
+        c2 = x + h / 2 * k1
+        k2 = self._slope(c2, middle, 0.5)
+        c3 = x + h / 2 * k2
+        k3 = self._slope(c3, middle, 0.5)
+        c4 = x + h * k3
+        x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + self._slope(c4, end, 1.0))
+        if not x.numel():
+            return x_next, y, None
+        # the same by way of the three states at which the stages are evaluated
+        c = ca.SX.sym("c", 3 * x.numel())
+        s2, s3, s4 = ca.vertsplit(c, x.numel())
+        by_c = ca.vertcat(c2, x + h / 2 * self._slope(s2, middle, 0.5), x + h * self._slope(s3, middle, 0.5))
+        by_stages = (s2 + 2 * s3 + s4 - x) / 3 + h / 6 * self._slope(s4, end, 1.0)
+        return x_next, y, (c, ca.vertcat(c2, c3, c4), by_c, by_stages)
+
+
 def states_along(model: Model, drive: np.ndarray, p: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """States at the start of each step of a run from x, shape (K, n_x); p (n_p,), or (K, n_p) where it changes."""
+    """Run from x: states at the start of each step, shape (K, n_x); p (n_p,), or (K, n_p) where it changes."""
     rows = p if p.ndim == 2 else np.broadcast_to(p, (len(drive), len(p)))
     with np.errstate(all="ignore"):
         found = accumulate_steps(model.closed, x, drive, rows)[0]
     return np.vstack([x[None], found[:-1]])
 
 
-def signals(simulator: Simulator) -> ca.Function:
-    """`(x, u, slope, t, p) -> (z, dz, lift, push)` of every port of `all_ports`, in its order, laws left out.
+def signals(simulator: Equations) -> ca.Function:
+    """Make `(x, u, slope, t, p) -> (z, dz, lift, push)` of every port of `all_ports`, in its order, without laws.
 
-    x (n_x,), u (n_u,), slope = du/dt (n_u,), t and p as in `discretise`; each result has one row a port. A unit force
-    in the port moves z at once at the rate `lift`, and dz at the rate `push`: where `lift` is zero and `push` negative,
-    a positive force opposes the port's motion.
+    x (n_x,), u (n_u,), slope = du/dt (n_u,), t and p as in `discretise`; each result has one row for each port. A unit
+    force in the port moves z at once at the rate `lift`, and dz at the rate `push`: where `lift` is zero and `push` is
+    negative, a positive force opposes the port's motion.
     """
-    own = ParameterSet(dict(simulator.parameters))
+    own = simulator.parameter_set
     vector = ca.SX.sym("p", own.size)
     p = Named("parameter", own.symbols(vector))
     n_x, n_u = len(simulator.states), len(simulator.inputs)
@@ -261,3 +290,140 @@ def signals(simulator: Simulator) -> ca.Function:
     names = ["x", "u", "slope", "t", "p"]
     columns = [ca.vertcat(*column) for column in zip(*rows, strict=True)]
     return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push"])
+
+
+def _flow(simulator: Equations, n_p: int) -> ca.Function:
+    """Make `(x, u, p) -> (f, ∂f/∂x)` of [x; laws' states], memory at rest."""
+    vector = ca.SX.sym("p", n_p)
+    equations = ClosedEquations(simulator, vector)
+    n_x = len(simulator.states) + sum(equations.n_q)
+    x, u = ca.SX.sym("x", n_x), ca.SX.sym("u", len(simulator.inputs))
+    s = ca.SX.zeros(sum(equations.n_s))
+    f = equations.evaluate(Instant(x, s, u, ca.SX.zeros(u.shape), ca.SX(0.0)))[0]
+    return ca.Function("flow", [x, u, vector], [f, ca.densify(ca.jacobian(f, x))])
+
+
+def fastest_rates(simulator: Equations, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Compute the largest |eigenvalue| of ∂f/∂x, rad/s, at x (K, n_x) and u (K, n_u), shape (K,); nan if infinite."""
+    if not simulator.states or simulator.discrete:
+        return np.zeros(len(x))
+    flow = _flow(simulator, len(p))
+    n_x, out = flow.size1_in(0), np.full(len(x), np.nan)
+    for k, (row, inputs) in enumerate(zip(x, u, strict=True)):
+        full = np.concatenate([row, np.zeros(n_x - len(row))]) if len(row) < n_x else row[:n_x]
+        a = np.asarray(flow(full, inputs, p)[1])
+        if np.all(np.isfinite(a)):
+            out[k] = float(np.max(np.abs(np.linalg.eigvals(a))))
+    return out
+
+
+def growth_rate(simulator: Equations, recording: Recording) -> float:
+    """Compute the largest real part of the eigenvalues of ∂f/∂x where a recording begins, 1/s; 0 without a state."""
+    if not simulator.states or simulator.discrete:
+        return 0.0
+    p = simulator.parameter_set.start
+    flow, start = _flow(simulator, len(p)), _start(simulator, recording)
+    a = np.asarray(flow(np.append(start, np.zeros(flow.size1_in(0) - len(start))), recording.u[0], p)[1])
+    return float(np.max(np.linalg.eigvals(a).real)) if np.all(np.isfinite(a)) else 0.0
+
+
+def needed_substeps(simulator: Equations, recordings: Sequence[Recording]) -> tuple[int, float]:
+    """Count the sub-steps per sample that keep |λ| h below `LARGEST_STEP`, and give the largest |λ|, rad/s."""
+    rate, first = rate_at_start(simulator, recordings[0]), recordings[0]
+    if rate * first.dt > VERY_FAST:
+        p = simulator.parameter_set.start
+        rate = _along_a_run(simulator, first, p, _start(simulator, first), rate)
+    return max(1, int(np.ceil(rate * first.dt / LARGEST_STEP))), rate
+
+
+def rate_at_start(simulator: Equations, recording: Recording) -> float:
+    """Compute the largest |λ|, rad/s, where a recording begins; `INFINITE` where it is infinite."""
+    p, start = simulator.parameter_set.start, _start(simulator, recording)
+    rate = fastest_rates(simulator, start[None], np.mean(recording.u, axis=0)[None], p)[0]
+    return float(np.nan_to_num(rate, nan=INFINITE))
+
+
+def choose_substeps(simulator: Equations, recordings: Sequence[Recording]) -> int:
+    """Choose the sub-steps per sample that keep |λ| h below `LARGEST_STEP` where the first recording begins.
+
+    Where a rate is very fast, the rates along a run decide (a square root is infinitely steep at zero).
+
+    Raises
+    ------
+    InputError
+        If more than `MOST_SUBSTEPS` would be needed, or a derivative is not finite.
+    """
+    needed, rate = needed_substeps(simulator, recordings)
+    if needed <= MOST_SUBSTEPS:
+        return needed
+    raise InputError(
+        _not_finite(simulator, recordings[0])
+        or f"The simulator has an eigenvalue of {rate:.3g} rad/s, too fast for samples {recordings[0].dt:g} s apart; "
+        "check its units, or replace the fast state by its steady state."
+    )
+
+
+def _start(simulator: Equations, recording: Recording) -> np.ndarray:
+    """Give the simulator's states where a recording begins: as given, else zero."""
+    given = np.asarray(recording.initial, dtype=float) if not isinstance(recording.initial, str) else np.zeros(0)
+    n_x = len(simulator.states)
+    return given[:n_x] if len(given) >= n_x else np.zeros(n_x)
+
+
+def _run(simulator: Equations, recording: Recording, p: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Compute the states at every sub-step, `FINE` per sample, at the beginning of a recording."""
+    model = discretise(simulator, recording.dt, "zero", substeps=FINE)
+    first = np.append(start, np.zeros(model.n_state - len(start)))
+    return states_along(model, model.drive(recording), p, first)
+
+
+def _along_a_run(simulator: Equations, recording: Recording, p: np.ndarray, start: np.ndarray, rate: float) -> float:
+    """Compute a high quantile of the rates along a run; the given rate where the run diverges."""
+    short = recording.slice(0, min(len(recording), 400))
+    states = _run(simulator, short, p, start)[::FINE]
+    found = fastest_rates(simulator, states[40::20], short.u[40::20], p)
+    found = found[np.isfinite(found)]
+    return min(rate, float(np.quantile(found, 0.9))) if len(found) > 5 else rate
+
+
+def _not_finite(simulator: Equations, recording: Recording) -> str:
+    """Say which state's derivative, or its slope, is not finite, and where; empty if all are finite."""
+    p, start = simulator.parameter_set.start, _start(simulator, recording)
+    flow = _flow(simulator, len(p))
+    n_x, names = flow.size1_in(0), simulator.states
+
+    def derivative(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return np.asarray(flow(x, u, p)[0]).ravel()
+
+    begun = np.append(start, np.zeros(n_x - len(start)))
+    points = [(begun, recording.u[0]), (begun, np.mean(recording.u, axis=0))]
+    if all(np.all(np.isfinite(derivative(*point))) for point in points):  # the run meets it later
+        short = recording.slice(0, min(len(recording), 400))
+        states = _run(simulator, short, p, start)[:, :n_x]
+        last = int(np.argmin(np.append(np.all(np.abs(states) < ENDLESS, axis=1), False))) - 1
+        x, u = states[last], short.u[last // FINE]
+        points += [(x + share * recording.dt / FINE * derivative(x, u), u) for share in (0.0, 0.5, 1.0)]
+    for x, u in points:
+        off = ~np.isfinite(derivative(x, u)[: len(names)])
+        if np.all(np.abs(x) < ENDLESS) and np.any(off):
+            return _where(simulator, f"The derivative of the state {names[int(np.argmax(off))]!r}", x, u)
+    slope = ~np.isfinite(np.asarray(flow(*points[0], p)[1])[: len(names), : len(names)])
+    if not np.any(slope):
+        return ""
+    i, j = np.argwhere(slope)[0]
+    return _where(simulator, f"The slope of the derivative of {names[i]!r} by the state {names[j]!r}", *points[0])
+
+
+def _where(simulator: Equations, what: str, x: np.ndarray, u: np.ndarray) -> str:
+    values = [*zip(simulator.states, x, strict=False), *zip(simulator.inputs, u, strict=True)]
+    values += [(k, 0.0) for k, v in simulator.parameters.items() if v.value.ndim == 0 and float(v.value) == 0]
+    shown = ", ".join(f"{name} = {float(value):.4g}" for name, value in values[:SHOWN])
+    more = f" and {len(values) - SHOWN} more" if len(values) > SHOWN else ""
+    at_rest = (
+        "; where the machine is never at zero, write the equations about its working point, or in Python say where a "
+        "recording begins, by the argument `initial` of Recording"
+    )
+    return (
+        f"{what} is not finite at {shown}{more}; check what the equations divide by, or take a root or a logarithm of, "
+        f"and the parameters' values{'' if np.any(x) else at_rest}."
+    )

@@ -29,7 +29,7 @@ from pilfr_casadi.engine import VirtualMachine, compiler
 from pilfr_casadi.laws import CubicStiffness, StopHysteresis
 from pilfr_casadi.linear import modal
 from pilfr_casadi.models import ParameterSet
-from pilfr_casadi.simulators import discretise, fastest, load_simulator
+from pilfr_casadi.simulators import discretise, fastest_rates, load_simulator
 from problems import emps, masing_diagnosis, piezo_diagnosis, silverbox, tanks
 from problems.concealed_rigs_more import RIGS
 from problems.zoo import CASES
@@ -96,7 +96,9 @@ def from_rig(rig):
 def pace(simulator):
     """A step that suits a simulator's fastest mode."""
     p = ParameterSet(dict(simulator.parameters)).start
-    rate = fastest(simulator, np.full((1, len(simulator.states)), 0.1), np.zeros((1, len(simulator.inputs))), p)[0]
+    rate = fastest_rates(simulator, np.full((1, len(simulator.states)), 0.1), np.zeros((1, len(simulator.inputs))), p)[
+        0
+    ]
     return 0.3 / rate if np.isfinite(rate) and rate > 0 else 0.01
 
 

@@ -22,7 +22,7 @@ from pilfr_casadi.laws import (
 )
 from pilfr_casadi.models import ParameterSet, close_loop
 from pilfr_casadi.optimise import GaussNewton, Problem
-from pilfr_casadi.simulators import MOST, REACH, choose_substeps, discretise
+from pilfr_casadi.simulators import LARGEST_STEP, MOST_SUBSTEPS, choose_substeps, discretise
 
 DT, M = 0.02, 250
 VALUES = {"m": 1.3, "k": 90.0, "d": 1.1}
@@ -332,8 +332,8 @@ def test_the_memory_at_the_first_sample_is_estimated(record):
 
 def test_substeps_follow_the_fastest_eigenvalue(record):
     counts = [choose_substeps(rig(parameters={**rig().parameters, "k": Parameter(k)}), [record]) for k in (90.0, 9e3)]
-    assert counts[0] == 1 and counts[1] == int(np.ceil(np.sqrt(9e3 / 1.3) * DT / REACH))
-    too_fast = rig(parameters={**rig().parameters, "k": Parameter(90.0 * (MOST * 50) ** 2)})
+    assert counts[0] == 1 and counts[1] == int(np.ceil(np.sqrt(9e3 / 1.3) * DT / LARGEST_STEP))
+    too_fast = rig(parameters={**rig().parameters, "k": Parameter(90.0 * (MOST_SUBSTEPS * 50) ** 2)})
     with pytest.raises(InputError, match="too fast"):
         choose_substeps(too_fast, [record])
 
@@ -403,3 +403,85 @@ def test_a_port_with_the_name_of_a_built_in_one_is_refused():
     (port,) = rig().ports[:1]
     with pytest.raises(InputError, match="'actuator:force' is declared"):
         rig(ports=(replace(port, name="actuator:force"),))
+
+
+def test_one_port_needs_no_tuple(record):
+    (port,) = rig().ports[:1]
+    alone = rig(ports=port)
+    assert [p.name for p in alone.ports] == ["ground"]
+    stiff = CubicStiffness(values={"k_3": 700.0})
+    assert np.array_equal(
+        run(alone.with_element("ground", stiff), record), run(rig().with_element("ground", stiff), record)
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Port("mount", {"vel": -1.0}, across="x1"), "`across` of port 'mount' is 'x1'; give a function"),
+        (lambda: Port("mount", {"vel": -1.0}, lambda x: x.pos, rate="x2"), "`rate` of port 'mount' is 'x2'"),
+        (
+            lambda: Port("mount", "vel", lambda x: x.pos),
+            "`into` of port 'mount' is 'vel'; give {state or output: factor}",
+        ),
+        (lambda: Port(3, {"vel": -1.0}, lambda x: x.pos), "A port's name is 3; give a text"),
+        (lambda: Port("mount", {"vel": -1.0}, lambda x: x.pos, unit=1), "`unit` of port 'mount' is 1; give plain text"),
+        (lambda: rig(ports="ground"), "The simulator's ports are 'ground'; give Port"),
+        (lambda: rig(ports=[("ground", None)]), "ports are .* give Port"),
+        (lambda: rig(ports=5), "ports are 5; give Port"),
+        (lambda: rig(dynamics={"pos": 1}), "The simulator's dynamics are {'pos': 1}; give a function"),
+        (lambda: rig(outputs=None), "The simulator's outputs are None; give a function"),
+        (lambda: rig(states=(1, 2)), r"The simulator's states are \(1, 2\); give their names"),
+        (lambda: rig(inputs=7), "The simulator's inputs are 7; give their names"),
+        (lambda: rig(parameters=[1.0]), r"parameters are \[1.0\]; give {name: Parameter"),
+        (lambda: rig(parameters={"m": 1.0}), "parameter 'm' is 1.0; give Parameter"),
+        (lambda: rig(units="N"), "units are 'N'; give {name: unit}"),
+        (lambda: rig(dynamics=dict), "dynamics is <class 'dict'>; give a function"),
+    ],
+)
+def test_wrong_types_get_one_sentence(make, says):
+    with pytest.raises(InputError, match=says) as error:
+        make()
+    assert str(error.value).endswith(".") and "\n" not in str(error.value)
+
+
+def test_a_simulator_simulates_and_scores_a_recording(record):
+    own = rig().with_element("ground", CubicStiffness(values={"k_3": 700.0}))
+    y = own.simulate(record)
+    np.testing.assert_allclose(y, run(own, record, substeps=choose_substeps(own, [record])), rtol=0, atol=1e-13)
+    given = record.with_(y=y + 0.01 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape), skip=10)
+    swapped = given.with_(
+        u=given.u[:, ::-1], inputs=given.inputs[::-1], y=given.y[:, ::-1], outputs=given.outputs[::-1]
+    )
+    moving = rig(outputs=lambda x: dict(position=x.pos, load=x.vel))
+    measured = record.with_(y=moving.simulate(record))
+    assert moving.nrmse(measured) == 0.0
+    assert 0.1 < rig(outputs=moving.outputs, parameters={**rig().parameters, "k": Parameter(80.0)}).nrmse(measured) < 2
+    np.testing.assert_array_equal(own.simulate(swapped), y)
+    started = rig().simulate(record.with_(initial=np.array([0.2, 0.0])))
+    assert started[0, 0] == 0.2
+    with pytest.raises(InputError, match="has the inputs force, valve; the simulator has force, table"):
+        own.simulate(record.with_(inputs=("force", "valve")))
+    with pytest.raises(InputError, match="has no output 'load'; it has position, weight"):
+        own.nrmse(record.with_(outputs=("position", "weight")))
+    with pytest.raises(InputError, match="A list was given; give a Recording"):
+        own.simulate([record])
+
+
+def test_other_values_check_no_equation_again(record):
+    calls = []
+
+    def counted(x, u, p):
+        calls.append(1)
+        return dynamics(x, u, p)
+
+    simulator = rig(dynamics=counted)
+    before = len(calls)
+    stiffer = simulator.with_parameters({**simulator.parameters, "k": Parameter(95.0)})
+    law = stiffer.with_element("ground", CubicStiffness(values={"k_3": 700.0}))
+    assert len(calls) == before and law.without_last_element().elements == ()
+    whole = rig(parameters={**rig().parameters, "k": Parameter(95.0)})
+    expected = run(whole.with_element("ground", CubicStiffness(values={"k_3": 700.0})), record)
+    assert np.array_equal(run(law, record), expected)
+    with pytest.raises(InputError, match="There is no parameter"):
+        simulator.with_parameters({"k": Parameter(95.0)})

@@ -1,0 +1,396 @@
+"""Continuous-time equations with ports that missing physics can be put into, as CasADi expressions.
+
+    ẋ = f(x, u, p) + Σ into_j(p) w_j,   y = h(x, u, p) + Σ into_j(p) w_j,
+    w_j = law_j(z_j, ż_j),   z_j = across_j(x, u)
+
+The user's functions are called with the symbols that they name: `x.<state>`, `u.<input>`, `p.<parameter>`. At an
+actuator or a sensor a law acts in series: it adds `w = law(u) - u` to the signal.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Self
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError, listed
+from ..models import Parameter, ParameterSet
+
+Expression = Callable[..., Any]
+BUILT_IN = ("actuator:", "sensor:", "equation:")  # prefixes of the ports that need no declaration
+
+
+class Named:
+    """Symbols by name: `x.pos`, `p.k` or `p["k"]`."""
+
+    def __init__(self, kind: str, values: Mapping[str, Any]) -> None:
+        self.__dict__.update(_kind=kind, _values=dict(values))
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self._values[name]
+        except KeyError:
+            if name.startswith("__"):
+                raise AttributeError(name) from None
+            known = ", ".join(self._values) or "none"
+            raise InputError(f"There is no {self._kind} {name!r}; there are {known}.") from None
+
+    __getitem__ = __getattr__
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise InputError(f"The {self._kind} {name!r} cannot be assigned; return the equations in a dict instead.")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+
+def call(function: Expression, name: str, **available: Any) -> Any:
+    """Call a user's function, called `name` in messages, with those of the available symbols that it names.
+
+    Raises
+    ------
+    InputError
+        If it is not a function, names something else, or fails.
+    """
+    try:
+        arguments = inspect.signature(function).parameters.items()
+    except (TypeError, ValueError):
+        raise InputError(f"The {name} is {function!r}; give a function of {', '.join(available)} by name.") from None
+    wanted = [
+        key for key, p in arguments if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) and p.default is p.empty
+    ]
+    for key in wanted:
+        if key not in available:
+            raise InputError(f"The {name} asks for {key!r}; it can have {', '.join(available)}.")
+    try:
+        return function(**{key: available[key] for key in wanted})
+    except InputError as error:
+        raise InputError(f"In the {name}: {error}") from None
+    except Exception as error:
+        if "truth value" in str(error):
+            raise InputError(
+                f"The {name} decides by the value of a symbol (if, and, or, min, max), which has none yet; "
+                "use casadi.if_else, casadi.fmin and casadi.fmax."
+            ) from error
+        raise InputError(f"The {name} fails: {type(error).__name__}: {error}.") from error
+
+
+def numbers_or_nan(function: ca.Function, *arguments: Any) -> np.ndarray:
+    """Evaluate the first output of a function; nan where CasADi's linear solvers raise at a singular matrix."""
+    try:
+        return np.asarray(function.call(arguments)[0])
+    except RuntimeError:
+        return np.full(function.size_out(0), np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Port:
+    """A place where physics may be missing.
+
+    Parameters
+    ----------
+    name : str
+        Name in results.
+    into : callable or mapping
+        Where an internal force w enters: `{state: factor}` (added to the state's derivative) or `{output: factor}`; a
+        callable takes any of x, u, p by name.
+    across : callable
+        Local coordinate z, from any of x, u, p.
+    rate : callable, optional
+        dz/dt, from any of x, u, p; by default `across` is differentiated along the dynamics. For a drive without an
+        angle both are the speed, which friction opposes.
+    unit, across_unit : str
+        Units of w and of z.
+
+    Raises
+    ------
+    InputError
+        If an argument has the wrong type.
+
+    Examples
+    --------
+    >>> Port("mount", into={"vel": -1.0}, across=lambda x: x.pos, unit="N").kinds
+    {'parallel'}
+    """
+
+    name: str
+    into: Any
+    across: Expression
+    rate: Expression | None = None
+    unit: str = ""
+    across_unit: str = ""
+    series: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError(f"A port's name is {self.name!r}; give a text, such as 'mount'.")
+        what = f"of port {self.name!r}"
+        if not callable(self.into) and not isinstance(self.into, Mapping):
+            raise InputError(f"`into` {what} is {self.into!r}; give {{state or output: factor}} or a function.")
+        for option, wanted in (("across", "lambda x: x.pos"), ("rate", "lambda x: x.vel")):
+            given = getattr(self, option)
+            if not callable(given) and not (option == "rate" and given is None):
+                raise InputError(f"`{option}` {what} is {given!r}; give a function, such as {wanted}.")
+        for option in ("unit", "across_unit"):
+            if not isinstance(getattr(self, option), str):
+                raise InputError(f"`{option}` {what} is {getattr(self, option)!r}; give plain text, such as 'N'.")
+
+    @property
+    def kinds(self) -> set[str]:
+        """Kinds of places of a law that it offers: "parallel", or "series" and at a sensor "sensor"."""
+        if not self.series:
+            return {"parallel"}
+        return {"series", "sensor"} if self.name.startswith("sensor:") else {"series"}
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A law in a port, and the prefix of its parameters' names."""
+
+    port: str
+    law: Any
+    prefix: str
+
+    def own(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Extract the law's values by its own names from values by full name."""
+        return {name: values[f"{self.prefix}{name}"] for name in self.law.parameters()}
+
+    def of(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Extract the law's values by full name from all values."""
+        return self.named(self.own(values))
+
+    def named(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Give values of the law their full names."""
+        return {f"{self.prefix}{name}": value for name, value in own.items()}
+
+
+def in_series(port: str) -> bool:
+    """Tell by its name whether a port belongs to a signal: an actuator or a sensor."""
+    return port.startswith(("actuator:", "sensor:"))
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Equations with ports and the laws in them; the fields are those of `Simulator`."""
+
+    dynamics: Expression
+    outputs: Expression
+    states: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    ports: tuple[Port, ...] = ()
+    hold: str | None = None
+    discrete: bool = False
+    elements: tuple[Placed, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kind in ("dynamics", "outputs"):
+            if not callable(getattr(self, kind)):
+                raise InputError(f"The simulator's {kind} are {getattr(self, kind)!r}; give a function of x, u and p.")
+        for kind in ("states", "inputs"):
+            object.__setattr__(self, kind, _distinct_names(getattr(self, kind), kind))
+        if self.hold not in (None, "zero", "linear"):
+            raise InputError(f"hold = {self.hold!r} was given; use 'zero', 'linear' or None.")
+        for kind, wanted in (("parameters", "{name: Parameter(value, ...)}"), ("units", "{name: unit}")):
+            if not isinstance(getattr(self, kind), Mapping):
+                raise InputError(f"The simulator's {kind} are {getattr(self, kind)!r}; give {wanted}.")
+        for name, given in self.parameters.items():
+            if not isinstance(given, Parameter):
+                raise InputError(f"The simulator's parameter {name!r} is {given!r}; give Parameter(value, ...).")
+        object.__setattr__(self, "parameters", ParameterSet(dict(self.parameters)))
+        object.__setattr__(self, "ports", _checked_ports(self.ports))
+        x, u, p, t = self._symbols()
+        derivatives = ca.vertsplit(self.derivatives(x, u, p, t)) if self.states else ()
+        found = {**dict(zip(self.states, derivatives, strict=True)), **self.measured(x, u, p, t)}
+        _check_expressions(found, [*x._values.values(), *u._values.values(), *p._values.values(), t])
+        for port in self.ports:
+            self.into(port, x, u, p, t)
+            self.across(port, x, u, p, t)
+
+    def _with(self, **changes: Any) -> Self:
+        """Copy with other elements or values of parameters, which leave the equations as they were checked."""
+        copy = object.__new__(type(self))
+        copy.__dict__.update(self.__dict__, **changes)
+        return copy
+
+    def with_elements(self, elements: tuple[Placed, ...]) -> Self:
+        """Copy with other laws in place of its own; they have the same parameters."""
+        return self._with(elements=elements)
+
+    @property
+    def parameter_set(self) -> ParameterSet:
+        """The parameters with the layout of their vector."""
+        return self.parameters if isinstance(self.parameters, ParameterSet) else ParameterSet(self.parameters)
+
+    def _symbols(self) -> tuple[Named, Named, Named, Any]:
+        x = Named("state", {n: ca.SX.sym(n) for n in self.states})
+        u = Named("input", {n: ca.SX.sym(n) for n in self.inputs})
+        own = self.parameter_set
+        return x, u, Named("parameter", own.symbols(ca.SX.sym("p", own.size))), ca.SX.sym("t")
+
+    def derivatives(self, x: Named, u: Named, p: Named, t: Any) -> Any:
+        """Evaluate the dynamics without laws, a vector (n_x, 1)."""
+        if not self.states:
+            return ca.SX(0, 1)
+        found = call(self.dynamics, "simulator's dynamics", x=x, u=u, p=p, t=t)
+        if not isinstance(found, Mapping):
+            raise InputError(f"The simulator's dynamics returned {type(found).__name__}; return {{state: derivative}}.")
+        return ca.vertcat(*_row(found, self.states, "dynamics", "derivative"))
+
+    def measured(self, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        """Evaluate the outputs by name, without laws."""
+        found = call(self.outputs, "simulator's outputs", x=x, u=u, p=p, t=t)
+        if not isinstance(found, Mapping) or not found:
+            raise InputError("The simulator's outputs must be a dict {output: expression} with at least one entry.")
+        return dict(zip(found, _row(found, tuple(found), "outputs", "expression"), strict=True))
+
+    @cached_property
+    def output_names(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return tuple(self.measured(*self._symbols()))
+
+    def into(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
+        """Evaluate the factors of w by state or output."""
+        name = f"`into` of port {port.name!r}"
+        found = call(port.into, name, x=x, u=u, p=p, t=t) if callable(port.into) else port.into
+        if not isinstance(found, Mapping) or not found:
+            raise InputError(f"The {name} must be a dict {{state or output: factor}}; got {found!r}.")
+        known = (*self.states, *self.output_names)
+        for target in found:
+            if target not in known:
+                raise InputError(f"Port {port.name!r} goes into {target!r}; there are {', '.join(known)}.")
+        return dict(zip(found, _row(found, tuple(found), f"port {port.name!r}", "factor"), strict=True))
+
+    def across(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> Any:
+        """Evaluate the local coordinate z."""
+        name = f"`across` of port {port.name!r}"
+        return _scalar(call(port.across, name, x=x, u=u, p=p, t=t), name)
+
+    def port(self, name: str) -> Port:
+        """Find a port by name: declared, `actuator:<input>`, `sensor:<output>` or `equation:<state>`."""
+        for port in self.all_ports():
+            if port.name == name:
+                return port
+        known = ", ".join(port.name for port in self.all_ports())
+        raise InputError(f"There is no port {name!r}; there are {known}.")
+
+    def all_ports(self) -> tuple[Port, ...]:
+        """List the declared ports (else one for each state's equation), then actuators and sensors."""
+        return self._every_port
+
+    @cached_property
+    def _every_port(self) -> tuple[Port, ...]:
+        inner = self.ports or (() if self.discrete else tuple(map(self._equation, self.states)))
+        actuators = (_series("actuator", n, lambda u, n=n: u[n], self.units) for n in self.inputs)
+        sensors = (_series("sensor", n, lambda: 0, self.units) for n in self.output_names)
+        return (*inner, *actuators, *sensors)
+
+    def _equation(self, state: str) -> Port:
+        """Make the port of a state's equation: w is subtracted from its derivative.
+
+        Where the state is the derivative of another state (a velocity), the local coordinate is that other state.
+        """
+        x, u, p, t = self._symbols()
+        derivatives = ca.vertsplit(self.derivatives(x, u, p, t))
+        integral = next(
+            (n for n, d in zip(self.states, derivatives, strict=True) if d.is_symbolic() and d.name() == state), None
+        )
+        if integral is None or integral == state:
+            return Port(f"equation:{state}", {state: -1.0}, lambda x: x[state])
+        return Port(f"equation:{state}", {state: -1.0}, lambda x: x[integral], lambda x: x[state])
+
+    @cached_property
+    def kinematic(self) -> frozenset[str]:
+        """States that are the integral of another state: their equations are definitions and lack nothing."""
+        if self.discrete:
+            return frozenset()
+        x, u, p, t = self._symbols()
+        derivatives = zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True)
+        return frozenset(n for n, d in derivatives if d.is_symbolic() and d.name() in self.states and d.name() != n)
+
+    @cached_property
+    def idle_inputs(self) -> tuple[str, ...]:
+        """Inputs that no equation reads: they may scale the missing physics."""
+        x, u, p, t = self._symbols()
+        read = ca.vertcat(self.derivatives(x, u, p, t), *self.measured(x, u, p, t).values())
+        return tuple(name for name in self.inputs if not ca.depends_on(read, u[name]))
+
+
+def _series(kind: str, name: str, across: Expression, units: Mapping[str, str]) -> Port:
+    unit = units.get(name, "")
+    return Port(f"{kind}:{name}", {}, across, None, unit, unit, series=True)
+
+
+def _check_expressions(found: Mapping[str, Any], known: list[Any]) -> None:
+    """Refuse foreign symbols, and the NaN that `math.sin(symbol)` gives without an error."""
+    names, expressions = list(found), list(found.values())
+    f = ca.Function("equations", known, expressions, {"allow_free": True})
+    if f.has_free():
+        raise InputError(f"The simulator's equations hold a symbol {f.get_free()[0]!r}; use x, u, p and t alone.")
+    k = range(f.n_instructions())
+    if any(f.instruction_id(i) == ca.OP_CONST and f.instruction_constant(i) != f.instruction_constant(i) for i in k):
+        for name in names:
+            _check_expressions({name: found[name]}, known) if len(names) > 1 else None
+        raise InputError(
+            f"The equation of {names[0]!r} holds a number that is none (NaN); use CasADi's functions on symbols, "
+            "as in ca.sin(x.pos) rather than math.sin(x.pos), and check constants."
+        )
+
+
+def _scalar(value: Any, name: str) -> Any:
+    try:
+        value = ca.SX(value)
+    except Exception:
+        raise InputError(f"The {name} gave {value!r}; give a number or a CasADi expression.") from None
+    if value.shape != (1, 1):
+        raise InputError(f"The {name} has the shape {value.shape}; give one number or expression.")
+    return value
+
+
+def _row(found: Mapping[str, Any], names: tuple[str, ...], where: str, kind: str) -> list[Any]:
+    for name in names:
+        if name not in found:
+            raise InputError(f"The simulator's {where} give no {kind} for the state {name!r}; add it.")
+    for name in found:
+        if name not in names:
+            raise InputError(
+                f"The simulator's {where} give {name!r}, which is not a state; there are {', '.join(names)}."
+            )
+    return [_scalar(found[name], f"{kind} of {name!r} in the {where}") for name in names]
+
+
+def _distinct_names(given: Any, kind: str) -> tuple[str, ...]:
+    try:
+        names = (given,) if isinstance(given, str) else tuple(given)
+    except TypeError:
+        names = (None,)
+    if not all(isinstance(name, str) and name for name in names):
+        raise InputError(f"The simulator's {kind} are {given!r}; give their names, such as ('pos', 'vel').")
+    if len(set(names)) != len(names):
+        raise InputError(f"The simulator's {kind} {', '.join(names)} are not unique; name each once.")
+    return names
+
+
+def _checked_ports(given: Any) -> tuple[Port, ...]:
+    try:
+        ports = (given,) if isinstance(given, Port) else tuple(given)
+    except TypeError:
+        ports = (None,)
+    if not all(isinstance(port, Port) for port in ports):
+        raise InputError(f"The simulator's ports are {given!r}; give Port(name, into, across) or a tuple of several.")
+    names = [port.name for port in ports]
+    if len(set(names)) != len(names):
+        raise InputError(f"The port names {listed(names)} are not unique; name each port once.")
+    for name in names:
+        if name.startswith(BUILT_IN):
+            raise InputError(
+                f"The port {name!r} is declared with a name that begins like those of the built-in ports "
+                f"({', '.join(BUILT_IN)}), which need no declaration; call it something else."
+            )
+    return ports
