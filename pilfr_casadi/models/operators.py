@@ -1,15 +1,14 @@
 """Stop, play and generalized play: exact one-step hysteresis operators.
 
-Each operator has one number of memory `q`, the play state, and maps `(z, q, r)` to `(v, q_next)`:
+Each operator has one memory state `q`, the play state, and maps `(z, q, r)` to `(v, q_next)`:
 
 - play, Krikelis et al. (2024), Eq. 5 and 11: `v = q_next = max(z - r, min(z + r, q))`;
 - stop, Eq. 3 and 9 in the clip form `v = min(r, max(-r, z - q))`, `q_next = z - v`. The memory is the play state
-  `q = z(k-1) - v(k-1)`, which makes `play + stop = z` (Eq. 8) an identity of one line and needs no division by r;
+  `q = z(k-1) - v(k-1)`, which makes `play + stop = z` (Eq. 8) an identity and needs no division by r;
 - generalized play, Eq. 7 and 13: `v = q_next = max(gl - r, min(hi, q))`, `gl = γ_l(z)`, `gr = γ_r(z)`.
 
 The generalized play is a play only where `γ_l(z) - r <= γ_r(z) + r`. This is met by construction: the upper curve is
-`hi = max(gr + r, gl - r)`, which is `γ_r + r` wherever the condition holds and closes the loop (no width) where it
-does not.
+`hi = max(gr + r, gl - r)`, which is `γ_r + r` wherever the condition holds; elsewhere the loop has no width.
 
 All work on numbers, NumPy arrays and CasADi symbols alike. The derivative at a kink is the one of the sticking side.
 `eps > 0` rounds min and max over a band of half-width eps (compact support: outside the band nothing changes, so no
@@ -27,7 +26,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, is_number
 from .parameters import Parameter, ParameterSet
 
 _TINY = 1e-300
@@ -35,7 +34,7 @@ _SYMBOLIC = (ca.SX, ca.MX, ca.DM)
 
 
 def fmax(a: Any, b: Any, eps: Any = 0.0) -> Any:
-    """max(a, b), rounded over |a - b| < eps by `(eps - |a - b|)₊² / 4 eps`; numbers, arrays or symbols.
+    """Compute max(a, b), rounded over |a - b| < eps by `(eps - |a - b|)₊² / 4 eps`; numbers, arrays or symbols.
 
     In the exact form the derivative at a tie is that of `b`.
     """
@@ -50,17 +49,17 @@ def fmax(a: Any, b: Any, eps: Any = 0.0) -> Any:
 
 
 def fmin(a: Any, b: Any, eps: Any = 0.0) -> Any:
-    """min(a, b), the mirror of `fmax`; in the exact form the derivative at a tie is that of `b`."""
+    """Compute min(a, b), the mirror of `fmax`; in the exact form the derivative at a tie is that of `b`."""
     return -fmax(-a, -b, eps)
 
 
 def play(z: Any, q: Any, r: Any, eps: Any = 0.0) -> Any:
-    """Play (backlash) of half-width r: the new play state `max(z - r, min(z + r, q))`, Eq. 5."""
+    """Step a play (backlash) of half-width r: the new play state `max(z - r, min(z + r, q))`, Eq. 5."""
     return fmax(z - r, fmin(z + r, q, eps), eps)
 
 
 def stop(z: Any, q: Any, r: Any, eps: Any = 0.0) -> Any:
-    """Stop of threshold r, `z - play(z, q, r)`: the clip `min(r, max(-r, z - q))` of Eq. 3 and 9."""
+    """Step a stop of threshold r, `z - play(z, q, r)`: the clip `min(r, max(-r, z - q))` of Eq. 3 and 9."""
     if isinstance(eps, _SYMBOLIC) or np.any(np.asarray(eps) != 0):
         return z - play(z, q, r, eps)
     return fmin(r, fmax(-r, z - q))
@@ -69,7 +68,7 @@ def stop(z: Any, q: Any, r: Any, eps: Any = 0.0) -> Any:
 def generalized_play(
     z: Any, q: Any, r: Any, gamma_l: Callable[[Any], Any], gamma_r: Callable[[Any], Any], eps: Any = 0.0
 ) -> Any:
-    """Generalized play between `γ_l(z) - r` (below) and `γ_r(z) + r` (above), Eq. 7, well posed by construction."""
+    """Step a generalized play between `γ_l(z) - r` (below) and `γ_r(z) + r` (above), Eq. 7; always well posed."""
     low = gamma_l(z) - r
     high = fmax(gamma_r(z) + r, low)
     return fmax(low, fmin(high, q, eps), eps)
@@ -134,8 +133,8 @@ class GeneralizedPlay:
     name = "generalized_play"
 
     def __post_init__(self) -> None:
-        if self.neurons != int(self.neurons) or self.neurons < 0:
-            raise InputError(f"An envelope with {self.neurons} neurons was asked for; give a whole number, 0 or more.")
+        if not is_number(self.neurons) or not 0 <= self.neurons < np.inf or self.neurons != int(self.neurons):
+            raise InputError(f"An envelope has {self.neurons!r} neurons; give a whole number, 0 or more.")
 
     @property
     def networks(self) -> bool:
@@ -143,7 +142,7 @@ class GeneralizedPlay:
         return self.gamma_l is None and self.gamma_r is None
 
     def parameters(self, channels: int) -> ParameterSet:
-        """Envelope parameters, one row a channel; start: nearly the identity, with a little of every neuron."""
+        """Envelope parameters, one row for each channel; they start near the identity, with small neurons."""
         entries: dict[str, Parameter] = dict(self.extra or {})
         for side, own in (("l", self.gamma_l), ("r", self.gamma_r)):
             if own is not None:
@@ -158,7 +157,7 @@ class GeneralizedPlay:
         return ParameterSet(entries)
 
     def envelope(self, side: str, z: Any, p: Any, channel: int = 0) -> Any:
-        """γ_l or γ_r at z; `side` is "l" or "r", p maps names to values or symbols."""
+        """Evaluate γ_l or γ_r at z; `side` is "l" or "r", p maps names to values or symbols."""
         own = self.gamma_l if side == "l" else self.gamma_r
         if own is not None:
             return own(z, p)
@@ -170,11 +169,11 @@ class GeneralizedPlay:
         return out
 
     def far_slope(self, side: str, p: Any) -> Any:
-        """Slope of the network γ_l or γ_r where its neurons are saturated, `a_0` of each channel: (channels, 1)."""
+        """Give the slope of the network γ_l or γ_r with saturated neurons, `a_0` of each channel: (channels, 1)."""
         return p[f"gamma_{side}_a0"]
 
     def steepest(self, side: str, p: Any) -> np.ndarray:
-        """Largest slope of the network γ_l or γ_r of named numbers p, each channel: (channels,)."""
+        """Compute the largest slope of the network γ_l or γ_r for numbers p, each channel: (channels,)."""
         a0, a, b, d = (np.asarray(p[f"gamma_{side}_{k}"], dtype=float) for k in ("a0", "a", "b", "d"))
         out = []
         for i in range(len(a0)):

@@ -202,8 +202,9 @@ def test_own_envelopes_read_the_named_parameters():
 
 
 def test_a_network_needs_neurons_in_whole_numbers():
-    with pytest.raises(InputError, match="neurons"):
-        GeneralizedPlay(neurons=-1)
+    for wrong in (-1, 2.5, np.inf, "3", None):
+        with pytest.raises(InputError, match=f"An envelope has {wrong!r} neurons; give a whole number"):
+            GeneralizedPlay(neurons=wrong)
 
 
 # ---- the paper's forms and its slips (errata) ----

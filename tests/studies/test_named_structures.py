@@ -152,7 +152,7 @@ def test_bad_options_get_one_sentence(folder, model, says):
 def test_the_command_line_fits_them_too(capsys, folder):
     data = ("fit", folder / "train.csv", "--inputs", "u", "--outputs", "y", "--initial", "zero", "--starts", 1)
     tested = ("--test", folder / "test.csv", "--out", folder / "out", "--overwrite", "--hidden", 2)
-    for options in (("noe", "--lags", 2), ("ssnn", "--nx", 1), ("network_lfr", "--nx", 1, "--fix", "D_yu=0")):
+    for options in (("noe", "--lags", 2), ("network_lfr", "--nx", 1, "--fix", "D_yu=0")):
         status, out, err = run(capsys, *data, *tested, "--structure", *options)
         assert status == 0, err
         assert "NRMSE on test" in out and (folder / "out" / "report.html").exists()
