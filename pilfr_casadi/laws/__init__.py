@@ -1,4 +1,9 @@
-"""The catalogue of physical laws that may be missing from a simulator; one hypothesis a class."""
+"""The catalogue of physical laws that may be missing from a simulator, one small class for each hypothesis.
+
+`base` holds the class `Law` and shows how to add a law in ten lines; the files beside it hold the laws by kind
+(`stiffness`, `friction`, `hysteresis`, `limits`, `curves`, `periodic`, `dynamic`), `composed` makes laws from laws, and
+`catalogue` lists those that are tried. `forces` evaluates laws along given signals.
+"""
 
 from typing import TYPE_CHECKING
 

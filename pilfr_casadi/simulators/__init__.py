@@ -1,4 +1,9 @@
-"""The user's equations with their ports: `Simulator`, integration over a sample, and what is accepted in its place."""
+"""The user's equations with ports for missing physics.
+
+`equations` evaluates them with their laws, `integration` makes them a discrete-time `Model`, `simulator` holds the class
+`Simulator`, `adapters` accept a Python file, a state space or a fitted model in its place, and `observer` adds output
+injection to a model.
+"""
 
 from typing import TYPE_CHECKING
 

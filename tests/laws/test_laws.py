@@ -310,7 +310,18 @@ def test_hysteresis_behind_a_gap_keeps_the_gap():
     assert np.all(np.isfinite(unit_forces(law, LOCAL, list(law.shapes(LOCAL))[:1])))
 
 
-def test_the_examples_of_the_base_class_run():
-    module = importlib.import_module("pilfr_casadi.laws.base")
-    assert doctest.testmod(module).attempted > 0
-    assert doctest.testmod(module).failed == 0
+@pytest.mark.parametrize(
+    "name",
+    [
+        "laws.base",
+        "models.parameters",
+        "models.elements",
+        "models.pilfr",
+        "models.model",
+        "simulators.equations",
+        "simulators.simulator",
+    ],
+)
+def test_the_examples_in_docstrings_run(name):
+    found = doctest.testmod(importlib.import_module(f"pilfr_casadi.{name}"))
+    assert found.attempted > 0 and found.failed == 0
