@@ -1,8 +1,8 @@
 """The user's equations with ports for missing physics.
 
-`equations` evaluates them with their laws, `integration` makes them a discrete-time `Model`, `simulator` holds the class
-`Simulator`, `adapters` accept a Python file, a state space or a fitted model in its place, and `observer` adds output
-injection to a model.
+`equations` evaluates them with their laws, `integration` makes them a discrete-time `Model`, `simulator` holds the
+class `Simulator`, `adapters` accept a Python file, a state space or a fitted model in its place, and `observer` holds
+Kalman gains and output injection.
 """
 
 from typing import TYPE_CHECKING
@@ -38,7 +38,12 @@ if TYPE_CHECKING:
         signals as signals,
         states_along as states_along,
     )
-    from .observer import GAMMA as GAMMA, add_observer as add_observer, kalman_gain as kalman_gain
+    from .observer import (
+        INJECTION as INJECTION,
+        measurement_update as measurement_update,
+        steady_state_gain as steady_state_gain,
+        with_output_injection as with_output_injection,
+    )
     from .simulator import Simulator as Simulator
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
