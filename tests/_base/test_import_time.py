@@ -8,7 +8,7 @@ import pytest
 
 import pilfr_casadi
 
-HEAVY = ("scipy", "control", "matplotlib", "jinja2", "rich")
+HEAVY = ("scipy", "control", "matplotlib", "jinja2", "rich", "pydantic", "typer")
 
 
 def in_fresh_python(code):
@@ -33,9 +33,6 @@ def test_import_alone_takes_nothing_heavy():
 
 
 def test_public_names_are_listed_and_there():
-    assert {"Recording", "InputError", "read_csv", "nrmse", "multisine", "tukey_realizations"} <= set(
-        pilfr_casadi.__all__
-    )
     assert set(pilfr_casadi.__all__) <= set(dir(pilfr_casadi))
     for name in pilfr_casadi.__all__:
         value = getattr(pilfr_casadi, name)
