@@ -111,6 +111,7 @@ def test_a_diagnosis_exports_what_it_fitted():
     one_sentence(error)
 
 
+@pytest.mark.slow
 def test_a_real_diagnosis_exports_what_it_judged():
     simulator = load_simulator("pilfr_casadi/cli/demo_data/rig.py")
     known = {"inputs": "force", "outputs": "x2", "initial": "zero", "hold": "zero"}
@@ -171,7 +172,7 @@ def test_files_that_cannot_be_written(tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("flags", [("-O2", "-Wextra", "-Wno-unused-parameter", "-pedantic"), ("-O0",)])
+@pytest.mark.parametrize("flags", [("-O2", "-Wextra", "-pedantic"), ("-O0",)])
 def test_hostile_names_stay_names(tmp_path, flags):
     """Names come from files: nothing in them reaches the compiler as code."""
     names = ('a" */ #error\n"', "b\\", "*/ int evil(void) { return 1; } /*", "a b", "a-b", "??/", "µ*//*", "\u202e", "")
@@ -204,7 +205,7 @@ def test_c_for_a_program(tmp_path):
         "  for (k = 0; k < 50; k++) {\n    u[RIG_U_U] = k * RIG_DT;\n    rig_step(x, u, x, y);\n"
         '    printf("%.17g\\n", y[RIG_Y_Y]);\n  }\n  return 0;\n}\n'
     )
-    command = [compiler(), "-std=c99", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror", "main.c", "rig.c", "-lm"]
+    command = [compiler(), "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "main.c", "rig.c", "-lm"]
     subprocess.run([*command, "-o", "rig"], cwd=tmp_path, check=True, capture_output=True)
     done = subprocess.run(["./rig"], cwd=tmp_path, capture_output=True, text=True, check=True)
     memory, *y = map(float, done.stdout.split())
@@ -479,7 +480,7 @@ def test_odd_names_compile_beside_each_other_and_step(name, tmp_path):
     user = f'#include "{name}.h"\nint used(void) {{ double x[{name.upper()}_NX]; {name}_x0(x); return x[0] == 0.0; }}\n'
     (tmp_path / "user.c").write_text(user)
     library = tmp_path / "both.so"
-    strict = ["-std=c99", "-O1", "-Wall", "-Werror", "-Wno-unused", "-shared", "-fPIC", f"-I{tmp_path}"]
+    strict = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC", f"-I{tmp_path}"]
     subprocess.run([compiler(), *strict, source, tmp_path / "user.c", "-o", library, "-lm"], check=True)
     code = ctypes.CDLL(str(library))
     assert code.used() == 1
