@@ -28,6 +28,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from platformdirs import user_cache_path
 
 from .._base import InputError, one_at_a_time
 from ..models import Model
@@ -244,11 +245,14 @@ def _private(directory: Path) -> bool:
 
 @functools.cache
 def cache_directory() -> Path:
-    """The private cache, `$XDG_CACHE_HOME/pilfr_casadi` or `~/.cache/pilfr_casadi`; else one for this process alone."""
+    """Return the private per-user cache; where it cannot be made or is not private, one for this process alone.
+
+    `platformdirs` names it: `~/.cache/pilfr_casadi` on Linux. `XDG_CACHE_HOME` moves it on every system.
+    """
+    home = os.environ.get("XDG_CACHE_HOME")
     try:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        directory = base / "pilfr_casadi"
-        base.mkdir(mode=0o700, parents=True, exist_ok=True)
+        directory = Path(home) / "pilfr_casadi" if home else user_cache_path("pilfr_casadi", appauthor=False)
+        directory.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         directory.mkdir(mode=0o700, exist_ok=True)
         if _private(directory) and os.access(directory, os.W_OK | os.X_OK):
             return directory

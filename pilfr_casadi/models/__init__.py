@@ -57,6 +57,7 @@ if TYPE_CHECKING:
         Neighbours as Neighbours,
         Parameter as Parameter,
         ParameterSet as ParameterSet,
+        check_size as check_size,
         or_one as or_one,
     )
     from .pilfr import (

@@ -23,7 +23,7 @@ from .._base import InputError, is_number
 from ..data import Recording
 from .elements import StaticNetwork
 from .model import Model
-from .parameters import Parameter, ParameterSet, or_one
+from .parameters import Parameter, ParameterSet, check_size, or_one
 from .pilfr import PILFR
 
 Array = np.ndarray
@@ -86,6 +86,7 @@ class Lagged:
         for name, value in numbers.items():
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise InputError(f"{name} = {value!r} was given; give a whole number, 1 or more.")
+        check_size("A model", self.hidden * max(self.lags, self.input_lags or 1) ** 2)
         share = self.validation
         if not is_number(share) or not 0 <= share < 1:
             raise InputError(f"validation = {share!r} was given; give the share to hold back, 0 or more and below 1.")

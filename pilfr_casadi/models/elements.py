@@ -26,7 +26,7 @@ import numpy as np
 
 from .._base import InputError, whole
 from .operators import GeneralizedPlay, Play, Stop, fmax, fmin
-from .parameters import Parameter, ParameterSet
+from .parameters import Parameter, ParameterSet, check_size
 
 LAYER = ("w", "r")  # parameters of a Prandtl-Ishlinskii layer that have an entry for each operator
 CREST = 3.0  # ratio of the largest z to the largest amplitude of an envelope
@@ -518,6 +518,7 @@ def unknown_slope(element: Element, p: Mapping[str, Any]) -> bool:
 def _check_counts(owner: str, **counts: Any) -> None:
     for count in counts.values():
         number = isinstance(count, int | float | np.number) and not isinstance(count, bool)
-        if not number or count < 1 or int(count) != count:
+        if not number or not 1 <= count < np.inf or int(count) != count:
             names, given = " and ".join(f"{k} >= 1" for k in counts), " and ".join(map(repr, counts.values()))
             raise InputError(f"{owner} needs whole numbers {names}; {given} were given.")
+    check_size(owner, prod(int(count) for count in counts.values()))

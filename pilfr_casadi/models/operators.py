@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, is_number
-from .parameters import Parameter, ParameterSet
+from .parameters import Parameter, ParameterSet, check_size
 
 _TINY = 1e-300
 _SYMBOLIC = (ca.SX, ca.MX, ca.DM)
@@ -135,6 +135,7 @@ class GeneralizedPlay:
     def __post_init__(self) -> None:
         if not is_number(self.neurons) or not 0 <= self.neurons < np.inf or self.neurons != int(self.neurons):
             raise InputError(f"An envelope has {self.neurons!r} neurons; give a whole number, 0 or more.")
+        check_size("A generalized play", 6 * int(self.neurons))
 
     @property
     def networks(self) -> bool:

@@ -17,6 +17,22 @@ import numpy as np
 from .._base import InputError, filled, listed
 
 Array = np.ndarray
+LARGEST_MODEL = 20_000  # parameters: the Gauss-Newton Hessian then takes 3.2 GB, and its factorisation a minute a step
+
+
+def check_size(owner: str, count: int) -> None:
+    """Refuse a model whose number of parameters no fit could handle, before anything of that size is allocated.
+
+    Raises
+    ------
+    InputError
+        With the number of parameters and the memory that a fit would take.
+    """
+    if count > LARGEST_MODEL:
+        raise InputError(
+            f"{owner} of this size has at least {float(count):.3g} parameters, and the matrix that a fit solves for "
+            f"takes {8e-9 * float(count) ** 2:.3g} GB of memory; give at most {LARGEST_MODEL} parameters."
+        )
 
 
 @dataclass(frozen=True, eq=False)

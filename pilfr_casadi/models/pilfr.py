@@ -19,7 +19,7 @@ import numpy as np
 from .._base import InputError, filled
 from .elements import Element, is_element
 from .model import Model, close_loop, open_model
-from .parameters import Parameter, ParameterSet
+from .parameters import Parameter, ParameterSet, check_size
 
 BLOCKS = ("A", "B_u", "B_w", "C_y", "D_yu", "D_yw", "C_z", "D_zu", "y_0")
 
@@ -88,6 +88,7 @@ class PILFR:
             raise InputError(f"The number of states is {self.nx!r}; give a whole number, 0 or more.")
         if int(self.nx) != self.nx:
             raise InputError(f"The number of states is {self.nx}; give a whole number, 0 or more.")
+        check_size(f"A model with nx = {self.nx}", int(self.nx) ** 2)
         object.__setattr__(self, "nx", int(self.nx))
         _check_element(self.element)
         for option in ("fixed", "bounds", "priors"):

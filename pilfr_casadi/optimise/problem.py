@@ -22,7 +22,7 @@ import numpy as np
 from .._base import InputError, numbers
 from ..data import Recording, as_recordings
 from ..engine import Engine, VirtualMachine, make_engine
-from ..models import Model, Neighbours, ParameterSet
+from ..models import Model, Neighbours, ParameterSet, check_size
 from .constraints import Constraint, Rows, check_gain
 
 
@@ -363,6 +363,7 @@ class Problem:
         self.start = np.concatenate([parameters.start[self.free], *states])
         if self.size == 0:
             raise InputError("Every parameter is fixed and no initial state is estimated; free at least one parameter.")
+        check_size("A problem", self.size)
         self._columns = np.where(self.free, np.cumsum(self.free) - 1, -1)
         self.noise = noise
         self.l1 = dict(l1 or {})

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from random_models import OPERATORS, random_input, random_lfr, reference
 
+import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.models import Parameter, ParameterSet, Play, open_model
@@ -290,3 +291,21 @@ def test_a_grey_box_in_physical_units():
     for i, h_i in enumerate((1.0, 1e-5)):
         d = h_i * np.eye(2)[i]
         assert gradient[i] == pytest.approx((p.cost(p.start + d) - p.cost(p.start - d)) / (2 * h_i), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: pilfr.PrandtlIshlinskii(pilfr.Play, 999_999_999),
+        lambda: pilfr.PrandtlIshlinskii(pilfr.Play, 10, 10**30),
+        lambda: pilfr.PILFR(10**20),
+        lambda: pilfr.GeneralizedPlay(10**9),
+        lambda: pilfr.NARX(10**9),
+        lambda: pilfr.NOE(2, 10**12),
+    ],
+)
+def test_a_size_that_no_fit_could_handle_is_refused_at_once(make):
+    with pytest.raises(
+        InputError, match=r"has at least .* parameters, and .* takes .* GB of memory; give at most 20000"
+    ):
+        make()

@@ -11,7 +11,7 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status
-from pilfr_casadi.optimise.ipopt import Callback, Damping, Point, Scaled, handled_interrupt
+from pilfr_casadi.optimise.ipopt import Callback, DampedHessian, Point, Scaled, handled_interrupt
 from problems.zoo import CASES
 
 
@@ -240,10 +240,10 @@ def quadratic(x, h, curve=0.0):
 
 
 def test_damping_falls_where_the_model_is_right():
-    h, damping = np.diag([2.0, 1.0]), Damping(0.3, 2)
-    first = damping.hessian(quadratic([1.0, 1.0], h), np.zeros(1), 1)
+    h, damping = np.diag([2.0, 1.0]), DampedHessian(0.3, 2)
+    first = damping.at(quadratic([1.0, 1.0], h), np.zeros(1), 1)
     np.testing.assert_allclose(first, h * 1.3)
-    damping.hessian(quadratic([0.5, 0.2], h), np.zeros(1), 1)
+    damping.at(quadratic([0.5, 0.2], h), np.zeros(1), 1)
     assert damping.value == pytest.approx(0.1)
 
 
@@ -256,9 +256,9 @@ def test_damping_falls_where_the_model_is_right():
     ],
 )
 def test_damping_grows(change, multipliers, trials):
-    h, damping = np.diag([2.0, 1.0]), Damping(0.3, 2)
-    damping.hessian(quadratic([1.0, 1.0], h, curve=1.0), np.zeros(1), 1)
-    damping.hessian(replace(quadratic([0.5, 0.2], h, curve=1.0), **change), np.array(multipliers), trials)
+    h, damping = np.diag([2.0, 1.0]), DampedHessian(0.3, 2)
+    damping.at(quadratic([1.0, 1.0], h, curve=1.0), np.zeros(1), 1)
+    damping.at(replace(quadratic([0.5, 0.2], h, curve=1.0), **change), np.array(multipliers), trials)
     assert damping.value > 0.5
 
 

@@ -166,6 +166,7 @@ def test_a_model_that_diverges_has_not_converged(record):
     assert pilfr.fit(pilfr.PILFR(1), offset).status is not Status.DIVERGES
 
 
+@pytest.mark.slow
 def test_a_second_fit_under_the_same_constraint_is_never_worse():
     record, gain = coupled_plays(5), [dc_gain(1.0)]
     first = pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=2, constraints=gain)
@@ -266,6 +267,7 @@ def test_pruning_takes_an_estimated_initial_state_along(record):
     assert small.nrmse(there) < 1.1 * full.nrmse(there)
 
 
+@pytest.mark.slow
 def test_operators_are_spread_over_the_density(record, full):
     fits = thinned(full, record, 3)
     assert len(fits) == len(WAYS) and all(f.structure.element.n == 3 for f in fits)
@@ -277,6 +279,7 @@ def test_operators_are_spread_over_the_density(record, full):
     assert thinned(bounded, record, 2) == ()
 
 
+@pytest.mark.slow
 def test_a_path_is_chosen_by_validation_alone(record, full):
     held = three_plays(7, 1200)
     path = pilfr.regularization_path(full, record, held)
@@ -369,6 +372,7 @@ def test_infeasible_constraints_get_one_sentence():
         assert "\n" not in sentence
 
 
+@pytest.mark.slow
 def test_the_table_on_a_small_rig():
     _, rows = stability_table(100, 5, 1, radii=(0.995, 0.99))
     assert 0.98 < slowest_pole() < 1
@@ -376,6 +380,7 @@ def test_the_table_on_a_small_rig():
         assert row.radius <= row.bound and row.cost <= 0.05
 
 
+@pytest.mark.slow
 def test_a_sparse_fit_halves_the_operators():
     case = sparse_plays(0, starts=2)
     assert case.operators[1] <= case.operators[0] / 2 and case.share <= 0.1

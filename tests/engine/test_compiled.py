@@ -63,11 +63,13 @@ def test_long_record_takes_memory_and_time_in_proportion(case):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_a_step_in_c_takes_less_than_a_microsecond(case):
     """Five states and 20 plays; a busy machine gets another try."""
     assert min(speed.run(case, "exported_step")["seconds"] for _ in range(AGAIN)) <= 1e-6
 
 
+@pytest.mark.slow
 def test_quick_tables(capsys):
     speed.main(["--quick"])
     out = capsys.readouterr().out
@@ -242,6 +244,7 @@ def test_threads_share_an_engine(model, kind):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_many_lags_compile_in_proportion_to_their_code(tmp_path, monkeypatch):
     """Jumps of thousands of outputs, threaded, would take twenty times as long for three times the code."""
     monkeypatch.setattr(compiled, "cache_directory", lambda: tmp_path)
