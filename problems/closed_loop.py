@@ -24,6 +24,7 @@ from .controllers import ByDoMpc, Compensated, Controller, Given, Plant, Predict
 Array = np.ndarray
 LINEAR, HYSTERESIS, PI = "MPC, linear model", "MPC, hysteresis model", "PI control"
 MOVE = 1e-4  # weight of moves
+ITERATIONS = 1  # of SQP per sample: the real-time iteration, which leaves most of a millisecond free
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +127,8 @@ class Task:
         if solver == "do-mpc":
             common: dict[str, Any] = {"inputs": self.inputs, "outputs": limits, "move": move}
             return do_mpc_controller(function, self.horizon, self.reference, **common, **scales)
-        return PredictiveController(
-            function, self.horizon, inputs=self.inputs, outputs=limits, move=move, solver=solver, **scales
-        )
+        options: dict[str, Any] = {"inputs": self.inputs, "outputs": limits, "move": move, "solver": solver, **scales}
+        return PredictiveController(function, self.horizon, iterations=ITERATIONS, **options)
 
 
 def compare(

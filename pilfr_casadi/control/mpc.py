@@ -117,7 +117,9 @@ class PredictiveController:
     solver : {"sqp", "ipopt"}
         `"sqp"` takes about a millisecond, `"ipopt"` some ten times as long.
     iterations : int
-        Largest number of SQP iterations in a call; the first call may take ten times as many. IPOPT has its own limit.
+        Largest number of SQP iterations in a call; the first call may take ten times as many. With 1 each sample costs
+        one QP, the real-time iteration of Diehl, Bock & Schlöder (2005), SIAM J. Control Optim. 43: the loops of
+        `problems.mpc_piezo` track as well so, although few plans converge. IPOPT has its own limit.
 
     Raises
     ------

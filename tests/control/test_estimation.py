@@ -14,6 +14,7 @@ from pilfr_casadi.control import PredictiveController, ekf_step, feedforward, ka
 from pilfr_casadi.diagnose import Diagnosis
 from pilfr_casadi.laws import Delay, StopHysteresis
 from pilfr_casadi.models import play
+from pilfr_casadi.simulators import steady_state_gain
 from problems import observer as observer_problem
 
 LAW = StopHysteresis().at({"w": 80.0, "r": np.geomspace(0.001, 0.04, 6)})
@@ -64,6 +65,7 @@ def test_a_linear_model_gets_the_kalman_gain_of_the_riccati_equation():
     assert float(predicted) == pytest.approx((c @ state).item(), abs=1e-14)
     np.testing.assert_allclose(p, solve_discrete_are(A.T, c.T, q, r), rtol=1e-10)
     gain = A @ p @ c.T / (c @ p @ c.T + r)
+    np.testing.assert_allclose(steady_state_gain(A, c, q, r), gain, rtol=1e-9)
     following = step(state, p, 0.7, 0.9)[0]
     np.testing.assert_allclose(
         np.asarray(following).ravel(), A @ state + 0.7 + (gain * (0.9 - c @ state)).ravel(), rtol=1e-10
@@ -207,7 +209,7 @@ def test_a_corrected_simulator_is_inverted(corrected, late):
     if late:  # a shift register carries the input on, which memory of operators does not
         delayed = found.corrected.with_element("actuator:force", Delay().at({"T": 3 * DT}))
         found = diagnosis(delayed, [train])
-    made = feedforward(found, train)
+    made = feedforward(found, train, ahead=10 if late else 7)
     assert made.delay >= 4 * late and "an approximate inverse" in str(made)
     wanted = 0.5 * np.convolve(test.y[:, 0], np.hanning(41) / 20, "same")[:400]
     step = found.export().step

@@ -351,6 +351,49 @@ def test_do_mpc_closes_the_same_loop():
     np.testing.assert_allclose(ours, others, atol=1e-6)
 
 
+A_2 = [[0.8622, -0.0014, 0.1846, -0.0142], [0.0121, 0.8605, 0.0097, 0.1861]]
+A_2 += [[-0.0889, -0.0095, 0.9761, 0.0089], [0.0113, -0.0883, -0.0039, 0.975]]
+B_U = [[-0.0018222, -0.45575], [0.0030919, -0.60995], [-0.02109, -5.8091], [0.024291, -6.1048]]
+B_W = [[-0.0257, 0.0217], [0.0329, 0.0265], [-0.0255, 0.0229], [0.0382, 0.0201]]
+C_Y = [[-120.17, 75.809, -4.111, 4.2161], [-1.4393e-4, -1.3061e-4, 1.0382e-5, 8.5671e-6]]
+C_Z, D_ZU = (
+    [[-0.4479, 0.4143, 0.2249, -0.1571], [-0.2891, -0.0909, -0.5639, -0.6338]],
+    [[-0.28374, -4.319], [0.018536, -27.489]],
+)
+D_YU, D_YW = [[-0.18744, -20.902], [1.7332e-7, 6.8862e-7]], [[-11.084, -3.9368], [-3.9134e-6, -3.6805e-5]]
+W, WIDTHS_2 = [[0.2688, 0.0768, 0.1578], [0.5708, 0.3775, 0.0971]], [[1.9594, 3.3583, 4.2506], [0.2297, 0.8097, 1.8146]]
+
+
+def stage():
+    """Two crossed axes in unlike units, identified with three plays behind each of two signals."""
+    x, u = ca.SX.sym("x", 10), ca.SX.sym("u", 2)
+    z = ca.mtimes(ca.DM(C_Z), x[:4]) + ca.mtimes(ca.DM(D_ZU), u)
+    memory, widths = (x[4:7], x[7:10]), ca.DM(WIDTHS_2)
+    q = [ca.fmin(z[i] + widths[i, :].T, ca.fmax(z[i] - widths[i, :].T, memory[i])) for i in range(2)]
+    v = ca.vertcat(*(ca.dot(ca.DM(W[i]), q[i]) for i in range(2)))
+    following = ca.mtimes(ca.DM(A_2), x[:4]) + ca.mtimes(ca.DM(B_U), u) + ca.mtimes(ca.DM(B_W), v)
+    y = ca.mtimes(ca.DM(C_Y), x[:4]) + ca.mtimes(ca.DM(D_YU), u) + ca.mtimes(ca.DM(D_YW), v)
+    return ca.Function("F", [x, u], [ca.vertcat(following, *q), y])
+
+
+@pytest.mark.slow
+def test_two_inputs_behind_plays_track_as_by_ipopt():
+    """Most plans stop at a kink here, by either solver, yet the loops follow their paths."""
+    function, samples, horizon = stage(), 60, 15
+    t = np.arange(samples + horizon)
+    path = np.c_[300 * np.sin(0.05 * t), 1e-3 * np.cos(0.03 * t)] * np.minimum(1, t / 50)[:, None]
+    most, errors = np.array([15.0, 0.06]), {}
+    for solver in ("sqp", "ipopt"):
+        controller = PredictiveController(function, horizon, inputs=(-most, most), solver=solver, iterations=20)
+        x, u, y = np.zeros(10), np.zeros(2), []
+        for k in range(samples):
+            u = controller(x, path[k : k + horizon], u).u
+            x, now = (np.asarray(v).ravel() for v in function(x, u))
+            y.append(now)
+        errors[solver] = np.sqrt(np.mean(((np.array(y) - path[:samples]) / controller.y_scale[:2])[20:] ** 2))
+    assert errors["sqp"] < 1.1 * errors["ipopt"], errors
+
+
 @pytest.mark.slow
 def test_piezo_stage_is_tracked_with_a_fifth_of_the_linear_error():
     found = {o.name: o for o in mpc_piezo.outcomes(250, quick=True)[0]}
