@@ -1,9 +1,11 @@
 """A small rig with one law hidden in a port, its recordings, and its diagnosis filled in by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from pilfr_casadi.data import Recording
-from pilfr_casadi.diagnose import Diagnosis, Effect, Workbench
+from pilfr_casadi.diagnose import Diagnosis, Effect, Workbench, mismatch
 from pilfr_casadi.diagnose.gates import Gate
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import BoucWen, CubicStiffness, Saturation
@@ -45,6 +47,12 @@ def recorded(true, seed, samples=700, **more):
     return blank.with_(y=y + NOISE * np.std(y, axis=0) * rng.standard_normal(y.shape), **more)
 
 
+def as_it_stands(bench, simulator):
+    """Run a simulator at its own values along a bench's recordings."""
+    fixed = {name: replace(p, fixed=True) for name, p in simulator.parameters.items()}
+    return bench.fit(simulator.with_parameters(fixed))
+
+
 def example(verdict="missing-physics", port="ground", law="ground", test=True, outputs=("pos",), **more):
     """A diagnosis as `diagnose` returns it, with the truth filled in by hand."""
     clean = rig(name=port if ":" not in port else "ground", outputs=outputs)
@@ -52,6 +60,10 @@ def example(verdict="missing-physics", port="ground", law="ground", test=True, o
     train, held_out = [recorded(true, s) for s in (0, 1)], recorded(true, 2, name="slow & steady")
     refit = rig(430.0, 5.0, clean.ports[0].name, outputs)
     element = LAWS[law]
+    bench = Workbench.of(refit, train, "zero")
+    before = as_it_stands(bench, refit)
+    after = as_it_stands(bench, true) if verdict == "missing-physics" else before
+    noise = NOISE * bench.scale
     effect = Effect(
         port,
         element.id,
@@ -81,7 +93,9 @@ def example(verdict="missing-physics", port="ground", law="ground", test=True, o
         effects=(effect,) if named else (),
         candidates=tuple(rows),
         gates=(gate,) if verdict == "recording-fault" else (),
-        mismatch={"sentence": ""},
+        mismatch=mismatch(
+            train, before.residual, [e + r.y for e, r in zip(before.residual, train, strict=True)], noise, bench.scale
+        ),
         parameters={
             n: {"nominal": v, "refit_without": 1.1 * v, "refit_with": np.asarray(v), "std": None, "unit": "N/m"}
             for n, v in {"k": 380.0, "d": 4.4}.items()
@@ -94,5 +108,6 @@ def example(verdict="missing-physics", port="ground", law="ground", test=True, o
         train=tuple(train),
         test=(held_out,) if test else (),
         seconds=3.0,
+        evidence={"without": before, "after": after},
     )
     return Diagnosis(**{**fields, **more})

@@ -64,6 +64,24 @@ class Effect:
 
 
 @dataclass(frozen=True, eq=False)
+class Comparison:
+    """A recording beside the refitted and the corrected simulator.
+
+    Attributes
+    ----------
+    recording : Recording
+        With the corrections of the diagnosis (sign, unit, shift).
+    before, after : array, shape (M, n_y), or None
+        Outputs of the refitted and of the corrected simulator. None where the simulation diverges; `after` is None
+        too where nothing was put into the simulator.
+    """
+
+    recording: Recording
+    before: np.ndarray | None
+    after: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
 class Diagnosis:
     """Where the simulator is wrong, what it lacks, how sure that is, and the proof.
 
@@ -121,7 +139,7 @@ class Diagnosis:
         It is unknown without test recordings and where the corrected simulator is the refitted one.
         """
         errors = self.errors.get("test")
-        if not errors or not (self.effects or self.description or self.let_go):
+        if not errors or not self._changed:
             return ""
         before, after = errors["before"], errors["after"]
         if not after <= WORSE * before:
@@ -207,19 +225,32 @@ class Diagnosis:
         matplotlib.figure.Figure
             A row for each output: the signals around the largest swing, and the errors over the whole recording.
         """
-        from ..plots import compared_residuals, compared_traces, new_figure
+        from ..plots import Simulated, compared_residuals, compared_traces, new_figure
 
-        r, after, _ = self._run(recording)
-        simulated = [("refitted", self._run(recording, self.refitted)[1]), ("corrected", after)]
-        finite = [(label, y if np.all(np.isfinite(y)) else None) for label, y in simulated]
+        found = self.compare(recording)
+        r = found.recording
+        simulated: Simulated = [("refitted", found.before)]
+        simulated += [("corrected", found.after)] if self._changed else []
         figure = new_figure(11.0, 3.4 * r.n_y)
         axes = figure.subplots(r.n_y, 2, squeeze=False)
         noise = self.floor["nrmse"] * np.std(r.y[r.skip :], axis=0)
         for i, (left, right) in enumerate(axes):
             unit = r.units.get(r.outputs[i], "")
-            compared_traces(r, finite, i, unit, ax=left)
-            compared_residuals(r, finite, i, unit, float(noise[i]), ax=right)
+            compared_traces(r, simulated, i, unit, ax=left)
+            compared_residuals(r, simulated, i, unit, float(noise[i]), ax=right)
         return figure
+
+    def compare(self, recording: Recording) -> Comparison:
+        """Simulate the refitted and the corrected simulator along a recording; see `simulate`."""
+        r, before, _ = self._run(recording, self.refitted)
+        after = self._run(recording)[1] if self._changed else None
+        finite = (y if y is not None and np.all(np.isfinite(y)) else None for y in (before, after))
+        return Comparison(r, *finite)
+
+    @property
+    def _changed(self) -> bool:
+        """Whether the corrected simulator differs from the refitted one."""
+        return bool(self.effects or self.description or self.let_go)
 
     def _run(self, recording: Recording, simulator: Simulator | None = None) -> tuple[Recording, np.ndarray, int]:
         """The recording as corrected, the outputs of a simulator along it, and the first scored sample."""
@@ -227,8 +258,9 @@ class Diagnosis:
         r, dt = arranged(simulator, recording), self.train[0].dt
         if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
-        for gate in self.gates:
-            r = gate.change(r) if gate.change is not None else r
+        if not any(recording is known for known in self.train):  # those are corrected already
+            for gate in self.gates:
+                r = gate.change(r) if gate.change is not None else r
         fitted = self.evidence.get("after" if simulator is self.corrected else "without")
         substeps = fitted.model.substeps if fitted is not None else self.substeps
         model = discretise(simulator, dt, self.hold, substeps)

@@ -1,13 +1,16 @@
-"""Self-contained HTML pages of fits, diagnoses and anything else."""
+"""Self-contained HTML pages of fits, diagnoses and anything else.
+
+`page.py` holds the general page and its blocks, `fit.py` and `diagnosis.py` fill it. The look of every page (colours,
+fonts, layout) stands in `templates/report.css`, its structure in `templates/page.html` and `templates/blocks.html`.
+"""
 
 from typing import TYPE_CHECKING
 
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .diagnosis_files import diagnosis_report as diagnosis_report
-    from .fit import fit_page as fit_page
-    from .fit_files import fit_report as fit_report
+    from .diagnosis import diagnosis_report as diagnosis_report
+    from .fit import fit_page as fit_page, fit_report as fit_report
     from .page import (
         Code as Code,
         Page as Page,
@@ -17,5 +20,5 @@ if TYPE_CHECKING:
         Text as Text,
         write_report as write_report,
     )
-else:
-    __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)
+
+__getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -1,4 +1,4 @@
-"""Tables and words of a diagnosis: errors, effects, candidates, parameters, notes, and how to use the result."""
+"""Tables and sentences of a diagnosis: errors, effects, candidates, parameters, checks, and how to use the result."""
 
 from __future__ import annotations
 
@@ -11,20 +11,19 @@ from typing import Any
 import numpy as np
 
 from ..diagnose import Diagnosis, plain
-from ..models import ParameterSet
-from .fit_tables import _cell
-from .page import Block, Code, Table, Text, number_text
+from ..models import Parameter, ParameterSet
+from .page import Block, Code, Table, Text, number_text, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
-ALIKE = 1.03  # errors within this factor are as good
-RANKED = 12  # rows of the ranked table that are not folded away
-PEOPLE = ("coulomb", "stribeck")
+ALIKE = 1.03  # ratio of two errors up to which two laws do equally well
+RANKED = 12  # rows of the ranked table that are shown; the rest is folded
+PEOPLE = ("coulomb", "stribeck")  # laws that bear a person's name
 FORMS = {"bouc_wen": "Bouc-Wen", "prandtl_ishlinskii": "Prandtl-Ishlinskii", "hertz": "Hertz"}
 STEPS = {"nominal": "as given", "before": "refitted"}
 
 
 def words(law: str) -> str:
-    """The id of a law or form as words."""
+    """Write the id of a law or form as words."""
     if law in FORMS:
         return FORMS[law]
     text = law.replace("_", " ")
@@ -32,7 +31,7 @@ def words(law: str) -> str:
 
 
 def percent(value: float | None) -> str:
-    """A relative error for people."""
+    """Write a relative error as a percentage."""
     if value is None or not np.isfinite(value):
         return "diverges"
     return f"{number_text(100 * value, 3)}\u00a0%"
@@ -62,20 +61,20 @@ def tone(diagnosis: Diagnosis) -> str:
 
 
 def _steps(diagnosis: Diagnosis) -> dict[str, str]:
-    """Keys of the errors that are shown, and their names."""
+    """Return the keys of the errors that are shown, with their names."""
     last = correction_words(diagnosis)
     return STEPS | ({"after": last} if last else {})
 
 
-def judged(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
-    """The recordings that count, and their errors."""
+def errors_that_count(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
+    """Return the kind of recording that the answer is judged on, and its errors: test where there are any."""
     errors = diagnosis.errors.get("test")
     return ("test", errors) if errors else ("training", diagnosis.errors["train"] or {})
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """The verdict with its numbers."""
-    role, errors = judged(diagnosis)
+    """Write the verdict with its errors."""
+    role, errors = errors_that_count(diagnosis)
     on = "On held-out recordings" if role == "test" else "On the training recordings (no test was given)"
     text = f"{diagnosis.summary.rstrip('. ')}. {on} the error is {percent(errors.get('nominal'))} as given"
     text += f", {percent(errors.get('before'))} refitted"
@@ -85,8 +84,8 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def facts(diagnosis: Diagnosis) -> dict[str, str]:
-    """Figures of merit."""
-    role, errors = judged(diagnosis)
+    """Collect the figures of merit."""
+    role, errors = errors_that_count(diagnosis)
     out = {f"{role} error, {name}": percent(errors.get(k)) for k, name in _steps(diagnosis).items()}
     kind = {"periods": "from periods", "repeats": "from repeats"}.get(diagnosis.floor["source"], "estimated")
     out[f"noise floor, {kind}"] = percent(diagnosis.floor["nrmse"])
@@ -96,36 +95,42 @@ def facts(diagnosis: Diagnosis) -> dict[str, str]:
 
 
 def error_table(diagnosis: Diagnosis) -> Table:
-    """Errors before and after, training and test."""
+    """Tabulate the errors before and after, on training and test recordings."""
     steps = _steps(diagnosis)
     rows: list[list[Any]] = []
     for kind, name in (("train", "training"), ("test", "test (held out)")):
         errors = diagnosis.errors.get(kind)
         if errors:
             rows.append([name, *(percent(errors.get(k)) for k in steps), percent(diagnosis.floor["nrmse"])])
-    note = "Rms error of the free-run simulation over the standard deviation of the measured output, mean over outputs."
+    note = (
+        "Rms error of the free-run simulation divided by the standard deviation of the measured output, averaged over "
+        "outputs."
+    )
     if diagnosis.floor["source"] == "estimated":
         note += " The noise floor is estimated from the residual; coloured noise would make it larger."
     return Table(["recordings", *steps.values(), "noise floor"], rows, note=note, emphasis=[len(rows) - 1])
 
 
 def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
-    """What is missing: the law, its parameters, and what could be meant instead."""
+    """Describe an effect: its law, its parameters, and the laws that could be meant instead."""
     e = diagnosis.effects[number]
     form = f" ({words(e.form)})" if e.form else ""
     out: list[Block] = [
         Text(f"At {e.port}: {words(e.law)}{form}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
     ]
     out.append(Code(e.equation))
-    rows = [[name, _cell(p["value"], _number(p["std"])), p["unit"] or "–"] for name, p in e.parameters.items()]
+    rows = [
+        [name, uncertain_text(p["value"], float(_array(p["std"]))), p["unit"] or "–"]
+        for name, p in e.parameters.items()
+    ]
     if rows:
-        given = any(np.isfinite(_number(p["std"])) for p in e.parameters.values())
+        given = any(np.isfinite(float(_array(p["std"]))) for p in e.parameters.values())
         note = "± one standard deviation." if given else ""
         out.append(Table(["parameter", "value", "unit"], rows, note=note))
     if e.indistinguishable:
         others = "; ".join(f"{words(law)} at {port}" for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
-    best = [r for rows in passes(diagnosis)[number : number + 1] for r in rows]
+    best = [r for rows in candidates_by_pass(diagnosis)[number : number + 1] for r in rows]
     mine = min((score(r) for r in best if (r["port"], r["law"]) == (e.port, e.law)), default=np.nan)
     known = {(e.port, e.law), *e.indistinguishable}
     close = list(dict.fromkeys((r["port"], r["law"]) for r in best if score(r) < ALIKE * mine))
@@ -137,12 +142,12 @@ def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
     return out
 
 
-def _number(value: Any) -> float:
-    return np.nan if value is None else float(value)
+def _array(value: Any) -> np.ndarray:
+    return np.asarray(np.nan if value is None else value, dtype=float)
 
 
-def passes(diagnosis: Diagnosis) -> list[list[dict[str, Any]]]:
-    """Candidates of each pass, best first: the second is fitted with the first effect in place."""
+def candidates_by_pass(diagnosis: Diagnosis) -> list[list[dict[str, Any]]]:
+    """Return the candidates of each pass, best first; in the second pass the first effect is in place."""
     search = diagnosis.evidence.get("search")
     sizes = [len(p.candidates) for p in search.passes] if search is not None else []
     rows = list(diagnosis.candidates)
@@ -154,19 +159,19 @@ def passes(diagnosis: Diagnosis) -> list[list[dict[str, Any]]]:
 
 
 def score(row: Mapping[str, Any]) -> float:
-    """Geometric mean of the errors on the fitted part and on the rest."""
+    """Rank a candidate: geometric mean of its errors on the fitted part and on the rest."""
     a, b = (np.inf if row.get(k) is None else float(row[k]) for k in ("nrmse_train", "nrmse_validation"))
     return float(np.sqrt(a) * np.sqrt(b)) if np.isfinite(a * b) else np.inf
 
 
 def held_out(row: Mapping[str, Any]) -> float:
-    """A candidate's error on the part of the training recordings that it was not fitted to."""
+    """Return a candidate's error on the part of the training recordings that it was not fitted to."""
     value = row.get("nrmse_validation")
     return np.inf if value is None else float(value)
 
 
 def held_out_before(diagnosis: Diagnosis, number: int) -> float | None:
-    """The same error without the candidates of a pass, where it is known."""
+    """Return the same error of the simulator without the candidates of a pass; None where it is unknown."""
     search = diagnosis.evidence.get("search")
     passes = [p for p in search.passes if p.candidates] if search is not None else []
     if number >= len(passes) or not np.isfinite(passes[number].before[1]):
@@ -175,7 +180,7 @@ def held_out_before(diagnosis: Diagnosis, number: int) -> float | None:
 
 
 def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, str]], title: str) -> list[Block]:
-    """The ranking with margins, best first; the tail is folded."""
+    """Rank the candidates with their margins, best first; the tail is folded."""
     winner = next((i for i, r in enumerate(rows) if (r["port"], r["law"]) in chosen), None)
     best = score(rows[winner or 0])
     cells = []
@@ -194,10 +199,12 @@ def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, s
             ]
         )
     emphasis = [] if winner is None else [winner]
-    columns = ["law", "port", "error, fitted part", "error, not fitted part", "margin", "ΔBIC"]
-    note = "Each is fitted together with the simulator's own parameters to the first part of the recordings, and "
-    note += "judged on the rest. Margin: error (mean of both parts) over the winner's. "
-    note += "ΔBIC: below zero is better than no law."
+    columns = ["law", "port", "error, fitted part", "error, other part", "margin", "ΔBIC"]
+    note = (
+        "Each law is fitted together with the simulator's own parameters to the first part of the recordings and "
+        "judged on the other part. Margin: error (geometric mean of both parts) divided by the winner's. ΔBIC: below "
+        "zero is better than no law."
+    )
     out: list[Block] = [
         Table(columns, cells[:RANKED], caption=title, note=note, emphasis=[i for i in emphasis if i < RANKED])
     ]
@@ -209,50 +216,52 @@ def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, s
 
 
 def flexible_table(diagnosis: Diagnosis) -> Table | None:
-    """How much of the mismatch an arbitrary force at each port could explain."""
+    """Tabulate how much of the mismatch an arbitrary force at each port could explain."""
     search = diagnosis.evidence.get("search")
     if search is None or not search.open_before:
         return None
     rows = [[port, percent(share)] for port, share in sorted(search.open_before.items(), key=lambda item: -item[1])]
     note = (
-        "A flexible force of the local coordinate and its rate, in place of a law of the catalogue. With few outputs "
+        "The flexible force is a smooth function of the local coordinate and its rate, not a law of the catalogue. "
+        "With few outputs, several ports can explain the mismatch: look in the pictures for the port where the force "
+        "is a simple curve."
     )
-    note += "several ports can do it; a simple law, seen in the pictures, tells which."
     title = "What a flexible force at each port could explain"
     return Table(["port", "share of the mismatch explained"], rows, caption=title, note=note, emphasis=[0])
 
 
 def parameter_table(diagnosis: Diagnosis) -> Table:
-    """The simulator's own parameters: nominal, refitted, and with the effects in place."""
-    rows, what = [], "with the effects" if diagnosis.effects else correction_words(diagnosis)
+    """Tabulate the simulator's own parameters: nominal, refitted, and with the correction in place."""
+    rows, what = [], correction_words(diagnosis)
     for name, p in diagnosis.parameters.items():
-        columns = ("nominal", "refit_without", "refit_with")
-        given, without, after = (np.ravel(np.asarray(p[k], dtype=float)) for k in columns)
-        std = np.ravel(np.full(given.shape, np.nan) if p["std"] is None else np.asarray(p["std"], dtype=float))
-        for i in range(len(given)):
-            label = name if len(given) == 1 else f"{name}[{i}]"
-            row = [label, _cell(given[i], np.nan), _cell(without[i], np.nan)]
+        known = ParameterSet({name: Parameter(p["nominal"])})
+        given, without, after, std = (
+            np.ravel(np.broadcast_to(_array(p[k]), known[name].shape), order="F")
+            for k in ("nominal", "refit_without", "refit_with", "std")
+        )
+        for i, label in enumerate(known.labels):
+            row = [label, uncertain_text(given[i], np.nan), uncertain_text(without[i], np.nan)]
             if what:
                 change = after[i] / given[i] - 1 if given[i] else np.nan
-                row += [_cell(after[i], std[i] if i < len(std) else np.nan)]
+                row += [uncertain_text(after[i], std[i])]
                 row += [f"{100 * change:+.1f}\u00a0%".replace("-", "−") if np.isfinite(change) else "–"]
             rows.append([*row, p["unit"] or "–"])
     more = [f"refitted {what}", "change from nominal"] if what else []
-    note = "A refit without the missing physics bends the other parameters to make up for it."
+    note = "A refit without the missing physics bends the other parameters to compensate for it."
     note = note if diagnosis.effects else ""
     return Table(["parameter", "nominal", "refitted as it is", *more, "unit"], rows, note=note)
 
 
-def note_table(diagnosis: Diagnosis) -> Table | None:
-    """What the gates found."""
+def check_table(diagnosis: Diagnosis) -> Table | None:
+    """Tabulate the findings of the recordings' checks; None without findings."""
     if not diagnosis.gates:
         return None
     rows = [[g.channel, words(g.finding), g.sentence, "yes" if g.corrected else "no"] for g in diagnosis.gates]
-    return Table(["channel", "finding", "in words", "corrected here"], rows)
+    return Table(["channel", "finding", "in words", "corrected"], rows)
 
 
 def usage(diagnosis: Diagnosis) -> str:
-    """Lines of Python that make the corrected simulator from the user's own and simulate a recording with it."""
+    """Write the lines of Python that make the corrected simulator from the user's own and simulate a recording."""
     simulator = diagnosis.corrected
     fitted = {k: plain(np.asarray(p.value)) for k, p in ParameterSet(dict(simulator.parameters)).items()}
     values = {k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters}

@@ -1,24 +1,69 @@
-"""The page of a fit: how good it is on what data, the hysteresis it found, its modes and parameters, and how to use it.
+"""The report of a fit: how well it predicts, the hysteresis it found, its modes and parameters, and how to use it.
 
-Errors are those of Krikelis et al. (2024), Eq. 27.
+Errors are NRMSE as in Krikelis et al. (2024), Eq. 27.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import plots
 from ..data import Recording, as_recordings, rmse_per_output
+from ..export import made, write_atomically
 from ..identify import Fit
 from ..models import StaticNetwork
-from .fit_pictures import curve, hysteresis, linear_part, output_pictures
-from .fit_tables import limit_blocks, parameter_blocks, usage
+from .fit_sections import (
+    curve,
+    hysteresis,
+    limit_blocks,
+    linear_part,
+    output_pictures,
+    parameter_blocks,
+    usage,
+)
 from .page import Block, Code, Page, Picture, Section, Table, Text
 
-RUNAWAY = 1e3  # NRMSE beyond which a simulation is not called a simulation
+RUNAWAY = 1e3  # NRMSE from which the page says that the simulation runs away
+
+
+def fit_report(
+    fit: Fit,
+    train: Recording | Sequence[Recording],
+    tests: Recording | Sequence[Recording],
+    folder: str | os.PathLike[str],
+) -> Path:
+    """Write `report.html` and `model.json` of a fit into a folder.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fitted model.
+    train : Recording or sequence of Recording
+        The recordings that it was fitted to.
+    tests : Recording or sequence of Recording
+        The recordings that it is judged on; may be empty.
+    folder : path
+        Made where it does not exist.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    InputError
+        If a recording does not fit the model, or the folder cannot be written.
+    """
+    page = fit_page(fit, train, tests, model_file="model.json")
+    target = made(folder)
+    fit.save(target / "model.json")
+    return write_atomically(target / "report.html", page.html())
 
 
 def fit_page(
@@ -28,7 +73,7 @@ def fit_page(
     *,
     model_file: str = "model.json",
 ) -> Page:
-    """Fill a page; see `fit_report`."""
+    """Fill the page of a fit; see `fit_report`."""
     used, judged = as_recordings(train), as_recordings(tests) if isinstance(tests, Recording) or len(tests) else ()
     named = [(r.with_(name=r.name or _numbered("training", i, used)), "training") for i, r in enumerate(used)]
     named += [(r.with_(name=r.name or _numbered("test", i, judged)), "test") for i, r in enumerate(judged)]
@@ -39,7 +84,7 @@ def fit_page(
         *([Section("The hysteresis it found", hysteresis(fit, shown))] if fit.model.n_s else []),
         *([Section("The curve it found", curve(fit, shown[0]))] if fit.model.n_w == 1 and not fit.model.n_s else []),
         Section("The linear part", linear_part(fit, used)),
-        Section("What holds it", limit_blocks(fit)),
+        Section("Constraints and active bounds", limit_blocks(fit)),
         Section("How it was found", _search(fit)),
         Section("Parameters", parameter_blocks(fit)),
         Section("How to use it", [Code(usage(fit, model_file))]),
@@ -60,7 +105,7 @@ def _numbered(word: str, i: int, recordings: Sequence[Recording]) -> str:
 
 
 def _errors(fit: Fit, recording: Recording, role: str) -> list[dict[str, Any]]:
-    """Errors of one recording, output by output, over the samples that are scored (`Fit.scored_from`)."""
+    """Compute the errors of one recording, output by output, over the scored samples (`Fit.scored_from`)."""
     recording = plots.as_scored(fit, recording)
     y, y_hat = recording.y, fit.simulate(recording)
     scored = y[recording.skip :]
@@ -129,7 +174,7 @@ def _error_table(rows: list[dict[str, Any]]) -> Table:
 
 def _verdict(rows: list[dict[str, Any]]) -> str:
     tests = [r for r in rows if r["role"] == "test"] or rows
-    seen = "on recordings it has never seen" if tests[0]["role"] == "test" else "on its training recordings"
+    seen = "on recordings that it has never seen" if tests[0]["role"] == "test" else "on its training recordings"
     worst = max(tests, key=lambda r: r["nrmse"])
     place = (
         f"{worst['output']} in {worst['recording']}" if len({r["output"] for r in tests}) > 1 else worst["recording"]

@@ -1,8 +1,8 @@
 """Self-contained HTML pages: one file with its pictures inside, readable offline, on a phone, in the dark and on paper.
 
-A `Page` is a title, a sentence that says how it ended, a few figures of merit, and sections of blocks (`Text`, `Table`,
-`Picture`, `Code`). Text of users is escaped by the template, and the page forbids itself scripts and any access to the
-network.
+A `Page` is a title, a headline, a few figures of merit, and sections of blocks (`Text`, `Table`, `Picture`, `Code`).
+The templates stand in `templates/`: `page.html` for the page, `blocks.html` for its blocks, `report.css` for colours
+and layout. They escape all text; the page forbids itself scripts and any access to the network.
 """
 
 from __future__ import annotations
@@ -17,18 +17,32 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .._base import InputError
 from ..export import write_atomically
 
 TONES = ("plain", "good", "warning", "bad")
-DPI = 160  # of pictures; twice what a screen shows
+DPI = 160  # dots an inch of the pictures: sharp at twice the resolution of an ordinary screen
 
 
 def number_text(value: float, digits: int = 4) -> str:
-    """A number for people: `−1.7·10⁻⁶` rather than `-1.7e-06`."""
+    """Write a number for people: `−1.7·10⁻⁶` rather than `-1.7e-06`."""
     mantissa, sign, exponent = f"{value:.{digits}g}".partition("e")
     raised = "·10" + str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")) if sign else ""
     return mantissa.replace("-", "−") + raised
+
+
+def uncertain_text(value: float, error: float) -> str:
+    """Write `value ± error`, to two digits of the error; the value alone where the error is not finite."""
+    if not np.isfinite(error):
+        return number_text(value)
+    decimals = 1 - int(np.floor(np.log10(error))) if error > 0 else 9
+    if decimals < 8 and 1e-3 <= abs(value) < 1e6:
+        texts = (f"{value:.{max(decimals, 0)}f}".replace("-", "−"), f"{error:.{max(decimals, 0)}f}")
+    else:
+        texts = (number_text(value), number_text(error, 2))
+    return "\u00a0±\u00a0".join(texts)
 
 
 @dataclass(frozen=True)
@@ -41,7 +55,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Code:
-    """Text to be copied, as it stands."""
+    """Text that the reader copies, shown as it stands."""
 
     code: str
     caption: str = ""
@@ -59,11 +73,16 @@ class Table:
     rows : sequence of sequences
         Cells: text, or numbers, which are written with `digits` significant digits; None and nan become a dash.
     caption, note : str
-        Above and below the table.
+        Text above and below the table.
     emphasis : sequence of int
-        Rows that stand out, counted from 0.
+        Rows in bold type, counted from 0.
     folded : bool
-        Hidden until the reader opens it.
+        Whether the table is closed until the reader opens it.
+
+    Raises
+    ------
+    InputError
+        If a row has not as many cells as there are columns.
     """
 
     columns: Sequence[str]
@@ -79,12 +98,12 @@ class Table:
         for row in self.rows:
             if len(row) != len(self.columns):
                 raise InputError(
-                    f"A row of a table has {len(row)} cells and its head {len(self.columns)}; give as many."
+                    f"A row of a table has {len(row)} cells and its head {len(self.columns)}; give as many as columns."
                 )
 
     @property
     def cells(self) -> list[list[tuple[str, bool]]]:
-        """Text of every cell, and whether it is a number."""
+        """The text of every cell, and whether it is a number."""
         return [[self._cell(value) for value in row] for row in self.rows]
 
     def _cell(self, value: Any) -> tuple[str, bool]:
@@ -106,11 +125,11 @@ class Picture:
     figure : matplotlib Figure or bytes
         The figure, or the bytes of a PNG file.
     caption : str
-        What is to be seen in it.
+        Text below the figure.
     alt : str
-        What a reader who cannot see it needs to know.
+        Description for readers who cannot see the figure.
     wide : bool
-        Across the page; otherwise two pictures stand side by side where there is room.
+        Whether it fills the width of the page; otherwise two pictures stand side by side where there is room.
     """
 
     figure: Any
@@ -150,7 +169,7 @@ class Section:
 
     @property
     def groups(self) -> list[list[Block]]:
-        """The blocks in their order, pictures that may stand side by side together."""
+        """The blocks in their order; pictures that may stand side by side are in one group."""
         out: list[list[Block]] = []
         for block in self.blocks:
             narrow = isinstance(block, Picture) and not block.wide
@@ -171,13 +190,13 @@ class Page:
     title, subtitle : str
         Head of the page.
     sections : sequence of Section
-        Its body.
+        Body of the page.
     status : str
-        One sentence that says how it ended.
+        Headline: one sentence that states the result.
     tone : {"plain", "good", "warning", "bad"}
-        How the sentence is shown.
-    facts : mapping
-        A few figures of merit, from their names to their values, both text.
+        Colour of the headline.
+    facts : mapping of str to str
+        A few figures of merit by name.
     footer : str
         Last line.
 
@@ -208,12 +227,13 @@ class Page:
 
 @cache
 def _template() -> Any:
-    from importlib.resources import files
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
+    loader = PackageLoader(__package__, "templates")
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template("page.html")
 
 
 def write_report(path: str | os.PathLike[str], title: str, sections: Sequence[Section], **more: Any) -> Path:

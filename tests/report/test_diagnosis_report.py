@@ -5,13 +5,12 @@ import re
 import sys
 import types
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, in_a_browser
 from diagnosis_contract import SCHEMA, problems
-from diagnosis_example import NOISE, PAIRS, example, rig
+from diagnosis_example import NOISE, PAIRS, as_it_stands, example, rig
 from test_report import EVIL, Reader
 
 from pilfr_casadi._base import InputError
@@ -19,9 +18,8 @@ from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Gate
 from pilfr_casadi.laws import CubicStiffness
 from pilfr_casadi.report import diagnosis_report, diagnosis_report as same
-from pilfr_casadi.report.diagnosis_force import hidden_force
-from pilfr_casadi.report.diagnosis_runs import comparisons, replay
 from pilfr_casadi.report.diagnosis_tables import usage
+from pilfr_casadi.report.hidden_force import hidden_force
 
 
 def test_the_checker_can_fail():
@@ -83,12 +81,14 @@ def test_what_is_closed_in_without_a_name_is_said_with_the_error(tmp_path):
 def test_it_is_simulated_in_the_steps_of_the_fits():
     d = example()
     bench = Workbench.of(rig(), d.train, "zero")
-    steps = {"without": 2, "after": 5}
-    fine = replace(d, evidence={k: SimpleNamespace(model=SimpleNamespace(substeps=n)) for k, n in steps.items()})
-    found, known = (comparisons(bench, d.train, each, "train")[0] for each in (fine, d))
-    for name, simulator, n in (("before", d.refitted, 2), ("after", d.corrected, 5)):
-        expected = replay(bench, simulator, n)
-        assert np.array_equal(getattr(found, name), expected.residual[0] + d.train[0].y)
+    fine = {
+        "without": as_it_stands(replace(bench, substeps=2), d.refitted),
+        "after": as_it_stands(replace(bench, at_least=5), d.corrected),
+    }
+    assert [f.model.substeps for f in fine.values()] == [2, 5]
+    found, known = replace(d, evidence=fine).compare(d.train[0]), d.compare(d.train[0])
+    for name, evidence in (("before", "without"), ("after", "after")):
+        assert np.allclose(getattr(found, name), fine[evidence].residual[0] + d.train[0].y, rtol=0, atol=1e-12)
         assert not np.array_equal(getattr(found, name), getattr(known, name))
 
 
@@ -139,7 +139,7 @@ def test_users_text_is_text(tmp_path):
 def test_the_recovered_force_is_the_hidden_one(port, law):
     d = example(port=port, law=law)
     bench = Workbench.of(d.refitted, d.train, d.hold)
-    fitted = replay(bench, d.corrected)
+    fitted = as_it_stands(bench, d.corrected)
     hidden = hidden_force(bench, fitted, port, 0, NOISE * bench.scale)
     assert np.std(hidden.force - hidden.law_held) < 0.2 * np.std(hidden.law)
     assert np.corrcoef(hidden.force, hidden.law_held)[0, 1] > 0.98
@@ -149,13 +149,13 @@ def test_the_recovered_force_is_the_hidden_one(port, law):
 def test_the_recovered_force_owes_nothing_to_the_law():
     d = example()
     bench = Workbench.of(d.refitted, d.train, d.hold)
-    blind = replay(bench, rig())
+    blind = as_it_stands(bench, rig())
     hidden = hidden_force(bench, blind, "ground", None, NOISE * bench.scale)
     true = 2.0e4 * hidden.z**3
     assert len(hidden.law) == 0
     assert np.std(hidden.force - true) < 0.25 * np.std(true)
     wrong = rig().with_element("ground", CubicStiffness().at({"k_3": 1.0e4}))
-    other = hidden_force(bench, replay(bench, wrong), "ground", 0, NOISE * bench.scale)
+    other = hidden_force(bench, as_it_stands(bench, wrong), "ground", 0, NOISE * bench.scale)
     assert np.std(other.force - hidden.force) < 0.1 * np.std(hidden.force)
 
 

@@ -16,8 +16,7 @@ from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, block_shapes
 from pilfr_casadi.optimise import Iteration, Solution, Status
 from pilfr_casadi.plots import new_figure
 from pilfr_casadi.report import Code, Page, Picture, Section, Table, Text, fit_report, write_report
-from pilfr_casadi.report.fit_tables import _cell
-from pilfr_casadi.report.page import number_text
+from pilfr_casadi.report.page import number_text, uncertain_text
 
 EVIL = "<script>alert(1)</script>\" onload='x' & $\\frac"
 
@@ -125,10 +124,10 @@ def test_tables_write_numbers_for_people():
     assert [text for text, _ in table.cells[0]] == ["x", "0.0123", "−1.5·10⁻⁶", "–", "12", "∞"]
     assert [number for _, number in table.cells[0]] == [False, True, True, True, True, True]
     assert number_text(np.float64(6.02214e23)) == "6.022·10²³"
-    assert _cell(1.23456, 0.0123) == "1.235\xa0±\xa00.012"
-    assert _cell(-123456.0, 250.0) == "−123456\xa0±\xa0250"
-    assert _cell(1.5e-7, 2e-9) == "1.5·10⁻⁷\xa0±\xa02·10⁻⁹"
-    assert _cell(0.25, np.nan) == "0.25"
+    assert uncertain_text(1.23456, 0.0123) == "1.235\xa0±\xa00.012"
+    assert uncertain_text(-123456.0, 250.0) == "−123456\xa0±\xa0250"
+    assert uncertain_text(1.5e-7, 2e-9) == "1.5·10⁻⁷\xa0±\xa02·10⁻⁹"
+    assert uncertain_text(0.25, np.nan) == "0.25"
     with pytest.raises(InputError, match="a table has 1 cells and its head 2"):
         Table(["a", "b"], [["x"]])
 

@@ -1,0 +1,313 @@
+"""The report of a diagnosis: `report.html` with the verdict and its proof, `diagnosis.json`, and the figures."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import plots
+from ..diagnose import Comparison, Diagnosis, Fitted, Workbench
+from ..export import made, write_atomically
+from . import diagnosis_tables as tables
+from .diagnosis_tables import words
+from .hidden_force import force_blocks
+from .page import Block, Code, Page, Picture, Section, Text
+
+MOST_DRAWN = 3  # outputs and recordings that are drawn; the tables have all of them
+WIDE_MAP = 6  # ports from which the map of ports and laws fills the page
+
+
+def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
+    """Write `report.html`, `diagnosis.json` and `figures/*.png` of a diagnosis into a folder.
+
+    Each file is written atomically, the page last. Figures of an earlier diagnosis are removed.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+    folder : path
+        Made where it does not exist.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    page, figures = _draw(diagnosis_page(diagnosis))
+    html = page.html()
+    content = json.dumps(diagnosis.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    target = made(Path(folder) / "figures").parent
+    for name, png in figures.items():
+        write_atomically(target / "figures" / name, png)
+    write_atomically(target / "diagnosis.json", content)
+    path = write_atomically(target / "report.html", html)
+    for old in (target / "figures").glob("diagnosis-[0-9][0-9]-*.png"):
+        if old.name not in figures:
+            with contextlib.suppress(OSError):
+                old.unlink()
+    return path
+
+
+def _draw(page: Page) -> tuple[Page, dict[str, bytes]]:
+    """Draw each picture once; return the page with the drawn pictures, and their PNG files by name."""
+    files: dict[str, bytes] = {}
+
+    def draw(block: Block) -> Block:
+        if not isinstance(block, Picture):
+            return block
+        png = block.png
+        short = "".join(c if c.isascii() and c.isalnum() else "-" for c in block.alt.lower())[:50].strip("-")
+        files[f"diagnosis-{len(files) + 1:02d}-{short}.png"] = png
+        return replace(block, figure=png)
+
+    return replace(page, sections=[Section(s.title, [draw(b) for b in s.blocks]) for s in page.sections]), files
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A diagnosis with the data that its pictures need."""
+
+    diagnosis: Diagnosis
+    bench: Workbench
+    before: Fitted
+    after: Fitted
+    noise: np.ndarray  # standard deviation of each output's noise, (n_y,)
+
+    @classmethod
+    def of(cls, d: Diagnosis) -> _Case:
+        bench = Workbench.of(d.refitted, d.train, d.hold)
+        search = d.evidence.get("search")
+        noise = float(d.floor["nrmse"]) * bench.scale if search is None else np.asarray(search.floor.deviation)
+        return cls(d, bench, d.evidence["without"], d.evidence["after"], np.nan_to_num(noise))
+
+    def unit(self, name: str) -> str:
+        """Unit of an input or output; empty where it is unknown."""
+        known = self.bench.recordings[0].units
+        return known.get(name, self.diagnosis.refitted.units.get(name, ""))
+
+
+def diagnosis_page(diagnosis: Diagnosis) -> Page:
+    """Fill the page of a diagnosis; see `diagnosis_report`."""
+    case, d = _Case.of(diagnosis), diagnosis
+    checks = tables.check_table(d)
+    notes = Section("What the recordings' checks found", [checks] if checks else [])
+    faulty = d.verdict == "recording-fault"
+    sections = [
+        *([notes] if faulty else []),
+        Section(_result_title(d), _result(d)),
+        Section("Where the simulator is off", _mismatch(case)),
+        Section("The hidden force", _hidden(case)),
+        Section("What was tried", _tried(d)),
+        Section("The simulator's own parameters", [tables.parameter_table(d)] if d.parameters else []),
+        Section("The proof" if d.test else "Measured and simulated", _proof(case)),
+        *([] if faulty else [notes]),
+        Section("The next experiment", _next_experiment(d)),
+        Section(_usage_title(d), _usage(d)),
+    ]
+    names = f"{', '.join(d.refitted.inputs)} → {', '.join(d.refitted.output_names)}"
+    return Page(
+        f"Diagnosis of a simulator: {names}",
+        [s for s in sections if s.blocks],
+        subtitle=_subtitle(case),
+        status=tables.headline(d),
+        tone=tables.tone(d),
+        facts=tables.facts(d),
+    )
+
+
+def _subtitle(case: _Case) -> str:
+    d, r = case.diagnosis, case.bench.recordings[0]
+    parts = [f"{len(d.train)} training recording{'s' * (len(d.train) != 1)}, {sum(map(len, d.train))} samples"]
+    parts += [f"{len(d.test)} held out, {sum(map(len, d.test))} samples"] if d.test else ["none held out"]
+    between = {"zero": "held", "linear": "interpolated"}.get(d.hold, d.hold)
+    parts += [f"step {r.dt:.4g} s", f"inputs {between} between samples", f"computed in {d.seconds:.1f} s"]
+    return "; ".join(parts)
+
+
+def _result_title(d: Diagnosis) -> str:
+    if d.effects:
+        return "What is missing" if d.sure and d.outcome in ("better", "") else "What may be missing"
+    return "A description without a sure name" if d.description else "How well it does"
+
+
+def _result(d: Diagnosis) -> list[Block]:
+    out: list[Block] = []
+    for k in range(len(d.effects)):
+        out += tables.effect_blocks(d, k)
+    if d.verdict == "complete" and not d.let_go:
+        out.append(Text("Refitted inside its bounds, the simulator follows the recordings down to the noise."))
+    elif d.verdict == "unexplained":
+        out.append(
+            Text("No law of the catalogue explains the mismatch. The pictures below show where and how it acts.")
+        )
+    elif d.verdict == "recording-fault":
+        out.append(Text("Correct the recordings before you look for missing physics; see the checks above."))
+    if d.description:
+        out.append(Text(d.description.sentence))
+    return [*out, tables.error_table(d), *map(Text, d.warnings())]
+
+
+def _mismatch(case: _Case) -> list[Block]:
+    found = case.diagnosis.mismatch
+    out: list[Block] = [Text(found["sentence"])] if found.get("sentence") else []
+    if "map" not in found:
+        return out
+    unit = case.unit(next(iter(found["scale"])))
+    outputs = "the outputs" if len(found["scale"]) > 1 else next(iter(found["scale"]))
+    drawn = (
+        (
+            plots.mismatch_map(found, unit),
+            f"Error of the refitted simulator, without any law added, over frequency and the amplitude of {outputs}.",
+            "Map of the error over frequency and amplitude.",
+        ),
+        (plots.mismatch_bands(found), "The error by frequency band, beside the noise.", "Error by frequency band."),
+        (
+            plots.mismatch_growth(found, unit),
+            "The error over the amplitude. The refit has bent the parameters to hide as much as it can: this shows "
+            "where the simulator fails, not why.",
+            "Error over amplitude.",
+        ),
+        (plots.mismatch_growth(found, unit, kind="rate"), "The error over the speed.", "Error over speed."),
+        (plots.mismatch_time(found), "The error over time, beside the motion of the output.", "Error over time."),
+        (
+            plots.mismatch_level(found, case.unit(found["level"]["output"])),
+            f"The error over the value of {found['level']['output']}.",
+            "Error over the value of the output.",
+        ),
+    )
+    return [*out, *(Picture(axes.figure, caption, alt) for axes, caption, alt in drawn)]
+
+
+def _hidden(case: _Case) -> list[Block]:
+    """The forces of the named effects; without a name, the force beside the nearest law and at the freest port."""
+    d, out = case.diagnosis, list[Block]()
+    for e in d.effects:
+        number = next((i for i, p in enumerate(d.corrected.elements) if (p.port, p.law.id) == (e.port, e.law)), None)
+        if number is not None:
+            out += force_blocks(case.bench, case.noise, case.after, e.port, number, words(e.law))
+    if d.verdict != "unexplained":
+        return out
+    search, rows = d.evidence.get("search"), tables.candidates_by_pass(d)
+    nearest = search.passes[0].choice if search is not None and search.passes else None
+    if nearest is not None:
+        fitted, port = nearest.winner.fitted, nearest.winner.port
+        number, name = len(fitted.simulator.elements) - 1, f"{words(nearest.winner.law.id)} (the nearest law)"
+        out += force_blocks(case.bench, case.noise, fitted, port, number, name)
+    elif rows:
+        out += force_blocks(case.bench, case.noise, case.before, rows[0][0]["port"], None, "")
+    table = tables.flexible_table(d)
+    if table is not None:
+        out.append(table)
+        freest = str(table.rows[0][0])
+        if nearest is None or freest != nearest.winner.port:
+            out += force_blocks(case.bench, case.noise, case.before, freest, None, "")
+    return out
+
+
+def _tried(d: Diagnosis) -> list[Block]:
+    out: list[Block] = []
+    for k, rows in enumerate(tables.candidates_by_pass(d)):
+        named = d.effects[k : k + 1] if k else d.effects[: max(len(d.effects), 1)]
+        chosen = {(e.port, e.law) for e in named}
+        title = "Every port and law that was fitted"
+        if k:
+            before = " and ".join(f"{words(e.law)} at {e.port}" for e in d.effects[:k]) or "the first law"
+            title = f"A second look, with {before} in place"
+        cells = [(r["port"], words(r["law"]), tables.held_out(r)) for r in rows]
+        framed = [(port, words(law)) for port, law in chosen]
+        axes = plots.port_law_map(cells, framed, tables.held_out_before(d, k), d.floor["nrmse"] or None)
+        caption = (
+            f"{title}: the error on the part of the training recordings that was not fitted, in %, by port and law "
+            "(best form). Grey: left out by the quick test before the fits."
+        )
+        wide = len({r["port"] for r in rows}) > WIDE_MAP
+        out += [Picture(axes.figure, caption, "Errors by port and law.", wide)]
+        out += tables.candidate_tables(rows, chosen, title)
+    return out
+
+
+def _proof(case: _Case) -> list[Block]:
+    d, out = case.diagnosis, list[Block]()
+    if d.test:
+        out.append(
+            Text(
+                "Simulated from their inputs alone. These recordings were used neither to fit nor to choose; only an "
+                "unknown initial state was estimated from their first samples."
+            )
+        )
+    role, recordings = ("test", d.test) if d.test else ("training", d.train)
+    for k, r in enumerate(recordings[:MOST_DRAWN]):
+        label = r.name or (role if len(recordings) == 1 else f"{role} {k + 1}")
+        compared = d.compare(r)
+        compared = replace(compared, recording=compared.recording.with_(name=label))
+        for i in range(min(r.n_y, MOST_DRAWN)):
+            out += _compared(case, compared, i)
+    return out
+
+
+def _compared(case: _Case, c: Comparison, i: int) -> list[Block]:
+    """Draw one output of a recording: two stretches, the errors over time, and the spectra."""
+    r, name = c.recording, c.recording.outputs[i]
+    unit, floor = case.unit(name), float(case.noise[i])
+    simulated: plots.Simulated = [("refitted", c.before)]
+    if correction := tables.correction_words(case.diagnosis):
+        simulated.append((correction.removesuffix(" put back").removesuffix(" added"), c.after))
+    diverging = [label for label, y in simulated if y is None]
+    note = f" The simulation diverges: {', '.join(diverging)}." if diverging else ""
+    where = f"{name} in {r.name}"
+    drawn = (
+        (
+            plots.compared_traces(r, simulated, i, unit),
+            f"{where}: measured and simulated, around the largest swing.{note}",
+            f"Measured and simulated {where}.",
+        ),
+        (
+            plots.compared_traces(r, simulated, i, unit, quiet=True),
+            f"{where}: a stretch with little motion.",
+            f"Measured and simulated {where}, little motion.",
+        ),
+        (
+            plots.compared_residuals(r, simulated, i, unit, floor),
+            f"{where}: the error over the whole recording.",
+            f"Errors of {where}.",
+        ),
+        (
+            plots.compared_spectra(r, simulated, i, unit, floor),
+            f"{where}: output and errors over frequency, beside the noise.",
+            f"Spectra of {where}.",
+        ),
+    )
+    return [Picture(axes.figure, caption, alt) for axes, caption, alt in drawn]
+
+
+def _next_experiment(d: Diagnosis) -> list[Block]:
+    if not d.next_experiment:
+        return []
+    sentence = d.next_experiment.get("sentence")
+    settings = {k: v for k, v in d.next_experiment.items() if isinstance(v, str | int | float) and k != "sentence"}
+    rows: Sequence[Sequence[Any]] = [[words(str(k)), v] for k, v in settings.items()]
+    out: list[Block] = [Text(str(sentence))] if sentence else []
+    return [*out, *([tables.Table(["setting", "value"], rows)] if rows else [])]
+
+
+def _usage_title(d: Diagnosis) -> str:
+    corrected = (d.effects or d.description) and d.outcome != "worse"
+    return "How to use the corrected simulator" if corrected else "How to use the result"
+
+
+def _usage(d: Diagnosis) -> list[Block]:
+    kind = "with the law closed in, at the fitted values" if d.effects or d.description else "refitted"
+    text = f"In the session that made the diagnosis, diagnosis.corrected is the simulator {kind}. Anywhere else, run:"
+    return [Text(text), Code(tables.usage(d))]

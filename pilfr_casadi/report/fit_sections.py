@@ -1,0 +1,291 @@
+"""The sections of a fit's page: outputs, hysteresis, linear part (Krikelis et al. 2024, Figs. 8-11, 15), parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .. import plots
+from .._base import InputError
+from ..data import Recording
+from ..identify import Fit
+from ..linear import plain_bla, robust_bla
+from ..models import BLOCKS, ParameterSet, Play, Stop
+from .page import Block, Picture, Table, Text, uncertain_text
+
+MOST_DRAWN = 4  # outputs of a recording that are drawn; the table has all of them
+ALIKE = 0.9  # correlation of an output with an input from which the device is drawn as quasi-static, over its input
+
+
+def output_pictures(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
+    """Draw the outputs of recordings, measured and simulated."""
+    out: list[Block] = []
+    for r in recordings:
+        for i in range(min(r.n_y, MOST_DRAWN)):
+            out += _draw_output(fit, r, i)
+        if r.n_y > MOST_DRAWN:
+            out.append(Text(f"The first {MOST_DRAWN} of {r.n_y} outputs are drawn; the table has them all."))
+    return out
+
+
+def _draw_output(fit: Fit, r: Recording, i: int) -> list[Block]:
+    """Draw one output: over its input for a quasi-static device, over time for any other."""
+    name = f"{r.outputs[i]} in {r.name}"
+    likeness = [abs(np.corrcoef(u, r.y[:, i])[0, 1]) if np.ptp(u) > 0 else 0.0 for u in r.u.T]
+    j = int(np.argmax(likeness))
+    if likeness[j] > ALIKE:
+        whole = Picture(
+            plots.output_over_input(fit, r, input=j, output=i).figure,
+            f"{name}, over {r.inputs[j]}.",
+            f"Measured and simulated {name} over {r.inputs[j]}.",
+        )
+    else:
+        whole = Picture(
+            plots.time(fit, r, output=i).figure,
+            f"{name}: the whole recording, with the errors of the models.",
+            f"Output and errors of {name} over time.",
+        )
+    return [
+        Picture(
+            plots.traces(fit, r, output=i).figure,
+            f"{name}, measured and simulated, around the largest excursion.",
+            f"Simulated over measured {name}.",
+        ),
+        whole,
+        Picture(
+            plots.remains(fit, r, output=i).figure,
+            f"{name}: the error of this model, enlarged.",
+            f"Error of {name} over time.",
+        ),
+        Picture(
+            plots.spectrum(fit, r, output=i).figure,
+            f"{name}: output and errors over frequency.",
+            f"Amplitude densities of output and errors of {name}.",
+        ),
+    ]
+
+
+def curve(fit: Fit, recording: Recording) -> list[Block]:
+    """Draw the curve of an element without memory."""
+    drawn = plots.loop(fit, recording).figure
+    return [Picture(drawn, "The element has no memory: w is a curve over z.", "Curve of the element, w over z.")]
+
+
+def hysteresis(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
+    """Draw loops, loading curves and weights of every channel of the element."""
+    intro = (
+        "The element turns its local input z into w. Its scale is arbitrary, because the linear part can absorb it: "
+        "look at its shape, not at its size."
+    )
+    out: list[Block] = [Text(intro)]
+    for c in range(fit.model.n_w):
+        of = f" of channel {c + 1}" if fit.model.n_w > 1 else ""
+        out.append(
+            Picture(
+                plots.loop(fit, recordings[0], channel=c).figure,
+                f"The identified loop{of}: w over z.",
+                f"Hysteresis loop{of}, w over z.",
+            )
+        )
+        out.append(
+            Picture(
+                plots.loading_curve(fit, recordings, channel=c).figure,
+                f"Loading curve{of}: w while z grows from rest.",
+                f"Loading curve{of}.",
+            )
+        )
+        out.insert(
+            -1,
+            Picture(
+                plots.loop(fit, recordings[0], channel=c, bare=True).figure,
+                f"The same{of} without its mean slope: the hysteresis alone.",
+                f"Hysteresis loop{of} without its slope.",
+            ),
+        )
+        if {"r", "w"} <= set(fit.parameters):
+            out.append(
+                Picture(
+                    plots.weights(fit, recordings, channel=c).figure,
+                    f"Weights of the operators{of} over their thresholds, with standard errors where known.",
+                    f"Weights{of} over thresholds.",
+                )
+            )
+    return out
+
+
+def linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
+    """Tabulate the modes, and draw the linear model of the start over the best linear approximation of the data."""
+    out = mode_tables(fit)
+    linear = fit.linear if fit.linear is not None else fit.model if fit.model.element is None else None
+    if linear is None or "A" not in linear.parameters:
+        return out
+    try:
+        periodic = all(r.period for r in train)
+        bla = robust_bla(train) if periodic else plain_bla(train)
+    except InputError:
+        return out
+    for i in range(min(bla.n_y, 2)):
+        for j in range(min(bla.n_u, 2)):
+            if bla.var_total is not None and np.mean(bla.var_total[:, i, j] < np.abs(bla.G[:, i, j]) ** 2) < 0.5:
+                continue  # the training data excites too few frequencies for this one
+            units = [fit.units.get(n, "") for n in (fit.model.outputs[i], fit.model.inputs[j])]
+            figure = plots.best_linear_approximation(
+                bla, linear, output=i, input=j, unit="/".join(units) if all(units) else ""
+            ).figure
+            of = f"{fit.model.outputs[i]} over {fit.model.inputs[j]}"
+            caption = f"Best linear approximation of {of} in the training data, and the linear model of the start."
+            out.append(Picture(figure, caption, f"Frequency response, {of}."))
+    return out
+
+
+def mode_tables(fit: Fit) -> list[Block]:
+    """Tabulate the modes in small motions, where no operator slips, and in large ones, where all do."""
+    values, element = fit.parameters, fit.model.element
+    a = values.get("A")
+    if a is None or not len(a) or a.shape != (fit.model.n_x,) * 2:
+        return []
+    operator = getattr(element, "operator", None)
+    if not isinstance(operator, Play | Stop):
+        return [Table(*_modes(a, fit.dt), caption="Modes of the linear part")]
+    with_slope = a + values["B_w"] @ np.diag(values["w"].sum(axis=1)) @ values["C_z"]
+    small, large = (a, with_slope) if isinstance(operator, Play) else (with_slope, a)
+    note = (
+        "In small motions no operator reaches its threshold; in large ones all of them slip. With growing amplitude "
+        "the hysteresis moves the modes from the first table towards the second."
+    )
+    return [
+        Table(*_modes(small, fit.dt), caption="Modes in small motions"),
+        Table(*_modes(large, fit.dt), caption="Modes in large motions", note=note),
+    ]
+
+
+def _modes(a: np.ndarray, dt: float) -> tuple[list[str], list[list[Any]]]:
+    """Return columns and rows of a table of the eigenvalues of a discrete-time A."""
+    rows: list[list[Any]] = []
+    for value in sorted(np.linalg.eigvals(a), key=lambda v: abs(np.angle(v))):
+        if value.imag < 0:
+            continue
+        rate = np.log(complex(value)) / dt if value != 0 else complex(np.nan)
+        oscillates = value.imag > 0 or value.real < 0
+        kind = "oscillation" if oscillates else "decay" if abs(value) < 1 else "drift"
+        frequency, damping = (abs(rate) / (2 * np.pi), -rate.real / abs(rate)) if oscillates else (None, None)
+        rows.append([kind, frequency, damping, -1 / rate.real if rate.real < 0 else None, abs(value)])
+    return ["mode", "frequency [Hz]", "damping ratio", "time constant [s]", "|eigenvalue|"], rows
+
+
+def parameter_blocks(fit: Fit) -> list[Block]:
+    """Tabulate values with standard errors: vectors and scalars, matrices, and the operators by threshold."""
+    parameters = fit.model.parameters
+    known = any(np.any(np.isfinite(e)) for e in fit.errors.values())
+    basis = (
+        " The errors of a PI-LFR hold in the scale and state basis of these values; entries that are fixed or at a "
+        "bound have none."
+        if set(BLOCKS) <= set(parameters)
+        else ""
+    )
+    text = (
+        f"Values with standard errors (±), the spread over records with other noise.{basis}"
+        if known
+        else "Values; standard errors are not known."
+    )
+    layer = [name for name in ("r", "w") if name in parameters and parameters[name].value.ndim == 2]
+    matrices = [name for name, p in parameters.items() if min(p.shape) > 1 and name not in layer]
+    out: list[Block] = []
+    rows = [
+        [label, value, error, parameters[name].unit, "yes" if fixed else ""]
+        for name in parameters
+        if name not in (*layer, *matrices)
+        for label, value, error, fixed in _entries(fit, name)
+    ]
+    if rows:
+        kept = [k for k in range(5) if k != 3 or any(row[3] for row in rows)]  # no column of units without units
+        columns = ["parameter", "value", "standard error", "unit", "fixed"]
+        caption = "Vectors and scalars" if layer else "Parameters"
+        out.append(
+            Table([columns[k] for k in kept], [[row[k] for k in kept] for row in rows], caption, folded=bool(layer))
+        )
+    for name in matrices:
+        values, errors = parameters[name].value, _errors_of(fit, name)
+        rows = [
+            [str(i + 1), *(uncertain_text(v, e) for v, e in zip(values[i], errors[i], strict=True))]
+            for i in range(len(values))
+        ]
+        caption = f"{name}, {values.shape[0]} × {values.shape[1]}"
+        out.append(Table(["row", *(str(j + 1) for j in range(values.shape[1]))], rows, caption=caption, folded=True))
+    for c in range(fit.model.n_w if layer else 0):
+        of = f" of channel {c + 1}" if fit.model.n_w > 1 else ""
+        cells = {
+            name: [
+                uncertain_text(v, e) for v, e in zip(parameters[name].value[c], _errors_of(fit, name)[c], strict=True)
+            ]
+            for name in layer
+        }
+        order = np.argsort(parameters[layer[0]].value[c], kind="stable")
+        columns = ["operator", *({"r": "threshold r", "w": "weight w"}[name] for name in layer)]
+        rows = [[str(k + 1), *(cells[name][j] for name in layer)] for k, j in enumerate(order)]
+        out.append(Table(columns, rows, caption=f"Operators{of}, by threshold", folded=True))
+    return [Text(text), *out]
+
+
+def _errors_of(fit: Fit, name: str) -> np.ndarray:
+    return np.broadcast_to(fit.errors.get(name, np.nan), fit.model.parameters[name].value.shape)
+
+
+def _entries(fit: Fit, name: str) -> list[tuple[str, float, float, bool]]:
+    """Return label, value, standard error and whether it is fixed for every entry of a parameter."""
+    p = fit.model.parameters[name]
+    columns = [np.ravel(a, order="F") for a in (p.value, _errors_of(fit, name), p.fixed)]
+    return [
+        (label, float(v), float(e), bool(f))
+        for label, v, e, f in zip(ParameterSet({name: p}).labels, *columns, strict=True)
+    ]
+
+
+def limit_blocks(fit: Fit) -> list[Block]:
+    """Tabulate constraints and active bounds with their multipliers; empty without limits."""
+    if not fit.limits:
+        return []
+    rows = [
+        [
+            limit.name,
+            "active" if limit.active else "not active" if limit.met else "NOT MET",
+            limit.value,
+            limit.lower if np.isfinite(limit.lower) else "",
+            limit.upper if np.isfinite(limit.upper) else "",
+            limit.multiplier,
+            limit.kind,
+        ]
+        for limit in fit.limits
+    ]
+    note = (
+        "Multiplier: the fall of the objective (half the mean square error divided by the output's variance) per unit "
+        "by which the limit is relaxed. Spectral radii are computed from the eigenvalues of the fitted matrices."
+    )
+    columns = ["limit", "state", "value", "lower", "upper", "multiplier", "kind"]
+    return [Table(columns, rows, note=note, emphasis=[i for i, v in enumerate(fit.limits) if not v.met], digits=9)]
+
+
+def usage(fit: Fit, model_file: str) -> str:
+    """Write the lines of Python that load the model and simulate with it."""
+    load = (
+        f"pilfr.load({model_file!r})"
+        if fit.structure is not None
+        else f"pilfr.load({model_file!r}, model=model)  # model: your equations"
+    )
+    names = f"inputs={list(fit.model.inputs)!r}, outputs={list(fit.model.outputs)!r}"
+    return "\n".join(
+        [
+            "import pilfr_casadi as pilfr",
+            "",
+            f"fit = {load}",
+            f'recording = pilfr.read_csv("new.csv", {names})',
+            "print(fit.nrmse(recording))         # error in free-run simulation",
+            "y = fit.simulate(recording)         # simulated outputs, (samples, outputs)",
+            "",
+            "step = fit.to_casadi()              # casadi.Function (x, u) -> (x_next, y), for controllers",
+            "x = fit.initial_state(recording)    # linear states, then the operators' memory",
+            "x, y0 = step(x, recording.u[0])",
+        ]
+    )
