@@ -186,7 +186,7 @@ def test_the_table_of_errors_is_that_of_the_fit():
 
 
 def test_modes_are_eigenvalues():
-    from pilfr_casadi.report.fit_tables import mode_tables
+    from pilfr_casadi.report.fit_sections import mode_tables
 
     fitted = example()
     rate = 2 * np.pi * 5 * complex(-0.1, np.sqrt(1 - 0.01))
