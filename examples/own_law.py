@@ -8,23 +8,16 @@ from pilfr_casadi.laws import CubicStiffness, PiecewiseStiffness, QuadraticStiff
 
 
 class Magnet(Law):
-    """w = -c (1 / (g - z)² - 1 / g²): pull of a magnet at the distance g, less what it pulls at rest."""
+    """w = -c (1 / (g - z)² - 1 / g²): pull of a magnet at the distance g, less its pull at rest."""
 
     id, equation = "magnet", "w = -c (1 / (g - z)^2 - 1 / g^2)"
     sentence = "a magnet: a pull that grows steeply as the gap closes"
     units, strength = {"c": "w*z^2", "g": "z"}, ("c",)  # linear in c; the gap g is a shape
+    starts, ranges = {"g": ("high", 1.2, 1.5, 2.0, 3.0)}, {"g": ("high", 1.05, 10.0)}  # multiples of the largest z
 
     def force(self, z, p):
         """Force w."""
         return -p.c * (1 / (p.g - z) ** 2 - 1 / p.g**2)
-
-    def shapes(self, local):
-        """Gaps worth trying, from how far the recordings go."""
-        return ({"g": local.high * s} for s in (1.2, 1.5, 2.0, 3.0))
-
-    def bounds(self, local):
-        """Gaps that the recordings can speak to."""
-        return {"g": (1.05 * local.high, 10 * local.high)}
 
 
 simulator = Simulator(

@@ -123,7 +123,8 @@ class Law:
         Parameters in which the force is linear.
     starts, ranges : mapping
         Start values and (lower, upper) bounds of parameters, as multiples of an attribute of `Local`: "reach", "half",
-        "speed", "dt", "duration", "stiffest", or "" for plain numbers. Every combination of start values is tried.
+        "low", "high", "speed", "dt", "duration", "stiffest", or "" for plain numbers. Every combination of start values
+        is tried.
     places : tuple of {"parallel", "series", "sensor"}
         Allowed places: inside the dynamics, at an actuator or a sensor, or at a sensor alone.
     dissipative : bool
