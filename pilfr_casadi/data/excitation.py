@@ -38,10 +38,8 @@ def excited_bins(
     ----------
     n_samples : int
         Samples per period.
-    f_max, f_min : float
-        Band, Hz; rounded to the nearest bin. Bin 0 and the one at ``fs / 2`` are never excited.
-    fs : float
-        Sampling frequency, Hz.
+    f_max, fs, f_min : float
+        Band and sampling frequency, Hz; the band is rounded to the nearest bins. Bin 0 and ``fs / 2`` are left out.
     grid : {"full", "odd", "odd-random"} or array of int
         All bins, the odd ones, the odd ones with one left out at random in every group of four, or the bins themselves.
     rng : numpy.random.Generator, optional

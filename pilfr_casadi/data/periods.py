@@ -74,7 +74,7 @@ def noise_weights(recordings: Recording | Iterable[Recording], error: float = 0.
     InputError
         As `period_noise`, or if `error` is not above zero.
     """
-    positive(error, "error", "the relative error that is hoped for")
+    positive(error, "error", "the relative error that the model is expected to reach")
     given = as_recordings(recordings)
     deviation = np.array([np.std(_by_period(r, r.y), axis=(0, 1)) for r in given])
     every = np.sqrt(np.mean(deviation**2, axis=0))
@@ -95,7 +95,9 @@ def repeats_itself(recording: Recording) -> bool:
     power = np.concatenate([[0.0], np.cumsum(np.sum(u**2, axis=1))])
     apart = (power[-1] - power[:m] + power[m - np.arange(m)] - 2 * _correlate(u, u)[:m]) / n  # (1/n) Σ |u(t+p) - u(t)|²
     size = u.shape[1] * 1.0
-    away = np.argmax(apart > size)  # a slow input is like itself a moment later: first it has to be unlike
+    away = np.argmax(
+        apart > size
+    )  # a slow input resembles itself a moment later: skip to the first lag where it does not
     last = int(LARGEST_LAG * m)
     return bool(away and away < last and np.min(apart[away : last + 1]) <= ALIKE**2 * size)
 
