@@ -458,7 +458,7 @@ class _Reader:
             self.fail(
                 "holds the values of a model of your own equations, not the equations; give the model as `model=`"
             )
-        element = None if table.element is None else self._element(table.element)
+        element = None if table.element is None else self._outer_element(table.element)
         for name, shape in block_shapes(table.nx, n_u, n_y, 0 if element is None else element.channels).items():
             self.parameter(name, shape)
 
@@ -473,7 +473,19 @@ class _Reader:
         bounds, priors = pairs("bounds", -np.inf, np.inf), pairs("priors", None, None)
         return self.build(PILFR, table.nx, element, fixed, bounds, priors, table.offset)
 
-    def _element(self, table: schema.ElementTable, prefix: str = "") -> Element:
+    def _outer_element(self, table: schema.OuterElementTable) -> Element:
+        """Build the element of the structure, which may combine others."""
+        if table.kind != "combined":
+            return self._element(table, "")
+        if len(table.parts) > MOST_PARTS:
+            self.damaged(f"it combines {len(table.parts)} elements")
+        parts = []
+        for row in table.parts:
+            element = self._element(row.element, f"{row.name}_")
+            parts.append(self.build(Part, row.name, element, tuple(row.reads), tuple(row.writes)))
+        return self.build(Combined, tuple(parts), table.channels)
+
+    def _element(self, table: schema.ElementTable, prefix: str) -> Element:
         """Build the element that a table describes; its parameters in the file are called `prefix + name`."""
         channels, hidden, degrees = table.channels, table.hidden, tuple(table.degrees)
         terms = sum(comb(channels + d - 1, d) for d in set(degrees) if d <= MOST_PARTS)
@@ -488,8 +500,6 @@ class _Reader:
         }
         if table.kind == "prandtl_ishlinskii":
             return self._layer(table, prefix)
-        if table.kind == "combined" and not prefix:
-            return self._combined(table)
         if table.kind not in known:
             self.fail(f"has the element {table.kind[:40]!r}, which a file cannot hold; give the model as `model=`")
         shapes, make, arguments = known[table.kind]
@@ -513,15 +523,6 @@ class _Reader:
                 self.parameter(f"{prefix}gamma_l_{name}", (table.channels, table.neurons))
             operator = self.build(GeneralizedPlay, table.neurons)
         return self.build(PrandtlIshlinskii, operator, table.n, table.channels, table.rounded)
-
-    def _combined(self, table: schema.ElementTable) -> Element:
-        if len(table.parts) > MOST_PARTS:
-            self.damaged(f"it combines {len(table.parts)} elements")
-        parts = []
-        for row in table.parts:
-            element = self._element(row.element, f"{row.name}_")
-            parts.append(self.build(Part, row.name, element, tuple(row.reads), tuple(row.writes)))
-        return self.build(Combined, tuple(parts), table.channels)
 
     def _with_values(self, model: Model, structure: PILFR | None) -> Model:
         """Put the file's values into the model: all of them, inside their bounds, and equal to what is fixed."""

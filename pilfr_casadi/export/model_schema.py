@@ -80,7 +80,6 @@ class ElementTable(Table):
     expressions: list[str] = []
     hidden: Count = 0
     degrees: list[Count] = []
-    parts: list[PartTable] = []
 
 
 class PartTable(Table):
@@ -92,12 +91,18 @@ class PartTable(Table):
     writes: list[Count]
 
 
+class OuterElementTable(ElementTable):
+    """The element of a structure, which alone may combine others."""
+
+    parts: list[PartTable] = []
+
+
 class Structure(Table):
     """A PI-LFR; its numbers are read as arrays."""
 
     nx: Count
     offset: bool
-    element: ElementTable | None = None
+    element: OuterElementTable | None = None
     fixed: dict[str, Any]
     bounds: dict[str, Pair]
     priors: dict[str, Pair]
