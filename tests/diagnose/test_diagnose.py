@@ -48,8 +48,8 @@ def test_the_catalogue_holds_every_law_of_the_contract():
     ("port", "law"),
     [
         ("ground-m1", CubicStiffness().at({"k_3": 4e5})),
-        ("m1-m2", CoulombFriction().at({"F_c": 4.0, "v_0": 1e-3})),
-        ("sensor:x2", Backlash().at({"r": 0.002})),
+        pytest.param("m1-m2", CoulombFriction().at({"F_c": 4.0, "v_0": 1e-3}), marks=pytest.mark.slow),
+        pytest.param("sensor:x2", Backlash().at({"r": 0.002}), marks=pytest.mark.slow),
     ],
     ids=lambda v: v if isinstance(v, str) else v.id,
 )
@@ -82,6 +82,7 @@ def test_a_wrong_sign_is_a_fault_of_the_recording():
     assert [(g.channel, g.finding) for g in found.gates] == [("x2", "sign")]
 
 
+@pytest.mark.slow
 def test_an_output_before_its_cause_is_a_fault_of_the_recording():
     train = [r.with_(y=np.vstack([r.y[7:], np.repeat(r.y[-1:], 7, axis=0)])) for r in recordings()]
     found = pilfr.diagnose(rig(OFF), train)
@@ -90,6 +91,7 @@ def test_an_output_before_its_cause_is_a_fault_of_the_recording():
     assert found.gates[-1].value == pytest.approx(-7 * 2e-3, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_a_shift_is_whole_though_nobody_said_what_inputs_do_between_samples():
     """Half a sample more or less, and inputs held or interpolated: the one may look like the other."""
     cut = [(r.u[:-9], r.y[9:]) for r in recordings(hold="linear")]
@@ -108,6 +110,7 @@ def test_a_clipped_output_is_a_fault_of_the_recording():
     assert [g.finding for g in found.gates] == ["clipping"]
 
 
+@pytest.mark.slow
 def test_the_next_experiment_stays_within_the_users_limits():
     """A delay before or behind a linear rig is the same; only what the rig does not do linearly can tell them apart."""
     law = Delay(values={"T": 3.3e-3}, limits={"T": (0.0, 0.02)})
@@ -139,6 +142,7 @@ def test_a_missing_column_is_said():
         pilfr.diagnose(rig(), train)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("left_out", "hidden", "port", "name", "strength"),
     [

@@ -51,6 +51,7 @@ def test_a_filter_in_one_sensor_of_two_is_told_from_that():
     assert effect.confidence > 0.9
 
 
+@pytest.mark.slow
 def test_beside_friction_filters_in_all_sensors_are_told_from_one_at_the_actuator():
     friction = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
     tried = [laws.Lag, laws.Resonance, laws.CoulombFriction]

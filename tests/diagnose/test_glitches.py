@@ -48,6 +48,7 @@ def test_what_lasts_longer_than_a_sample_is_no_glitch(kind):
     assert not len(glitches(y)[0])
 
 
+@pytest.mark.slow
 def test_friction_is_named_beside_glitches():
     train = [spoilt(r) for r in recordings(laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01}))]
     found = pilfr.diagnose(rig(OFF), train)

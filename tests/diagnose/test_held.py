@@ -21,6 +21,7 @@ def test_a_value_that_is_held_is_told_in_place_of_a_spring(held, words):
     assert found.errors["train"]["after"] < 0.01 < found.errors["train"]["before"]
 
 
+@pytest.mark.slow
 def test_a_value_whose_bounds_are_powers_of_ten_away_is_told_and_no_law_is_named_for_it():
     """As a stiffness in N/mm where the equations take N/m: what is seen cancels the simulator's own outputs."""
     simulator = rig(OFF)

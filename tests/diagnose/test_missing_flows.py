@@ -72,6 +72,7 @@ def spilling(seed, m=900, dt=4.0):
     return Recording(u, y, dt, ("pump",), ("level",), initial="estimate")
 
 
+@pytest.mark.slow
 def test_a_spill_is_found_with_its_share():
     found = pilfr.diagnose(tanks(), [spilling(0)], test=spilling(1))
     assert [(e.port, e.law) for e in found.effects] == [("upper", "piecewise_stiffness")]
@@ -112,6 +113,7 @@ def moved(seed, m=3000, dt=2e-3):
     return Recording(np.array(u), y, dt, ("force",), ("position",), initial="zero")
 
 
+@pytest.mark.slow
 def test_friction_that_depends_on_direction_needs_no_second_effect():
     found = pilfr.diagnose(axis(), [moved(0)], test=moved(1))
     assert [(e.port, e.law, e.form) for e in found.effects] == [("guide", "coulomb_friction", "directional")]

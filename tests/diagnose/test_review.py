@@ -7,7 +7,7 @@ import pytest
 from diagnosis_rig import DT, recordings, rig
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.diagnose import Workbench, prepare, prepared_search, review
+from pilfr_casadi.diagnose import Workbench, preparation, review, search_start
 from pilfr_casadi.diagnose.choice import Choice
 from pilfr_casadi.diagnose.first_effect import led_out
 from pilfr_casadi.diagnose.floor import Floor
@@ -124,17 +124,18 @@ def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
 @pytest.fixture
 def stuck_refit(monkeypatch):
     """Recordings that lack nothing, of a simulator whose refit stays in a local minimum."""
-    refit = prepare.refitted
+    refit = preparation.refitted
 
     def stuck(bench, starts=()):
         if starts:
             return refit(bench, starts)
         return bench.fit(bench.simulator, solver=GaussNewton(max_iterations=1))
 
-    monkeypatch.setattr(prepare, "refitted", stuck)
+    monkeypatch.setattr(preparation, "refitted", stuck)
     return recordings(None, count=1)
 
 
+@pytest.mark.slow
 def test_a_shift_that_only_led_out_of_a_dead_end_is_no_fault(stuck_refit):
     found = pilfr.diagnose(rig((1.4, 0.8, 0.8, 1.2)), stuck_refit)
     assert (found.verdict, found.gates) == ("complete", ()), str(found)
@@ -158,16 +159,16 @@ def test_a_search_begins_anew_from_where_a_law_has_led(monkeypatch):
             raise KeyboardInterrupt
         return SimpleNamespace(bench=None, without=None, floor=None, gates=())
 
-    monkeypatch.setattr(prepared_search, "prepare", prepare)
-    monkeypatch.setattr(prepared_search, "Search", Led)
+    monkeypatch.setattr(search_start, "prepare", prepare)
+    monkeypatch.setattr(search_start, "Search", Led)
     asked = Asked(rig(), (), (), "zero", "auto", 1, 2, 0.0, None)
     stops = False
-    _, search = prepared_search.prepared_search(asked)
+    _, search = search_start.prepared_search(asked)
     assert begun == [(), [values]] and not search.may_be_led
     assert list(search.times) == ["gates and refit"]
     begun.clear()
     stops = True
-    _, search = prepared_search.prepared_search(asked)
+    _, search = search_start.prepared_search(asked)
     assert search.interrupted and search.passes == [] and search.base == "refitted"
 
 
@@ -192,9 +193,9 @@ def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monk
         return SimpleNamespace(bench=None, without=None, floor=None, gates=gates if given[6] else ())
 
     gates = (SimpleNamespace(finding="alignment", value=-0.1),)
-    monkeypatch.setattr(prepared_search, "prepare", prepare)
-    monkeypatch.setattr(prepared_search, "Search", Unsure)
-    ready, _ = prepared_search.prepared_search(Asked(rig(), (), (), "zero", "auto", 1, 2, 0.0, None))
+    monkeypatch.setattr(search_start, "prepare", prepare)
+    monkeypatch.setattr(search_start, "Search", Unsure)
+    ready, _ = search_start.prepared_search(Asked(rig(), (), (), "zero", "auto", 1, 2, 0.0, None))
     assert early_or_not == [True, False] and ready.gates == (() if nearer else gates)
 
 

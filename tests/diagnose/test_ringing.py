@@ -27,6 +27,7 @@ def test_a_force_that_is_not_recorded_is_not_called_noise():
     assert "swings at the simulator's own" in found.sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 def test_noise_white_or_coloured_is_not_a_missing_force(pole):
     rng = np.random.default_rng(2)

@@ -36,6 +36,7 @@ def test_what_dies_away_is_said_and_the_initial_state_estimated():
     assert gate.change(dying).initial == "estimate"
 
 
+@pytest.mark.slow
 def test_a_diagnosis_of_recordings_that_have_not_settled_finds_nothing_missing():
     """From rest, the rig takes some periods to settle; said to be periodic, it is not yet."""
     (one,) = recordings(count=1, seed=3)

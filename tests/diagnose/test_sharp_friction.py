@@ -55,6 +55,7 @@ def ran(seed, v_0):
     return blank.with_(y=y + 5e-4 * np.std(y) * rng.standard_normal(y.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("v_0", [5e-4, 1e-4])
 def test_friction_that_turns_round_at_once_is_named_as_what_it_is(v_0):
     train, test = ran(0, v_0), ran(1, v_0)
@@ -102,6 +103,7 @@ def test_finer_steps_only_where_the_run_depends_on_them_whatever_else_is_missing
         assert finer.model(sharp().with_element("guide", law)).substeps == finer.substeps
 
 
+@pytest.mark.slow
 def test_what_is_missing_beside_friction_that_turns_round_is_named():
     def late(r, samples):
         return r.with_(y=np.vstack([np.zeros((samples, 1)), r.y[:-samples]]))
@@ -116,6 +118,7 @@ def test_what_is_missing_beside_friction_that_turns_round_is_named():
     assert found.errors["test"]["after"] < 2 * found.floor["nrmse"]
 
 
+@pytest.mark.slow
 def test_what_takes_the_place_of_the_simulators_own_is_told():
     found = pilfr.diagnose(carriage(mass=1.7, drag=5.0), ran(0, 1e-3), laws=(CoulombFriction,))
     assert found.sentence == "The simulator leaves out coulomb friction at guide."

@@ -48,6 +48,7 @@ def test_exchanged_channels_are_told(exchanged):
     assert found.errors["train"]["after"] < 0.01 and "are exchanged" in found.sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("moved", "verdict"), [(0.3, "recording-fault"), (1e-3, "complete")])
 def test_an_offset_that_was_the_mismatch_is_a_fault(moved, verdict):
     u, y = recorded()
@@ -71,6 +72,7 @@ def beam(off=1.0):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["late", "sign"])
 def test_late_by_half_a_swing_is_no_wrong_sign(fault):
     rng, model, late = np.random.default_rng(1), discretise(beam(), DT), 10

@@ -88,6 +88,7 @@ def test_only_what_begins_somehow_begins_where_its_signal_stands():
         assert begun[2] == expected
 
 
+@pytest.mark.slow
 def test_a_late_sensor_about_a_working_point_is_a_delay():
     late = 3
 
@@ -99,6 +100,7 @@ def test_a_late_sensor_about_a_working_point_is_a_delay():
     assert found.effects[0].parameters["T"]["value"] == pytest.approx(late * DT, rel=0.05)
 
 
+@pytest.mark.slow
 def test_degrees_fahrenheit_are_a_fault_of_the_recording():
     found = pilfr.diagnose(tank(1.15), recorded(30.0, change=lambda y: y * [1, 1.8] + [0, 32]))
     assert found.verdict == "recording-fault"

@@ -67,6 +67,7 @@ def test_hum_on_a_sensor_is_told_where_nothing_is_missing():
     assert gate.value == pytest.approx(49.97, abs=0.02)
 
 
+@pytest.mark.slow
 def test_an_uneven_encoder_is_named_at_its_sensor():
     (r,) = recordings(count=1)
     length = np.ptp(r.y) / 17.3

@@ -11,6 +11,7 @@ FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
 RIPPLE = laws.PeriodicForce(values={"a": 5.0, "b": 3.0, "L": 0.02})
 
 
+@pytest.mark.slow
 def test_friction_and_ripple_at_one_port_are_both_named():
     train, test = recordings(FRICTION, RIPPLE, noise=2e-3)
     found = pilfr.diagnose(rig(OFF), train, test=test)
