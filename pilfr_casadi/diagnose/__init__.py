@@ -11,11 +11,9 @@ if TYPE_CHECKING:
     from .._base import Progress
     from ..data import Recording
     from ..laws import Law
-    from .explain import prepare as prepare
     from .linearise import Constant as Constant, over_samples as over_samples
     from .mismatch_map import mismatch as mismatch
     from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect, plain as plain
-    from .search_start import prepared_search as prepared_search
     from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate
     from .workbench import Fitted as Fitted, Workbench as Workbench
 else:
