@@ -1,10 +1,16 @@
 """The engine that runs generated C: a model's step, called from the time loops of `_kernel.c`.
 
+Most partial derivatives of a state-space model are parameters, signals or constants themselves. The loops look these
+up; only the others become code, and expressions of parameters alone are evaluated once a run. Slopes of models with
+many operators are looked up in tables, whose zeros cost nothing; those of a step of several stages, of which nearly
+none is ever zero, are written out term by term.
+
 The loops are built once; a model's library is built once a structure. Both are kept in a private per-user cache, keyed
 by source, compiler, processor and CasADi version, in folders by the key's first letters: a cache of many thousands is
 not listed as a whole. A file name holds a digest of its content, so that a damaged library is built anew. A cache
 directory that others can write to is not used. Without a working C compiler `make_engine` falls back to the virtual
-machine of `sensitivities`, which gives the same numbers.
+machine of `sensitivities`, which gives the same numbers: bit by bit on x86-64, where neither engine fuses products
+and sums.
 """
 
 from __future__ import annotations
@@ -40,7 +46,7 @@ _VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "c", "computed")
 
 @dataclass(frozen=True, eq=False)
 class _Code:
-    """What is written out in C, and where the kernel finds the nonzeros of each block.
+    """Code of a step, and where the kernel finds the nonzeros of each block.
 
     Attributes
     ----------
@@ -190,11 +196,11 @@ def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[st
 
 
 def loops_code() -> str:
-    """The C source of the time loops."""
+    """Return the C source of the time loops."""
     return "\n".join((_text("_kernel.h"), _text("_kernel.c")))
 
 
-# without contraction the generated step gives the very numbers of the virtual machine: what slips, slips in both
+# without fused multiply-adds the generated step gives the bits of the virtual machine, so the same operators slip
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 FLAGS = (("-march=native", *COMMON), COMMON)  # the second where the first is not understood
 # long straight lines take seconds to optimise and gain nothing from it, unlike the loops; each output is asked whether
@@ -218,7 +224,7 @@ def compiler() -> str | None:
 
 @functools.cache
 def _machine(cc: str) -> str:
-    """What a compiled library depends on besides its source."""
+    """Describe the compiler and processor that a library depends on besides its source."""
     try:
         version = subprocess.run([cc, "--version"], capture_output=True, text=True, check=False).stdout
     except OSError as error:
@@ -268,7 +274,7 @@ def _digest(library: Path) -> str:
 
 
 def _shelf(key: str) -> Path:
-    """The folder of a library."""
+    """Return the cache folder of a library."""
     return cache_directory() / key[:2]
 
 
@@ -297,7 +303,7 @@ def _compile(cc: str, source: str, key: str, level: tuple[str, ...]) -> Path:
 
 
 def build(source: str, level: tuple[str, ...] = PLAIN) -> Path:
-    """The library of a source, from the cache or compiled.
+    """Return the library of a source, from the cache or compiled.
 
     Raises
     ------
@@ -338,7 +344,7 @@ def _loaded(library: Path) -> ctypes.CDLL:
 
 @functools.cache
 def _loops(_cache: Path) -> ctypes.CDLL:
-    """The time loops, once a cache."""
+    """Load the time loops, once a cache."""
     return _loaded(build(loops_code(), LOOPS))
 
 
@@ -387,7 +393,7 @@ class Compiled:
 
 
 def make_engine(model: Model, engine: str = "auto") -> Engine:
-    """The engine for a closed model: "c", "vm", or "auto" (C where there is a compiler that works).
+    """Make the engine for a closed model: "c", "vm", or "auto" (C where there is a compiler that works).
 
     Raises
     ------

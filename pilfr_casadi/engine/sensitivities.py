@@ -40,7 +40,7 @@ BLOCKS = tuple((target, source) for target, sources in TARGETS.items() for sourc
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """One step and all its partial derivatives.
+    """Step of a model with all its partial derivatives.
 
     Attributes
     ----------
@@ -60,11 +60,11 @@ class Linearization:
     substeps: int = 1
 
     def symbols(self) -> dict[str, Any]:
-        """Fresh symbols x, s, z, w, c, u, p."""
+        """Make symbols x, s, z, w, c, u, p."""
         return {k: ca.SX.sym(k, n) for k, n in self.sizes.items() if k != "y"}
 
     def blocks(self, values: dict[str, Any]) -> dict[tuple[str, str], Any]:
-        """The partial derivatives at values of x, s, z, w, c, u, p."""
+        """Evaluate the partial derivatives at values of x, s, z, w, c, u, p."""
         found = self.partial(*(values[k] for k in self.partial.name_in()))
         return dict(zip(BLOCKS, found, strict=True))
 
@@ -96,7 +96,7 @@ def linearize(model: Model) -> Linearization:
 
 
 class Engine(Protocol):
-    """What runs a model over a stretch of samples; both ways of running give the same numbers.
+    """Run of a model over a stretch of samples; both engines give the same numbers, bit by bit on x86-64.
 
     u has a row a step, `Model.substeps` of them a sample; outputs, derivatives and signals have one row a sample.
     """

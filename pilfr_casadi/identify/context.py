@@ -72,7 +72,7 @@ class Job:
     def solve(self, problem: Problem, stage: str, start: np.ndarray | None = None) -> Solution:
         """The solver's solution; those of the package report their iterations.
 
-        Where it leaves an exact bound on a spectral radius, the bound is tightened (`tightening`).
+        Where it leaves an exact bound on a spectral radius, the bound is tightened (`spectral_radius`).
         """
         if not isinstance(self.solver, GaussNewton | Ipopt):
             solution: Solution = self.solver.solve(problem, start)
@@ -134,7 +134,7 @@ def solve_inside(
     last: GaussNewton = STEP,
     held: bool = False,
 ) -> Solution:
-    """The solution of a solver, of the package or a user's, inside exact bounds on spectral radii (`tightening`).
+    """The solution of a solver, of the package or a user's, inside exact bounds on spectral radii (`spectral_radius`).
 
     Parameters
     ----------

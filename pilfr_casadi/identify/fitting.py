@@ -70,7 +70,7 @@ def fit(
         Training data; nothing else is used.
     solver : GaussNewton or Ipopt
         Solver of the final problem; by default `GaussNewton(tolerance=1e-4)`. Where an exact bound on a spectral radius
-        holds the solution, a Gauss-Newton SQP has the last word (see `tightening`).
+        holds the solution, a Gauss-Newton SQP has the last word (see `spectral_radius`).
     starts, seed : int
         Number of starts and the seed of all of them. With `start="grid"` the first two have the element at the output
         and at the input, whatever the seed (of Hammerstein and Wiener models it is one); more are drawn. More starts

@@ -1,4 +1,10 @@
-"""The simulation-error problem, its constraints, and the solvers: Gauss-Newton SQP and IPOPT."""
+"""The simulation-error problem, its constraints, and the solvers.
+
+`problem` states the problem and its derivatives, `constraints` what may be demanded of parameters, `gauss_newton` the
+default solver (its damping is the class `Damping`, its first value `GaussNewton(damping=...)`), `ipopt` the other one,
+`spectral_radius` the solves at a bound on stability, `exact_constraints` the last step onto exact limits, and
+`solution` the result with the limits that hold it.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -11,8 +11,8 @@ m^(n-1) and the left-hand side exceeds `log ρ(A)` by up to `(n - 1) log(m) / m`
 size of m. `stable` therefore has a slack, and a violation as small as that slack is no failure of a solver.
 
 Asked for as `exact`, a constraint has no slack and no tolerance: it is checked on the numbers of the result, the
-spectral radius by its eigenvalues. Where a check fails the result is moved (`exactness`); a radius is bounded by other
-rows than this one, which are smooth where eigenvalues meet (`tightening`).
+spectral radius by its eigenvalues. Where a check fails the result is moved (`exact_constraints`); at a tight bound a
+radius is held by rows that are smooth where eigenvalues meet (`spectral_radius`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .._base import InputError, filled, numbers
 from ..models import ParameterSet, Play, PrandtlIshlinskii, Stop
 from ..simulators import numbers_or_nan
 
-TOLERATED = 1e-6  # violation, in units of a constraint, that is no failure
+TOLERATED = 1e-6  # violation, in units of a constraint, that counts as met
 AT_MOST, AT_LEAST = 100.0, 1e-6  # limits that a unit comes to at most; share of the largest change, at least
 UNIT = 100.0  # unit of log ρ: a violation of 1e-4 is tolerated
 SLACK = 1e-4  # share by which `stable` lets the radius exceed its limit
@@ -46,7 +46,7 @@ class Constraint:
     lower, upper : float or array
         Bounds of the expression; equal for an equation.
     name : str
-        How the constraint is called in results.
+        Name of the constraint in results.
     unit : float, optional
         A change of the expression that counts: violations are judged next to it. By default the largest change that one
         of its variables brings about when it changes by its own size, so that units do not matter, and a hundred times
@@ -80,7 +80,7 @@ def log_norm_of_power(matrix: Any, squarings: int = 20) -> Any:
 
 
 def linear_part(p: Mapping[str, Any]) -> Any:
-    """The matrix `A`."""
+    """Return the matrix `A`."""
     return p["A"]
 
 
@@ -92,19 +92,19 @@ class LogRadius:
     squarings: int = 20
 
     def __call__(self, p: Mapping[str, Any]) -> Any:
-        """The expression for named parameters p."""
+        """Return the expression for named parameters p."""
         return log_norm_of_power(self.matrix(p), self.squarings)
 
 
 @dataclass(frozen=True)
 class BeyondRadius:
-    """How far the largest eigenvalue of a square matrix of named numbers exceeds a radius."""
+    """Excess of the largest eigenvalue of a square matrix of named numbers over a radius."""
 
     radius: float
     matrix: Callable[[Mapping[str, Any]], Any] = linear_part
 
     def __call__(self, p: Mapping[str, Any]) -> float:
-        """0 or less where the bound holds."""
+        """Return the excess; 0 or less where the bound holds."""
         numbers = np.asarray(ca.DM(self.matrix({name: ca.DM(value) for name, value in p.items()})))
         return float(np.max(np.abs(np.linalg.eigvals(numbers)), initial=0.0)) - self.radius
 
@@ -118,8 +118,9 @@ def stable(
 ) -> Constraint:
     """Spectral radius of `A` (or of another square expression of the parameters) at most `radius`.
 
-    What holds is `radius (1 + slack)`, and with `exact` the radius itself, to the last digit of the eigenvalues.
-    Without slack no solver could meet a limit of 1 at a double integrator.
+    The bound that holds is `radius (1 + slack)`, and with `exact` the radius itself, checked on the eigenvalues of the
+    result, which may stop up to three digits inside. Without slack no solver could meet a limit of 1 at a double
+    integrator.
 
     Raises
     ------
@@ -140,7 +141,7 @@ def stable(
 
 
 def loosened(constraints: Sequence[Constraint], least: float = 0.0) -> tuple[Constraint, ...]:
-    """The constraints with exact bounds on spectral radii, of `least` or more, at 1 or more and up to the slack."""
+    """Loosen exact bounds on spectral radii, of `least` or more, to at least 1 plus the slack."""
     return tuple(
         stable(max(c.check.radius, 1.0), c.check.matrix, c.name.partition(" <=")[0])
         if c.exact and isinstance(c.check, BeyondRadius) and c.check.radius >= least
@@ -166,7 +167,7 @@ class Rows:
     Raises
     ------
     InputError
-        As `compile_constraints` and `check_free`.
+        As `compile_constraints` and `_check_free`.
     """
 
     def __init__(self, constraints: tuple[Constraint, ...], parameters: ParameterSet) -> None:
@@ -177,7 +178,7 @@ class Rows:
         named = parameters.unpack(p)
         held = np.repeat([c.check is not None and c.check(named) <= 0 for c in constraints], self.sizes).astype(bool)
         logs = np.repeat([isinstance(c.expression, LogRadius) for c in constraints], self.sizes).astype(bool)
-        check_free(self.function, self._slope, parameters.free, p, self.lower, self.upper, self.labels, held, logs)
+        _check_free(self, parameters.free, p, held, logs)
 
     def units_from(self, change: np.ndarray) -> np.ndarray:
         """Units as given, or from the largest change of each entry (n_g,), no larger than its limits warrant."""
@@ -261,34 +262,25 @@ def _expression(c: Constraint, named: Mapping[str, Any], parameters: ParameterSe
 
 
 def constraint_sizes(constraints: tuple[Constraint, ...], parameters: ParameterSet) -> tuple[int, ...]:
-    """Number of entries of each constraint."""
+    """Return the number of entries of each constraint."""
     named = parameters.symbols(ca.MX.sym("p", parameters.size))
     return tuple(int(_expression(c, named, parameters).shape[0]) for c in constraints)
 
 
-def check_free(
-    g: ca.Function,
-    slope: ca.Function,
-    free: np.ndarray,
-    p: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    labels: tuple[str, ...],
-    held: np.ndarray,
-    logs: np.ndarray,
-) -> None:
+def _check_free(rows: Rows, free: np.ndarray, p: np.ndarray, held: np.ndarray, logs: np.ndarray) -> None:
     """Refuse a constraint that is no number at the start, or that does not hold and that no free parameter enters.
 
-    `held` says of which entries a check of their own says that they hold, `logs` which are logarithms of what is told.
+    `held` marks entries whose own check says that they hold, `logs` entries that are logarithms of the shown value.
 
     Raises
     ------
     InputError
         With its name, its value and its limits.
     """
-    reach = np.asarray(ca.DM(g.jac_sparsity(0, 0), 1).full(), dtype=bool).reshape(len(labels), len(p))
-    value = numbers_or_nan(g, p).ravel()
-    steep = numbers_or_nan(slope, p).reshape(len(labels), len(p))[:, free]
+    lower, upper, labels = rows.lower, rows.upper, rows.labels
+    reach = np.asarray(ca.DM(rows.function.jac_sparsity(0, 0), 1).full(), dtype=bool).reshape(len(labels), len(p))
+    value = rows.values(p)
+    steep = rows.slope(p).reshape(len(labels), len(p))[:, free]
     for i in np.flatnonzero(~np.isfinite(value) | ~np.all(np.isfinite(steep), axis=1)):
         what, shown = ("value", value[i]) if not np.isfinite(value[i]) else ("slope", np.nan)
         raise InputError(
@@ -317,7 +309,7 @@ class Gain:
     shape: tuple[int, ...] = ()
 
     def __call__(self, p: Mapping[str, Any]) -> Any:
-        """The expression for named parameters p."""
+        """Return the expression for named parameters p."""
         a, b, c, d = p["A"], p["B_u"], p["C_y"], p["D_yu"]
         if "w" in p:
             s = self.slope * ca.diag(ca.sum2(p["w"]))
@@ -339,13 +331,13 @@ class Steps:
     name: str = "r"
 
     def __call__(self, p: Mapping[str, Any]) -> Any:
-        """The expression for named parameters p."""
+        """Return the expression for named parameters p."""
         rows = p[self.name] if p[self.name].shape[1] > 1 else p[self.name].T
         return ca.vec((rows[:, 1:] - rows[:, :-1]).T)
 
 
 def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
-    """A known steady gain of a linear model or a PI-LFR of plays or stops, from every input to every output.
+    """Constrain the steady gain of a linear model or a PI-LFR of plays or stops, from every input to every output.
 
     Other elements, such as generalized plays and networks, have no slope `Σw`: with them it is refused.
 
@@ -380,7 +372,7 @@ def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
 
 
 def check_gain(constraints: Iterable[Constraint], element: Any) -> None:
-    """Refuse a DC gain for an element whose gain is not the one of `Gain`.
+    """Refuse a DC gain for an element to which the formula of `Gain` does not apply.
 
     Raises
     ------
@@ -398,7 +390,7 @@ def check_gain(constraints: Iterable[Constraint], element: Any) -> None:
 
 
 def ordered(name: str = "r", gap: float = 0.0) -> Constraint:
-    """The entries of a parameter ascend along each row, by `gap` at least: by default the thresholds of each channel.
+    """Let the entries of a parameter ascend along each row, by `gap` at least: by default the thresholds of a channel.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-r"""A result moved inside the constraints that are asked for as exact, where rounding has left it outside.
+r"""Move a result inside its exact constraints where rounding has left it outside.
 
 A solver meets constraints up to a tolerance. Where an exact one fails on the numbers of the result, the point is moved
 by the smallest step, in the metric of the outputs, that meets it and keeps all others to first order:
@@ -21,12 +21,12 @@ from .gauss_newton import QuadraticProgram, without_rounding
 from .problem import Problem
 from .solution import Solution, Status
 
-ROUNDS = 40
+ROUNDS = 40  # steps with doubled margins, from `FIRST` to more than any constraint needs
 FIRST = 1e-9  # margin of the first step, in units of a constraint
 
 
 def beyond(problem: Problem, theta: np.ndarray) -> list[str]:
-    """Names of the exact constraints that do not hold at the numbers θ."""
+    """Return the names of the exact constraints that do not hold at the numbers θ."""
     if not any(c.exact for c in problem.constraints):
         return []
     g, names, at = problem.constraint(theta), [], 0
@@ -46,20 +46,20 @@ def beyond(problem: Problem, theta: np.ndarray) -> list[str]:
 
 
 def missed(problem: Problem, theta: np.ndarray) -> np.ndarray:
-    """Which constraints are violated by more than is tolerated in their units at θ: (n_g,), bool."""
+    """Tell which constraints are violated beyond tolerance in their units at θ: (n_g,), bool."""
     g, unit = problem.constraint(theta), problem.constraint_units(theta)
     over = np.maximum(problem.g_lower - g, g - problem.g_upper)
     return ~np.asarray(over <= TOLERATED * np.where(unit > 0, unit, 1.0))
 
 
 def _far(problem: Problem, theta: np.ndarray, unit: np.ndarray) -> bool:
-    """Whether a step has led away: a constraint is violated by more than its unit."""
+    """Whether a constraint is violated by more than its unit, so that the step has led astray."""
     g = problem.constraint(theta)
     return bool(np.any(np.maximum(problem.g_lower - g, g - problem.g_upper) > unit))
 
 
 def exactly(problem: Problem, solution: Solution) -> Solution:
-    """The solution, moved where an exact constraint does not hold; infeasible where no small step brings it inside."""
+    """Move a solution inside its exact constraints; its status is infeasible where no small step does it."""
     theta = solution.theta
     if solution.status is Status.INFEASIBLE or not np.isfinite(solution.cost) or not beyond(problem, theta):
         return solution

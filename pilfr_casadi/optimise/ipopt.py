@@ -1,8 +1,8 @@
 """The simulation-error problem through IPOPT, by single shooting with the package's own derivatives.
 
-IPOPT is given the problem in the units of `scaling`, with bounds and constraints as they are, and the damped
-Gauss-Newton Hessian of `damping`: an interior-point iteration turned Levenberg-Marquardt method, with a barrier for
-bounds and a filter for constraints (Wächter & Biegler 2006). With an undamped or the exact Hessian, trials diverged.
+IPOPT is given the problem in the units of `Scaled`, with bounds and constraints as they are, and the damped
+Gauss-Newton Hessian of `DampedHessian`: an interior-point iteration turned Levenberg-Marquardt method, with a barrier
+for bounds and a filter for constraints (Wächter & Biegler 2006). With an undamped or the exact Hessian trials diverged.
 Only where IPOPT restores feasibility, and the cost is out of its sight, is the curvature of the constraints used.
 
 An interior-point method pushes away from bounds, and thresholds start on theirs (r = 0): push and barrier are kept
@@ -72,7 +72,10 @@ def check_settings(options: Any) -> None:
 
 
 class Callback(ca.Callback):
-    """A CasADi Function around a Python function.
+    """CasADi Function around a Python function.
+
+    An exception must not cross a solver's C++ frames: CasADi would turn it into a failed evaluation and forget it.
+    It is handed to `failed` instead, and the solver sees NaN.
 
     Parameters
     ----------
@@ -198,7 +201,14 @@ class DampedHessian:
 
 
 class Scaled:
-    """The scaled problem.
+    """Problem in variables and units for a solver with absolute tolerances.
+
+        x = s θ,    F(x) = cost(x / s) / cost(θ_0),    G(x) = g(x / s) / u
+
+    s are the column norms of the Jacobian over the root of the first cost: a unit of any variable changes the residuals
+    by about their own size. u are the largest entries of each row of ∇g, so results do not depend on anybody's units.
+    At the usual start (`B_w = 0`, Krikelis et al. (2024), Eq. 24) whole columns vanish; norms are therefore the larger
+    ones of the start and of one damped Gauss-Newton step from it.
 
     Parameters
     ----------
@@ -285,7 +295,7 @@ class Scaled:
 
 
 def _filled(squares: np.ndarray, labels: tuple[str, ...], start: np.ndarray, unit: float) -> np.ndarray:
-    """Columns that vanish at both points get the norm of their like (idle thresholds), else one to fit their value."""
+    """Give columns that vanish at both points the norm of others of their name, else one that fits their value."""
     names, out = np.array([label.split("[")[0] for label in labels]), squares.copy()
     for name in set(names[~(squares > 0)]):
         alike = names == name
@@ -343,7 +353,7 @@ class Ipopt:
 
 
 class _Run:
-    """One solve: the last point evaluated, and the best one."""
+    """One solve: the last point evaluated and the best one."""
 
     def __init__(self, options: Ipopt, problem: Problem, start: np.ndarray, progress: Progress | None) -> None:
         self.options, self.problem, self.progress = options, problem, progress
@@ -393,7 +403,7 @@ class _Run:
         return self._solution(status or Status.SOLVER_FAILED, message)
 
     def _ending(self, message: str, violation: float, cost: float) -> Status | None:
-        """What IPOPT's last word means, given what there was before; None to try again."""
+        """Translate IPOPT's return status, given violation and cost before; None to try again."""
         status = self.stopped or ENDINGS.get(message)
         if status is Status.INFEASIBLE and self.violation <= FEASIBLE:
             return None
@@ -402,7 +412,7 @@ class _Run:
         return status
 
     def _nlpsol(self, damping: float) -> str:
-        """One run of IPOPT from the best point; returns its own word for how it ended."""
+        """Run IPOPT once from the best point and return its status."""
         scaled, n, n_g, dense = self.scaled, self.problem.size, len(self.problem.g_lower), ca.Sparsity.dense
         self.hessian, self.trials = DampedHessian(damping, n), 0
         x, g, one = dense(n, 1), dense(n_g, 1), dense(1, 1)

@@ -28,7 +28,7 @@ from .constraints import Constraint, Rows, check_gain
 
 @dataclass(frozen=True)
 class Part:
-    """One recording inside the problem.
+    """Recording with its place in the problem.
 
     Attributes
     ----------
@@ -39,11 +39,11 @@ class Part:
     state : array, (n_state,)
         State at its first sample, before any periods that are run before.
     drive, warm_up : array
-        What drives it, and the periods before it.
+        Its inputs, and those of the periods run before it.
     scale : array, (n_y,)
-        What residuals are divided by.
+        Divisors of the residuals.
     steady : bool
-        Whether it begins at the fixed point of its period, where periods from rest lead.
+        Whether it begins at the fixed point of its period.
     """
 
     recording: Recording
@@ -63,7 +63,7 @@ def lay_out(
     periods: int | None,
     scales: Sequence[np.ndarray],
 ) -> Iterator[Part]:
-    """Each recording with its first state, which is a variable from index `at` on where it is to be estimated."""
+    """Lay out each recording with its first state, which is a variable from index `at` on where it is estimated."""
     n_state = model.n_x + model.n_s
     for r, scale in zip(recordings, scales, strict=True):
         zero, drive = np.zeros(n_state), model.drive(r)
@@ -92,7 +92,7 @@ def lay_out(
 
 
 def _periods_before(model: Model, engine: Engine, one: np.ndarray, periods: int | None) -> np.ndarray:
-    """What drives the periods before a periodic recording: as many as the start model takes to settle, 2 to 50."""
+    """Return the inputs of the periods before a recording: as many as the start model takes to settle, 2 to 50."""
     state = np.zeros(model.n_x + model.n_s)
     for count in range(1, 51 if periods is None else 1):
         before, state = state, engine.simulate(one, model.parameters.start, state)[1]
@@ -105,7 +105,7 @@ def _periods_before(model: Model, engine: Engine, one: np.ndarray, periods: int 
 
 
 def checked_weights(given: Sequence[float] | np.ndarray | None, count: int) -> np.ndarray:
-    """One weight above zero for each recording, ones where none are given."""
+    """Return one weight above zero for each recording; ones where none are given."""
     weights = numbers(np.ones(count) if given is None else given, "A weight of a recording").ravel()
     if len(weights) != count or not np.all(weights > 0):
         raise InputError(
@@ -116,12 +116,12 @@ def checked_weights(given: Sequence[float] | np.ndarray | None, count: int) -> n
 
 
 def output_scale(recordings: Sequence[Recording]) -> np.ndarray:
-    """Standard deviation of each output over all recordings, (n_y,)."""
+    """Return the standard deviation of each output over all recordings, (n_y,)."""
     return np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
 
 
 class Penalties:
-    """What is added to the simulation error.
+    """Quadratic and L1 terms that are added to the simulation error.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class Penalties:
     Raises
     ------
     InputError
-        If what an L1 penalty is on may be negative.
+        If a parameter under an L1 penalty may be negative.
     """
 
     def __init__(
@@ -161,27 +161,26 @@ class Penalties:
         self.weight, self.mean, self.slope = (np.concatenate([a[parameters.free], pad]) for a in (weight, mean, slope))
 
     def value(self, theta: np.ndarray) -> float:
-        """Both terms."""
+        """Return the sum of both terms."""
         return float(0.5 * self.weight @ (theta - self.mean) ** 2 + self.slope @ theta)
 
     def gradient(self, theta: np.ndarray) -> np.ndarray:
-        """Their gradient, shape (n,); the Hessian is diagonal, `weight`."""
+        """Return their gradient, shape (n,); the Hessian is diagonal, `weight`."""
         return np.asarray(self.weight * (theta - self.mean) + self.slope)
 
 
 Array = np.ndarray
-SETTLED = 1e-10  # change over a period, next to the largest entry of the state, that is none
-NEARLY = 1e-6  # the same where it has to do
-MOST, WAIT = 200, 10  # periods, and periods before each leap
-CHUNK = 512  # samples of a period whose slopes are held at a time
+SETTLED = 1e-10  # change over a period, relative to the largest entry of the state, that counts as none
+NEARLY = 1e-6  # the same change, accepted when the periods run out
+MOST, WAIT = 200, 10  # periods run at most; periods between two Newton steps
+CHUNK = 512  # samples of a period whose slopes are kept in memory at a time
 
 
 def settled(engine: Engine, period: Array, p: Array, state: Array, tolerance: float = SETTLED) -> Array:
-    """State at the beginning of a steady period, not finite where none is reached.
+    """Find the state at the beginning of a steady period; not finite where none is reached.
 
-    Memory of operators that never slip in a period is not decided by it: it stays as the periods leave it that are run
-    from the state given, which is zero for a recording (`open_memory` finds it). Periods are run from there; where that
-    takes long, for slow poles, Newton's rule on `x = Φ(x)` leaps ahead.
+    Periods are run from the given state; for slow poles, where that takes long, Newton's rule on `x = Φ(x)` helps.
+    A period does not determine the memory of operators that never slip in it: that keeps its given value.
     """
     change, size = np.inf, 1.0
     with np.errstate(over="ignore", invalid="ignore"):
@@ -196,7 +195,7 @@ def settled(engine: Engine, period: Array, p: Array, state: Array, tolerance: fl
 
 
 def _leap(engine: Engine, period: Array, p: Array, state: Array) -> Array:
-    """One step of Newton's rule towards the fixed point of a period, where it brings it nearer; else one period."""
+    """Take one Newton step towards the fixed point of a period if that brings it nearer, else run one period."""
     after, slope = state, np.eye(len(state))
     rows = CHUNK * engine.linear.substeps
     for a in range(0, len(period), rows):
@@ -225,7 +224,7 @@ def steady_slope(after: Array, n: int) -> Array:
 
 @dataclass
 class Pass:
-    """One run of a recording with derivatives.
+    """Run of one recording with derivatives.
 
     Parameters
     ----------
@@ -264,7 +263,7 @@ class Pass:
 
 
 def sums(run: Pass, substeps: int) -> tuple[float, Array, Array]:
-    """`e'e`, `J'e` and `J'J` over a recording, for the columns of the seed."""
+    """Accumulate `e'e`, `J'e` and `J'J` over a recording, for the columns of the seed."""
     n_c = run.seed.shape[1]
     value, gradient, hessian = 0.0, np.zeros(n_c), np.zeros((n_c, n_c))
     for e, jac in run.stretches(substeps):
@@ -283,7 +282,7 @@ def steady_sums(run: Pass, substeps: int, n: int) -> tuple[float, Array, Array]:
     return value, total.T @ gradient, total.T @ hessian @ total
 
 
-STRETCH = 2_000_000  # numbers in the piece of the Jacobian that is held at a time
+STRETCH = 2_000_000  # entries of the Jacobian kept in memory at a time (16 MB)
 
 
 class Problem:
@@ -407,14 +406,14 @@ class Problem:
         return self._each(first, list(zip(self._parts, self.initial_states(theta), strict=True)))
 
     def _each(self, function: Any, items: Sequence[Any]) -> list[Any]:
-        """The function of each item, a few at a time."""
+        """Map the function over the items, a few at a time."""
         if self.threads == 1 or len(items) == 1:
             return [function(item) for item in items]
         with ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(function, items))
 
     def simulate(self, theta: np.ndarray) -> list[np.ndarray]:
-        """Simulated outputs, one (M, n_y) array a recording."""
+        """Simulate all recordings: outputs, one (M, n_y) array each."""
         p, states = self.parameters(theta), self.first_states(theta)
         pairs = [(part.drive, state) for part, state in zip(self._parts, states, strict=True)]
         return self._each(lambda pair: self.engine.simulate(pair[0], p, pair[1])[0], pairs)
@@ -426,7 +425,7 @@ class Problem:
             return np.concatenate([((y - p.recording.y) / p.scale)[p.recording.skip :].ravel() for p, y in pairs])
 
     def cost(self, theta: np.ndarray) -> float:
-        """Value of the objective; infinite where the simulation diverges."""
+        """Return the objective; infinite where the simulation diverges."""
         e = self.residual(theta)
         with np.errstate(over="ignore", invalid="ignore"):
             value = 0.5 * float(e @ e) / self._residuals + self.penalties.value(theta)
@@ -478,7 +477,7 @@ class Problem:
         return out
 
     def normal(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Objective, its gradient and Gauss-Newton Hessian at θ."""
+        """Return the objective, its gradient and Gauss-Newton Hessian at θ."""
         n_free, n = int(self.free.sum()), self.model.substeps
 
         def of(pair: tuple[Part, np.ndarray]) -> tuple[float, np.ndarray, np.ndarray]:
@@ -499,7 +498,7 @@ class Problem:
         return 0.5 * value / m + self.penalties.value(theta), gradient, hessian / m + np.diag(self.penalties.weight)
 
     def constraint(self, theta: np.ndarray) -> np.ndarray:
-        """Values g(θ) of the general constraints."""
+        """Return the values g(θ) of the general constraints."""
         return self.rows.values(self.parameters(theta))
 
     def constraint_jacobian(self, theta: np.ndarray) -> np.ndarray:
@@ -510,7 +509,7 @@ class Problem:
         return jac
 
     def constraint_units(self, theta: np.ndarray, squares: np.ndarray | None = None) -> np.ndarray:
-        """A change of each general constraint that counts, shape (n_g,): as given, else what its variables bring about.
+        """Return a change of each general constraint that counts, shape (n_g,): as given, else from its variables.
 
         The largest change that one variable brings about which moves by its size (`magnitude`) or, where that is zero,
         by what changes the outputs by their own size, `squares` (size,) being the diagonal of the Gauss-Newton Hessian.

@@ -14,7 +14,7 @@ from .problem import Problem
 
 
 class Status(Enum):
-    """How a solve ended; the value is the sentence shown to the user."""
+    """Status of a solve; the value is the sentence shown to the user."""
 
     CONVERGED = "Converged: no admissible step improves the fit noticeably."
     SMALL_STEP = "Converged: the last steps were too small to matter."
@@ -30,12 +30,12 @@ class Status(Enum):
 
     @property
     def converged(self) -> bool:
-        """Whether the result is what was looked for: a minimum, or the best point on data held back."""
+        """Whether the solve ended at a minimum, or at the best point on data held back."""
         return self in (Status.CONVERGED, Status.SMALL_STEP, Status.STOPPED_EARLY)
 
     @property
     def advice(self) -> str:
-        """What to do about it, in one sentence; empty where nothing is to be done or the status says it."""
+        """One sentence of advice; empty where the status already gives it or none is needed."""
         return ADVICE.get(self, "")
 
 
@@ -88,13 +88,13 @@ class Solution:
 Progress = Callable[[Iteration], None]
 
 
-AT_RADIUS = 1e-3  # share of a bound by which a radius that it holds may lie inside
-FELT = 1e-3  # multiplier next to the logarithm of a radius, in units of the objective, from which a bound holds it
+AT_RADIUS = 1e-3  # share of a bound within which a radius counts as lying at it
+FELT = 1e-3  # multiplier of a log radius, in units of the objective, from which its bound counts as active
 
 
 @dataclass(frozen=True)
 class Limit:
-    """A general constraint, or a bound that is active, at a solution.
+    """General constraint, or active bound, at a solution.
 
     Attributes
     ----------
@@ -106,8 +106,8 @@ class Limit:
         The expression's value and its limits; infinite where there is none. Of a bound on a spectral radius the radius
         itself, by the eigenvalues of the result, and what it is to be at most.
     multiplier : float
-        Fall of the objective for each unit that the limit is moved outwards; 0 where it is not active, nan where the
-        solver gave none, or ended at a kink of the error, where there is no such rate.
+        Fall of the objective per unit that the limit is moved outwards; 0 where it is not active, nan where the solver
+        gave none or ended at a kink of the error, where no such rate exists.
     active : bool
         Whether the value is at a limit.
     met : bool
@@ -132,7 +132,7 @@ class Limit:
 
 
 def unknown_multipliers(limits: Sequence[Limit], status: Status) -> str:
-    """That multipliers of active constraints are not known, empty where they are."""
+    """Say why multipliers of active constraints are unknown; empty where they are known."""
     names = [
         limit.name for limit in limits if limit.kind == "constraint" and limit.active and np.isnan(limit.multiplier)
     ]
@@ -146,7 +146,7 @@ def unknown_multipliers(limits: Sequence[Limit], status: Status) -> str:
 
 
 def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
-    """All general constraints and the bounds that are active, as they are at a solution."""
+    """Return all general constraints and the active bounds at a solution."""
     theta, n = solution.theta, problem.size
     known = len(solution.multipliers) == n + len(problem.g_lower)
     size = np.abs(solution.multipliers) if known else np.full(n + len(problem.g_lower), np.nan)
@@ -175,7 +175,7 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
 
 
 def _radius(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, felt: bool) -> Limit:
-    """A bound on a spectral radius; `force` is its multiplier next to the logarithm, `felt` if that counts."""
+    """Describe a bound on a spectral radius; `force` is the multiplier of its logarithm, `felt` whether it counts."""
     excess, bound = check(values), check.radius
     active = -excess <= AT_RADIUS * bound and (felt or -excess <= 10 * TOLERATED * bound)
     multiplier = force / bound if active else 0.0
