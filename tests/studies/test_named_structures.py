@@ -123,7 +123,7 @@ def test_a_campaign_does_each_model_once_and_leaves_columns_empty(folder, capsys
     [
         ('structure = "narx"\nnx = 2', "'lags' in [model] is missing; give the number of past outputs"),
         ('structure = "ssnn"\nhidden = 2', "'nx' in [model] is missing; give the number of states"),
-        ('structure = "noe"\nlags = 0', "'lags' in [model] is 0; give 1 or more"),
+        ('structure = "noe"\nlags = 0', "'lags' in [model] is 0; give a whole number from 1"),
         ('structure = "noe"\nlags = 2\nnx = 1', "'nx' in [model] is not for structure = 'noe', which takes lags"),
         ('structure = "ssnn"\nnx = 2\noperators = 3', "'operators' in [model] is not for structure = 'ssnn'"),
         ("nx = 2\nhidden = 3", "'hidden' in [model] is not for structure = 'lfr'"),
@@ -169,13 +169,13 @@ def test_unfit_options_of_the_command_get_one_sentence(capsys, folder):
     refused(capsys, *few, "--structure", "narx", "--lags", 2, says="--nx is not for --structure narx")
     bare = [a for a in few if a not in ("--nx", 1)]
     refused(capsys, *bare, "--structure", "narx", says="--structure narx needs --lags")
-    refused(capsys, *bare, "--structure", "noe", "--lags", 0, says="--lags 0 was given; give 1 or more.")
+    refused(capsys, *bare, "--structure", "noe", "--lags", 0, says="--lags 0 was given; give a whole number from 1")
     refused(capsys, *bare, "--structure", "noe", "--lags", 2, "--bound", "w=0:1", says="--bound is not for")
 
 
 def test_too_many_lags_and_a_start_of_another_kind_are_refused(capsys, folder):
     data = ("fit", folder / "train.csv", "--inputs", "u", "--outputs", "y", "--out", folder / "out")
-    refused(capsys, *data, "--structure", "narx", "--lags", 2000, says=("400 scored samples", "smaller model"))
+    refused(capsys, *data, "--structure", "narx", "--lags", 2000, says="give at most 20000 parameters")
     path = written(folder, 'structure = "noe"\nlags = 2')
     path.write_text(path.read_text().replace("[solver]", '[solver]\nstart = "plain"'))
     refused(capsys, "run", path, says="start = 'plain' is not for a NARX or NOE")
