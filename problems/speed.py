@@ -34,8 +34,7 @@ ONE_THREAD = {key: "1" for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "M
 
 def prepare(folder: Path) -> None:
     """Write the case: training record, a start of the default pipeline, and a point on the way from it."""
-    from pilfr_casadi.identify.linear_start import linear_model
-    from pilfr_casadi.identify.start import grid_start, unit_states
+    from pilfr_casadi.identify import grid_start, linear_model, unit_states
     from pilfr_casadi.optimise import GaussNewton, Problem
 
     from .masing_data import records

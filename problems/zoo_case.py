@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pilfr_casadi.data import Recording, multisine
-from pilfr_casadi.identify.start import grid_start, unit_states
+from pilfr_casadi.identify import grid_start, unit_states
 from pilfr_casadi.linear import subspace_matrices
 from pilfr_casadi.models import PILFR, Model, direction_fixed
 from pilfr_casadi.optimise import Problem

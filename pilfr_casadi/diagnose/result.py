@@ -13,9 +13,9 @@ import numpy as np
 from .._base import InputError
 from ..data import SAME_STEP, Recording, nrmse
 from ..engine import make_engine
+from ..identify import match_channels
 from ..models import ParameterSet
 from ..simulators import Simulator, discretise
-from .arranged import arranged
 from .description import Description
 from .gates import Gate
 from .proof import run_free
@@ -255,7 +255,7 @@ class Diagnosis:
     def _run(self, recording: Recording, simulator: Simulator | None = None) -> tuple[Recording, np.ndarray, int]:
         """The recording as corrected, the outputs of a simulator along it, and the first scored sample."""
         simulator = simulator or self.corrected
-        r, dt = arranged(simulator, recording), self.train[0].dt
+        r, dt = match_channels(simulator, recording), self.train[0].dt
         if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
         if not any(recording is known for known in self.train):  # those are corrected already

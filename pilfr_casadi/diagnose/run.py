@@ -10,9 +10,9 @@ import numpy as np
 
 from .._base import InputError, Progress, listed, one_blas_thread, processors
 from ..data import Recording, as_recordings, check_for_identification
+from ..identify import match_channels
 from ..laws import CATALOGUE, SCALABLE, Law, readable_unit, scaled
 from ..simulators import as_simulator
-from .arranged import arranged
 from .candidate import Candidate
 from .choice import Choice
 from .conclusion import Conclusion, concluded
@@ -53,8 +53,8 @@ def run_diagnosis(
     workers = workers or min(processors(), 4)
     say = Stages(progress or (lambda stage, done, total, best: None))
     simulator = as_simulator(simulator, as_recordings(train))
-    recordings = check_for_identification([arranged(simulator, r) for r in as_recordings(train)], 20)
-    tests = tuple(arranged(simulator, r) for r in as_recordings(test)) if test is not None else ()
+    recordings = check_for_identification([match_channels(simulator, r) for r in as_recordings(train)], 20)
+    tests = tuple(match_channels(simulator, r) for r in as_recordings(test)) if test is not None else ()
     _check_apart(recordings, tests)
     for r in tests:
         if abs(r.dt / recordings[0].dt - 1) > 1e-4:

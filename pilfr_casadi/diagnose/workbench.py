@@ -11,6 +11,7 @@ import numpy as np
 from .._base import InputError, one_at_a_time
 from ..data import Recording
 from ..engine import Engine, make_engine
+from ..identify import FitContext, match_channels, solve_within_bounds
 from ..models import Model, ParameterSet
 from ..optimise import GaussNewton, Problem, Status
 from ..simulators import (
@@ -26,7 +27,6 @@ from ..simulators import (
     rate_at_start,
     with_output_injection,
 )
-from .arranged import arranged
 from .standing import standing, stands
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
@@ -107,7 +107,7 @@ class Workbench:
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
         """Check that simulator and recordings fit each other, and choose the sub-steps."""
-        ordered = tuple(arranged(simulator, r) for r in recordings)
+        ordered = tuple(match_channels(simulator, r) for r in recordings)
         steps = {round(r.dt / ordered[0].dt, 4) for r in ordered}
         if steps != {1.0}:
             given = ", ".join(f"{r.dt:g} s" for r in ordered)
@@ -127,7 +127,7 @@ class Workbench:
 
     def on(self, recordings: Sequence[Recording]) -> Workbench:
         """The same with other recordings, errors still in units of the training outputs' deviation."""
-        return replace(self, recordings=tuple(arranged(self.simulator, r) for r in recordings))
+        return replace(self, recordings=tuple(match_channels(self.simulator, r) for r in recordings))
 
     @one_at_a_time
     def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
@@ -159,7 +159,8 @@ class Workbench:
 
     def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:
         """The simulation-error problem of a model."""
-        return Problem(model, recordings or self.recordings, engine=engine or self.engine, scale=self.scale)
+        context = FitContext(tuple(recordings or self.recordings), QUICK, state_prior=False)
+        return context.problem(model, engine=engine or self.engine, scale=self.scale)
 
     def fit(
         self,
@@ -272,7 +273,7 @@ class Workbench:
                 continue
             try:
                 with np.errstate(all="ignore"):
-                    solution = solver.solve(problem, theta)
+                    solution = solve_within_bounds(problem, theta, solver)
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 continue
             if solution.status is Status.INTERRUPTED:

@@ -23,7 +23,7 @@ from ..data import Recording, as_recordings, check_for_identification, group_by_
 from ..engine import Engine, make_engine
 from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
 from ..optimise import GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
-from .context import Job, iterations
+from .context import FitContext, report_iterations
 from .multistart import EXPLORE, run_tasks
 from .result import Candidate, Fit, with_solution
 
@@ -36,13 +36,13 @@ class LaggedSearch:
 
     wanted: Lagged
     structure: PILFR
-    job: Job
+    context: FitContext
     kept: tuple[Recording, ...]
     held: tuple[Recording, ...]
 
     def problem(self, model: Model, engine: Engine | None) -> Problem:
         """The error of a model over what is trained on."""
-        return replace(self.job, recordings=self.kept).problem(model, engine=engine or self.job.engine)
+        return replace(self.context, recordings=self.kept).problem(model, engine=engine or self.context.engine)
 
 
 def check_lagged_options(wanted: Lagged, stable: bool | float, start: Any) -> None:
@@ -66,7 +66,7 @@ def check_lagged_options(wanted: Lagged, stable: bool | float, start: Any) -> No
 def fit_lagged(
     wanted: Lagged,
     train: Recording | Sequence[Recording],
-    job: Job,
+    context: FitContext,
     starts: int,
     seed: int,
     executor: Executor | None,
@@ -78,21 +78,21 @@ def fit_lagged(
     InputError
         If the recordings hold too little, no start gives a finite simulation, or an option is unfit.
     """
-    if job.l1:
+    if context.l1:
         raise InputError("An L1 penalty is for the weights of an element; leave l1 out, or give a PILFR.")
-    if not isinstance(job.solver, GaussNewton) and wanted.validation:
+    if not isinstance(context.solver, GaussNewton) and wanted.validation:
         raise InputError("Early stopping needs the solver GaussNewton(); give that, or validation=0.")
     first = as_recordings(train)[0]
-    job = replace(job, recordings=check_for_identification(train, wanted.unknowns(first.n_u, first.n_y) + 2))
+    context = replace(context, recordings=check_for_identification(train, wanted.unknowns(first.n_u, first.n_y) + 2))
     structure = wanted.structure(first.n_u, first.n_y)
-    whole = job.recordings, (), ""
-    kept, held, note = hold_back(job.recordings, wanted.validation) if wanted.validation else whole
-    told = job.progress if executor is None else None  # a callable stays in its process
-    search = LaggedSearch(wanted, structure, replace(job, progress=told), kept, held)
+    whole = context.recordings, (), ""
+    kept, held, note = split_validation(context.recordings, wanted.validation) if wanted.validation else whole
+    told = context.progress if executor is None else None  # a callable stays in its process
+    search = LaggedSearch(wanted, structure, replace(context, progress=told), kept, held)
 
     def report(found: list[Candidate], total: int) -> None:
-        if job.progress:
-            job.progress("starts", len(found), total, min((c.error for c in found), default=np.nan))
+        if context.progress:
+            context.progress("starts", len(found), total, min((c.error for c in found), default=np.nan))
 
     sequences = np.random.SeedSequence(seed).spawn(starts)
     found, stopped = run_tasks(explore_lagged, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
@@ -105,8 +105,8 @@ def fit_lagged(
         )
     best = min(usable, key=lambda c: c.error)
     solution = replace(best.solution, status=Status.INTERRUPTED) if stopped else best.solution
-    more: dict[str, Any] = {"candidates": tuple(found), "minimum": False, "note": note}
-    return job.result(best.model, search.structure, job.problem(best.model), solution, **more)
+    more: dict[str, Any] = {"candidates": tuple(found), "errors": {}, "note": note}
+    return context.result(best.model, search.structure, context.problem(best.model), solution, **more)
 
 
 @one_blas_thread
@@ -125,13 +125,13 @@ def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequ
         begin = problem.start if solution is None else solution.theta
         if solution is not None and not np.isfinite(problem.cost(begin)):
             break
-        solver = EXPLORE if share != shares[-1] else search.job.solver
+        solver = EXPLORE if share != shares[-1] else search.context.solver
         told: dict[str, Any] = {}
         if isinstance(solver, GaussNewton | Ipopt):
-            told["progress"] = iterations(search.job.progress, "steps", solver.max_iterations)
-        if search.held and solver is search.job.solver:
-            held = held_problem(trained, search.held, problem)
-            solution = solve_watched(solver, problem, held, begin, **told)
+            told["progress"] = report_iterations(search.context.progress, "steps", solver.max_iterations)
+        if search.held and solver is search.context.solver:
+            held = validation_problem(trained, search.held, problem)
+            solution = solve_with_early_stopping(solver, problem, held, begin, **told)
         else:
             solution = solver.solve(problem, begin, **told)
         if solution.status is Status.INTERRUPTED:
@@ -142,14 +142,14 @@ def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequ
 
 def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution) -> Candidate:
     """What a start has led to, judged in free run over all the training data."""
-    engine = make_engine(model, search.job.engine)
-    problem = Problem(model, search.job.recordings, engine=engine)
+    engine = make_engine(model, search.context.engine)
+    problem = Problem(model, search.context.recordings, engine=engine)
     theta = solution.theta
-    known = [r for k, r in zip(search.kept, search.job.recordings, strict=False) if _begins_alike(k, r)]
+    known = [r for k, r in zip(search.kept, search.context.recordings, strict=False) if _begins_alike(k, r)]
     known = known if len(known) == len(search.kept) else []
     if problem.size > len(theta) or not known:  # the initial states of what was held back, or began elsewhere
         fitted, n = with_solution(model, problem, solution), int(problem.free.sum())
-        others = [r for r in search.job.recordings[len(known) :] if r.begins == "estimate"]
+        others = [r for r in search.context.recordings[len(known) :] if r.begins == "estimate"]
         after = theta if known else theta[:n]
         theta = np.concatenate([after, *(first_state(fitted, engine, r) for r in others)])
         bounds, rest = np.split(solution.multipliers, [len(solution.theta)])
@@ -202,7 +202,7 @@ SAME = (
 )
 
 
-def hold_back(
+def split_validation(
     recordings: Sequence[Recording], share: float
 ) -> tuple[tuple[Recording, ...], tuple[Recording, ...], str]:
     """What is trained on, what is looked at only to stop (scored on the part held back), and a sentence to tell, or "".
@@ -270,7 +270,7 @@ class Watch:
         return self.failed >= self.patience
 
 
-def solve_watched(
+def solve_with_early_stopping(
     solver: GaussNewton, problem: Problem, held: Problem, start: np.ndarray, progress: Progress | None = None
 ) -> Solution:
     """The solver's solution, moved back to the point with the smallest error on `held`."""
@@ -284,6 +284,6 @@ def solve_watched(
     return solution
 
 
-def held_problem(model: Model, held: Sequence[Recording], problem: Problem) -> Problem:
+def validation_problem(model: Model, held: Sequence[Recording], problem: Problem) -> Problem:
     """The problem that scores what is held back, with the engine and scale of the one that trains."""
     return Problem(model, held, engine=problem.engine, scale=problem.scale)

@@ -26,9 +26,9 @@ from ..data import Recording
 from ..linear import FrequencyProblem, in_modal_coordinates, is_modal, propagate, robust_bla, subspace_matrices
 from ..models import PILFR, Model
 from ..optimise import Constraint, GaussNewton, Problem, Solution, Status, stability_limits
-from .context import Job, iterations
+from .context import FitContext, report_iterations
 from .result import with_solution
-from .start import states_of
+from .start import simulate_states
 
 Array = np.ndarray
 BLA = "bla"
@@ -76,9 +76,9 @@ def linear_model(
     if given is None:
         a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset, progress=progress)
     elif isinstance(given, str) and given == BLA:
-        a, b, c, d = best_approximation(recordings, structure.nx)
+        a, b, c, d = best_linear_matrices(recordings, structure.nx)
     else:
-        a, b, c, d = matrices_of(given, structure.nx, first)
+        a, b, c, d = state_space_matrices(given, structure.nx, first)
     offset = _offset(recordings, a, b, c, d) if structure.offset else np.zeros(first.n_y)
     blocks, form = {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset}, structure.linear()
     if is_modal(structure.fixed, structure.nx):
@@ -89,7 +89,7 @@ def linear_model(
         cost = problem.cost(problem.start)
         status = Status.CONVERGED if np.isfinite(cost) else Status.DIVERGED_START
         return model, problem, Solution(problem.start, cost, status, 0, 0.0)
-    report = iterations(progress, "linear model", solver.max_iterations)
+    report = report_iterations(progress, "linear model", solver.max_iterations)
     if not constraints:
         return model, problem, solver.solve(problem, progress=report)
     free = Problem(model, recordings, engine=problem.engine)
@@ -102,7 +102,7 @@ def linear_model(
     return model, problem, min(found, key=lambda s: (s.status is Status.INFEASIBLE, s.cost))
 
 
-def best_approximation(recordings: Sequence[Recording], nx: int) -> tuple[Array, Array, Array, Array]:
+def best_linear_matrices(recordings: Sequence[Recording], nx: int) -> tuple[Array, Array, Array, Array]:
     """The matrices of the best linear approximation from periodic recordings, Krikelis et al. (2024), Sec. 5.3.
 
     Of order 0 it is the static gain of least squares about the means.
@@ -124,7 +124,7 @@ def best_approximation(recordings: Sequence[Recording], nx: int) -> tuple[Array,
     return model.A, model.B, model.C, model.D
 
 
-def matrices_of(given: Any, nx: int, recording: Recording) -> tuple[Array, Array, Array, Array]:
+def state_space_matrices(given: Any, nx: int, recording: Recording) -> tuple[Array, Array, Array, Array]:
     """The matrices of a `control.StateSpace` that is to begin with.
 
     Raises
@@ -167,28 +167,28 @@ def known_entries(structure: PILFR) -> dict[str, np.ndarray]:
     return {k: np.asarray(v) for k, v in structure.fixed.items() if k in COORDINATES and np.any(np.asarray(v) != 0)}
 
 
-def in_known_coordinates(structure: PILFR, linear: Model, job: Job) -> Model:
+def transform_to_known_basis(structure: PILFR, linear: Model, context: FitContext) -> Model:
     """The linear model in the basis in which what the structure knows holds; as it is where nothing is known."""
     known = known_entries(structure)
     if not known or not structure.nx or (set(known) == {"A"} and is_modal(known, structure.nx)):
         return linear  # which is in modal coordinates already
     blocks = {k: p.value for k, p in linear.parameters.items()}
-    blocks = nearest_basis(_scaled(blocks, np.concatenate([r.u for r in job.recordings])), known)
+    blocks = find_nearest_basis(_scaled(blocks, np.concatenate([r.u for r in context.recordings])), known)
     alone = replace(structure.linear(), fixed=known)
     model = alone.model(linear.n_u, linear.n_y, blocks, inputs=linear.inputs, outputs=linear.outputs)
-    problem = replace(job, limits=stability_limits(structure, job.asked.stable)[:1]).problem(model)
+    problem = replace(context, constraints=stability_limits(structure, context.options.stable)[:1]).problem(model)
     if not np.isfinite(problem.cost(problem.start)):
         return model
-    return with_solution(model, problem, job.solve(problem, "linear model"))
+    return with_solution(model, problem, context.solve(problem, "linear model"))
 
 
 def _scaled(blocks: Blocks, u: np.ndarray) -> Blocks:
     """States of unit deviation, from which the search for a basis begins."""
-    spread = np.sqrt(np.mean(states_of(blocks, u) ** 2, axis=0))
-    return changed_basis(blocks, np.diag(np.where(spread > 0, spread, 1.0)))
+    spread = np.sqrt(np.mean(simulate_states(blocks, u) ** 2, axis=0))
+    return change_basis(blocks, np.diag(np.where(spread > 0, spread, 1.0)))
 
 
-def changed_basis(blocks: Mapping[str, np.ndarray], t: np.ndarray) -> Blocks:
+def change_basis(blocks: Mapping[str, np.ndarray], t: np.ndarray) -> Blocks:
     """The blocks with `x = T x'`."""
     back = np.linalg.inv(t)
     return {
@@ -199,7 +199,7 @@ def changed_basis(blocks: Mapping[str, np.ndarray], t: np.ndarray) -> Blocks:
     }
 
 
-def nearest_basis(blocks: Blocks, known: Mapping[str, np.ndarray], seed: int = 0) -> Blocks:
+def find_nearest_basis(blocks: Blocks, known: Mapping[str, np.ndarray], seed: int = 0) -> Blocks:
     """The blocks in the basis in which their known entries (nan: unknown) come nearest to what is known.
 
     Parameters
@@ -221,7 +221,7 @@ def nearest_basis(blocks: Blocks, known: Mapping[str, np.ndarray], seed: int = 0
         t = flat.reshape(n, n)
         if not np.linalg.cond(t) < 1e10:
             return np.full(sum(int(np.sum(~np.isnan(v))) for v in want.values()), 1e6)
-        found = changed_basis(blocks, t)
+        found = change_basis(blocks, t)
         return np.concatenate([((found[k] - v) / size[k])[~np.isnan(v)] for k, v in want.items()])
 
     rng, best, least = np.random.default_rng(seed), np.eye(n), np.inf
@@ -229,7 +229,7 @@ def nearest_basis(blocks: Blocks, known: Mapping[str, np.ndarray], seed: int = 0
         t = np.eye(n) if k == 0 else rng.standard_normal((n, n))
         for name, side in (("B_u", 1), ("C_y", -1)):  # the known size of inputs and outputs tells the states' scale
             if name in want:
-                norm = float(np.linalg.norm(changed_basis(blocks, t)[name]))
+                norm = float(np.linalg.norm(change_basis(blocks, t)[name]))
                 t = t * (norm / (size[name] * np.sqrt(want[name].size))) ** side if norm > 0 else t
                 break
         result: Any = least_squares(left, t.ravel(), x_scale="jac", max_nfev=200)
@@ -237,4 +237,4 @@ def nearest_basis(blocks: Blocks, known: Mapping[str, np.ndarray], seed: int = 0
             best, least = result.x.reshape(n, n), float(result.cost)
         if least < 1e-10:
             break
-    return changed_basis(blocks, best)
+    return change_basis(blocks, best)

@@ -35,9 +35,18 @@ from ..data import Recording
 from ..engine import Engine, make_engine
 from ..models import PILFR, Model, PrandtlIshlinskii, StaticNetwork, direction_fixed, fixed_whole, places
 from ..optimise import Constraint, GaussNewton, Problem, Solution, Status, held_at_bounds, loosened
-from .context import Job, solve_inside
+from .context import FitContext, solve_within_bounds
 from .result import PRIOR, Candidate
-from .start import Blocks, enveloped, grid_start, has_networks, network_start, paper_start, regridded, unit_states
+from .start import (
+    Blocks,
+    envelope_start,
+    grid_start,
+    has_networks,
+    network_start,
+    paper_start,
+    regrid_channels,
+    unit_states,
+)
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
@@ -47,7 +56,7 @@ MARGIN = 1.1  # times the smallest error, for the weights of a smooth density
 
 
 @one_blas_thread
-def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Candidate:
+def explore(search: StartSearch, seed: int, sequence: np.random.SeedSequence) -> Candidate:
     """One start, run until it has shown what it is worth; with the paper's start to the end, polish included or not.
 
     The paper's start draws thresholds far smaller than z, which end in clusters and beyond the visited range: a solver
@@ -63,13 +72,13 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
         place = dict(enumerate(places(search.structure))).get(seed, "random")
         values = grid_start(search.structure, scaled, inputs, states, rng, place)
         if has_networks(search.structure):
-            values = enveloped(search.structure, scaled, values, search.recordings, states, place)
+            values = envelope_start(search.structure, scaled, values, search.recordings, states, place)
     else:
         values = paper_start(search.structure, scaled, inputs, states, rng)
     model = search.model(values)
     problem = search.problem(model)
     candidate = _candidate(seed, model, problem, search.solve(problem, None, solver))
-    candidate = replace(candidate, drawn=drawn(search.structure, search.start, seed))
+    candidate = replace(candidate, drawn=is_drawn(search.structure, search.start, seed))
     done = candidate.solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error)
     if search.start != "paper" or done:
         return candidate
@@ -82,7 +91,7 @@ def explore(search: Search, seed: int, sequence: np.random.SeedSequence) -> Cand
     return _candidate(seed, polished.model, problem, solution, polished.note)
 
 
-def drawn(structure: Any, start: str, seed: int) -> bool:
+def is_drawn(structure: Any, start: str, seed: int) -> bool:
     """Whether a start has anything random in it: with the grid, the direction of z where it is free, or thresholds."""
     element = structure.element
     if start != "grid" or isinstance(element, StaticNetwork):
@@ -100,7 +109,7 @@ def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, no
 
 
 @one_blas_thread
-def polish(search: Search, candidate: Candidate) -> Candidate:
+def polish(search: StartSearch, candidate: Candidate) -> Candidate:
     """Re-grid a candidate and run it further, with and without a prior that holds the weights to a smooth density.
 
     The one with the prior (its `note` says so) is returned where its training error is hardly above the smallest.
@@ -122,10 +131,12 @@ def polish(search: Search, candidate: Candidate) -> Candidate:
         problem = search.problem(best.model, engine)
         values, states = problem.parameters(best.theta), problem.first_states(best.theta)
         runs = [engine.simulate(r.u, values, s, True) for r, s in zip(search.recordings, states, strict=True)]
-        moved = regridded(search.structure, parameters.unpack(values), np.concatenate([run[2] for run in runs]), beyond)
+        moved = regrid_channels(
+            search.structure, parameters.unpack(values), np.concatenate([run[2] for run in runs]), beyond
+        )
         model = candidate.model.with_parameters(parameters.at(parameters.pack(moved)))
         if spread:
-            model = held_near(model, moved, spread)
+            model = hold_near_density(model, moved, spread)
         problem = search.problem(model, engine, noise=best.error)
         solution = solve(problem, np.concatenate([problem.start[:n_free], best.theta[n_free:]]))
         found.append(_candidate(candidate.seed, model, problem, solution, PRIOR if spread else ""))
@@ -141,7 +152,7 @@ def polish(search: Search, candidate: Candidate) -> Candidate:
     return smooth if usable and smooth.error <= MARGIN * best.error else best
 
 
-def _held(search: Search, candidate: Candidate) -> bool:
+def _held(search: StartSearch, candidate: Candidate) -> bool:
     """Whether a candidate is at an exact bound on a spectral radius, which its multiplier says to hold it."""
     return held_at_bounds(search.problem(candidate.model), candidate.theta, candidate.solution)
 
@@ -152,7 +163,7 @@ def _best_so_far(found: list[Candidate]) -> Candidate:
     return replace(best, solution=replace(best.solution, status=Status.INTERRUPTED))
 
 
-def held_near(model: Model, values: dict[str, Any], spread: float) -> Model:
+def hold_near_density(model: Model, values: dict[str, Any], spread: float) -> Model:
     """Hold weights and thresholds near the smoothed density, with a relative standard deviation `spread`."""
     r, w = values["r"], values["w"]
     gap = np.gradient(r, axis=1) if r.shape[1] > 1 else r
@@ -170,7 +181,7 @@ def _merit(candidate: Candidate) -> tuple[bool, float]:
 
 
 def search_starts(
-    search: Search,
+    search: StartSearch,
     starts: int,
     seed: int,
     executor: Executor | None,
@@ -209,7 +220,7 @@ def search_starts(
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class StartSearch:
     """All that the tasks of one identification share."""
 
     structure: PILFR
@@ -227,10 +238,10 @@ class Search:
     progress: Progress | None = None  # gets the steps of every solve; of starts in other processes they are not heard
 
     @classmethod
-    def of(cls, job: Job, structure: PILFR, linear: Blocks, **options: Any) -> Search:
-        """The search for a structure with the recordings, solver and options of a job."""
-        given = {"engine": job.engine, "noise": job.asked.noise, "weights": job.weights, **options}
-        return cls(structure, job.recordings, linear, job.solver, job.limits, **given)
+    def of(cls, context: FitContext, structure: PILFR, linear: Blocks, **options: Any) -> StartSearch:
+        """The search for a structure with the recordings, solver and options of a context."""
+        given = {"engine": context.engine, "noise": context.options.noise, "weights": context.weights, **options}
+        return cls(structure, context.recordings, linear, context.solver, context.constraints, **given)
 
     def problem(self, model: Model, engine: Engine | None = None, noise: float | None = None) -> Problem:
         """The simulation-error problem of a model of this structure.
@@ -246,11 +257,12 @@ class Search:
             l1=self.l1,
             noise=self.noise or noise or self.level,
             weights=self.weights,
+            state_prior=True,
         )
 
     def solve(self, problem: Problem, start: np.ndarray | None, solver: Any, held: bool = False) -> Solution:
         """A solver's solution inside exact bounds on spectral radii; `held` says that they hold it."""
-        return solve_inside(problem, start, solver, "steps", self.progress, held=held)
+        return solve_within_bounds(problem, start, solver, "steps", self.progress, held=held)
 
     def model(self, values: dict[str, Any]) -> Model:
         """The closed model starting at `values`."""

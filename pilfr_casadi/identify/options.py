@@ -1,9 +1,8 @@
-"""What a fit was asked with, which holds for fits made from it too.
+"""`FitOptions`: the options of `fit` that also hold for fits made from its result.
 
-That are a bound on spectral radii, constraints, the noise that priors are weighed against, and weights of recordings.
-
-A model file has no code in it, hence no constraints: it tells their names, and of spectral radii the bound. What only
-its name is known of has to be given again, or given up, rather than be left out unnoticed.
+These are the bound on spectral radii, the constraints, the noise that priors are weighed against, and the weights of
+recordings. A model file holds no code, hence no constraints: it holds their names, and the bound on spectral radii. A
+constraint known only by name must be supplied again or dropped explicitly.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from ..data import Recording, as_recordings, fingerprint
 from ..models import PILFR
 from ..optimise import Constraint, Limit, checked_weights, stability_limits
 
-RADIUS = "spectral radius"
+RADIUS = "spectral radius"  # how the names of bounds on spectral radii begin
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
-    """What `fit` was asked with.
+class FitOptions:
+    """Options that a fit passes on to fits made from it.
 
     Attributes
     ----------
@@ -32,11 +31,11 @@ class Asked:
         As for `fit`.
     constraints : tuple of Constraint
     lost : tuple of str
-        Names of constraints that held the fit before it went through a file.
+        Names of constraints that the fit had before it was written to a file.
     noise : float or None
-        What priors are weighed against, relative to the output's deviation; None where it is estimated.
+        Noise that priors are weighed against, relative to the output's deviation; None to estimate it.
     weights : mapping or None
-        How much each recording counts, by its `fingerprint`; None where all count the same.
+        Weight of each recording by its `fingerprint`; None for equal weights.
     """
 
     stable: bool | float = True
@@ -45,21 +44,20 @@ class Asked:
     noise: float | None = None
     weights: Mapping[str, float] | None = None
 
-    def but(
+    def updated(
         self,
         stable: bool | float | None = None,
         constraints: Any = None,
         noise: float | str | None = None,
         weights: Any = None,
         train: Any = (),
-    ) -> Asked:
-        """The same, but for what is given; None is not given. Weights are those of the recordings `train`.
+    ) -> FitOptions:
+        """Return the options with some replaced; None keeps the present one. `weights` belong to recordings `train`.
 
         Raises
         ------
         InputError
-            If what is given are no constraints, no noise or no weights of those recordings, or no constraints are given
-            and those of the fit are lost.
+            If a constraint, the noise or the weights are unfit, or constraints were lost in a file and none are given.
         """
         if noise is not None and noise != "estimate" and not (is_number(noise) and 0 < noise < np.inf):
             raise InputError(f"noise = {noise!r} was given; give a number above zero, or 'estimate'.")
@@ -68,20 +66,20 @@ class Asked:
                 f"The fit was held by constraints that its file cannot hold ({listed(self.lost)}); give them again as "
                 "constraints=, or constraints=() to do without."
             )
-        return Asked(
+        return FitOptions(
             self.stable if stable is None else stable,
-            self.constraints if constraints is None else constraint_list(constraints),
+            self.constraints if constraints is None else _constraint_list(constraints),
             noise=self.noise if noise is None else None if noise == "estimate" else float(noise),
-            weights=self.weights if weights is None else weights_by_recording(weights, train),
+            weights=self.weights if weights is None else _weights_by_recording(weights, train),
         )
 
     def weights_of(self, recordings: Sequence[Recording]) -> np.ndarray | None:
-        """The weight of each recording, or None.
+        """Weight of each recording, or None.
 
         Raises
         ------
         InputError
-            If there are weights, but none for one of them.
+            If there are weights, but none for one of the recordings.
         """
         if self.weights is None:
             return None
@@ -94,29 +92,29 @@ class Asked:
                 )
         return np.array([self.weights[name] for name in prints])
 
-    def limits(self, structure: PILFR | None) -> tuple[Constraint, ...]:
-        """All of it as constraints, those on spectral radii first."""
+    def all_constraints(self, structure: PILFR | None) -> tuple[Constraint, ...]:
+        """Bounds on spectral radii, then the other constraints."""
         return (*(stability_limits(structure, self.stable) if structure else ()), *self.constraints)
 
 
-def weights_by_recording(weights: Any, train: Any) -> dict[str, float]:
-    """The weights of recordings by their fingerprints; of one that is given twice their root mean square."""
+def _weights_by_recording(weights: Any, train: Any) -> dict[str, float]:
+    """Weights by the recordings' fingerprints; a recording given twice gets the root mean square of both."""
     recordings, sums = as_recordings(train), dict[str, list[float]]()
     for r, weight in zip(recordings, checked_weights(weights, len(recordings)), strict=True):
         sums.setdefault(fingerprint(r), []).append(float(weight))
     return {name: float(np.sqrt(np.mean(np.square(some)))) for name, some in sums.items()}
 
 
-def asked_by(limits: Sequence[Limit], structure: PILFR | None, **more: Any) -> Asked:
-    """What can be told from the limits that a file names, and what `more` it says."""
+def options_from_limits(limits: Sequence[Limit], structure: PILFR | None, **more: Any) -> FitOptions:
+    """Recover the options from the limits in a model file; `more` are options that the file states."""
     names = dict.fromkeys(limit.name.partition("[")[0] for limit in limits if limit.kind == "constraint")
     radii = [limit.upper for limit in limits if limit.name.startswith(f"{RADIUS} <= ")]
     lost = tuple(name for name in names if not name.startswith(RADIUS))
-    return Asked(min(radii) if radii else structure is None or not structure.nx, lost=lost, **more)
+    return FitOptions(min(radii) if radii else structure is None or not structure.nx, lost=lost, **more)
 
 
-def constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
-    """One constraint, or several, as several."""
+def _constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
+    """Return one constraint, or several, as a tuple."""
     if isinstance(given, Constraint):
         return (given,)
     if not isinstance(given, Sequence) or not all(isinstance(c, Constraint) for c in given):

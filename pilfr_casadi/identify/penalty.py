@@ -32,7 +32,7 @@ import numpy as np
 from .._base import InputError, is_number
 from ..models import LAYER, Model, Parameter, ParameterSet, Play, PrandtlIshlinskii, Stop
 from ..optimise import Problem, Solution, Status
-from .context import Job, Stage
+from .context import FitContext, Stage
 from .result import with_solution
 
 SLACK = 0.02  # share of the objective that merging operators may cost before the last solve
@@ -56,7 +56,7 @@ def check_penalty(l1: dict[str, float], parameters: ParameterSet, linear: bool) 
             raise InputError(f"An L1 penalty on {name!r} needs a lower bound of zero or more; bound it or use a prior.")
 
 
-def unit_weights(model: Model) -> Model:
+def normalise_weights(model: Model) -> Model:
     """The same outputs with the weights of each channel at a sum of one, where nothing stands against it."""
     parameters = model.parameters
     if not isinstance(model.element, PrandtlIshlinskii):
@@ -78,14 +78,14 @@ def _scales(p: Parameter, part: Any, low: float) -> bool:
     return p.prior is None and bool(np.all(free | (fixed & (p.value[part] == 0))))
 
 
-def element_alone(model: Model, penalised: Iterable[str]) -> Model:
-    """The model with everything held but `y_0`, what is penalised and, with weights or thresholds, both of them."""
-    loose = {"y_0", *penalised} | (set(LAYER) if set(LAYER) & set(penalised) else set())
+def hold_all_but_element(model: Model, names: Iterable[str]) -> Model:
+    """Fix all parameters but `y_0`, the penalised names and, if weights or thresholds are among them, both of these."""
+    loose = {"y_0", *names} | (set(LAYER) if set(LAYER) & set(names) else set())
     held = {name: {"fixed": True, "prior": None} for name in model.parameters if name not in loose}
     return model.with_parameters(model.parameters.change(**held))
 
 
-def without_idle(model: Model) -> Model:
+def fix_idle_operators(model: Model) -> Model:
     """The model with operators of no weight held, so that they do not split from another one again."""
     p = model.parameters
     if not isinstance(model.element, PrandtlIshlinskii):
@@ -94,7 +94,7 @@ def without_idle(model: Model) -> Model:
     return model.with_parameters(p.change(**{name: {"fixed": p[name].fixed | idle} for name in LAYER}))
 
 
-def merged(held: Problem, theta: np.ndarray) -> np.ndarray:
+def merge_operators(held: Problem, theta: np.ndarray) -> np.ndarray:
     """Variables with operators of like thresholds merged, the nearest first; see above."""
     element, parameters = held.model.element, held.model.parameters
     if not (isinstance(element, PrandtlIshlinskii) and isinstance(element.operator, Play | Stop)):
@@ -133,7 +133,7 @@ def merged(held: Problem, theta: np.ndarray) -> np.ndarray:
     return theta
 
 
-def restored(solution: Solution, held: Problem, problem: Problem) -> Solution:
+def restore_variables(solution: Solution, held: Problem, problem: Problem) -> Solution:
     """The solution of a problem with parameters held, in the variables of the problem without."""
     n_held, n = int(held.free.sum()), int(problem.free.sum())
     theta = np.concatenate([held.parameters(solution.theta)[problem.free], solution.theta[n_held:]])
@@ -144,25 +144,25 @@ def restored(solution: Solution, held: Problem, problem: Problem) -> Solution:
     return replace(solution, theta=theta, multipliers=multipliers)
 
 
-def sentence(model: Model, l1: dict[str, float]) -> str:
+def penalty_sentence(model: Model, l1: dict[str, float]) -> str:
     """How many entries the penalty has brought to zero."""
     counts = [f"{np.sum(model.parameters[k].value == 0)} of {model.parameters[k].size} entries of {k}" for k in l1]
     return f"L1 penalty: {', '.join(counts)} are exactly zero; the linear blocks were held while it acted"
 
 
-def penalised(model: Model, problem: Problem, solution: Solution, job: Job, noise: float) -> Stage:
+def solve_with_penalty(model: Model, problem: Problem, solution: Solution, context: FitContext, noise: float) -> Stage:
     """The model, problem and solution with the L1 penalty, from the solution without, and a note; see `penalty`."""
     if solution.status is Status.INTERRUPTED:
         return model, problem, solution, "interrupted before the L1 penalty was applied"
-    found = unit_weights(with_solution(model, problem, solution))
+    found = normalise_weights(with_solution(model, problem, solution))
     states = solution.theta[int(problem.free.sum()) :]
-    options: dict[str, Any] = {"engine": problem.engine, "l1": job.l1}
-    whole, held = (job.problem(m, noise, **options) for m in (found, element_alone(found, job.l1)))
-    begin = merged(held, np.concatenate([held.start[: int(held.free.sum())], states]))
+    options: dict[str, Any] = {"engine": problem.engine, "l1": context.l1}
+    whole, held = (context.problem(m, noise, **options) for m in (found, hold_all_but_element(found, context.l1)))
+    begin = merge_operators(held, np.concatenate([held.start[: int(held.free.sum())], states]))
     states = begin[int(held.free.sum()) :]
-    last = without_idle(held.model.with_parameters(held.model.parameters.at(held.parameters(begin))))
+    last = fix_idle_operators(held.model.with_parameters(held.model.parameters.at(held.parameters(begin))))
     if np.any(last.parameters.free):
-        held = job.problem(last, noise, **options)
+        held = context.problem(last, noise, **options)
     begin = np.concatenate([held.start[: int(held.free.sum())], states])
-    result = restored(job.solve(held, "L1 penalty", begin), held, whole)
-    return found, whole, result, sentence(with_solution(found, whole, result), job.l1)
+    result = restore_variables(context.solve(held, "L1 penalty", begin), held, whole)
+    return found, whole, result, penalty_sentence(with_solution(found, whole, result), context.l1)

@@ -1,6 +1,6 @@
 """`Fit`, the result of `fit`: a fitted model that simulates, judges, draws and saves itself.
 
-`outcome` builds it from the solution of a problem. Its note says two things that the recordings leave open.
+`FitContext.result` builds it from the solution of a problem. Its note says two things that the recordings leave open.
 
 Memory in a periodic steady state: an operator that never slips in a whole period keeps whatever memory it has. Its row
 of the state's slope over a period is that of the identity, every value in an interval is a steady state, and the
@@ -18,7 +18,7 @@ have no threshold),
 from __future__ import annotations
 
 import os
-import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -29,7 +29,7 @@ import numpy as np
 from .._base import InputError
 from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse, rmse_per_output
 from ..engine import Engine, make_engine
-from ..export import FitContent, SavedStart, exported, write_model_file
+from ..export import FitContent, SavedStart, exported, read_model_file, write_model_file
 from ..models import PILFR, Model, PrandtlIshlinskii, Stop
 from ..optimise import (
     Gain,
@@ -38,13 +38,12 @@ from ..optimise import (
     Solution,
     Status,
     first_state,
-    limits_of,
     samples_for_state,
-    unbounded_sentence,
     unknown_multipliers,
 )
-from .options import Asked
-from .uncertainty import standard_errors, unknown_sentences
+from ..simulators import Simulator
+from .options import FitOptions, options_from_limits
+from .uncertainty import describe_unknown_errors
 
 PRIOR = "weights held near a smooth density by a weak prior"
 
@@ -91,8 +90,10 @@ class Fit:
         The linear model that the search began with, `linear_nrmse` its NRMSE on each training recording.
     candidates : tuple of Candidate
         Every start that was tried.
-    asked : Asked
+    options : FitOptions
         Bound on spectral radii, constraints, noise and weights, which hold for fits made from this one too.
+    simulator : Simulator or None
+        The simulator with the fitted values, if one was fitted.
     """
 
     model: Model
@@ -112,7 +113,8 @@ class Fit:
     note: str = ""
     linear_nrmse: tuple[float, ...] = ()
     limits: tuple[Limit, ...] = ()
-    asked: Asked = Asked()  # noqa: RUF009  (frozen)
+    options: FitOptions = FitOptions()  # noqa: RUF009  (frozen)
+    simulator: Simulator | None = None
 
     @property
     def status(self) -> Status:
@@ -123,6 +125,16 @@ class Fit:
     def parameters(self) -> dict[str, np.ndarray]:
         """Fitted values by name."""
         return {name: p.value for name, p in self.model.parameters.items()}
+
+    @property
+    def asked(self) -> FitOptions:
+        """Old name of `options`."""
+        return self.options
+
+    def with_simulator(self, simulator: Simulator) -> Fit:
+        """Return the fit of a simulator's model with the simulator at the fitted values."""
+        own = {name: self.model.parameters[name] for name in simulator.parameters}
+        return replace(self, simulator=simulator.with_parameters(own))
 
     @cached_property
     def _engine(self) -> Engine:
@@ -135,9 +147,9 @@ class Fit:
         held and the state fitted to the first `samples` samples (default: ten a state, at least 50); nothing later is
         looked at, and `nrmse` does not score them.
         """
-        self._check(recording)
+        recording = self._matched(recording)
         known = self.initial.get(fingerprint(recording))
-        return first_state(self.model, self._engine, recording, samples) if known is None else known
+        return first_state(self.model, self._engine, recording, samples, state_prior=True) if known is None else known
 
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulated outputs for a recording's inputs, shape (M, n_y).
@@ -151,7 +163,7 @@ class Fit:
 
     def signals(self, recording: Recording) -> dict[str, np.ndarray]:
         """Simulated `y` (M, n_y) with the element's `z` and `w` (M, n_w)."""
-        self._check(recording)
+        recording = self._matched(recording)
         state = self.initial_state(recording)
         y, _, z, w = self._engine.simulate(self.model.drive(recording), self.model.parameters.start, state, True)
         return {"y": y, "z": z, "w": w}
@@ -164,6 +176,7 @@ class Fit:
         InputError
             If no sample is left.
         """
+        recording = self._matched(recording)
         estimated = recording.begins == "estimate"
         if not estimated or fingerprint(recording) in self.initial or not self.model.n_x + self.model.n_s:
             return recording.skip
@@ -188,7 +201,7 @@ class Fit:
             If a recording does not fit the model, is not longer than what its initial state is fitted to, or an output
             never changes.
         """
-        given = as_recordings(recordings)
+        given = [self._matched(r) for r in as_recordings(recordings)]
         first = [self.scored_from(r) for r in given]
         pooled = np.concatenate([r.y[k:] for r, k in zip(given, first, strict=True)])
         nrmse(pooled, pooled)  # refuses an output that never changes
@@ -199,12 +212,15 @@ class Fit:
             errors.append(np.mean(rmse_per_output(r.y, self.simulate(r), k) / spread))
         return float(np.mean(errors))
 
-    def _check(self, recording: Recording) -> None:
+    def _matched(self, recording: Recording) -> Recording:
+        """Check that a recording fits the model; for a simulator, put its columns in the simulator's order."""
         if not isinstance(recording, Recording):
             raise InputError(
                 f"A {type(recording).__name__} was given to simulate; give a Recording, which holds inputs, outputs "
                 "and the time step."
             )
+        if self.simulator is not None:
+            recording = match_channels(self.simulator, recording)
         n_u, n_y = len(self.model.inputs), self.model.n_y
         unmeasured = recording.n_y == 0 and recording.begins != "estimate"
         if recording.n_u != n_u or not (recording.n_y == n_y or unmeasured):
@@ -216,6 +232,7 @@ class Fit:
             raise InputError(
                 f"The recording's step is {recording.dt:g} s, the model's {self.dt:g} s; resample the recording."
             )
+        return recording
 
     def plot(self, recordings: Recording | Sequence[Recording], **options: Any) -> Any:
         """Figures of the fit over recordings; see `plots.plot_fit`."""
@@ -224,8 +241,26 @@ class Fit:
         return plot_fit(self, recordings, **options)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model as JSON, atomically; see `identify.save`."""
+        """Write the fit as JSON, atomically: an existing file stays as it is until the new one is complete on disk.
+
+        Parameters
+        ----------
+        path : path
+            The file, usually `*.json`. Of a model or a simulator of the user's own it holds the values alone, which a
+            warning says for a simulator; give the model to `load`.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        """
         write_model_file(path, self.content())
+        if self.simulator is not None:
+            warnings.warn(
+                f"{os.fspath(path)} holds the fitted values, not the simulator's equations, which are code; load it "
+                "with load(path, model=fit.model).",
+                stacklevel=2,
+            )
 
     def content(self) -> FitContent:
         """Return the values that a model file holds of this fit."""
@@ -244,8 +279,8 @@ class Fit:
             seconds=self.seconds,
             active=self.active,
             limits=self.limits,
-            noise=self.asked.noise,
-            weights=self.asked.weights,
+            noise=self.options.noise,
+            weights=self.options.weights,
             starts=tuple(SavedStart(c.seed, c.error, c.solution, c.note, c.drawn) for c in self.candidates),
         )
 
@@ -281,7 +316,7 @@ class Fit:
             lines.append(f"the linear model alone{without}, to judge the element by: NRMSE {alone}")
         if self.note:
             lines.append(self.note)
-        lines += unknown_sentences(self.errors)
+        lines += describe_unknown_errors(self.errors)
         lines.append(f"bounds that are active: {', '.join(self.active) if self.active else 'none'}")
         constraints = [limit for limit in self.limits if limit.kind == "constraint"]
         if constraints:
@@ -297,94 +332,103 @@ class Fit:
     __repr__ = __str__
 
 
+def match_channels(simulator: Simulator, recording: Recording) -> Recording:
+    """Return a recording with its columns in a simulator's order, others left out.
+
+    Raises
+    ------
+    InputError
+        If a column is missing; a recording without outputs needs none.
+    """
+    changes: dict[str, Any] = {}
+    for kind, names, own, values in (
+        ("input", simulator.inputs, recording.inputs, recording.u),
+        ("output", simulator.output_names, recording.outputs, recording.y),
+    ):
+        if tuple(own) == tuple(names) or (kind == "output" and not own):
+            continue
+        for name in names:
+            if name not in own:
+                raise InputError(
+                    f"The recording {recording.label} has no {kind} {name!r}, which the simulator has; "
+                    f"it has {', '.join(own) or 'none'}. Map a column to it by name."
+                )
+        changes["u" if kind == "input" else "y"] = values[:, [own.index(n) for n in names]]
+        changes[f"{kind}s"] = tuple(names)
+    if changes:
+        kept = {*changes.get("inputs", recording.inputs), *changes.get("outputs", recording.outputs)}
+        changes["units"] = {k: v for k, v in recording.units.items() if k in kept}
+    return recording.with_(**changes) if changes else recording
+
+
+def save(fit: Fit, path: str | os.PathLike[str]) -> None:
+    """Write a fit to a file; see `Fit.save`."""
+    fit.save(path)
+
+
+def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fit:
+    """Read a fit that `save` wrote; simulations are the same to the last digit.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    model : Model or PILFR, optional
+        The equations, where the file cannot hold them: a closed model of your own, or a PI-LFR whose element has
+        envelope expressions of your own. Its values are replaced by those of the file.
+
+    Returns
+    -------
+    Fit
+        Of the starts that were tried only what they reached is kept: each candidate has its seed, error and status, an
+        empty `theta` and the fitted model.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, unreadable, damaged, of another kind or version, was changed after it was written, does
+        not fit `model`, or holds values that are missing, not finite, or outside their bounds.
+
+    Warns
+    -----
+    UserWarning
+        If the file is of the first version of the format, which has no digest to tell changes by.
+    """
+    content = read_model_file(path, model)
+    candidates = tuple(
+        Candidate(c.seed, content.model, np.zeros(0), c.error, c.solution, note=c.note, drawn=c.drawn)
+        for c in content.starts
+    )
+    options = FitOptions()  # the first files did not hold them
+    if content.limits is not None:
+        options = options_from_limits(content.limits, content.structure, noise=content.noise, weights=content.weights)
+    return Fit(
+        model=content.model,
+        structure=content.structure,
+        dt=content.dt,
+        solution=content.solution,
+        train_nrmse=content.train_nrmse,
+        initial=dict(content.initial),
+        labels=content.labels,
+        errors=dict(content.errors),
+        active=content.active,
+        candidates=candidates,
+        linear=content.linear,
+        seconds=content.seconds,
+        units=dict(content.units),
+        linear_nrmse=content.linear_nrmse,
+        limits=content.limits or (),
+        options=options,
+    )
+
+
 def _shown(error: float) -> str:
     return f"{error:.4f}" if error < 1e4 else f"{error:.3g}"
 
 
-FAR = 1e3  # times the error of no output at all, from which a model diverges
-
-
 def with_solution(model: Model, problem: Problem, solution: Solution) -> Model:
-    """The model at the values of a solution."""
+    """Return the model at the values of a solution."""
     return model.with_parameters(model.parameters.at(problem.parameters(solution.theta)))
-
-
-def outcome(
-    model: Model,
-    structure: PILFR | None,
-    problem: Problem,
-    solution: Solution,
-    began: float,
-    recordings: tuple[Recording, ...],
-    candidates: tuple[Candidate, ...] = (),
-    linear: Model | None = None,
-    note: str = "",
-    linear_nrmse: tuple[float, ...] = (),
-    engine: str = "auto",
-    minimum: bool = True,
-    asked: Asked | None = None,
-) -> Fit:
-    """The fit that a solution of a problem stands for; `began` is when its work began (`time.perf_counter`).
-
-    Standard errors are those of a `minimum` of the simulation error; where it is none there are none.
-
-    Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the standard
-    errors know of them. The note also says which memory a periodic steady state leaves open (`open_memory`), and
-    which DC gain holds beyond the recordings alone (`reached_gain`).
-    """
-    fitted = with_solution(model, problem, solution)
-    judged = problem
-    if note == PRIOR:
-        priors = structure.priors if structure else {}
-        fitted = fitted.with_parameters(
-            fitted.parameters.change(**{name: {"prior": priors.get(name)} for name in ("w", "r")})
-        )
-        names = ("constraints", "noise", "scale", "weights")
-        options: dict[str, Any] = {name: getattr(problem, name) for name in names}
-        judged = Problem(fitted, recordings, engine=problem.engine, **options)
-    theta, errors = solution.theta, tuple(problem.nrmse(solution.theta))
-    if solution.status.converged and not max(errors) < FAR * _of_nothing(problem):
-        solution = replace(solution, status=Status.DIVERGES)
-    values = problem.model.parameters.unpack(problem.parameters(theta))
-    told = (
-        note,
-        open_memory_sentence(judged, theta),
-        reached_gain_sentence(problem, theta),
-        unbounded_sentence(structure, problem.constraints, values),
-    )
-    note = "; ".join(part for part in told if part)
-    at_bound = [
-        f"{label} = {value:g}"
-        for label, value, low, high in zip(problem.labels, theta, problem.lower, problem.upper, strict=True)
-        if value in (low, high)
-    ]
-    limits = limits_of(problem, solution)
-    at_bound += [limit.name for limit in limits if limit.active and limit.kind == "constraint"]
-    return Fit(
-        model=fitted,
-        structure=structure,
-        dt=recordings[0].dt,
-        solution=solution,
-        train_nrmse=errors,
-        initial={fingerprint(r): state for r, state in zip(recordings, problem.first_states(theta), strict=True)},
-        labels=problem.labels,
-        errors=standard_errors(judged, theta, structure) if minimum else {},
-        active=tuple(at_bound),
-        candidates=candidates,
-        linear=linear,
-        seconds=time.perf_counter() - began,
-        units=dict(recordings[0].units),
-        note=note,
-        linear_nrmse=linear_nrmse,
-        engine=engine,
-        limits=limits,
-        asked=asked or Asked(),
-    )
-
-
-def _of_nothing(problem: Problem) -> float:
-    """The largest NRMSE of any output that a model without outputs has, at least 1."""
-    return max(1.0, *(float(np.max(np.sqrt(np.mean(r.y**2, axis=0)) / problem.scale)) for r in problem.recordings))
 
 
 Array = np.ndarray
@@ -392,7 +436,7 @@ CHUNK = 512  # samples of a period whose slopes are held at a time
 STILL = 1e-12  # difference from the identity that is none
 
 
-def open_memory(problem: Problem, theta: Array, recording: Recording, state: Array) -> Array:
+def find_open_memory(problem: Problem, theta: Array, recording: Recording, state: Array) -> Array:
     """Which memories a period from a steady state leaves alone though outputs see them, indices (k,)."""
     engine, p, n_x = problem.engine, problem.parameters(theta), problem.model.n_x
     rows = CHUNK * problem.model.substeps
@@ -405,14 +449,14 @@ def open_memory(problem: Problem, theta: Array, recording: Recording, state: Arr
     return np.flatnonzero(still[n_x:] & (seen[n_x:] > STILL * np.max(seen, initial=0.0)))
 
 
-def open_memory_sentence(problem: Problem, theta: Array) -> str:
+def describe_open_memory(problem: Problem, theta: Array) -> str:
     """What it means for a result, naming the recordings; empty where every memory is decided."""
     counts = {}
     for k, (r, state) in enumerate(zip(problem.recordings, problem.first_states(theta), strict=True)):
         periodic = r.begins == "periodic"
         if periodic and problem.model.n_s and np.all(np.isfinite(state)):
             counts[r.label if len(problem.recordings) == 1 or r.name else f"recording {k + 1}"] = len(
-                open_memory(problem, theta, r, state)
+                find_open_memory(problem, theta, r, state)
             )
     found = [f"{count} in {label}" for label, count in counts.items() if count]
     if not found:
@@ -426,7 +470,7 @@ def open_memory_sentence(problem: Problem, theta: Array) -> str:
 APART = 0.05  # difference of gains, next to the largest one asked for, that is told
 
 
-def reached_gain_sentence(problem: Problem, theta: Array) -> str:
+def describe_reached_gain(problem: Problem, theta: Array) -> str:
     """What it means that a gain is met beyond the recordings alone, one for all; empty where none is."""
     found, at = [], 0
     values, moved = problem.model.parameters.unpack(problem.parameters(theta)), None
@@ -436,14 +480,14 @@ def reached_gain_sentence(problem: Problem, theta: Array) -> str:
         if not isinstance(c.expression, Gain):
             continue
         if moved is None:
-            moved = slipping(problem, theta, values)
+            moved = find_slipping(problem, theta, values)
         low, high = problem.g_lower[rows], problem.g_upper[rows]
         room = APART * float(np.max(np.abs(np.concatenate([low, high])), initial=0.0))
 
         def far(gain: Array, low: Array = low, high: Array = high, room: float = room) -> bool:
             return bool(np.any(~((low - room <= gain) & (gain <= high + room))))
 
-        whole, within, odd = weights(problem.model.element, values, c.expression.slope, moved)
+        whole, within, odd = channel_weights(problem.model.element, values, c.expression.slope, moved)
         if far(gain_over(values, whole, None)):
             continue  # not met at all, which is told elsewhere
         reached = gain_over(values, within, samples)
@@ -458,7 +502,7 @@ def reached_gain_sentence(problem: Problem, theta: Array) -> str:
     return "; ".join(found)
 
 
-def slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -> Array:
+def find_slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -> Array:
     """Which operators slip in some recording, (channels, N); none without an element."""
     element = problem.model.element
     if not isinstance(element, PrandtlIshlinskii):
@@ -475,7 +519,9 @@ def slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -> Arr
     return moved
 
 
-def weights(element: object, values: Mapping[str, Array], slope: float, moved: Array) -> tuple[Array, Array, str]:
+def channel_weights(
+    element: object, values: Mapping[str, Array], slope: float, moved: Array
+) -> tuple[Array, Array, str]:
     """Σw of each channel (n_w,) as asked for and within the recordings, and how the operators differ in them."""
     if not isinstance(element, PrandtlIshlinskii):
         return np.zeros(0), np.zeros(0), ""

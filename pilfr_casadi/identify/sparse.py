@@ -24,9 +24,9 @@ from .._base import InputError, Progress, is_number
 from ..data import Recording, as_recordings, fingerprint
 from ..models import LAYER, PILFR, PrandtlIshlinskii
 from ..optimise import Status
-from .context import following
+from .context import context_of_fit
 from .fitting import fit as identify
-from .multistart import POLISH, Search, held_near, polish
+from .multistart import POLISH, StartSearch, hold_near_density, polish
 from .result import PRIOR, Candidate, Fit
 from .start import is_density, regrid
 
@@ -132,7 +132,7 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     memory = (np.arange(element.channels)[:, None] * element.n + kept).ravel()
     initial = {key: np.concatenate([s[: old.n_x], s[old.n_x :][memory]]) for key, s in fit.initial.items()}
     again = identify(replace(fit, model=model, structure=smaller, initial=initial), train, **options)
-    return again if again.status is Status.INTERRUPTED else polished(again, train, **options)
+    return again if again.status is Status.INTERRUPTED else polish_fit(again, train, **options)
 
 
 def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
@@ -140,24 +140,24 @@ def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
     return error if np.isfinite(error) else np.inf
 
 
-def polished(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = None, **options: Any) -> Fit:
+def polish_fit(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = None, **options: Any) -> Fit:
     """A fit with its thresholds placed anew, as the search does with its best starts, where that is no worse.
 
     The weights are then held near a smooth density by a weak prior (`multistart.polish`).
     """
-    structure, job = fit.structure, following(fit, train, solver=solver or POLISH, **options)
+    structure, context = fit.structure, context_of_fit(fit, train, solver=solver or POLISH, **options)
     assert structure is not None
-    search = Search.of(job, structure, {}, level=float(np.mean(fit.train_nrmse)))
+    search = StartSearch.of(context, structure, {}, level=float(np.mean(fit.train_nrmse)))
     problem = search.problem(fit.model)
-    states = [fit.initial_state(r) for r in job.recordings if r.begins == "estimate"]
+    states = [fit.initial_state(r) for r in context.recordings if r.begins == "estimate"]
     theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
     error = float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
     best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))
     if best.model is fit.model and best.error >= error:
         return fit
-    problem = job.problem(best.model, best.error)
-    solution = job.solve(problem, "solve", best.theta)
-    found = job.result(best.model, structure, problem, solution, note=best.note)
+    problem = context.problem(best.model, best.error)
+    solution = context.solve(problem, "solve", best.theta)
+    found = context.result(best.model, structure, problem, solution, note=best.note)
     return replace(found, seconds=found.seconds + fit.seconds, linear=fit.linear, linear_nrmse=fit.linear_nrmse)
 
 
@@ -274,7 +274,7 @@ def _sparser(
     pruned = _whole(prune(_whole(identify(fit, seen, l1={"w": strength}, **options)), seen, **options))
     n = max(1, pruned.structure.element.n)  # type: ignore[union-attr]
     if n not in thin:
-        thin[n] = tuple(_whole(f) for f in thinned(fit, seen, n, **options))
+        thin[n] = tuple(_whole(f) for f in thin_operators(fit, seen, n, **options))
     return min((pruned, *thin[n]), key=lambda f: _error(f, judged))
 
 
@@ -291,12 +291,12 @@ WAYS = tuple(
 SPREAD = 0.02  # relative deviation of the prior on weights that are spread over a density
 
 
-def thinned(
+def thin_operators(
     fit: Fit, train: Recording | Sequence[Recording], n: int, *, solver: Any = None, **options: Any
 ) -> tuple[Fit, ...]:
     """Fits with n operators a channel, spread in several ways over the density of weights that a fit had.
 
-    What the fit was asked with holds, where nothing else is given (`job.following`).
+    What the fit was asked with holds, where nothing else is given (`context.following`).
     None where weights or thresholds are fixed, bounded or have a prior.
     """
     structure, recordings = fit.structure, as_recordings(train)
@@ -310,7 +310,7 @@ def thinned(
     states = [np.concatenate([s[: old.n_x], np.zeros(n * structure.element.channels)]) for s in states]
     found: list[Fit] = []
     for beyond, spacing in WAYS:
-        job = following(replace(fit, structure=smaller), recordings, solver=solver or POLISH, **options)
+        context = context_of_fit(replace(fit, structure=smaller), recordings, solver=solver or POLISH, **options)
         rows = [
             regrid(r, w, float(top), beyond=beyond, spacing=spacing, count=n)
             if is_density(w) and top > 0
@@ -319,12 +319,12 @@ def thinned(
         ]
         values = {**fit.parameters, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
         model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
-        model = held_near(model, values, SPREAD)
-        problem = job.problem(model, float(np.mean(fit.train_nrmse)))
+        model = hold_near_density(model, values, SPREAD)
+        problem = context.problem(model, float(np.mean(fit.train_nrmse)))
         begin = np.concatenate([problem.start[: int(problem.free.sum())], *states])
         if not np.isfinite(problem.cost(begin)):
             continue
-        again = job.result(model, smaller, problem, job.solve(problem, "solve", begin), note=PRIOR)
+        again = context.result(model, smaller, problem, context.solve(problem, "solve", begin), note=PRIOR)
         found.append(replace(again, linear=fit.linear, linear_nrmse=fit.linear_nrmse))
         if again.status is Status.INTERRUPTED:
             break

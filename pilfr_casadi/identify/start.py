@@ -7,8 +7,8 @@ thresholds anew, each for an equal share of `density^0.4` (knots of a good piece
 curve); it continues the density's tail beyond the visited range, where the data say nothing. `network_start` is for
 elements without memory.
 
-`enveloped` starts generalized plays. Between its envelopes such a play keeps its value (Krikelis et al. 2024, Eq. 7),
-so the values `v` seen at one `z` fill the interval from the lower to the upper envelope: the outline of the cloud
+`envelope_start` starts generalized plays. Between its envelopes such a play keeps its value (Krikelis et al. 2024, Eq.
+7), so the values `v` seen at one `z` fill the interval from the lower to the upper envelope: the outline of the cloud
 `(z, v)` estimates both. The answer `v` is the output where the output is read through the element. Where the input
 passes the element, `v` is the input with which the linear model would have given the measured output,
 
@@ -51,7 +51,7 @@ LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
 FLAT = 0.1
 
 
-def states_of(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:
+def simulate_states(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:
     """States (M, nx) of the linear part driven by u (M, n_u), from zero."""
     a, b = blocks["A"], u @ blocks["B_u"].T
     out, x = np.empty((len(u), len(a))), np.zeros(len(a))
@@ -65,7 +65,7 @@ def unit_states(
     blocks: Mapping[str, np.ndarray], inputs: list[np.ndarray], free: bool = True
 ) -> tuple[Blocks, list[np.ndarray]]:
     """Scale each state to unit variance (Sec. 5.3), if free; returns the blocks, and the states of each recording."""
-    states = [states_of(blocks, u) for u in inputs]
+    states = [simulate_states(blocks, u) for u in inputs]
     if not free:
         return dict(blocks), states
     spread = np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0))
@@ -283,9 +283,11 @@ def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(x))])
 
 
-def regridded(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3) -> dict[str, Any]:
+def regrid_channels(
+    structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3
+) -> dict[str, Any]:
     """The values with every channel's thresholds and weights placed anew; z (M, n_w) is the fitted model's signal."""
-    reaches = [reach(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
+    reaches = [threshold_range(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
     rows = [
         regrid(r, w, most, beyond=beyond) if is_density(w) and most > 0 else (r, w)
         for r, w, most in zip(values["r"], values["w"], reaches, strict=True)
@@ -307,7 +309,7 @@ def has_networks(structure: PILFR) -> bool:
     return isinstance(operator, GeneralizedPlay) and operator.networks
 
 
-def reach(structure: PILFR, values: Mapping[str, Array], z: Array, channel: int) -> float:
+def threshold_range(structure: PILFR, values: Mapping[str, Array], z: Array, channel: int) -> float:
     """The threshold at which a channel's operators would rest over z (M,): its size, or half of its envelopes'.
 
     A generalized play rests when its lower curve `γ_l - r` is below its upper one `γ_r + r` at every two values of z.
@@ -320,7 +322,7 @@ def reach(structure: PILFR, values: Mapping[str, Array], z: Array, channel: int)
     return max(float(low - high) / 2, 0.0)
 
 
-def enveloped(
+def envelope_start(
     structure: PILFR,
     linear: Mapping[str, Array],
     values: Mapping[str, Array],
@@ -364,7 +366,7 @@ def enveloped(
     n_u, n_y = linear["B_u"].shape[1], len(linear["C_y"])
     at = channels % (n_u if before else n_y)
     if before:
-        v = np.concatenate([inputs_behind(linear, r, x)[r.skip :] for r, x in zip(recordings, states, strict=True)])
+        v = np.concatenate([deconvolve_inputs(linear, r, x)[r.skip :] for r, x in zip(recordings, states, strict=True)])
     else:
         v = np.concatenate([r.y[r.skip :] for r in recordings])
     centre, size = np.mean(v, axis=0), np.std(v, axis=0)
@@ -408,7 +410,7 @@ def _gain(linear: Mapping[str, Array]) -> Array:
     return linear["C_y"] @ np.linalg.solve(np.eye(len(a)) - a, linear["B_u"]) + linear["D_yu"]
 
 
-def inputs_behind(linear: Mapping[str, Array], recording: Recording, states: Array) -> Array:
+def deconvolve_inputs(linear: Mapping[str, Array], recording: Recording, states: Array) -> Array:
     """Inputs (M, n_u) with which the linear model would have given the measured outputs, damped where it hardly can."""
     u, y = recording.u, recording.y
     error = np.fft.rfft(y - states @ linear["C_y"].T - u @ linear["D_yu"].T - linear["y_0"], axis=0)
@@ -423,18 +425,18 @@ def inputs_behind(linear: Mapping[str, Array], recording: Recording, states: Arr
 
 def channel_start(element: PrandtlIshlinskii, z: Array, v: Array) -> Blocks:
     """Envelopes, thresholds and weights (a row each) of one channel from its signal z (M,) and its answer v (M,)."""
-    at, low, high = outline(z, v)
+    at, low, high = loop_outline(z, v)
     n, operator = element.n, element.operator
     widest = float(np.max(high - low)) / 2
     r = 0.9 * widest * np.arange(n) / n
     inner = float(np.mean(r))
     rows = {"r": r, "w": np.full(n, 1.0 / n)}
     for side, curve in (("l", low + inner), ("r", high - inner)):
-        rows |= {f"gamma_{side}_{k}": row for k, row in network(at, curve, operator.neurons).items()}
+        rows |= {f"gamma_{side}_{k}": row for k, row in fit_envelope(at, curve, operator.neurons).items()}
     return rows
 
 
-def outline(z: Array, v: Array) -> tuple[Array, Array, Array]:
+def loop_outline(z: Array, v: Array) -> tuple[Array, Array, Array]:
     """Where v (M,) lies over z (M,): bins' centres, and a lower and an upper curve (bins,), neither falling.
 
     Loops that run the wrong way round have no width.
@@ -463,7 +465,7 @@ def _rising(curve: Array) -> Array:
     return (np.maximum.accumulate(curve) + np.minimum.accumulate(curve[::-1])[::-1]) / 2
 
 
-def network(z: Array, curve: Array, neurons: int) -> Blocks:
+def fit_envelope(z: Array, curve: Array, neurons: int) -> Blocks:
     """Parameters `c, a0, a, b, d` (a row each) of the envelope network nearest to a curve (G,) over z (G,)."""
     from scipy.optimize import nnls
 

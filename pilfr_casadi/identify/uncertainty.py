@@ -199,7 +199,7 @@ def _snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, toleranc
     return held
 
 
-def unknown_sentences(errors: Mapping[str, np.ndarray]) -> list[str]:
+def describe_unknown_errors(errors: Mapping[str, np.ndarray]) -> list[str]:
     """What it means that standard errors are infinite, none where none is."""
     count = {name: int(np.sum(np.isinf(e))) for name, e in errors.items()}
     turned = [name for name in STATES if count.get(name)]

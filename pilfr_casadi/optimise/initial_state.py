@@ -9,7 +9,7 @@ from ..data import Recording
 from ..engine import Engine
 from ..models import Model
 from .gauss_newton import GaussNewton
-from .problem import Problem, settled
+from .problem import Penalties, Problem, settled, state_precision
 
 
 def samples_for_state(model: Model) -> int:
@@ -17,10 +17,13 @@ def samples_for_state(model: Model) -> int:
     return max(10 * (model.n_x + model.n_s), 50)
 
 
-def first_state(model: Model, engine: Engine, recording: Recording, samples: int | None = None) -> np.ndarray:
+def first_state(
+    model: Model, engine: Engine, recording: Recording, samples: int | None = None, *, state_prior: bool = False
+) -> np.ndarray:
     """State with memory at a recording's first sample, as its `initial` says; the model's parameters are held.
 
-    Where it is to be estimated, it is fitted to the first `samples` samples; nothing later is looked at.
+    Where it is to be estimated, it is fitted to the first `samples` outputs, and later outputs are not looked at. With
+    `state_prior` it has a prior around rest, whose scale is that of a run over all inputs (`state_precision`).
 
     Raises
     ------
@@ -47,5 +50,9 @@ def first_state(model: Model, engine: Engine, recording: Recording, samples: int
         spread = np.std(head.y, axis=0)
         spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
         problem = Problem(held, head, engine=engine, scale=spread)
+        if state_prior:
+            square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s)
+            priors = [] if square is None else [(0, square)]
+            problem.penalties = Penalties(held.parameters, {}, 1.0, problem.residuals, problem.size, priors)
         state = GaussNewton(max_iterations=50).solve(problem).theta
     return state

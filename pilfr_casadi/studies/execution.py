@@ -25,7 +25,7 @@ import numpy as np
 from .._base import InputError, Progress, close_workers, deferred_interrupt, whole
 from ..data import Recording, keeps_its_period, read
 from ..export import digest, made
-from ..identify import Fit, drawn
+from ..identify import Fit, is_drawn
 from ..models import PILFR, places
 from ..optimise import Status
 from .executor import AHEAD, Attempt, check_executor, side_by_side
@@ -227,9 +227,9 @@ def seeds_advice(cell: Cell) -> str:
     if model.element is None:
         return "a linear model has no starts, so every seed gives the same one; use one seed"
     first = len(places(model))
-    if any(drawn(model, start, i) for i in range(min(starts, first + 1))):
+    if any(is_drawn(model, start, i) for i in range(min(starts, first + 1))):
         return ""
-    more = f", or {first + 1} starts or more" if drawn(model, start, first) else ""
+    more = f", or {first + 1} starts or more" if is_drawn(model, start, first) else ""
     return f"no start is random, so every seed gives the same model; use one seed, start = 'paper' in [solver]{more}"
 
 

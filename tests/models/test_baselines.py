@@ -11,8 +11,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.export import ordered_digest
-from pilfr_casadi.identify.lagged import hold_back, solve_watched
-from pilfr_casadi.identify.uncertainty import gauge_tangents
+from pilfr_casadi.identify import gauge_tangents, solve_with_early_stopping, split_validation
 from pilfr_casadi.models import reading_output
 from pilfr_casadi.optimise import Problem
 
@@ -246,11 +245,11 @@ def test_early_stopping_takes_the_best_point_on_what_is_held_back():
     train, _ = recordings(truth("network_lfr"), noise=0.3, length=160)
     structure = pilfr.network_lfr(2, 6)
     model = pilfr.fit(structure, train, starts=1, start="plain", solver=pilfr.GaussNewton(max_iterations=1)).model
-    (kept,), (held,), _ = hold_back([train], 0.4)
+    (kept,), (held,), _ = split_validation([train], 0.4)
     problem, judged = Problem(model, kept, engine="vm"), Problem(model, held, engine="vm")
     seen = []
     free = pilfr.GaussNewton().solve(problem, watch=lambda theta: seen.append(judged.cost(theta)) or False)
-    found = solve_watched(pilfr.GaussNewton(), problem, judged, problem.start)
+    found = solve_with_early_stopping(pilfr.GaussNewton(), problem, judged, problem.start)
     assert judged.cost(found.theta) <= min(seen) * (1 + 1e-12)
     assert judged.cost(found.theta) < judged.cost(free.theta)
     assert found.status is pilfr.Status.STOPPED_EARLY and found.status.converged
@@ -259,31 +258,33 @@ def test_early_stopping_takes_the_best_point_on_what_is_held_back():
 
 def test_what_is_held_back():
     one = pilfr.Recording(np.arange(100.0), np.arange(100.0), 0.1, initial="zero", skip=20)
-    (kept,), (held,), told = hold_back([one], 0.25)
+    (kept,), (held,), told = split_validation([one], 0.25)
     assert (len(kept), len(held), held.skip) == (80, 100, 80)
     periodic = one.with_(initial="periodic", period=30, skip=0)
     for given, period in ((periodic, 30), (periodic.with_(period=60), 60), (periodic.slice(0, 60), 30)):
-        (kept,), (held,), told = hold_back([given], 0.2)  # the mean period is cut: whole ones have the same input
+        (kept,), (held,), told = split_validation(
+            [given], 0.2
+        )  # the mean period is cut: whole ones have the same input
         cut = round(0.8 * period)
         assert (len(kept), held.skip, len(held)) == (cut, period + cut, 2 * period) and "mean period" in told
         assert kept.initial == "estimate" and held.initial == "zero"
         assert np.array_equal(held.y[period : period + cut], kept.y)
     for period in (30, 60):  # known, but the start is no steady state: what is held back need not be whole periods
-        (kept,), (held,), told = hold_back([one.with_(initial="estimate", period=period)], 0.25)
+        (kept,), (held,), told = split_validation([one.with_(initial="estimate", period=period)], 0.25)
         assert (len(kept), held.skip, held.period) == (80, 80, None) and len(held) == 100
     several = [one.with_(name=str(k), initial="estimate") for k in range(4)]
     several = [r.with_(u=np.random.default_rng(k).normal(size=100)) for k, r in enumerate(several)]
-    kept, held, told = hold_back(several, 0.25)
+    kept, held, told = split_validation(several, 0.25)
     assert [r.name for r in kept] == ["0", "1", "2"] and [r.name for r in held] == ["3"]
     assert held[0].initial == "zero" and held[0].skip == 20 and not told
-    assert hold_back([r.with_(period=80) for r in several], 0.25)[1][0].skip == 20
+    assert split_validation([r.with_(period=80) for r in several], 0.25)[1][0].skip == 20
     again = [several[k].with_(name=name) for k, name in ((0, "a"), (1, "b"), (0, "c"), (1, "d"))]
-    kept, held, _ = hold_back(again, 0.25)  # what is held back has an input of its own
+    kept, held, _ = split_validation(again, 0.25)  # what is held back has an input of its own
     assert [r.name for r in kept] == ["a", "c"] and [r.name for r in held] == ["b", "d"]
-    kept, held, told = hold_back([again[0], again[2]], 0.25)  # one input: each is cut in time
+    kept, held, told = split_validation([again[0], again[2]], 0.25)  # one input: each is cut in time
     assert [len(r) for r in kept] == [80, 80] and [r.skip for r in held] == [80, 80] and not told
     sine = one.with_(u=np.sin(2 * np.pi * np.arange(100) / 20), initial="estimate")
-    assert "proves little" in hold_back([sine], 0.25)[2]
+    assert "proves little" in split_validation([sine], 0.25)[2]
 
 
 def test_a_noe_of_recordings_whose_inputs_repeat():

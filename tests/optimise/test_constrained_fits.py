@@ -9,8 +9,8 @@ from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.identify.linear_start import changed_basis, nearest_basis
-from pilfr_casadi.identify.sparse import WAYS, thinned
+from pilfr_casadi.identify import change_basis, find_nearest_basis
+from pilfr_casadi.identify import WAYS, thin_operators
 from pilfr_casadi.optimise import (
     Constraint,
     Gain,
@@ -240,9 +240,9 @@ def test_a_linear_model_with_known_entries(tmp_path):
 def test_the_basis_of_known_entries_is_found():
     rng = np.random.default_rng(1)
     blocks = {"A": np.diag([0.9, 0.5, -0.2]), "B_u": rng.normal(size=(3, 1)), "C_y": rng.normal(size=(1, 3))}
-    known = changed_basis(blocks, rng.normal(size=(3, 3)))
+    known = change_basis(blocks, rng.normal(size=(3, 3)))
     wanted = {"A": np.where(rng.random((3, 3)) < 0.5, known["A"], np.nan), "B_u": known["B_u"], "C_y": known["C_y"]}
-    found = nearest_basis(blocks, wanted)
+    found = find_nearest_basis(blocks, wanted)
     for name, value in wanted.items():
         np.testing.assert_allclose(found[name][~np.isnan(value)], value[~np.isnan(value)], atol=1e-6)
     assert np.allclose(np.sort(np.linalg.eigvals(found["A"]).real), [-0.2, 0.5, 0.9])
@@ -269,14 +269,14 @@ def test_pruning_takes_an_estimated_initial_state_along(record):
 
 @pytest.mark.slow
 def test_operators_are_spread_over_the_density(record, full):
-    fits = thinned(full, record, 3)
+    fits = thin_operators(full, record, 3)
     assert len(fits) == len(WAYS) and all(f.structure.element.n == 3 for f in fits)
     assert len({tuple(f.parameters["r"][0]) for f in fits}) > 1
     assert min(f.nrmse(record) for f in fits) < 2 * full.nrmse(record)
     assert all(p.prior is None for f in fits for p in f.model.parameters.values())
     element = pilfr.PrandtlIshlinskii(pilfr.Play, 4)
     bounded = pilfr.fit(pilfr.PILFR(1, element, bounds={"r": (0.0, 1.0)}), record, starts=1)
-    assert thinned(bounded, record, 2) == ()
+    assert thin_operators(bounded, record, 2) == ()
 
 
 @pytest.mark.slow
@@ -429,7 +429,7 @@ def holds(fit):
 
 def test_what_is_made_from_a_fit_holds_what_the_fit_was_asked_to_hold(record, bounded):
     assert holds(bounded)
-    for fit in (pilfr.fit(bounded, record), pilfr.prune(bounded, record), *thinned(bounded, record, 3)):
+    for fit in (pilfr.fit(bounded, record), pilfr.prune(bounded, record), *thin_operators(bounded, record, 3)):
         assert holds(fit) and fit.asked.stable == 0.78
     path = pilfr.regularization_path(bounded, record, three_plays(1, 600), strengths=(1e-5, 1e-3))
     assert all(holds(fit) for fit in path.fits)

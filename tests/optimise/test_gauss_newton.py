@@ -6,8 +6,7 @@ import pytest
 from random_models import random_input, random_lfr, reference
 
 from pilfr_casadi.data import Recording
-from pilfr_casadi.identify import fit
-from pilfr_casadi.identify.linear_start import linear_model
+from pilfr_casadi.identify import fit, linear_model
 from pilfr_casadi.linear import subspace_matrices
 from pilfr_casadi.models import PILFR, Neighbours, Play
 from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status, stable

@@ -7,7 +7,7 @@ from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.identify.result import reached_gain_sentence
+from pilfr_casadi.identify import describe_reached_gain
 from pilfr_casadi.optimise import Gain, Problem, Solution, Status, dc_gain, limits_of
 from pilfr_casadi.optimise.gauss_newton import ExactPenalty
 from problems.constrained import three_plays
@@ -62,12 +62,12 @@ def test_a_gain_that_a_slow_pole_reaches_is_told(record):
     slow = pilfr.PILFR(2, fixed={"A": np.diag([0.8, 1 - 1e-5])})
     known = {"A": slow.fixed["A"], "B_u": [[0.2], [1e-5]], "C_y": [[1.0, 1.0]]}
     problem = Problem(slow.model(1, 1, known), record, constraints=[dc_gain(2.0)])
-    assert reached_gain_sentence(problem, problem.start) == (
+    assert describe_reached_gain(problem, problem.start) == (
         "DC gain = 2 holds only beyond the recordings: it settles over more than their 1200 samples; within them it "
         "comes to 1.01"
     )
     fast = Problem(slow.model(1, 1, {**known, "C_y": [[2.0, 0.0]]}), record, constraints=[dc_gain(2.0)])
-    assert reached_gain_sentence(fast, fast.start) == ""
+    assert describe_reached_gain(fast, fast.start) == ""
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_which_operators_keep_a_gain_beyond_the_recording(record, operator, slop
     free = Problem(model, record)
     gain = float(Gain(slope)({k: ca.DM(v) for k, v in model.parameters.unpack(free.parameters(free.start)).items()}))
     problem = Problem(model, record, constraints=[dc_gain(gain, slope=slope)])
-    told = reached_gain_sentence(problem, problem.start)
+    told = describe_reached_gain(problem, problem.start)
     assert says in told if says else told == ""
 
 

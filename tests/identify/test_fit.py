@@ -9,9 +9,7 @@ import pytest
 
 import pilfr_casadi
 from pilfr_casadi._base import InputError
-from pilfr_casadi.identify import Fit, fit
-from pilfr_casadi.identify.linear_start import linear_model
-from pilfr_casadi.identify.penalty import element_alone, unit_weights
+from pilfr_casadi.identify import Fit, fit, hold_all_but_element, linear_model, normalise_weights
 from pilfr_casadi.linear import select_order
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, hammerstein, wiener
 from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, unconstrained
@@ -176,7 +174,7 @@ def test_l1_prunes_the_element_and_nothing_evades_it(structure, blocks):
 def test_without_the_scale_held_the_penalty_is_evaded(record):
     """What the penalty would do to all blocks at once: the weights shrink, B_w grows, the output stays."""
     free = fit(PILFR(2, layer(3), offset=False), record, starts=2)
-    model = unit_weights(free.model)
+    model = normalise_weights(free.model)
     problem = Problem(model, [record], l1={"w": 1e-3})
     theta = GaussNewton(max_iterations=60).solve(problem).theta
     evaded = problem.parameters(theta)[model.parameters.position("w")]
@@ -186,7 +184,7 @@ def test_without_the_scale_held_the_penalty_is_evaded(record):
 
 def test_unit_weights_change_no_output(record):
     found = fit(PILFR(2, layer(4), offset=False), record, starts=1)
-    scaled = unit_weights(found.model)
+    scaled = normalise_weights(found.model)
     assert scaled.parameters["w"].value.sum() == pytest.approx(1.0, rel=1e-12)
     y = found.simulate(record)
     np.testing.assert_allclose(replace(found, model=scaled).simulate(record), y, atol=1e-9 * np.ptp(y))
@@ -205,12 +203,12 @@ def test_weights_keep_their_scale_where_something_stands_against_it(change, reco
     values = {"B_w": np.ones((2, 1)), "w": np.ones((1, 4))}
     model = PILFR(2, layer(4)).model(1, 1, values)
     model = model.with_parameters(model.parameters.change(**change))
-    np.testing.assert_array_equal(unit_weights(model).parameters["w"].value, 1.0)
+    np.testing.assert_array_equal(normalise_weights(model).parameters["w"].value, 1.0)
 
 
 def test_only_the_element_moves():
     model = PILFR(2, layer(4), fixed={"r": 0.5}).model(1, 1)
-    held = element_alone(model, {"w": 1.0})
+    held = hold_all_but_element(model, {"w": 1.0})
     assert {name for name, p in held.parameters.items() if not np.all(p.fixed)} == {"w", "y_0"}
 
 

@@ -1,6 +1,5 @@
 """What a fit says about itself: errors, limits, noise and priors, initial states, what is scored, and interrupts."""
 
-import importlib
 import signal
 from dataclasses import dataclass, field, replace
 
@@ -11,13 +10,10 @@ from random_models import random_input, random_lfr, reference
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording, nrmse
-from pilfr_casadi.identify import fit, standard_errors
-from pilfr_casadi.identify.multistart import PRIOR
-from pilfr_casadi.identify.result import outcome
+from pilfr_casadi.identify import PRIOR, FitContext, fit, standard_errors
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import Constraint, GaussNewton, Problem, Status
 
-job_module = importlib.import_module("pilfr_casadi.identify.context")
 X0 = np.array([3.0, -3.0, 0.0, 0.0, 0.0, 0.0])
 SHORT = GaussNewton(max_iterations=3)
 
@@ -77,7 +73,7 @@ def test_the_searchs_own_prior_is_not_taken_for_knowledge(truth, record):
     held = model.with_parameters(model.parameters.change(**tight))
     problems = [Problem(m, record, noise=0.01) for m in (held, model)]
     solution = GaussNewton().solve(problems[0])
-    found = outcome(held, structure, problems[0], solution, 0.0, (record,), note=PRIOR)
+    found = FitContext((record,), None).result(held, structure, problems[0], solution, PRIOR)
     with_prior, without = (standard_errors(p, solution.theta, structure) for p in problems)
     assert np.all(with_prior["r"] < 0.1 * without["r"])
     for name in ("w", "r"):
@@ -239,11 +235,13 @@ def test_the_engine_is_kept(truth, record, engine):
 
 
 def test_ctrl_c_after_the_last_solve_loses_nothing(truth, record, monkeypatch):
-    def struck(*args, **more):
-        signal.raise_signal(signal.SIGINT)
-        return outcome(*args, **more)
+    build = FitContext._result
 
-    monkeypatch.setattr(job_module, "outcome", struck)
+    def struck(*args):
+        signal.raise_signal(signal.SIGINT)
+        return build(*args)
+
+    monkeypatch.setattr(FitContext, "_result", struck)
     found = fit(truth[2], record)
     assert found.status is Status.INTERRUPTED and found.train_nrmse[0] < 0.0105
 
@@ -267,7 +265,7 @@ def test_an_interrupt_between_two_solves(record, monkeypatch):
     def struck(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(job_module.Job, "settled", struck)
+    monkeypatch.setattr(FitContext, "settle_noise", struck)
     for task in (structure, structure.model(1, 1, {"D_yu": 0.4}), PILFR(2, priors={"D_yu": (0.5, 0.1)})):
         found = fit(task, record, starts=1)
         assert found.status is Status.INTERRUPTED and np.isfinite(found.train_nrmse[0])

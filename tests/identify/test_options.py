@@ -8,7 +8,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import fingerprint
-from pilfr_casadi.identify.sparse import thinned
+from pilfr_casadi.identify import thin_operators
 from problems.constrained import three_plays
 
 WEIGHTS = (1.0, 8.0)
@@ -56,7 +56,7 @@ def test_whatever_is_made_from_a_fit_has_its_weights_and_noise(records, weighted
     judged = three_plays(2, 300)
     pilfr.fit(weighted, records, solver=watching)
     pilfr.prune(weighted, records, solver=watching)
-    thinned(weighted, records, 2, solver=watching)
+    thin_operators(weighted, records, 2, solver=watching)
     pilfr.regularization_path(weighted, records, judged, strengths=(1e-3,), solver=watching)
     pilfr.regularization_path(weighted, records, judged, strengths=(1.0,), priors={"w": (0, 1)}, solver=watching)
     assert len(watching.problems) > 10

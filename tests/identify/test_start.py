@@ -9,8 +9,7 @@ from random_models import random_input, random_lfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.identify import fit
-from pilfr_casadi.identify.start import grid_start, network_start, paper_start, regrid, unit_states
+from pilfr_casadi.identify import fit, grid_start, network_start, paper_start, regrid, unit_states
 from pilfr_casadi.linear import frequency_subspace, robust_bla, time_subspace
 from pilfr_casadi.models import NARX, PILFR, Play, PrandtlIshlinskii, hammerstein, network_lfr, ssnn, wiener
 from pilfr_casadi.optimise import GaussNewton, Problem

@@ -8,10 +8,19 @@ import pytest
 from random_models import random_lfr
 
 from pilfr_casadi.cli.demo import demo_recordings, structure
-from pilfr_casadi.identify import POLISH, Candidate, multistart
-from pilfr_casadi.identify.linear_start import linear_model
-from pilfr_casadi.identify.multistart import Search, explore, polish, search_starts
-from pilfr_casadi.identify.start import grid_start, paper_start, unit_states
+from pilfr_casadi.identify import (
+    POLISH,
+    Candidate,
+    StartSearch,
+    explore,
+    grid_start,
+    linear_model,
+    multistart,
+    paper_start,
+    polish,
+    search_starts,
+    unit_states,
+)
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import GaussNewton, Solution, Status
 from pilfr_casadi.optimise.spectral_radius import stability
@@ -37,7 +46,7 @@ def search():
     linear, problem, solution = linear_model(train, model)
     parameters = linear.parameters.at(problem.parameters(solution.theta))
     blocks = {k: p.value for k, p in parameters.items()}
-    return Search(model, train, blocks, POLISH, stability(model), start="paper")
+    return StartSearch(model, train, blocks, POLISH, stability(model), start="paper")
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -82,7 +91,7 @@ def test_the_limit_with_the_elements_full_slope():
 def test_the_users_priors_stay():
     structure, values = random_lfr(1, nx=2, n=3)
     structure = replace(structure, priors={"w": (1.0, 0.5)})
-    model = multistart.held_near(structure.model(1, 1, values), values, 0.02)
+    model = multistart.hold_near_density(structure.model(1, 1, values), values, 0.02)
     assert model.parameters["w"].prior == (1.0, 0.5)
     np.testing.assert_array_equal(model.parameters["r"].prior[0], values["r"])
 

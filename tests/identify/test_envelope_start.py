@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 
 from pilfr_casadi.data import Recording, multisine
-from pilfr_casadi.identify import fit
-from pilfr_casadi.identify.start import enveloped, grid_start, inputs_behind, network, outline, reach, unit_states
+from pilfr_casadi.identify import (
+    deconvolve_inputs,
+    envelope_start,
+    fit,
+    fit_envelope,
+    grid_start,
+    loop_outline,
+    threshold_range,
+    unit_states,
+)
 from pilfr_casadi.models import (
     PILFR,
     GeneralizedPlay,
@@ -57,7 +65,7 @@ def filtered(u):
 def test_the_outline_of_a_loop_is_its_envelopes():
     z = np.tile(drive(), 4)
     v = loop(z)
-    at, low, high = outline(z, v)
+    at, low, high = loop_outline(z, v)
     for found, curve in ((low, np.maximum(lower(at), v.min())), (high, np.clip(upper(at), lower(at), v.max()))):
         assert np.max(np.abs(found - curve)) < 0.1
         assert np.sqrt(np.mean((found - curve) ** 2)) < 0.03
@@ -66,14 +74,14 @@ def test_the_outline_of_a_loop_is_its_envelopes():
 
 def test_a_loop_that_runs_the_wrong_way_round_has_no_width():
     z = drive()
-    _, low, high = outline(z[::-1], loop(z)[::-1])
+    _, low, high = loop_outline(z[::-1], loop(z)[::-1])
     np.testing.assert_array_equal(low, high)
 
 
 @pytest.mark.parametrize("neurons", [0, 1, 4])
 def test_networks_follow_a_curve_and_rise(neurons):
     z = np.linspace(-2.0, 3.0, 60)
-    p = network(z, upper(z), neurons)
+    p = fit_envelope(z, upper(z), neurons)
     named = {f"gamma_l_{k}": v[None] for k, v in p.items()}
     error = GeneralizedPlay(neurons).envelope("l", z, named) - upper(z)
     assert np.sqrt(np.mean(error**2)) < (0.02 if neurons == 4 else 0.2)
@@ -87,7 +95,7 @@ def test_the_input_behind_the_linear_model_is_found():
     y = np.fft.irfft(g * np.fft.rfft(want)) + 0.5 + 1e-3 * rng.standard_normal(PERIOD)
     record = Recording(u, y, 1.0, period=PERIOD, initial="periodic")
     states = unit_states(LINEAR, [np.tile(u, 3)[:, None]], free=False)[1][0][-PERIOD:]
-    found = inputs_behind(LINEAR, record, states)[:, 0]
+    found = deconvolve_inputs(LINEAR, record, states)[:, 0]
     assert np.sqrt(np.mean((found - want) ** 2)) < 0.02
 
 
@@ -98,7 +106,7 @@ def test_signals_that_fall_with_the_answer_are_turned_over():
     record = Recording(u, states[0] @ blocks["C_y"].T, 1.0)
     values = grid_start(structure, blocks, [u], states, np.random.default_rng(0), "output")
     turned = {**values, "C_z": -values["C_z"], "D_zu": -values["D_zu"]}
-    one, two = (enveloped(structure, blocks, v, [record], states, "output") for v in (values, turned))
+    one, two = (envelope_start(structure, blocks, v, [record], states, "output") for v in (values, turned))
     for name, value in one.items():
         np.testing.assert_allclose(two[name], value, err_msg=name)
     assert np.all(one["C_y"] == 0) and np.all(one["r"] >= 0)
@@ -106,11 +114,11 @@ def test_signals_that_fall_with_the_answer_are_turned_over():
 
 def test_reach_of_plays_and_of_envelopes():
     z = np.array([-3.0, 2.0])
-    assert reach(PILFR(1, PrandtlIshlinskii(Play, 3)), {}, z, 0) == 3.0
+    assert threshold_range(PILFR(1, PrandtlIshlinskii(Play, 3)), {}, z, 0) == 3.0
     structure = PILFR(1, PrandtlIshlinskii(GeneralizedPlay(0), 3))
     straight = {f"gamma_{s}_{k}": np.full((1, 1), v) for s in "lr" for k, v in (("c", 0.5), ("a0", 2.0))}
     empty = {f"gamma_{s}_{k}": np.zeros((1, 0)) for s in "lr" for k in "abd"}
-    assert reach(structure, straight | empty, z, 0) == pytest.approx(5.0)
+    assert threshold_range(structure, straight | empty, z, 0) == pytest.approx(5.0)
 
 
 def record_of(y, noise, seed):

@@ -8,8 +8,14 @@ import pytest
 from random_models import OPERATORS, envelope, random_input, random_lfr, reference
 
 from pilfr_casadi.data import Recording
-from pilfr_casadi.identify import covariance, standard_errors, variance
-from pilfr_casadi.identify.uncertainty import _snap_to_bounds, gauge_tangents, gradient_covariance
+from pilfr_casadi.identify import (
+    _snap_to_bounds,
+    covariance,
+    gauge_tangents,
+    gradient_covariance,
+    standard_errors,
+    variance,
+)
 from pilfr_casadi.models import (
     GeneralizedPlay,
     Parameter,
