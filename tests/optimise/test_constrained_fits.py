@@ -9,8 +9,7 @@ from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.identify import change_basis, find_nearest_basis
-from pilfr_casadi.identify import WAYS, thin_operators
+from pilfr_casadi.identify import WAYS, change_basis, find_nearest_basis, thin_operators
 from pilfr_casadi.optimise import (
     Constraint,
     Gain,
