@@ -343,7 +343,7 @@ def test_the_unknowns_of_a_lagged_model_are_its_free_parameters(linear, lags, in
 def test_too_many_lags_are_refused_before_the_model_is_built(monkeypatch):
     train, _ = recordings(truth("NARX"))
     monkeypatch.setattr(pilfr.NARX, "structure", lambda *_: pytest.fail("built"))
-    with pytest.raises(InputError, match="scored samples"):
+    with pytest.raises(InputError, match="give at most 20000 parameters"):
         pilfr.fit(pilfr.NARX(2000), train)
 
 
