@@ -7,6 +7,7 @@ import pytest
 from pilfr_casadi.diagnose import other_hold
 from pilfr_casadi.diagnose.candidate import Candidate
 from pilfr_casadi.diagnose.search_start import Asked
+from pilfr_casadi.diagnose.stages import Stages
 from pilfr_casadi.laws import Delay, Mode, Relaxation
 from pilfr_casadi.simulators import Placed
 
@@ -15,7 +16,7 @@ DT = 2e-3
 
 def asked():
     """A diagnosis of two effects, of nothing in particular."""
-    return Asked(None, (), (), None, "auto", 1, 2, 0.0, None)
+    return Asked(None, (), (), None, "auto", 1, 2, 0.0, Stages(lambda *_: None))
 
 
 def named(port, law, **values):
