@@ -259,7 +259,7 @@ def saved(tmp_path_factory):
         (lambda e: e["parts"][0].update(reads=[0]), "1 channels and its element has 2"),
         (
             lambda e: e["parts"][0].update(element=json.loads(json.dumps(e))),
-            "element 'combined', which a file cannot hold",
+            "unknown key 'parts'",
         ),
         (lambda e: e.update(parts=[]), "give a list of Part"),
         (lambda e: e.update(parts=e["parts"] * 40), "combines 120 elements"),
