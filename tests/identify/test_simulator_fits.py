@@ -1,0 +1,66 @@
+"""A simulator goes through the same `fit` as a model, and its fit has the same verbs."""
+
+import numpy as np
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import Parameter, Simulator
+from pilfr_casadi._base import InputError
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.simulators import discretise
+
+DT = 0.01
+
+
+def simulator(k=1100.0, d=15.0):
+    return Simulator(
+        lambda x, u, p: dict(pos=x.vel, vel=(u.force - p.k * x.pos - p.d * x.vel) / p.m),
+        lambda x, u, p: dict(position=x.pos),
+        states=("pos", "vel"),
+        inputs=("force",),
+        parameters=dict(m=Parameter(2.0, fixed=True), k=Parameter(k, bounds=(500, 3000)), d=Parameter(d)),
+    )
+
+
+@pytest.fixture(scope="module")
+def record():
+    u = 0.3 * np.cumsum(np.random.default_rng(0).standard_normal((400, 1)), axis=0)
+    model = discretise(simulator(1500.0, 25.0), DT, "zero", 4)
+    blank = pilfr.Recording(u, u, DT, ("force",), ("position",))
+    y = make_engine(model, "vm").simulate(model.drive(blank), model.parameters.start, np.zeros(2))[0]
+    return blank.with_(y=y)
+
+
+@pytest.fixture(scope="module")
+def fitted(record):
+    return pilfr.fit(simulator(), record, engine="vm")
+
+
+def test_the_parameters_are_found(record, fitted):
+    assert fitted.parameters["k"] == pytest.approx(1500.0, rel=1e-3)
+    assert fitted.simulator.parameters["d"].value == pytest.approx(25.0, rel=1e-2)
+    assert fitted.nrmse(record) < 1e-3
+    assert np.isfinite(fitted.errors["k"]) and np.isnan(fitted.errors["m"])
+
+
+def test_columns_are_matched_by_name(record, fitted):
+    wide = pilfr.Recording(
+        np.hstack([0 * record.u, record.u]),
+        np.hstack([record.y, 0 * record.y]),
+        DT,
+        ("idle", "force"),
+        ("position", "b"),
+    )
+    np.testing.assert_array_equal(fitted.simulate(wide), fitted.simulate(record))
+    with pytest.raises(InputError, match="has no input 'force'"):
+        fitted.simulate(pilfr.Recording(record.u, record.y, DT, ("thrust",), ("position",)))
+
+
+def test_the_verbs(record, fitted, tmp_path):
+    with pytest.warns(UserWarning, match="not the simulator's equations"):
+        fitted.save(tmp_path / "sim.json")
+    again = pilfr.load(tmp_path / "sim.json", model=fitted.model)
+    np.testing.assert_array_equal(again.simulate(record), fitted.simulate(record))
+    assert fitted.to_casadi().size1_in(0) == 2
+    assert fitted.plot(record) is not None
+    assert pilfr.fit(fitted, record, engine="vm").simulator is not None
