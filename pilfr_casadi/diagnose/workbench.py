@@ -159,7 +159,7 @@ class Workbench:
 
     def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:
         """The simulation-error problem of a model."""
-        context = FitContext(tuple(recordings or self.recordings), QUICK, state_prior=False)
+        context = FitContext(tuple(recordings or self.recordings), QUICK)
         return context.problem(model, engine=engine or self.engine, scale=self.scale)
 
     def fit(

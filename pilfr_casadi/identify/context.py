@@ -1,9 +1,9 @@
 """The context of one fit: recordings, solver and options, and the solves that every way to a fit makes.
 
-An initial state that is to be estimated has a prior around rest (`optimise.state_precision`). The prior alone does not
-keep a search from paying for a better fit with memories that no machine had. So a search begins with the state at rest
-where the recordings do not contradict it: where freeing the state would lower the cost by less than the Bayesian
-information criterion charges for the new variables (`FitContext.agrees_with_rest`).
+An initial state that is free in a search lets it pay for a better fit with memories that no machine had. A prior does
+not prevent this, because the units of states and memories are free too. So a search begins with the state at rest where
+the recordings do not contradict it: where freeing the state would lower the cost by less than the Bayesian information
+criterion charges for the new variables (`FitContext.agrees_with_rest`).
 """
 
 from __future__ import annotations
@@ -64,8 +64,6 @@ class FitContext:
     options : FitOptions
     began : float
         When the work began (`time.perf_counter`), s.
-    state_prior : bool
-        Whether estimated initial states have a prior around rest.
     """
 
     recordings: tuple[Recording, ...]
@@ -77,7 +75,6 @@ class FitContext:
     threads: int = 1
     options: FitOptions = FitOptions()  # noqa: RUF009  (frozen)
     began: float = field(default_factory=time.perf_counter)
-    state_prior: bool = True
 
     @cached_property
     def weights(self) -> np.ndarray | None:
@@ -87,8 +84,7 @@ class FitContext:
     def problem(self, model: Model, noise: float = 1.0, **others: Any) -> Problem:
         """Simulation-error problem of a model; `others` replace options of `Problem`."""
         given: dict[str, Any] = {"constraints": self.constraints, "noise": self.options.noise or noise}
-        given |= {"engine": self.engine, "weights": self.weights, "threads": self.threads}
-        given |= {"state_prior": self.state_prior, **others}
+        given |= {"engine": self.engine, "weights": self.weights, "threads": self.threads, **others}
         return Problem(model, self.recordings, **given)
 
     def solve(self, problem: Problem, stage: str, start: np.ndarray | None = None) -> Solution:
@@ -125,7 +121,7 @@ class FitContext:
         """
         if problem.size > int(problem.free.sum()) or not any(r.begins == "estimate" for r in self.recordings):
             return True
-        freed = self.problem(problem.model, engine=problem.engine, constraints=(), state_prior=False)
+        freed = self.problem(problem.model, engine=problem.engine, constraints=())
         n_free = int(freed.free.sum())
         _, gradient, hessian = freed.normal(np.concatenate([theta, freed.start[n_free:]]))
         cost = 0.5 * float(np.mean(problem.residual(theta) ** 2))
@@ -168,7 +164,7 @@ class FitContext:
             priors = structure.priors if structure else {}
             own = {name: {"prior": priors.get(name)} for name in LAYER}
             fitted = fitted.with_parameters(fitted.parameters.change(**own))
-            names = ("engine", "constraints", "noise", "scale", "weights", "state_prior")
+            names = ("engine", "constraints", "noise", "scale", "weights")
             options: dict[str, Any] = {name: getattr(problem, name) for name in names}
             judged = Problem(fitted, problem.recordings, **options)
         nrmse = tuple(problem.nrmse(theta))

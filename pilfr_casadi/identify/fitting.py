@@ -144,7 +144,7 @@ def fit(
     Notes
     -----
     A recording with `initial="estimate"` is taken to begin at rest unless the data contradict this; then its state and
-    memory are estimated with a prior around rest (`context`).
+    memory are estimated. For a test recording they are estimated with a prior around rest (`Fit.initial_state`).
 
     Raises
     ------

@@ -257,7 +257,6 @@ class StartSearch:
             l1=self.l1,
             noise=self.noise or noise or self.level,
             weights=self.weights,
-            state_prior=True,
         )
 
     def solve(self, problem: Problem, start: np.ndarray | None, solver: Any, held: bool = False) -> Solution:

@@ -9,7 +9,10 @@ from ..data import Recording
 from ..engine import Engine
 from ..models import Model
 from .gauss_newton import GaussNewton
-from .problem import Penalties, Problem, settled, state_precision
+from .problem import STATE_NOISE, Penalties, Problem, settled, state_precision
+
+ROUNDS = 20  # at most, of wider priors
+WIDE = 1.1  # mean square of a state in units of its prior up to which the prior stays
 
 
 def samples_for_state(model: Model) -> int:
@@ -50,9 +53,16 @@ def first_state(
         spread = np.std(head.y, axis=0)
         spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
         problem = Problem(held, head, engine=engine, scale=spread)
-        if state_prior:
-            square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s)
-            priors = [] if square is None else [(0, square)]
+        if not state_prior:
+            return GaussNewton(max_iterations=50).solve(problem).theta
+        square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s)
+        wider, start = 1.0, problem.start
+        for _ in range(ROUNDS):  # a machine that is let go from afar is no machine in forced motion
+            priors = [] if square is None else [(0, square / wider)]
             problem.penalties = Penalties(held.parameters, {}, 1.0, problem.residuals, problem.size, priors)
-        state = GaussNewton(max_iterations=50).solve(problem).theta
+            state = start = GaussNewton(max_iterations=50).solve(problem, start).theta
+            size = 0.0 if square is None else float(state @ square @ state) / STATE_NOISE**2 / n
+            if size <= WIDE * wider:
+                break
+            wider = size
     return state

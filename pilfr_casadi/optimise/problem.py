@@ -221,7 +221,7 @@ STATE_NOISE = 0.1  # share of the outputs' deviation: a model's errors change sl
 # not independent; of 1, .1, .03 and .01 the best over beginnings at rest and in motion of fits of the paper's rig
 STATE_SAMPLES = 256  # states along a run whose second moments are taken
 STILL_STATE = 1e-3  # deviation of a state that does not move, next to the largest of its kind
-CORRELATED = 1e-6  # variance that is left to each direction of the correlation matrix
+CORRELATED = 1e-2  # variance left to each direction of the correlation matrix: a displaced machine may be let go
 Array = np.ndarray
 SETTLED = 1e-10  # change over a period, relative to the largest entry of the state, that counts as none
 NEARLY = 1e-6  # the same change, accepted when the periods run out
@@ -361,8 +361,6 @@ class Problem:
         One a recording: its residuals are multiplied by it (see `periods.noise_weights`). The mean stays one over R.
     threads : int
         Recordings that are run at a time, where the engine is compiled; the numbers are the same.
-    state_prior : bool
-        Whether estimated initial states have a prior around rest; see `state_precision`.
 
     Raises
     ------
@@ -383,7 +381,6 @@ class Problem:
         scale: np.ndarray | None = None,
         weights: Sequence[float] | np.ndarray | None = None,
         threads: int = 1,
-        state_prior: bool = False,
     ) -> None:
         self.model = model
         self.recordings = as_recordings(recordings)
@@ -422,13 +419,7 @@ class Problem:
         self._columns = np.where(self.free, np.cumsum(self.free) - 1, -1)
         self.noise = noise
         self.l1 = dict(l1 or {})
-        self.state_prior = state_prior
-        priors = []
-        for part in self._parts if state_prior else ():
-            if part.first is not None:
-                square = state_precision(self.engine, part.drive, self._base, model.n_x, model.n_s)
-                priors += [(part.first, square)] if square is not None else []
-        self.penalties = Penalties(parameters, self.l1, noise, self._residuals, self.size, priors)
+        self.penalties = Penalties(parameters, self.l1, noise, self._residuals, self.size)
         self.rows = Rows(self.constraints, parameters)
         self.g_lower, self.g_upper, self.g_labels = self.rows.lower, self.rows.upper, self.rows.labels
         self.g_sizes = self.rows.sizes
@@ -674,8 +665,6 @@ def to_nlp(problem: Problem) -> Horizon:
         residual.append(ca.vec(((y - r.y.T) / np.tile(part.scale[:, None], (1, len(r))))[:, r.skip :]))
     e = ca.vertcat(*residual)
     prior = 0.5 * ca.dot(problem.penalties.weight, (theta - problem.penalties.mean) ** 2)
-    for states, square in problem.penalties.states:
-        prior += 0.5 * ca.bilin(ca.DM(square), theta[states], theta[states])
     return Horizon(
         x=theta,
         f=0.5 * ca.sumsqr(e) / problem.residuals + prior + ca.dot(problem.penalties.slope, theta),

@@ -438,7 +438,7 @@ def tighten(problem: Problem, theta: Array, last: GaussNewton, progress: Progres
 
 def with_constraints(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
     """Return the same problem under other constraints."""
-    names = ("engine", "l1", "noise", "scale", "weights", "threads", "state_prior")
+    names = ("engine", "l1", "noise", "scale", "weights", "threads")
     given: dict[str, Any] = {name: getattr(problem, name) for name in names}
     return Problem(problem.model, problem.recordings, constraints=constraints, **given)
 

@@ -269,7 +269,7 @@ SCRIPT = """
 import multiprocessing, sys
 import numpy as np
 import pilfr_casadi as pilfr
-from pilfr_casadi.recording import InputError
+from pilfr_casadi import InputError
 
 def work():
     rng = np.random.default_rng(0)
