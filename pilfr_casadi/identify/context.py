@@ -113,9 +113,10 @@ class FitContext:
         recordings = [r.with_(initial="zero") if r.begins == "estimate" else r for r in self.recordings]
         return replace(self, recordings=tuple(recordings))
 
-    def agrees_with_rest(self, problem: Problem, theta: np.ndarray) -> bool:
+    def agrees_with_rest(self, problem: Problem, theta: np.ndarray, correlated: float = 1.0) -> bool:
         """Whether the recordings agree with a beginning at rest, given the solution θ of the problem from rest.
 
+        `correlated` is the number of residuals that count as one, because a model's errors change slowly.
         True also for problems that have initial states of their own. Only the states are freed, in a linearised step,
         which foretells the largest decrease of the cost.
         """
@@ -130,7 +131,8 @@ class FitContext:
         slope, curvature = gradient[n_free:], hessian[n_free:, n_free:]
         decrease = 0.5 * float(slope @ np.linalg.lstsq(curvature, slope, rcond=None)[0])
         left = max(1 - decrease / cost, np.finfo(float).tiny)
-        return bool(-freed.residuals * np.log(left) < len(slope) * np.log(freed.residuals))
+        independent = max(freed.residuals / correlated, 2.0)
+        return bool(-independent * np.log(left) < len(slope) * np.log(independent))
 
     def result(
         self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, note: str = "", **fields: Any

@@ -221,7 +221,7 @@ STATE_NOISE = 0.1  # share of the outputs' deviation: a model's errors change sl
 # not independent; of 1, .1, .03 and .01 the best over beginnings at rest and in motion of fits of the paper's rig
 STATE_SAMPLES = 256  # states along a run whose second moments are taken
 STILL_STATE = 1e-3  # deviation of a state that does not move, next to the largest of its kind
-CORRELATED = 1e-2  # variance left to each direction of the correlation matrix: a displaced machine may be let go
+CORRELATED = 1e-6  # variance left to each direction of the correlation matrix
 Array = np.ndarray
 SETTLED = 1e-10  # change over a period, relative to the largest entry of the state, that counts as none
 NEARLY = 1e-6  # the same change, accepted when the periods run out
