@@ -166,7 +166,6 @@ _ELSEWHERE = {
     "modal",
     "network_lfr",
     "noise_weights",
-    "normalise",
     "one_step",
     "open_model",
     "ordered",
