@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     )
     from .files import (
         digest as digest,
-        made as made,
+        make_folder as make_folder,
         ordered_digest as ordered_digest,
         write_atomically as write_atomically,
     )

@@ -17,7 +17,7 @@ from typing import Any
 
 import casadi as ca
 
-from .files import made, write_atomically
+from .files import make_folder, write_atomically
 
 
 def write_c(
@@ -40,7 +40,7 @@ def write_c(
     tuple of Path
         Source and header.
     """
-    target, name = made(folder), names["name"]
+    target, name = make_folder(folder), names["name"]
     header = write_atomically(target / f"{name}.h", _header(names, interpolated))
     return write_atomically(target / f"{name}.c", _source(step, names)), header
 

@@ -60,7 +60,7 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
     return target
 
 
-def made(folder: str | os.PathLike[str]) -> Path:
+def make_folder(folder: str | os.PathLike[str]) -> Path:
     """Make a folder where it does not exist.
 
     Raises

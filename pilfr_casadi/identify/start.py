@@ -200,14 +200,14 @@ def _signal(inputs: list[np.ndarray], states: list[np.ndarray], blocks: Blocks) 
 
 
 def _between(structure: PILFR, linear: Mapping[str, np.ndarray], blocks: Blocks) -> Blocks:
-    """What the structure says of the blocks: z is the linear model's output where that is read through the element."""
+    """Blocks that the structure dictates: those fixed, and for a Wiener model z = the linear model's output."""
     out = {"C_z": linear["C_y"], "D_zu": linear["D_yu"]} if read_through(structure) else {}
     held = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_whole(structure) if k in blocks}
     return out | {k: np.broadcast_to(v, blocks[k].shape) for k, v in held.items()}
 
 
 def _halved(linear: Mapping[str, np.ndarray], size: np.ndarray, at: np.ndarray, output: bool) -> Blocks:
-    """Linear blocks of which one half passes the element: channel i carries output or input `at[i]`, over `size`."""
+    """Split the path of output or input `at[i]` in two: half direct, half through channel i of the element."""
     b, c, d = linear["B_u"], linear["C_y"], linear["D_yu"]
     through = np.zeros((len(at), len(c) if output else b.shape[1]))
     through[np.arange(len(at)), at] = size

@@ -1,7 +1,7 @@
 """The catalogue of physical laws that may be missing from a simulator, one small class for each hypothesis.
 
 `base` holds the class `Law` and shows how to add a law in ten lines; the files beside it hold the laws by kind
-(`stiffness`, `friction`, `hysteresis`, `limits`, `curves`, `periodic`, `dynamic`), `composed` makes laws from laws, and
+(`stiffness`, `friction`, `hysteresis`, `saturation`, `curves`, `periodic`, `dynamic`), `composed` makes laws from laws, and
 `catalogue` lists those that are tried. `forces` evaluates laws along given signals.
 """
 
@@ -62,7 +62,8 @@ if TYPE_CHECKING:
         SmoothHysteresis as SmoothHysteresis,
         StopHysteresis as StopHysteresis,
     )
-    from .limits import (
+    from .periodic import HarmonicForce as HarmonicForce, PeriodicForce as PeriodicForce, Ripple as Ripple
+    from .saturation import (
         AsymmetricDeadZone as AsymmetricDeadZone,
         AsymmetricSaturation as AsymmetricSaturation,
         DeadZone as DeadZone,
@@ -71,7 +72,6 @@ if TYPE_CHECKING:
         SkewSaturation as SkewSaturation,
         SoftSaturation as SoftSaturation,
     )
-    from .periodic import HarmonicForce as HarmonicForce, PeriodicForce as PeriodicForce, Ripple as Ripple
     from .stiffness import (
         Clearance as Clearance,
         CubicStiffness as CubicStiffness,

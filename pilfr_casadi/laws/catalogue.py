@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from . import curves, dynamic, friction, hysteresis, limits, periodic, stiffness
+from . import curves, dynamic, friction, hysteresis, periodic, saturation, stiffness
 from .base import Law
 from .composed import behind_gap
 
@@ -42,13 +42,13 @@ CATALOGUE: tuple[type[Law], ...] = (
     hysteresis.BoucWen,
     hysteresis.BoucWenActuator,
     hysteresis.Backlash,
-    limits.Saturation,
-    limits.AsymmetricSaturation,
-    limits.SoftSaturation,
-    limits.SkewSaturation,
-    limits.GradualSaturation,
-    limits.DeadZone,
-    limits.AsymmetricDeadZone,
+    saturation.Saturation,
+    saturation.AsymmetricSaturation,
+    saturation.SoftSaturation,
+    saturation.SkewSaturation,
+    saturation.GradualSaturation,
+    saturation.DeadZone,
+    saturation.AsymmetricDeadZone,
     curves.Quadratic,
     curves.Cubic,
     curves.Polynomial,

@@ -306,5 +306,5 @@ def direction_fixed(structure: PILFR) -> bool:
 
 
 def places(structure: PILFR) -> tuple[str, ...]:
-    """List the places of the element in the first starts, one where z has no free direction; later starts draw it."""
+    """Name the element's places in the first starts: output, then input; output alone if z's direction is fixed."""
     return ("output",) if direction_fixed(structure) else ("output", "input")

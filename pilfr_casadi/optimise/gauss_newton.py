@@ -83,7 +83,7 @@ class Damping:
     growth: float = 2.0
 
     def after_success(self, ratio: float) -> Damping:
-        """Lower λ by up to a third, or raise it by up to two, as the gain ratio (actual over predicted) says."""
+        """Multiply λ by a factor from 1/3 (good step) to 2 (poor step), by the gain ratio (actual over predicted)."""
         return Damping(self.value * max(1 / 3, 1.0 - (2.0 * min(ratio, 1.0) - 1.0) ** 3))
 
     def after_failure(self) -> Damping:

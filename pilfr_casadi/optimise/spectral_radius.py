@@ -50,7 +50,9 @@ ROUNDS = 6  # Schur forms taken at the bound, at most
 GAIN = 1e-4  # relative fall of the cost for which another round is worth it
 STEP = GaussNewton(max_iterations=100, tolerance=1e-4)
 ROW_UNIT = 1e-2  # unit of Jury's rows, next to which their violation is judged
-CURVATURE = 1e-2  # curvature of the objective along X: damps X next to a cost of order 1 (calibrated on three tight fits)
+CURVATURE = (
+    1e-2  # curvature of the objective along X: damps X next to a cost of order 1 (calibrated on three tight fits)
+)
 
 
 @dataclass(frozen=True)

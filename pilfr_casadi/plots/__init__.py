@@ -18,7 +18,7 @@ if TYPE_CHECKING:
         mismatch_time as mismatch_time,
         port_law_map as port_law_map,
     )
-    from .law import loading_curve as loading_curve, loop as loop, virgin_curve as virgin_curve, weights as weights
+    from .element import loading_curve as loading_curve, loop as loop, virgin_curve as virgin_curve, weights as weights
     from .overview import convergence as convergence, plot_fit as plot_fit
     from .proof import (
         Simulated as Simulated,

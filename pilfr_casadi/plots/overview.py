@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from ..data import Recording, as_recordings
 from ..optimise import Iteration
 from .canvas import GREY, VERMILLION, axes_or_new, finish, new_figure
-from .law import loading_curve, loop, weights
+from .element import loading_curve, loop, weights
 from .signals import PlottedFit, spectrum, time
 
 

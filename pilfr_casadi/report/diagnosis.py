@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import plots
 from ..diagnose import Comparison, Diagnosis, Fitted, Workbench
-from ..export import made, write_atomically
+from ..export import make_folder, write_atomically
 from . import diagnosis_tables as tables
 from .diagnosis_tables import words
 from .hidden_force import force_blocks
@@ -48,7 +48,7 @@ def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pa
     page, figures = _draw(diagnosis_page(diagnosis))
     html = page.html()
     content = json.dumps(diagnosis.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    target = made(Path(folder) / "figures").parent
+    target = make_folder(Path(folder) / "figures").parent
     for name, png in figures.items():
         write_atomically(target / "figures" / name, png)
     write_atomically(target / "diagnosis.json", content)

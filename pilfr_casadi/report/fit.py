@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import plots
 from ..data import Recording, as_recordings, rmse_per_output
-from ..export import made, write_atomically
+from ..export import make_folder, write_atomically
 from ..identify import Fit
 from ..models import StaticNetwork
 from .fit_sections import (
@@ -61,7 +61,7 @@ def fit_report(
         If a recording does not fit the model, or the folder cannot be written.
     """
     page = fit_page(fit, train, tests, model_file="model.json")
-    target = made(folder)
+    target = make_folder(folder)
     fit.save(target / "model.json")
     return write_atomically(target / "report.html", page.html())
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         locked as locked,
     )
     from .jobs import fold as fold, input_digests as input_digests, jobs_of as jobs_of
-    from .limits import LARGEST_SIZE as LARGEST_SIZE
+    from .largest_sizes import LARGEST_SIZE as LARGEST_SIZE
     from .schema import (
         ROLES as ROLES,
         Cell as Cell,

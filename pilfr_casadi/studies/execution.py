@@ -24,7 +24,7 @@ import numpy as np
 
 from .._base import InputError, Progress, close_workers, deferred_interrupt, whole
 from ..data import Recording, keeps_its_period, read
-from ..export import digest, made
+from ..export import digest, make_folder
 from ..identify import Fit, is_drawn
 from ..models import PILFR, places
 from ..optimise import Status
@@ -282,7 +282,7 @@ def _execute(
     recordings = {role: tuple(_read(given, name) for name in given.files[role]) for role in ROLES}
     if given.folds:
         fold(recordings["train"], 0, given.folds)  # refuses recordings that are too short for it
-    made(folder)
+    make_folder(folder)
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(locked(folder))

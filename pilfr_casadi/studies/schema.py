@@ -28,7 +28,7 @@ from ..identify import BLA, POLISH, STARTS
 from ..models import ANY, HYSTERETIC, LAGGED, OPERATORS, PILFR, STRUCTURES, TAKES, Lagged, Model, named_structure
 from ..optimise import Constraint, GaussNewton, Ipopt, check_gain, dc_gain, ordered
 from ..simulators import user_variable
-from .limits import LARGEST_SIZE, MOST_JOBS, MOST_SAMPLES
+from .largest_sizes import LARGEST_SIZE, MOST_JOBS, MOST_SAMPLES
 
 ROLES = ("train", "validation", "test")
 # keys of the grid: those of [model] and [solver] that a study varies

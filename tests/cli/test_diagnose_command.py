@@ -283,7 +283,7 @@ def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, monkeypatch
         write_csv(files / f"{name}.csv", force[:300], position[:300])
     monkeypatch.setattr(importlib.import_module("pilfr_casadi.diagnose.run"), "CATALOGUE", (CubicStiffness, Saturation))
     given = arguments(files, "--hold", "zero", "--initial", "zero", simulator="fit/model.json")
-    status, out, err = run(capsys, *given)
+    status, out, _ = run(capsys, *given)
     assert status == 0 and "the simulator's own values, refitted" in out
     found = json.loads((files / "out" / "diagnosis.json").read_text())
     assert np.shape(found["parameters"]["A"]["refit_with"]) == (2, 2) and found["candidates"]
