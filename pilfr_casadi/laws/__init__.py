@@ -1,8 +1,8 @@
 """The catalogue of physical laws that may be missing from a simulator, one small class for each hypothesis.
 
-`base` holds the class `Law` and shows how to add a law in ten lines; the files beside it hold the laws by kind
-(`stiffness`, `friction`, `hysteresis`, `saturation`, `curves`, `periodic`, `dynamic`), `composed` makes laws from laws, and
-`catalogue` lists those that are tried. `forces` evaluates laws along given signals.
+`base` holds the class `Law` and shows how to add a law in ten lines. The laws stand by kind in `stiffness`, `friction`,
+`hysteresis`, `saturation`, `curves`, `periodic` and `dynamic`; `composed` makes laws from laws, and `catalogue` lists
+those that are tried. `forces` evaluates laws along given signals.
 """
 
 from typing import TYPE_CHECKING
