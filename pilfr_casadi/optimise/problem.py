@@ -217,8 +217,9 @@ def state_precision(engine: Engine, drive: np.ndarray, p: np.ndarray, n_x: int, 
     return np.asarray(STATE_NOISE**2 * np.linalg.inv(together) / size / size[:, None])
 
 
-STATE_NOISE = 0.1  # share of the outputs' deviation: a model's errors change slowly, so the samples of a beginning are
-# not independent; of 1, .1, .03 and .01 the best over beginnings at rest and in motion of fits of the paper's rig
+# share of the outputs' deviation that a fitted model is trusted to: its errors change slowly, so the samples of a
+# beginning are not independent; calibrated on fits of the rig, begun at rest and in motion (problems.initial_state)
+STATE_NOISE = 0.2
 STATE_SAMPLES = 256  # states along a run whose second moments are taken
 STILL_STATE = 1e-3  # deviation of a state that does not move, next to the largest of its kind
 CORRELATED = 1e-6  # variance left to each direction of the correlation matrix
