@@ -129,6 +129,8 @@ class FitContext:
         if not np.isfinite(cost) or cost == 0:
             return True
         slope, curvature = gradient[n_free:], hessian[n_free:, n_free:]
+        if not len(slope):
+            return True
         decrease = 0.5 * float(slope @ np.linalg.lstsq(curvature, slope, rcond=None)[0])
         left = max(1 - decrease / cost, np.finfo(float).tiny)
         independent = max(freed.residuals / correlated, 2.0)

@@ -276,7 +276,8 @@ def _fit_structure(
 def _search_from_linear(structure: PILFR, context: FitContext, given: FitContext, starts: StartOptions) -> Fit:
     """Find the linear model, then search from it; `context` may begin at rest where `given` does not."""
     linear, problem, solution = _fit_linear_start(structure, context, starts.linear)
-    if solution.status is not Status.INTERRUPTED and not given.agrees_with_rest(problem, solution.theta):
+    stopped = solution.status is Status.INTERRUPTED
+    if context is not given and not stopped and not given.agrees_with_rest(problem, solution.theta):
         return _search_from_linear(structure, given, given, starts)
     if solution.status is Status.INTERRUPTED:
         return given.result(linear, structure.linear(), problem, solution)
@@ -386,7 +387,7 @@ def _fit_from_starts(
     latest = _finish(structure, candidates, best, stopped, context, starts.kind == "grid")
     model, problem, result, note = latest
     stopped = result.status is Status.INTERRUPTED
-    if not stopped and not given.agrees_with_rest(problem, result.theta, CORRELATED_SAMPLES):
+    if context is not given and not stopped and not given.agrees_with_rest(problem, result.theta, CORRELATED_SAMPLES):
         return _search_from_linear(structure, given, given, starts)
     return given.result(model, structure, problem, result, note, candidates=tuple(candidates), **compared)
 

@@ -73,7 +73,7 @@ def test_one_fit_under_every_name():
         (lambda r: fit(PILFR(2), r, progress=3), "progress = 3"),
         (lambda r: fit(PILFR(2), r, l1={"w": 1e-4}), "linear model"),
         (lambda r: fit(PILFR(2, layer()), r, l1=["w"]), "by name"),
-        (lambda r: fit(PILFR(5000, layer()), r), "choose a smaller model"),
+        (lambda r: fit(PILFR(100, layer()), r), "choose a smaller model"),
         (lambda r: fit(PILFR(2, layer()), r, l1={"v": 1e-4}), "no parameter 'v'"),
         (lambda r: fit(PILFR(2, layer()), r, l1={"w": -1}), "0 or more"),
         (lambda r: fit(PILFR(2, layer()), r, l1={"A": 1.0}), "lower bound of zero"),
