@@ -53,6 +53,7 @@ def test_every_law_is_hidden_somewhere():
     assert {law for rig in RIGS.values() for _, law in places(rig)} == LAWS
 
 
+@pytest.mark.slow
 def test_a_case_keeps_its_promises(cases):
     for c in cases:
         assert 0.9 * QUIETEST < c.details["noise"] < 1.1 * LOUDEST
@@ -185,6 +186,7 @@ def test_exported_files_are_read_back(tmp_path, cases):
     compile((tmp_path / "simulator.py").read_text(), "simulator.py", "exec")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", range(600, 620, 5))
 def test_concealed_cases_are_diagnosed(first):
     """Twenty cases, five at a time: four of five entirely right, and no confident wrong name."""

@@ -10,6 +10,7 @@ PIEZO = measured("piezo_dbo")
 needs_piezo = pytest.mark.skipif(PIEZO is None, reason="the piezo recordings are not beside the repository")
 
 
+@pytest.mark.slow
 @needs_piezo
 def test_piezo_stack_reaches_its_figures():
     errors = {(name, where): error for name, where, error, _ in run(PIEZO)}
@@ -18,6 +19,7 @@ def test_piezo_stack_reaches_its_figures():
     assert errors["linear gain", "sine -> varying"] > 5
 
 
+@pytest.mark.slow
 @needs_piezo
 def test_piezo_stack_on_the_command_line(capsys, tmp_path):
     names = ["--inputs", "u_control_V", "--outputs", "y_disp_um", "--skip", "20", "--nx", "0", "--operators", "20"]

@@ -8,6 +8,7 @@ from problems import table2
 from problems.masing_figures import draw, loop_width
 
 
+@pytest.mark.slow
 def test_the_command(capsys, tmp_path):
     wanted = ["--rows", "LTI", "N=5, paper", "nx=5, n=5", "--starts", "2", "--network-starts", "1", "--workers", "1"]
     table2.main([*wanted, "--seed", "101", "--figures", str(tmp_path)])

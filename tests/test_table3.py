@@ -60,6 +60,7 @@ def test_the_noise_floor_is_what_averaging_leaves():
     assert quiet == pytest.approx(loud / np.sqrt(PERIODS))
 
 
+@pytest.mark.slow
 def test_rows_of_a_small_platform_come_in_the_paper_s_order(capsys):
     data = small()
     averaged, floor = data.averaged(), data.floor()
@@ -97,6 +98,7 @@ def test_the_better_row_is_the_one_of_the_smaller_training_error():
     assert len(by_training(dict.fromkeys(rows(), Told(1, 1)), "train", "test", 1.0).split(",")) == 2 + 4 * 2 + 1
 
 
+@pytest.mark.slow
 def test_networks_of_a_small_platform():
     data = small()
     averaged, wanted = data.averaged(), {"LTI": Row(lti(6)), "SS-NN": Row(ss_nn(6, 3), None, (20, 5))}
@@ -120,6 +122,7 @@ def test_plays_beat_a_linear_model_on_the_real_stack():
     assert error["PI-LFR nx=1 N=10"] < 0.75 * error["LTI nx=1"]
 
 
+@pytest.mark.slow
 def test_some_rows_of_another_platform(capsys):
     with pytest.raises(SystemExit):
         main(["--rows", "nonsense"])

@@ -235,8 +235,9 @@ def parameter_table(diagnosis: Diagnosis) -> Table:
     rows, what = [], correction_words(diagnosis)
     for name, p in diagnosis.parameters.items():
         known = ParameterSet({name: Parameter(p["nominal"])})
+        shape = np.shape(p["nominal"])
         given, without, after, std = (
-            np.ravel(np.broadcast_to(_array(p[k]), known[name].shape), order="F")
+            np.ravel(np.broadcast_to(_array(p[k]), shape), order="F")
             for k in ("nominal", "refit_without", "refit_with", "std")
         )
         for i, label in enumerate(known.labels):

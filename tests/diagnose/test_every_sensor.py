@@ -32,6 +32,7 @@ def filtered(order, cutoff, outputs=(0, 1), law=None):
     return r.with_(y=y + 2e-3 * np.std(y, axis=0) * rng.standard_normal(y.shape), outputs=("x1", "x2"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order, form", [(1, "lag"), (2, "resonance")])
 def test_one_filter_in_all_sensors_is_no_sure_actuator(order, form):
     found = pilfr.diagnose(both(rig(OFF)), filtered(order, 12.0), laws=TRIED)
@@ -44,6 +45,7 @@ def test_one_filter_in_all_sensors_is_no_sure_actuator(order, form):
     assert ports == ["actuator:force", "sensor:x1 + sensor:x2"]
 
 
+@pytest.mark.slow
 def test_a_filter_in_one_sensor_of_two_is_told_from_that():
     found = pilfr.diagnose(both(rig(OFF)), filtered(1, 12.0, [1]), laws=TRIED)
     (effect,) = found.effects

@@ -61,6 +61,7 @@ def recorded(seed):
     return blank.with_(y=y + 4e-3 * np.std(y, axis=0) * rng.standard_normal(y.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 6])  # at each other's ports, and both at the pulley
 def test_laws_that_follow_better_at_other_ports_go_there(seed):
     simulator = drive(2.8, 2e4, 25.0, 8.0, 5.0, 66.0)

@@ -9,6 +9,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi.report.diagnosis_tables import headline
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("held", "words"), [({"fixed": True}, "held at"), ({"bounds": (1200, 9000)}, "by its bounds")])
 def test_a_value_that_is_held_is_told_in_place_of_a_spring(held, words):
     simulator = rig(OFF)

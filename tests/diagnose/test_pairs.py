@@ -25,6 +25,7 @@ def test_the_share_of_a_pair_is_that_of_least_squares(seed, widths):
                 assert found[i, j] == pytest.approx(1 - rest @ rest / (left @ left), rel=2e-3, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_two_effects_are_found_where_the_first_alone_leads_astray():
     """A curve of the pump and an uneven valve between the tanks: alone, hysteresis of the sensor comes nearest."""
     hidden = case(2121)

@@ -86,6 +86,7 @@ def test_late_by_half_a_swing_is_no_wrong_sign(fault):
     assert [g.finding for g in found.gates] == [{"late": "alignment", "sign": "sign"}[fault]]
 
 
+@pytest.mark.slow
 def test_of_two_near_units_the_wrong_hold_does_not_choose():
     """Degrees for radians: with inputs held instead of interpolated, a sixtieth fits better."""
     hidden = case(3660)

@@ -16,6 +16,7 @@ def lost(r, share, seed=0):
     return r.with_(y=y)
 
 
+@pytest.mark.slow
 def test_stale_samples_are_told_and_where():
     (r,) = recordings(count=1)
     (gate,) = stale_samples([lost(r, 0.1)])

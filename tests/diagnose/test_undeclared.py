@@ -11,6 +11,7 @@ from pilfr_casadi import laws
 from pilfr_casadi.diagnose import conclusion
 
 
+@pytest.mark.slow
 def test_a_law_that_no_declared_port_reaches_is_told_where_it_acts():
     friction = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
     full = rig(OFF)
@@ -29,6 +30,7 @@ def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(monkey
 
     search = SimpleNamespace(interrupted=unfinished, bench=None, without=None)
     monkeypatch.setattr(conclusion, "judge", lambda *given: ("unexplained", "Something is missing."))
+    monkeypatch.setattr(conclusion, "find_description", lambda search: None)
     monkeypatch.setattr(conclusion, "held_value", lambda search: None)
     monkeypatch.setattr(conclusion, "clipped_input", lambda *given: None)
     monkeypatch.setattr(conclusion, "mean_nrmse", lambda *given: 0.5)

@@ -138,6 +138,7 @@ def test_structures_with_fixed_blocks_find_their_envelopes(structure, truth):
     assert result.nrmse(test) < 2.5 * noise
 
 
+@pytest.mark.slow
 def test_only_generalized_plays_follow_a_shape_memory_wire():
     data = shape_memory.records()
     errors = {}

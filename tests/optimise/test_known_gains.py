@@ -20,6 +20,7 @@ def record():
     return three_plays(0, 1200)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed, gain", [(5, 2.0), (8, 2.0), (10, 2.0), (11, 1.0)])
 def test_a_gain_far_from_the_machines_own_is_met(seed, gain):
     """Beside a slow pole a gain has immense slopes, at a pole of 1 no value; one start may miss it, another not."""

@@ -134,6 +134,7 @@ def test_a_tight_bound_on_a_model_with_plays(demo):
     assert fit.train_nrmse[0] < 0.035
 
 
+@pytest.mark.slow
 def test_more_starts_are_never_worse(record):
     errors = [pilfr.fit(pilfr.PILFR(2, PLAYS), record, starts=n, stable=0.5).train_nrmse[0] for n in (1, 3)]
     assert errors[1] <= errors[0] * 1.0001
