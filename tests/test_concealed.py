@@ -69,6 +69,7 @@ def test_a_case_keeps_its_promises(cases):
             assert 3 < c.refit / c.details["noise"] < 100
 
 
+@pytest.mark.slow
 def test_refit_by_the_package_leaves_the_effect_visible(cases):
     """The generator's own linearised refit is no flattery: a full fit leaves at least 2.5 times the floor."""
     seen = 0
@@ -99,6 +100,7 @@ def answer(verdict, *pairs, confidence=0.9, gates=(), after=0.01):
     return {"verdict": verdict, "effects": effects, "gates": list(gates), "fit": {"test": {"after": after}}}
 
 
+@pytest.mark.slow
 def test_scores(cases):
     one = next(c for c in cases if "one" in c.tags)
     pair = (one.truth[0]["port"], one.truth[0]["law"])
@@ -177,6 +179,7 @@ def test_a_product_outside_the_catalogue_is_no_square(monkeypatch, seed, own):
     assert drawn[-1] not in own
 
 
+@pytest.mark.slow
 def test_exported_files_are_read_back(tmp_path, cases):
     c = cases[1]
     export(c, tmp_path)

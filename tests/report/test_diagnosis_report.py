@@ -63,6 +63,7 @@ def test_without_test_recordings_it_says_so(tmp_path):
     assert "no test was given" in text and "none held out" in text and "test (held out)" not in text
 
 
+@pytest.mark.slow
 def test_it_says_what_makes_the_answer_less_certain(tmp_path):
     d = example()
     assert "far above the training error" not in Reader(diagnosis_report(d, tmp_path).read_text()).text
@@ -71,6 +72,7 @@ def test_it_says_what_makes_the_answer_less_certain(tmp_path):
     assert "The test error is far above the training error" in text
 
 
+@pytest.mark.slow
 def test_what_is_closed_in_without_a_name_is_said_with_the_error(tmp_path):
     d, note = example(), Gate("ground", "unsure", "creep", "Beside it something more is missing.", False)
     assert "what is not sure" not in Reader(diagnosis_report(d, tmp_path).read_text()).text
