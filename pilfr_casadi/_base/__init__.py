@@ -1,4 +1,4 @@
-"""What every other folder stands on: errors with a sentence for the user, worker processes, interrupts and progress."""
+"""Foundation of every other folder: errors with a sentence for the user, worker processes, interrupts and progress."""
 
 from typing import TYPE_CHECKING
 

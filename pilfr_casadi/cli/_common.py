@@ -1,4 +1,4 @@
-"""What several commands share: exit statuses, the types of options, and reading recordings as the options say."""
+"""Shared parts of the commands: exit statuses, the types of options, and reading recordings as the options say."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class Description:
 
     @property
     def sentence(self) -> str:
-        """What the model is, how much better it predicts, and how much it leaves."""
+        """Describe the model: its law and port, how much better it predicts, and how much it leaves."""
         return (
             f"The corrected simulator is a description without a sure name: {self.words}. On parts of the training "
             f"recordings that were not fitted it lowers the error from {100 * self.before:.2g} % to "
