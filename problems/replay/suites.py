@@ -63,7 +63,7 @@ def _case(key: str) -> Answer:
 def from_files(folder: Path) -> Any:
     """Diagnose a folder with simulator.py, train_*.csv and test.csv, as `pilfr diagnose` does."""
     simulator = load_simulator(folder / "simulator.py")
-    names: dict[str, Any] = {"inputs": simulator.inputs, "outputs": simulator.outputs}
+    names: dict[str, Any] = {"inputs": simulator.inputs, "outputs": simulator.output_names}
     train = [pilfr.read_csv(path, **names) for path in sorted(folder.glob("train_*.csv"))]
     return pilfr.diagnose(simulator, train, test=pilfr.read_csv(folder / "test.csv", **names), workers=1)
 
