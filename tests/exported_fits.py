@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from pilfr_casadi import Parameter, Port, Recording, Simulator, laws
-from pilfr_casadi.export import ordered_digest
+from pilfr_casadi._base import ordered_digest
 from pilfr_casadi.identify import Fit
 from pilfr_casadi.laws import Local
 from pilfr_casadi.models import (

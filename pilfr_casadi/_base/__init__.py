@@ -18,6 +18,14 @@ if TYPE_CHECKING:
         usable as usable,
         whole as whole,
     )
+    from .files import (
+        digest as digest,
+        make_folder as make_folder,
+        ordered_digest as ordered_digest,
+        path_text as path_text,
+        short as short,
+        write_atomically as write_atomically,
+    )
     from .interrupts import (
         Clock as Clock,
         deferred_interrupt as deferred_interrupt,

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import typer
 
-from .._base import InputError, deferred_interrupt, listed, progress_bar
+from .._base import InputError, deferred_interrupt, listed, progress_bar, write_atomically
 from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
-from ..export import write_atomically
 from ..identify import load
 from ..simulators import Simulator, as_simulator, simulator_variable
 from ..studies import LARGEST_SIZE

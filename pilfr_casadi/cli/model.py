@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 import typer
 
-from .._base import InputError, listed
+from .._base import InputError, listed, write_atomically
 from ..data import Recording, column_names, nrmse, read_stack, written_times
-from ..export import NAMES, exported, write_atomically
+from ..export import NAMES, exported
 from ..identify import Fit, load
 from ..simulators import load_simulator
 from ._common import DONE, NO_RESULT, DataOptions, check_names, flag, name_list, option, pairs, say, takes_options

@@ -242,10 +242,10 @@ class Transcription:
         """Build CasADi's solver of the program."""
         x, p, g = self._variables, self._parameters, self._constraints
         factor, multipliers = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", g.shape[0])
-        hessian = factor * self._hessian
-        names, out = ["x", "p", "lam_f", "lam_g"], "hess_gamma_x_x"
-        if name == "ipopt":
-            hessian, out = ca.triu(hessian), "triu_hess_gamma_x_x"
+        hessian = ca.triu(factor * self._hessian)
+        names, out = ["x", "p", "lam_f", "lam_g"], "triu_hess_gamma_x_x"
+        if name == "sqp":  # each entry is computed once
+            hessian, out = ca.triu2symm(hessian), "hess_gamma_x_x"
         gauss_newton = ca.Function("gauss_newton", [x, p, factor, multipliers], [hessian], names, [out])
         own = {**SQP, "max_iter": iterations} if name == "sqp" else IPOPT
         plugin = "sqpmethod" if name == "sqp" else "ipopt"

@@ -12,12 +12,6 @@ if TYPE_CHECKING:
         exported as exported,
         to_casadi as to_casadi,
     )
-    from .files import (
-        digest as digest,
-        make_folder as make_folder,
-        ordered_digest as ordered_digest,
-        write_atomically as write_atomically,
-    )
     from .model_file import (
         FitContent as FitContent,
         SavedStart as SavedStart,

@@ -17,7 +17,7 @@ from typing import Any
 
 import casadi as ca
 
-from .files import make_folder, write_atomically
+from .._base import make_folder, write_atomically
 
 
 def write_c(

@@ -13,14 +13,13 @@ from typing import Any, Protocol, TypeGuard
 import casadi as ca
 import numpy as np
 
-from .._base import LARGEST, InputError, is_number, numbers
+from .._base import LARGEST, InputError, is_number, numbers, path_text, write_atomically
 from ..data import Recording
 from ..engine import make_engine
 from ..models import Model
 from ..optimise import first_state
 from ..simulators import Simulator, choose_substeps, discretise
 from .c_code import write_c
-from .files import path_text, write_atomically
 from .smoothing import enclosed, smoothed
 from .step import Sampled, right_hand_side, sampled
 

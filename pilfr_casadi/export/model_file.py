@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, __version__
+from .._base import InputError, __version__, ordered_digest, path_text, short, write_atomically
 from ..models import (
     PILFR,
     Combined,
@@ -43,7 +43,6 @@ from ..models import (
     block_shapes,
 )
 from ..optimise import Iteration, Limit, Solution, Status
-from .files import ordered_digest, path_text, short, write_atomically
 
 if TYPE_CHECKING:
     from . import model_schema as schema

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from .. import plots
+from .._base import make_folder, write_atomically
 from ..diagnose import Comparison, Diagnosis, Fitted, Workbench
-from ..export import make_folder, write_atomically
 from . import diagnosis_tables as tables
 from .diagnosis_tables import words
 from .hidden_force import force_blocks

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from .. import plots
+from .._base import make_folder, write_atomically
 from ..data import Recording, as_recordings, rmse_per_output
-from ..export import make_folder, write_atomically
 from ..identify import Fit
 from ..models import StaticNetwork
 from .fit_sections import (

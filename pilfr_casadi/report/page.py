@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError
-from ..export import write_atomically
+from .._base import InputError, write_atomically
 
 TONES = ("plain", "good", "warning", "bad")
 DPI = 160  # dots an inch of the pictures: sharp at twice the resolution of an ordinary screen

@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, close_workers, deferred_interrupt, whole
+from .._base import InputError, Progress, close_workers, deferred_interrupt, digest, make_folder, whole
 from ..data import Recording, keeps_its_period, read
-from ..export import digest, make_folder
 from ..identify import Fit, is_drawn
 from ..models import PILFR, places
 from ..optimise import Status

@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, listed
-from ..export import digest, write_atomically
+from .._base import InputError, digest, listed, write_atomically
 from ..identify import load
 from ..models import Model
 from .jobs import BAD_ENDS, FAILED, LOST, TIMED_OUT, Outcome, Recordings, RunJob, error_of, file_digest, versions

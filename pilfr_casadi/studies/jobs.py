@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, __version__
+from .._base import InputError, Progress, __version__, digest
 from ..data import NOTHING_SENTENCE, Recording, explains_nothing, fingerprint, group_by_input, repeats_itself
-from ..export import digest, model_text
+from ..export import model_text
 from ..identify import Fit, fit as identify, operators_used, prune, regularization_path
 from ..models import Model
 from ..optimise import Solution, Status

@@ -16,9 +16,9 @@ import pytest
 from command_line import fit_arguments, refused, run, sentence, write_csv
 
 import pilfr_casadi as pilfr
+from pilfr_casadi._base import ordered_digest
 from pilfr_casadi.cli import main
 from pilfr_casadi.cli.app import in_options
-from pilfr_casadi.export import ordered_digest
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ from exported_fits import CASES, changed, leaves, one_sentence, own_model, recor
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from pilfr_casadi import InputError, Limit, Recording, fit, load, save
+from pilfr_casadi._base import write_atomically
 from pilfr_casadi.cli.app import main
-from pilfr_casadi.export import write_atomically
 from pilfr_casadi.models import PILFR, GeneralizedPlay, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import Status
 

@@ -8,9 +8,8 @@ import pytest
 from random_models import random_input
 
 import pilfr_casadi as pilfr
-from pilfr_casadi._base import InputError
+from pilfr_casadi._base import InputError, ordered_digest
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.export import ordered_digest
 from pilfr_casadi.identify import gauge_tangents, solve_with_early_stopping, split_validation
 from pilfr_casadi.models import reading_output
 from pilfr_casadi.optimise import Problem

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given, strategies as st
 
 from pilfr_casadi import load
-from pilfr_casadi._base import InputError
+from pilfr_casadi._base import InputError, ordered_digest
 from pilfr_casadi.control import response_bound
 from pilfr_casadi.data import Recording
 from pilfr_casadi.engine import VirtualMachine
-from pilfr_casadi.export import ordered_digest
 from pilfr_casadi.identify import fit
 from pilfr_casadi.models import (
     PILFR,

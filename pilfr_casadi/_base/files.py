@@ -15,7 +15,7 @@ import secrets
 from pathlib import Path
 from typing import Any
 
-from .._base import InputError
+from .errors import InputError
 
 
 def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path:
@@ -30,15 +30,11 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
         If the folder does not exist or the file cannot be written there.
     """
     target = Path(os.path.realpath(path_text(path, "file")))
-    try:
-        folder = target.is_dir()
-    except OSError as error:
-        raise InputError(f"{short(path)} cannot be written ({error.strerror}); give another path.") from None
-    if folder:
-        raise InputError(f"{short(path)} is a folder; give the name of a file in it.")
     data = content.encode() if isinstance(content, str) else content
-    partial = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.tmp")
     try:
+        if target.is_dir():
+            raise InputError(f"{short(path)} is a folder; give the name of a file in it.")
+        partial = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.tmp")
         handle = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
         try:
             with os.fdopen(handle, "wb") as file:
@@ -56,7 +52,12 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes) -> Path
                 f"The folder {target.parent} does not exist; make it first or give another path."
             ) from error
         raise InputError(f"{short(path)} cannot be written ({error.strerror or error}); give another path.") from error
-    _sync_folder(target.parent)
+    with contextlib.suppress(OSError):  # force the new name to disk too, where the system allows it
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
     return target
 
 
@@ -88,13 +89,7 @@ def ordered_digest(content: dict[str, Any]) -> str:
 
 
 def path_text(path: Any, kind: str) -> str:
-    """Return a path as text.
-
-    Raises
-    ------
-    InputError
-        If it is not a path, or empty.
-    """
+    """Return a path as text, or refuse what is none."""
     try:
         name = os.fspath(path)
     except TypeError:
@@ -108,13 +103,3 @@ def short(path: Any) -> str:
     """Shorten a path for a message."""
     text = str(path)
     return text if len(text) <= 200 else f"{text[:100]}...{text[-60:]}"
-
-
-def _sync_folder(folder: Path) -> None:
-    """Force the new name to disk too, where the system allows it."""
-    with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
