@@ -25,8 +25,8 @@ if TYPE_CHECKING:
         locked as locked,
     )
     from .jobs import fold as fold, input_digests as input_digests, jobs_of as jobs_of
-    from .largest_sizes import LARGEST_SIZE as LARGEST_SIZE
     from .schema import (
+        LARGEST_SIZE as LARGEST_SIZE,
         ROLES as ROLES,
         Cell as Cell,
         ModelTable as ModelTable,

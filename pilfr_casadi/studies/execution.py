@@ -11,25 +11,22 @@ any time, and a summary with box plots ends it.
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, close_workers, deferred_interrupt, digest, make_folder, whole
+from .._base import InputError, Progress, deferred_interrupt, digest, make_folder, whole
 from ..data import Recording, keeps_its_period, read
 from ..identify import Fit, is_drawn
 from ..models import PILFR, places
 from ..optimise import Status
-from .executor import AHEAD, Attempt, check_executor, side_by_side
+from .executor import AHEAD, do_side_by_side
 from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, locked, read_times
-from .jobs import Batch, Recordings, RunJob, attempt, fold, input_digests, jobs_of, outcome
+from .jobs import Batch, RunJob, fold, input_digests, jobs_of, outcome
 from .schema import ROLES, Cell, Run, read_run
 from .summary import (
     CellSummary,
@@ -46,7 +43,7 @@ from .summary import (
 
 FITTED = "the structure is chosen on what was fitted, which favours the larger; add folds or validation recordings"
 Tell = Callable[[str], None]
-Perform = Callable[[Run, Recordings, Sequence[RunJob]], Iterator[Batch]]
+Perform = Callable[[Store, Sequence[RunJob]], Iterator[Batch]]
 
 
 class RunInterrupted(KeyboardInterrupt):
@@ -147,25 +144,23 @@ def run(
     RunInterrupted
         On Ctrl-C; complete jobs stay.
     """
-    given = path if isinstance(path, Run) else read_run(path)
-    given = given if engine is None else replace(given, engine=engine)
-    check_executor(executor)
+    given = _read_run(path, "run", executor, out=out, engine=engine)
 
-    def in_turn(given: Run, recordings: Recordings, jobs: Sequence[RunJob]) -> Iterator[Batch]:
+    def in_turn(place: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
         for job in jobs:
-            yield [(job, outcome(given, recordings, job, executor=executor, progress=progress))]
+            yield [(job, outcome(given, place.recordings, job, executor=executor, progress=progress))]
 
-    return _execute(given, in_turn, out, overwrite, progress, tell)
+    return _execute(given, in_turn, overwrite, progress, tell)
 
 
 def campaign(
     path: Any,
     *,
-    out: Any = None,
-    overwrite: bool = False,
     workers: int | None = None,
     executor: Executor | None = None,
     ahead: int = AHEAD,
+    out: Any = None,
+    overwrite: bool = False,
     progress: Progress | None = None,
     tell: Tell | None = None,
 ) -> RunResult:
@@ -177,12 +172,6 @@ def campaign(
 
     Parameters
     ----------
-    path : path or Run
-        The file, `.toml` or `.py`, or the result of `read_run`.
-    out : path, optional
-        Folder of the results, in place of the file's.
-    overwrite : bool
-        Compute everything again, whatever is in the folder.
     workers : int, optional
         Processes, in place of the file's; 1 without a time limit is this process.
     executor : concurrent.futures.Executor, optional
@@ -190,10 +179,8 @@ def campaign(
         workers does its jobs in a process beside it.
     ahead : int
         How many jobs the executor is given at a time; at least as many as it has workers.
-    progress : callable
-        Gets ("jobs", done, total, smallest training error so far).
-    tell : callable
-        Gets a line of text after every job.
+    path, out, overwrite, progress, tell
+        As for `run`.
 
     Returns
     -------
@@ -202,20 +189,29 @@ def campaign(
     Raises
     ------
     InputError
-        If the run file or a recording cannot be used, no job gives a model, results were changed afterwards or are of
-        other versions, the executor stops, or its workers are unfit.
+        As for `run`; also if earlier results are of other versions, the executor stops, or its workers are unfit.
     RunInterrupted
         On Ctrl-C; complete jobs stay.
     """
-    given = path if isinstance(path, Run) else read_run(path, "campaign")
-    if workers is not None:
-        given = replace(given, workers=whole(workers, "workers", 1))
-    check_executor(executor)
+    workers = None if workers is None else whole(workers, "workers", 1)
+    given = _read_run(path, "campaign", executor, out=out, workers=workers)
     for cell in given.cells if len(given.seeds) > 1 else ():
         advice = seeds_advice(cell)
         if advice and cell.model.element is not None:  # a linear model may be one of a grid
             raise InputError(f"{given.file}: {len(given.seeds)} seeds were given, but {advice}.")
-    return _execute(given, functools.partial(_side_by_side, executor, ahead), out, overwrite, progress, tell, True)
+
+    def in_processes(place: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
+        return do_side_by_side(given, place.recordings, jobs, executor, ahead)
+
+    return _execute(given, in_processes, overwrite, progress, tell, campaign=True)
+
+
+def _read_run(path: Any, kind: str, executor: Any, **changes: Any) -> Run:
+    """Return the run with what is given in place of the file's."""
+    given = path if isinstance(path, Run) else read_run(path, kind)
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")
+    return replace(given, **{name: value for name, value in changes.items() if value is not None})
 
 
 def seeds_advice(cell: Cell) -> str:
@@ -232,61 +228,23 @@ def seeds_advice(cell: Cell) -> str:
     return f"no start is random, so every seed gives the same model; use one seed, start = 'paper' in [solver]{more}"
 
 
-def _side_by_side(
-    executor: Executor | None, ahead: int, given: Run, recordings: Recordings, jobs: Sequence[RunJob]
-) -> Iterator[Batch]:
-    """Do jobs by an executor, else in processes, else (one worker without a time limit) in this process."""
-    options: dict[str, Any] = {"time_limit": given.time_limit, "retries": given.retries}
-    function: Any = Attempt(given, recordings)
-    if executor is not None:
-        yield from side_by_side(function, jobs, executor, ahead=ahead, **options)
-    elif given.workers > 1 or given.time_limit is not None:
-        pool = ThreadPoolExecutor(given.workers)
-        try:
-            yield from side_by_side(function, jobs, pool, ahead=2 * given.workers, **options)
-        finally:
-            _end(pool)
-    else:
-        for job in jobs:
-            yield [(job, attempt(given, recordings, job))]
-
-
-def _end(pool: ThreadPoolExecutor) -> None:
-    """End a pool and its worker processes, also those that its threads are about to begin."""
-    pool.shutdown(wait=False, cancel_futures=True)
-    ending = threading.Thread(target=pool.shutdown, daemon=True)
-    ending.start()
-    while ending.is_alive():
-        close_workers()
-        ending.join(0.02)
-    close_workers()
-
-
 def _execute(
     given: Run,
     perform: Perform,
-    out: Any,
     overwrite: bool,
     progress: Progress | None,
     tell: Tell | None,
     campaign: bool = False,
 ) -> RunResult:
     """Execute a run whose jobs `perform` does, in any order."""
-    folder = Path(out if out is not None else given.out)
-    try:
-        check_own(folder, given.file, overwrite)
-    except OSError as error:
-        raise InputError(f"The folder {folder} cannot be read ({error.strerror}); give another one.") from None
+    folder = Path(given.out)
+    check_own(folder, given.file, overwrite)
     inputs = input_digests(given)
     recordings = {role: tuple(_read(given, name) for name in given.files[role]) for role in ROLES}
     if given.folds:
         fold(recordings["train"], 0, given.folds)  # refuses recordings that are too short for it
     make_folder(folder)
-    with contextlib.ExitStack() as stack:
-        try:
-            stack.enter_context(locked(folder))
-        except OSError as error:
-            raise InputError(f"The folder {folder} cannot be written ({error.strerror}); give another one.") from None
+    with locked(folder):
         place = Store(folder, given, inputs, recordings, overwrite, campaign)
         return _Execution(place, perform, progress or (lambda *_: None), tell or (lambda line: None)).execute()
 
@@ -331,14 +289,12 @@ class _Execution:
         self.total = total = len(before) + len(jobs)
         ready = [j for j in jobs if place.complete(j)]
         self.skipped += [j.id for j in ready]
-        if place.campaign and ready:
+        if ready:
             self.tell(f"{len(ready)} jobs done before")
-        for job in () if place.campaign else ready:
-            self.tell(f"{job.id}: done before")
         place.write_table((*before, *ready))
         ready_ids = {j.id for j in ready}
         try:
-            for batch in self.perform(place.run, place.recordings, [j for j in jobs if j.id not in ready_ids]):
+            for batch in self.perform(place, [j for j in jobs if j.id not in ready_ids]):
                 with deferred_interrupt():  # a job that is done must not be lost
                     place.note(batch)
                     ready += [job for job, _ in batch]
@@ -410,11 +366,7 @@ class _Execution:
 
 def _read(given: Run, name: str) -> Recording:
     options = dict(given.reading)
-    inputs, outputs = options.pop("inputs"), options.pop("outputs")
-    try:
-        found = read(given.located(name), inputs, outputs, **options)
-    except TypeError as error:
-        raise InputError(f"{given.file}: {error}.") from None
+    found = read(given.located(name), options.pop("inputs"), options.pop("outputs"), **options)
     if not keeps_its_period(found):
         raise InputError(
             f'{given.file}: the input of {name} does not repeat after {found.period} samples, as initial = "periodic" '

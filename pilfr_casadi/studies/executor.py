@@ -1,4 +1,4 @@
-"""Jobs side by side over an executor: in the order in which they end, again where a worker has died.
+"""Jobs side by side over an executor, in the order in which they end, and again where a worker has died.
 
 Every job runs in a process of its own beside its worker, whatever the executor is made of. The result of a job does not
 depend on where, when or how often it ran.
@@ -7,74 +7,76 @@ depend on where, when or how often it ran.
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import pickle
+import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from collections.abc import Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from typing import Any
 
-from .._base import InputError, Reply, run_in_worker
-from .jobs import LOST, TIMED_OUT, Batch, Outcome, RunJob, attempt, unfinished, versions
+from .._base import InputError, Reply, close_workers, run_in_worker
+from .jobs import LOST, TIMED_OUT, Batch, Outcome, Recordings, RunJob, attempt, unfinished, versions
+from .schema import Run
 
 AHEAD = 64  # jobs that an executor is given at a time
 SCHEDULER_TIMEOUT = 10.0  # seconds that a Dask scheduler has to answer
 
 
-def check_executor(executor: Any) -> None:
-    """Refuse an executor without `submit`.
-
-    Raises
-    ------
-    InputError
-        If it has none.
-    """
-    if executor is not None and not callable(getattr(executor, "submit", None)):
-        raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")
-
-
-def side_by_side(
-    function: Callable[[RunJob], Outcome],
-    jobs: Sequence[RunJob],
-    executor: Executor,
-    *,
-    time_limit: float | None = None,
-    retries: int = 2,
-    ahead: int = AHEAD,
+def do_side_by_side(
+    run: Run, recordings: Recordings, jobs: Sequence[RunJob], executor: Executor | None, ahead: int
 ) -> Iterator[Batch]:
-    """Yield outcomes as they arrive.
+    """Do jobs by an executor, else in processes, else (one worker without a time limit) in this process."""
+    if executor is not None:
+        yield from _outcomes(run, recordings, jobs, executor, ahead)
+    elif run.workers > 1 or run.time_limit is not None:
+        pool = ThreadPoolExecutor(run.workers)
+        try:
+            yield from _outcomes(run, recordings, jobs, pool, 2 * run.workers)
+        finally:
+            _end(pool)
+    else:
+        for job in jobs:
+            yield [(job, attempt(run, recordings, job))]
 
-    Parameters
-    ----------
-    function : callable
-        Called with each job; it is pickled.
-    executor : concurrent.futures.Executor
-        Threads, processes, or a Dask cluster's.
-    time_limit : float, optional
-        Seconds a job may take before it is ended.
-    retries : int
-        How often a job whose worker has died is tried again.
-    ahead : int
-        Jobs that the executor is given at a time.
 
-    Raises
-    ------
-    InputError
-        If the jobs cannot be sent, the executor stops, its workers cannot begin, or have other versions.
-    """
-    shared = _pickled(function)
+def _end(pool: ThreadPoolExecutor) -> None:
+    """End a pool and its worker processes, also those that its threads are about to begin."""
+    pool.shutdown(wait=False, cancel_futures=True)
+    ending = threading.Thread(target=pool.shutdown, daemon=True)
+    ending.start()
+    while ending.is_alive():
+        close_workers()
+        ending.join(0.02)
+    close_workers()
+
+
+def _outcomes(
+    run: Run, recordings: Recordings, jobs: Sequence[RunJob], executor: Executor, ahead: int
+) -> Iterator[Batch]:
+    """Yield outcomes as they arrive; `ahead` jobs are with the executor at a time."""
+    shared = _pickled(functools.partial(_attempt_with_versions, run, recordings))
     waiting, running = deque((job, 1) for job in jobs), dict[Future[Reply], tuple[RunJob, int]]()
     try:
         while waiting or running:
             while waiting and len(running) < ahead:
                 job, trial = waiting.popleft()
-                running[executor.submit(run_in_worker, shared, _pickled(job), time_limit)] = job, trial
+                running[executor.submit(run_in_worker, shared, _pickled(job), run.time_limit)] = job, trial
             batch: Batch = []
             stop: Exception | None = None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, trial = running.pop(future)
                 try:
-                    outcome = _outcome(future, trial > retries, time_limit)
+                    outcome = _outcome(future, trial > run.retries, run.time_limit)
                     if outcome is None:
                         waiting.appendleft((job, trial + 1))
                     else:
@@ -122,15 +124,9 @@ def _outcome(future: Future[Reply], last: bool, time_limit: float | None) -> Out
     return outcome
 
 
-class Attempt:
-    """A function that workers call: do a job of a run, and say with which versions."""
-
-    def __init__(self, run: Any, recordings: Any) -> None:
-        self.run, self.recordings = run, recordings
-
-    def __call__(self, job: RunJob) -> tuple[Outcome, dict[str, str]]:
-        """Return the outcome of a job, and the versions it was computed with."""
-        return attempt(self.run, self.recordings, job), versions()
+def _attempt_with_versions(run: Run, recordings: Recordings, job: RunJob) -> tuple[Outcome, dict[str, str]]:
+    """Return the outcome of a job, and the versions it was computed with; workers call this."""
+    return attempt(run, recordings, job), versions()
 
 
 def _pickled(thing: Any) -> bytes:
@@ -151,18 +147,7 @@ def _pickled(thing: Any) -> bytes:
 
 @contextlib.contextmanager
 def dask_executor(address: str) -> Iterator[tuple[Executor, int, int]]:
-    """Yield an executor of a Dask cluster, how many jobs it does at a time, and how many to give it at a time.
-
-    Parameters
-    ----------
-    address : str
-        Of the scheduler, such as `tcp://host:8786`.
-
-    Raises
-    ------
-    InputError
-        If `distributed` is not installed, or no scheduler answers.
-    """
+    """Yield an executor of a Dask cluster, how many jobs it does at a time, and how many to give it at a time."""
     try:
         from distributed import Client
     except ImportError:

@@ -20,12 +20,24 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, digest, listed, write_atomically
+from .._base import InputError, digest, listed, make_folder, write_atomically
 from ..identify import load
 from ..models import Model
-from .jobs import BAD_ENDS, FAILED, LOST, TIMED_OUT, Outcome, Recordings, RunJob, error_of, file_digest, versions
+from .jobs import (
+    BAD_ENDS,
+    FAILED,
+    LOST,
+    TIMED_OUT,
+    Outcome,
+    Recordings,
+    RunJob,
+    error_of,
+    file_digest,
+    scored_files,
+    versions,
+)
 from .schema import Run
-from .summary import Score, results_table, scored_files
+from .summary import Score, results_table
 
 FORMAT, VERSION, MANIFEST = "pilfr_casadi run", 1, "manifest.json"
 TABLE, PAGE, MODEL, TIMES, JOBS, LOCK = "results.csv", "report.html", "model.json", "times.json", "jobs", ".lock"
@@ -36,19 +48,16 @@ ADVICE = "restore it, or give --overwrite to compute everything again"
 
 
 def check_own(folder: Path, file: Path, overwrite: bool) -> None:
-    """Refuse a folder that holds the run file, or files of somebody else.
-
-    Raises
-    ------
-    InputError
-        That names what was found there.
-    """
+    """Refuse a folder that holds the run file, or files of somebody else."""
     place = os.path.realpath(folder)
     if place in map(str, Path(os.path.realpath(file)).parents):
         raise InputError(f"The folder {folder} holds the run file {file.name}; give results a folder of their own.")
     if not os.path.isdir(place):
         return
-    found = sorted(name for name in os.listdir(place) if name != LOCK and not _is_half_written(name))
+    try:
+        found = sorted(name for name in os.listdir(place) if name != LOCK and not _is_half_written(name))
+    except OSError as error:
+        raise InputError(f"The folder {folder} cannot be read ({error.strerror}); give another one.") from None
     if MANIFEST in found:
         return
     foreign = [name for name in found if name not in OWN]
@@ -67,18 +76,15 @@ def _is_half_written(name: str) -> bool:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other runs out of a folder and remove half-written files; the lock ends with the process, however it ends.
-
-    Raises
-    ------
-    InputError
-        If another run is at work there.
-    """
+    """Keep other runs out of a folder, until the process ends, and remove half-written files."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(ImportError):  # on systems without such locks
             import fcntl
 
-            lock = stack.enter_context((folder / LOCK).open("w"))
+            try:
+                lock = stack.enter_context((folder / LOCK).open("w"))
+            except OSError as error:
+                raise InputError(f"The folder {folder} cannot be written ({error.strerror}); give another.") from None
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
@@ -108,13 +114,7 @@ class Manifest:
 
     @classmethod
     def read(cls, folder: Path) -> Manifest:
-        """Read the manifest of an earlier run, an empty one where there is none.
-
-        Raises
-        ------
-        InputError
-            If it is damaged, of another version, or was changed after the run wrote it.
-        """
+        """Read the manifest of an earlier run, an empty one where there is none; refuse one that was changed."""
         path = folder / MANIFEST
         if not path.exists():
             return cls(folder)
@@ -137,13 +137,7 @@ class Manifest:
         write_atomically(self.folder / MANIFEST, text + "\n")
 
     def holds(self, name: str) -> bool:
-        """Whether a file of the run is there, as the run wrote it; False where it is missing.
-
-        Raises
-        ------
-        InputError
-            If it was changed.
-        """
+        """Whether a file of the run is there, as the run wrote it; False where it is missing. Refuse a changed one."""
         path = self.folder / name
         if name not in self.content["files"] or not path.is_file():
             return False
@@ -169,27 +163,15 @@ class Manifest:
             self.content["writing"] = found
             self.write()
         for name, data in contents.items():
-            target = self.folder / name
-            try:
-                target.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise InputError(
-                    f"The folder {target.parent} cannot be made ({error.strerror}); give another."
-                ) from None
-            write_atomically(target, data)
+            make_folder((self.folder / name).parent)
+            write_atomically(self.folder / name, data)
         self.content["files"] |= found
         self.content["jobs"] |= jobs or {}
         self.write()
 
 
 class Store:
-    """The results of a run: what it has written, and writes.
-
-    Raises
-    ------
-    InputError
-        If files of the run were changed afterwards; for a campaign also if its results are of other versions.
-    """
+    """The results of a run: what it has written, and writes. Files that were changed afterwards are refused."""
 
     def __init__(
         self, path: Path, run: Run, inputs: Mapping[str, str], recordings: Recordings, overwrite: bool, campaign: bool

@@ -15,7 +15,7 @@ the rest would show them.
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, __version__, digest
+from .._base import InputError, Progress, __version__, digest, existing_file
 from ..data import NOTHING_SENTENCE, Recording, explains_nothing, fingerprint, group_by_input, repeats_itself
 from ..export import model_text
 from ..identify import Fit, fit as identify, operators_used, prune, regularization_path
 from ..models import Model
 from ..optimise import Solution, Status
-from .schema import Run
+from .schema import ROLES, Run
 
 Recordings = Mapping[str, tuple[Recording, ...]]
 # how a job of a campaign may end besides a solver's status
@@ -76,17 +76,11 @@ Batch = list[tuple[RunJob, Outcome]]  # jobs that ended together
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
+    """Return the SHA-256 of a file; refuse one that cannot be read."""
     try:
-        return digest(path.read_bytes())
+        return digest(existing_file(path).read_bytes())
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); check its name and permissions.") from None
+        raise InputError(f"{path} cannot be read ({error.strerror}); check its permissions.") from None
 
 
 def versions() -> dict[str, str]:
@@ -110,18 +104,8 @@ def input_digests(run: Run) -> dict[str, str]:
 
 
 def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | None = None) -> tuple[RunJob, ...]:
-    """Return one job a cell and seed.
-
-    Parameters
-    ----------
-    run : Run
-    inputs : mapping
-        SHA-256 by file name, from `input_digests`.
-    train : sequence of Recording, optional
-        The training recordings; the jobs then are those of the cross-validation: one a cell, seed and fold, whose
-        models hold one fold out.
-    """
-    read = run.files["train"] + (run.files["validation"] if run.path is not None else ())
+    """Return one job a cell and seed; given the training recordings, those of the cross-validation: one a fold too."""
+    read = run.files["train"] + (run.files["validation"] if run.regularization.path else ())
     common = {
         "program": file_digest(run.file) if run.own else None,
         "reading": {k: list(v) if isinstance(v, tuple) else v for k, v in run.reading.items()},
@@ -129,18 +113,20 @@ def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | No
         "engine": run.engine,
         "versions": versions(),
     }
-    dealt: dict[int | None, Any] = {None: {}}
-    if train is not None:
-        dealt = {k: {"fold": k, "dealt": _contents(fold(train, k, run.folds))} for k in range(run.folds)}
-    jobs = []
-    for number, cell in enumerate(run.cells):
-        said = {"said": {**run.said, "grid": None, **cell.said}}
-        for part, about in dealt.items():
-            own = {} if part is None else {"fold": part}
-            for seed in run.seeds:
-                key = digest({**common, **said, "seed": seed, **about})
-                jobs.append(RunJob({**cell.values, **own, "seed": seed}, key, number))
-    return tuple(jobs)
+    if train is None:
+        folds: list[Any] = [({}, {})]
+    else:
+        folds = [({"fold": k}, {"fold": k, "dealt": _contents(fold(train, k, run.folds))}) for k in range(run.folds)]
+    return tuple(
+        RunJob(
+            {**cell.values, **name, "seed": seed},
+            digest({**common, "said": {**run.said, "grid": None, **cell.said}, "seed": seed, **dealt}),
+            number,
+        )
+        for number, cell in enumerate(run.cells)
+        for name, dealt in folds
+        for seed in run.seeds
+    )
 
 
 def _contents(parts: Sequence[Sequence[Recording]]) -> list[list[tuple[str, int]]]:
@@ -189,15 +175,7 @@ def outcome(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Outcome:
-    """Do a job: identify its model and judge it.
-
-    Raises
-    ------
-    InputError
-        If the model cannot be identified.
-    KeyboardInterrupt
-        On Ctrl-C.
-    """
+    """Do a job: identify its model and judge it."""
     fit = _without_times(found := _identify(run, recordings, job, executor, progress))
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
@@ -217,8 +195,7 @@ def outcome(
         return Outcome(about, found.seconds)
     if job.fold is not None:
         return Outcome({**about, "held": fit.nrmse(fold(recordings["train"], job.fold, run.folds)[1])}, found.seconds)
-    pairs = ((name, r) for role, names in run.files.items() for name, r in zip(names, recordings[role], strict=True))
-    errors = {name: error_of(fit, recording) for name, recording in pairs}
+    errors = {name: error_of(fit, recording) for _, name, recording in scored_files(run, recordings)}
     return Outcome(about, found.seconds, model_text(fit.content()), errors)
 
 
@@ -235,6 +212,13 @@ def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:
 def unfinished(status: str, sentence: str, **more: Any) -> Outcome:
     """Make the outcome of a job without a model."""
     return Outcome({"status": status, "sentence": sentence, "operators_used": "", **more})
+
+
+def scored_files(run: Run, recordings: Recordings) -> Iterator[tuple[str, str, Recording]]:
+    """Yield role, name and recording of every file of a run."""
+    for role in ROLES:
+        for name, recording in zip(run.files[role], recordings[role], strict=True):
+            yield role, name, recording
 
 
 def error_of(fit: Fit, recording: Recording) -> float | None:
@@ -256,41 +240,28 @@ def _identify(
         "constraints": run.constraints,
         "engine": run.engine,
     }
-    cell = run.cells[job.cell]
-    search = (
-        {**cell.search, "seed": int(job.parameters["seed"]), "executor": executor}
-        if not isinstance(cell.model, Model)
-        else {}
-    )
+    model, search = run.cells[job.cell].model, {}
+    if not isinstance(model, Model):
+        search = {**run.cells[job.cell].search, "seed": int(job.parameters["seed"]), "executor": executor}
     train = recordings["train"] if job.fold is None else fold(recordings["train"], job.fold, run.folds)[0]
-    l1 = {"w": run.l1} if run.l1 else None
-    found = identify(cell.model, train, **options, **search, l1=l1, progress=progress)
+    sparse = run.regularization
+    l1 = {"w": sparse.l1} if sparse.l1 else None
+    found = identify(model, train, **options, **search, l1=l1, progress=progress)
     if found.status is Status.INTERRUPTED:
         return found
-    if l1 and run.prune and found.structure is not None:
+    if l1 and sparse.prune is not False and found.structure is not None:
         return prune(found, train, **options)
-    if run.path is not None:
-        return regularization_path(
-            found,
-            train,
-            recordings["validation"],
-            strengths=run.path or None,
-            margin=run.margin,
-            progress=progress,
-            **options,
-        ).fit
+    if sparse.path:
+        options |= {"strengths": None if sparse.path is True else sparse.path, "margin": sparse.margin}
+        return regularization_path(found, train, recordings["validation"], progress=progress, **options).fit
     return found
 
 
 def _without_times(fit: Fit) -> Fit:
     """Drop the times a fit took, which no second execution would repeat."""
-    return replace(
-        fit,
-        seconds=0.0,
-        solution=_solution_without_times(fit.solution),
-        candidates=tuple(replace(c, solution=_solution_without_times(c.solution)) for c in fit.candidates),
-    )
 
+    def timeless(solution: Solution) -> Solution:
+        return replace(solution, seconds=0.0, history=tuple(replace(h, seconds=0.0) for h in solution.history))
 
-def _solution_without_times(solution: Solution) -> Solution:
-    return replace(solution, seconds=0.0, history=tuple(replace(h, seconds=0.0) for h in solution.history))
+    candidates = tuple(replace(c, solution=timeless(c.solution)) for c in fit.candidates)
+    return replace(fit, seconds=0.0, solution=timeless(fit.solution), candidates=candidates)

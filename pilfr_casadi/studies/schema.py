@@ -19,16 +19,26 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    InstanceOf,
+    Strict,
+    ValidationError,
+    create_model,
+    model_validator,
+)
 
-from .._base import InputError, is_number
+from .._base import InputError, existing_file
 from ..identify import BLA, POLISH, STARTS
 from ..models import ANY, HYSTERETIC, LAGGED, OPERATORS, PILFR, STRUCTURES, TAKES, Lagged, Model, named_structure
 from ..optimise import Constraint, GaussNewton, Ipopt, check_gain, dc_gain, ordered
 from ..simulators import user_variable
-from .largest_sizes import LARGEST_SIZE, MOST_JOBS, MOST_SAMPLES
 
 ROLES = ("train", "validation", "test")
 # keys of the grid: those of [model] and [solver] that a study varies
@@ -37,26 +47,35 @@ SOLVER_KEYS = ("start", "starts", "linear")
 READING = ("period", "hold", "skip", "dt", "time_tolerance", "initial")  # fields of a Recording
 SIZE = {"nx": "states", "lags": "past outputs"}
 
+# The largest sizes that a run file or the command line may ask for, far above every model that makes sense: what is
+# larger never ends, or fills the memory.
+LARGEST_SIZE = {
+    "nx": 1_000,  # states: A alone has 1e6 parameters, and the Gauss-Newton matrix 1e12 entries
+    "operators": 10_000,  # a channel: the Jacobian of the paper's 6144 samples has 1 GB then
+    "channels": 100,  # of the element: each has all its operators
+    "neurons": 1_000,  # of an envelope
+    "hidden": 10_000,  # neurons of a network: as operators
+    "lags": 10_000,  # samples: a recording must be longer, as the fit says
+    "input_lags": 10_000,
+    "starts": 1_000_000,  # 12 days at a second each
+    "seed": 2**63 - 1,  # the largest integer of 64 bits
+    "max_iterations": 1_000_000,
+    "folds": 10_000,
+    "retries": 1_000,
+    "workers": 1_024,  # processes: each takes 100 MB and more
+    "samples": 10**9,  # of a period, or left out: 8 GB a channel
+    "jobs": 100_000,  # of a run: the manifest names each, about 300 bytes a job, and is written after every one
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One model of a study.
+    """One model of a study with its search: `starts` and `start`, and `linear` where it is given, as for `fit`."""
 
-    Attributes
-    ----------
-    values : dict
-        Key of the grid -> value, of the keys that matter to the cell; empty where there is no grid.
-    model : PILFR, NARX, NOE or Model
-    search : dict
-        `starts` and `start`, and `linear` where it is given, as for `fit`.
-    said : dict
-        What the jobs of the cell depend on, as plain numbers and texts: `model` and `solver` with the cell's values.
-    """
-
-    values: Mapping[str, Any]
+    values: Mapping[str, Any]  # key of the grid -> value, of the keys that matter to the cell
     model: PILFR | Lagged | Model
     search: dict[str, Any]
-    said: dict[str, Any] = field(default_factory=dict)
+    said: dict[str, Any] = field(default_factory=dict)  # its tables `model` and `solver` as plain numbers and texts
 
     @property
     def name(self) -> str:
@@ -81,12 +100,6 @@ class Run:
         How they are read: `inputs`, `outputs`, `columns` and fields of `Recording`.
     cells : tuple of Cell
         The models of the grid with their searches; one where there is no grid.
-    path : tuple of float, optional
-        Strengths of the L1 regularization to choose from; empty for the usual ones.
-    folds : int
-        Of the cross-validation that chooses among the cells; 0 for none.
-    time_limit : float, optional
-        Seconds that a job of a campaign may take.
     """
 
     file: Path
@@ -96,13 +109,10 @@ class Run:
     files: dict[str, tuple[str, ...]]
     reading: dict[str, Any]
     cells: tuple[Cell, ...]
-    solver: Any = POLISH
-    stable: bool | float = True
-    constraints: tuple[Constraint, ...] = ()
-    l1: float | None = None
-    prune: bool = True
-    path: tuple[float, ...] | None = None
-    margin: float = 0.05
+    solver: Any
+    stable: bool | float
+    constraints: tuple[Constraint, ...]
+    regularization: RegularizationTable
     seeds: tuple[int, ...] = (0,)
     folds: int = 0
     time_limit: float | None = None
@@ -134,51 +144,62 @@ def _number(least: float, default: float | None = None) -> Any:
     return Field(default, ge=least, allow_inf_nan=False, description=f"a number, {least:g} or more")
 
 
-def _choice(choices: Iterable[str], default: str | None = None) -> Any:
+def _choice(choices: Iterable[str], default: str | None = None, more: str = "") -> Any:
     pattern = f"^({'|'.join(map(re.escape, choices))})$"
-    return Field(default, pattern=pattern, description=", ".join(map(repr, choices)))
+    return Field(default, pattern=pattern, description=", ".join(map(repr, choices)) + more)
 
 
-def _as_names(value: Any) -> tuple[str, ...]:
-    """Turn a name, or a list of names, into a tuple."""
-    given = [value] if isinstance(value, str | Path) else value
-    if not isinstance(given, list | tuple) or not all(isinstance(v, str | Path) and str(v).strip() for v in given):
+def _as_list(value: Any) -> Any:
+    """Turn one value, or a range, into a list; paths into texts."""
+    given = [value] if isinstance(value, str | Path | int) else value
+    return [str(v) if isinstance(v, Path) else v for v in given] if isinstance(given, list | tuple | range) else given
+
+
+def _as_seeds(value: Any) -> Any:
+    if not isinstance(value, Mapping):
+        return _as_list(value)
+    table = validate(SeedsTable, value, "seeds")
+    return range(table.first, table.first + table.count)
+
+
+def _all_different(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    if len(set(values)) < len(values):
         raise ValueError
-    return tuple(map(str, given))
+    return values
 
 
-def _as_seeds(value: Any) -> tuple[int, ...]:
-    """Turn a number, a list, or a table of `first` and `count` into a tuple of different seeds."""
-    if isinstance(value, Mapping):
-        table = validate(SeedsTable, value, "seeds")
-        return tuple(range(table.first, table.first + table.count))
-    given = [value] if type(value) is int else value
-    usable = isinstance(given, list | tuple | range) and 0 < len(given) <= MOST_JOBS
-    usable = usable and all(type(s) is int and 0 <= s <= LARGEST_SIZE["seed"] for s in given)
-    if not usable or len(set(given)) < len(given):
-        raise ValueError
-    return tuple(given)
+def _as_gap(value: bool | float) -> Constraint | None:
+    return None if value is False else ordered("r", 0.0 if value is True else value)
 
 
-def _as_axis(values: Any) -> list[Any]:
-    """Check a list of different values of the grid."""
-    usable = isinstance(values, list | tuple) and values and all(isinstance(v, int | str) for v in values)
-    if not usable or len(set(values)) < len(values):
-        raise ValueError
-    return list(values)
+def _as_gain(value: Any) -> Constraint:
+    given = dict(value) if isinstance(value, Mapping) else {"value": value}
+    try:
+        return dc_gain(given.pop("value"), **given)
+    except (TypeError, KeyError, OverflowError):
+        raise ValueError from None
 
 
-Names = Annotated[tuple[str, ...], BeforeValidator(_as_names)]
-Axis = Annotated[list[Any] | None, BeforeValidator(_as_axis)]
-AXIS: Any = Field(None, description="a list of different values")
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Seed = Annotated[int, Field(ge=0, le=LARGEST_SIZE["seed"])]
+Names = Annotated[tuple[Annotated[str, Field(pattern=r"\S")], ...], Strict(False), BeforeValidator(_as_list)]
+Seeds = Annotated[
+    tuple[Seed, ...],
+    Strict(False),
+    Field(min_length=1, max_length=LARGEST_SIZE["jobs"]),
+    AfterValidator(_all_different),
+    BeforeValidator(_as_seeds),
+]
+Axis = Annotated[tuple[int | str, ...], Strict(False), Field(min_length=1), AfterValidator(_all_different)]
 NAMES = "a name, or a list of names"
+SAMPLES = "a whole number of samples"
 
 
 class SeedsTable(Table):
     """`seeds = { first = 0, count = 100 }`."""
 
     first: int = _whole("seed", 0, 0)
-    count: int = Field(1, ge=1, le=MOST_JOBS, description=f"a whole number from 1 to {MOST_JOBS}")
+    count: int = _whole("jobs", 1, 1)
 
 
 class DataTable(Table):
@@ -190,9 +211,9 @@ class DataTable(Table):
     inputs: Names = Field(min_length=1, description=NAMES)
     outputs: Names = Field(min_length=1, description=NAMES)
     columns: dict[str, str] = Field({}, description="a table of names and their columns")
-    period: int | None = Field(None, ge=0, le=MOST_SAMPLES, description="a whole number of samples")
+    period: int | None = Field(None, ge=0, le=LARGEST_SIZE["samples"], description=SAMPLES)
     hold: str | None = Field(None, description="a text")
-    skip: int | None = Field(None, ge=0, le=MOST_SAMPLES, description="a whole number of samples")
+    skip: int | None = Field(None, ge=0, le=LARGEST_SIZE["samples"], description=SAMPLES)
     dt: float | None = Field(None, description="a number of seconds")
     time_tolerance: float | None = Field(None, description="a number of steps")
     initial: str | None = Field(None, description="a text")
@@ -201,7 +222,7 @@ class DataTable(Table):
 class ModelTable(Table):
     """`[model]`: the structure and its sizes."""
 
-    structure: str = _choice(STRUCTURES, "lfr")
+    structure: str = _choice(STRUCTURES, "lfr", "; for a linear model give 'lfr' with operators = 0")
     nx: int | None = _whole("nx", 0)
     operators: int | None = _whole("operators", 0)
     operator: str | None = _choice(OPERATORS)
@@ -215,6 +236,24 @@ class ModelTable(Table):
     bounds: dict[str, Any] | None = Field(None, description="a table of parameters and their bounds")
     priors: dict[str, Any] | None = Field(None, description="a table of parameters and their priors")
 
+    def build(self) -> PILFR | Lagged:
+        """Build the model, of keys that its structure takes."""
+        given = {key: value for key, value in self if value is not None and key != "structure"}
+        takes = TAKES[self.structure]
+        if takes[0] not in given:
+            raise InputError(f"'{takes[0]}' in [model] is missing; give the number of {SIZE[takes[0]]}.")
+        for key in given:
+            if key not in takes:
+                raise InputError(
+                    f"{key!r} in [model] is not for structure = {self.structure!r}, which takes {', '.join(takes)}."
+                )
+        if self.neurons is not None and self.operator != "generalized_play":
+            raise InputError("'neurons' in [model] goes with operator = 'generalized_play'; leave it out.")
+        try:
+            return named_structure(self.structure, **given)
+        except InputError as error:
+            raise InputError(f"[model]: {error}") from None
+
 
 class SolverTable(Table):
     """`[solver]`: the solver, and the search for its start."""
@@ -226,23 +265,79 @@ class SolverTable(Table):
     max_iterations: int | None = _whole("max_iterations", 1)
     tolerance: float | None = _number(0.0)
 
+    @property
+    def search(self) -> dict[str, Any]:
+        """The options of the search, as for `fit`."""
+        search = {"starts": self.starts, "start": self.start}
+        return {**search, "linear": BLA} if self.linear == BLA else search
+
+    def build(self) -> Any:
+        """Build the solver; an object stays as it is."""
+        given = {k: getattr(self, k) for k in ("max_iterations", "tolerance") if getattr(self, k) is not None}
+        if not isinstance(self.name, str):
+            if given:
+                raise InputError(
+                    f"{', '.join(given)} in [solver] goes with a name; the solver is an object that has its own."
+                )
+            return self.name
+        if self.name not in ("gauss-newton", "ipopt"):
+            raise InputError(f"'name' in [solver] is {shown(self.name)}; give 'gauss-newton' or 'ipopt'.")
+        if self.name == "ipopt":
+            return Ipopt(**given)
+        return GaussNewton(**{"tolerance": POLISH.tolerance, **given}) if given else POLISH
+
 
 class ConstraintsTable(Table):
     """`[constraints]`."""
 
-    spectral_radius: Any = True
-    ordered_thresholds: Any = False
-    dc_gain: Any = None
-    own: Any = ()
+    spectral_radius: bool | Positive = Field(True, description="a number above zero, true or false")
+    ordered_thresholds: Annotated[bool | float, AfterValidator(_as_gap)] | None = Field(
+        None, description="true, or a least gap"
+    )
+    dc_gain: Annotated[Any, BeforeValidator(_as_gain)] = Field(
+        None, description="a number, or a table of value, within and slope"
+    )
+    own: Annotated[tuple[InstanceOf[Constraint], ...], Strict(False)] = Field(
+        (), description="a list of Constraint, in a Python run file"
+    )
+
+    def for_models(self, models: Sequence[PILFR | Lagged | Model]) -> tuple[Constraint, ...]:
+        """Return the constraints, which have to suit all models."""
+        given: list[Any] = [self.dc_gain, self.ordered_thresholds]  # constraints by now
+        found = [c for c in given if c is not None]
+        try:
+            for model in models:
+                check_gain((*found, *self.own), model.element)
+        except InputError as error:
+            raise InputError(f"[constraints]: {error}") from None
+        if found and isinstance(models[0], Model):
+            raise InputError("dc_gain and ordered_thresholds are for a PI-LFR, and the model is your own; use 'own'.")
+        if any(isinstance(model, Lagged) for model in models) and not isinstance(self.spectral_radius, bool):
+            raise InputError(
+                "'spectral_radius' in [constraints] is not for structure = 'narx' or 'noe', whose state is the past."
+            )
+        return (*found, *self.own)
 
 
 class RegularizationTable(Table):
     """`[regularization]`: one L1 weight, or a path of them."""
 
-    path: Any = False
+    path: bool | Annotated[tuple[Positive, ...], Strict(False), Field(min_length=1)] = Field(
+        False, description="true, or a list of strengths above zero"
+    )
     margin: float = _number(0.0, 0.05)
     l1: float | None = _number(0.0)
     prune: bool | None = Field(None, description="true or false")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.prune is not None and self.l1 is None:
+            raise InputError(
+                "'prune' in [regularization] goes with 'l1', a path prunes by itself; give l1, or leave prune out."
+            )
+        if self.path and self.l1 is not None:
+            raise InputError("'path' and 'l1' in [regularization] exclude each other; leave one out.")
+        return self
 
 
 class CampaignTable(Table):
@@ -252,11 +347,8 @@ class CampaignTable(Table):
     retries: int = _whole("retries", 0, 2)
 
 
-def _as_axes(content: Any) -> dict[str, list[Any]]:
-    """Check `[grid]`: lists of different values of keys of [model] and [solver], in their order there."""
-    fields: dict[str, Any] = {key: (Axis, AXIS) for key in (*MODEL_KEYS, *SOLVER_KEYS)}
-    kind: type[Table] = create_model("GridTable", __base__=Table, **fields)
-    return {key: values for key, values in validate(kind, content, "grid") if values}
+AXIS: Any = (Axis | None, Field(None, description="a list of different values"))
+GridTable: Any = create_model("GridTable", __base__=Table, **dict.fromkeys((*MODEL_KEYS, *SOLVER_KEYS), AXIS))
 
 
 def _table(kind: str) -> Any:
@@ -266,8 +358,8 @@ def _table(kind: str) -> Any:
 class RunTable(Table):
     """The whole run file; `model` and `solver` are checked with the values of each cell."""
 
-    seeds: Annotated[tuple[int, ...], BeforeValidator(_as_seeds)] = Field(
-        (0,), description=f"at most {MOST_JOBS} different whole numbers of 0 or more, or first and count"
+    seeds: Seeds = Field(
+        (0,), description=f"at most {LARGEST_SIZE['jobs']} different whole numbers of 0 or more, or first and count"
     )
     out: str | None = Field(None, description="a text")
     report: bool = Field(True, description="true or false")
@@ -276,51 +368,57 @@ class RunTable(Table):
     folds: int = _whole("folds", 0, 0)
     data: DataTable = _table("data")
     model: Any = Field({}, description="a table [model]")
-    grid: Annotated[dict[str, list[Any]], BeforeValidator(_as_axes)] = Field({}, description="a table [grid]")
+    grid: GridTable = _table("grid")
     solver: Any = Field({}, description="a table [solver]")
     constraints: ConstraintsTable = _table("constraints")
     regularization: RegularizationTable = _table("regularization")
     campaign: CampaignTable = _table("campaign")
 
+    @property
+    def axes(self) -> dict[str, tuple[int | str, ...]]:
+        """The keys of the grid that are given, in their order in [model] and [solver], with their values."""
+        return {key: values for key, values in self.grid if values}
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.folds == 1:
+            raise InputError("'folds' is 1; give 2 or more, or leave it out.")
+        count = math.prod(map(len, self.axes.values())) * len(self.seeds) * max(self.folds, 1)
+        if count > LARGEST_SIZE["jobs"]:
+            raise InputError(f"grid, seeds and folds make {count} jobs; give at most {LARGEST_SIZE['jobs']}.")
+        if self.regularization.path and not self.data.validation:
+            raise InputError("'path' in [regularization] is chosen by validation; give [data] a validation recording.")
+        return self
+
 
 def validate(kind: type[T], content: Any, name: str = "") -> T:
-    """Check a table.
-
-    Raises
-    ------
-    InputError
-        With one sentence: the key, what was given, what is expected, and the key that may have been meant.
-    """
-    if not isinstance(content, Mapping):
-        raise InputError(f"{name or 'the run'} is {shown(content)}; give a table.")
+    """Check a table; an `InputError` says in one sentence the key, what was given, and what is expected."""
     try:
-        return kind.model_validate(dict(content))
+        return kind.model_validate(dict(content) if isinstance(content, Mapping) else content)
     except ValidationError as error:
-        raise InputError(_sentence(error, kind, content, name)) from None
+        raise InputError(_sentence(error, kind, name)) from None
 
 
-def _sentence(error: ValidationError, kind: type[Table], content: Any, name: str) -> str:
+def _sentence(error: ValidationError, kind: type[Table], name: str) -> str:
     """Put the first error into a sentence; unknown keys go first, since a misspelt key leaves another one missing."""
     found = error.errors(include_url=False)
     first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
     own = first.get("ctx", {}).get("error")
     if isinstance(own, InputError):
         return str(own)
-    for key in map(str, first["loc"]):
-        if key not in kind.model_fields:
-            near = difflib.get_close_matches(key.lower(), kind.model_fields, 1)
-            place = f"[{name}]" if name else "the run"
-            known = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(kind.model_fields)}."
-            return f"{place} has an unknown key {key!r}; {known}"
-        expected = kind.model_fields[key]
-        value = content.get(key, {}) if isinstance(content, Mapping) else {}
-        inner = expected.annotation
-        if not (isinstance(inner, type) and issubclass(inner, Table) and isinstance(value, Mapping)):
-            break
-        kind, content, name = inner, value, key
+    if not first["loc"]:
+        return f"{name or 'the run'} is {shown(first['input'])}; give a table."
+    key, *inner = map(str, first["loc"])
+    table = kind.model_fields[key].annotation if inner else None
+    if isinstance(table, type) and issubclass(table, Table):
+        kind, name, key = table, key, inner[0]
+    if key not in kind.model_fields:
+        near = difflib.get_close_matches(key.lower(), kind.model_fields, 1)
+        known = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(kind.model_fields)}."
+        return f"{f'[{name}]' if name else 'the run'} has an unknown key {key!r}; {known}"
     where = f"{key!r} in [{name}]" if name else repr(key)
-    given = "is missing" if first["type"] == "missing" else f"is {shown(value)}"
-    return f"{where} {given}; give {expected.description}."
+    given = "is missing" if first["type"] == "missing" else f"is {shown(first['input'])}"
+    return f"{where} {given}; give {kind.model_fields[key].description}."
 
 
 def shown(value: Any) -> str:
@@ -356,15 +454,18 @@ def read_run(path: Any, kind: str = "run") -> Run:
         If it cannot be read, or asks for something impossible: one sentence with the file and the key.
     """
     file = Path(path)
-    if file.suffix.lower() == ".py":
-        content = user_variable(file, "run", "the run")
-    else:
-        try:
+    try:
+        existing_file(file)
+        if file.suffix.lower() == ".py":
+            content = user_variable(file, "run", "the run")
+        else:
             content = tomllib.loads(file.read_bytes().decode())
-        except OSError as error:
-            raise InputError(f"The run file {file} cannot be read ({error.strerror}); check its name.") from None
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{file} is not a TOML file ({error}); correct it.") from None
+    except InputError as error:
+        raise InputError(f"The run file cannot be read: {error}") from None
+    except OSError as error:
+        raise InputError(f"The run file {file} cannot be read ({error.strerror}); check its permissions.") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file} is not a TOML file ({error}); correct it.") from None
     try:
         return _checked(file, content, kind)
     except InputError as error:
@@ -373,36 +474,28 @@ def read_run(path: Any, kind: str = "run") -> Run:
 
 def _checked(file: Path, content: Any, kind: str) -> Run:
     table = validate(RunTable, content)
-    said = {k: content.get(k) for k in ("model", "grid", "solver", "constraints", "regularization")}
-    plain, own = as_plain(said)
+    said, own = as_plain({k: content.get(k) for k in ("model", "grid", "solver", "constraints", "regularization")})
     files = {role: getattr(table.data, role) for role in ROLES}
     _check_files(file, files)
     reading = {"inputs": table.data.inputs, "outputs": table.data.outputs, "columns": table.data.columns}
     reading |= {key: content["data"][key] for key in READING if getattr(table.data, key) is not None}
-    if table.folds == 1:
-        raise InputError("'folds' is 1; give 2 or more, or leave it out.")
-    count = math.prod(map(len, table.grid.values())) * len(table.seeds) * max(table.folds, 1)
-    if count > MOST_JOBS:
-        raise InputError(f"grid, seeds and folds make {count} jobs; give at most {MOST_JOBS}.")
     cells, solver = _cells(table)
     if "period" not in reading and any("linear" in cell.search for cell in cells):
         raise InputError(
             "linear = 'bla' is for periodic training recordings; give their 'period' in [data], in samples."
         )
-    stable, constraints = _constraints(table.constraints, [cell.model for cell in cells])
     return Run(
-        file,
-        _folder(file, f"{file.stem}-{kind}" if table.out is None else table.out),
-        plain,
-        own,
-        files,
-        reading,
-        cells,
-        solver,
-        stable,
-        constraints,
-        **_regularization(table.regularization, files),
-        **{key: getattr(table, key) for key in ("seeds", "folds", "workers", "engine", "report")},
+        file=file,
+        out=_folder(file, f"{file.stem}-{kind}" if table.out is None else table.out),
+        said=said,
+        own=own,
+        files=files,
+        reading=reading,
+        cells=cells,
+        solver=solver,
+        stable=table.constraints.spectral_radius,
+        constraints=table.constraints.for_models([cell.model for cell in cells]),
+        **{key: getattr(table, key) for key in ("regularization", "seeds", "folds", "workers", "engine", "report")},
         **dict(table.campaign),
     )
 
@@ -426,10 +519,10 @@ def _check_files(file: Path, files: Mapping[str, tuple[str, ...]]) -> None:
     for role, names in files.items():
         for name in names:
             path = os.path.realpath(file.parent / name)
-            if not os.path.isfile(path):
-                raise InputError(
-                    f"the {role} recording {name} does not exist; check its name, which is relative to the run file."
-                )
+            try:
+                existing_file(path)
+            except InputError as error:
+                raise InputError(f"{role!r} in [data]: {error}") from None
             if path in seen:
                 raise InputError(f"{name} is given twice, as {seen[path]} and {role} recording; leave one out.")
             seen[path] = role
@@ -441,35 +534,41 @@ def _cells(table: RunTable) -> tuple[tuple[Cell, ...], Any]:
     A cell has the keys that matter to its model (a NARX has lags and no operators); combinations that differ in
     nothing else are one cell.
     """
-    model, solver, axes = table.model, table.solver, table.grid
+    model, solver, axes = table.model, table.solver, table.axes
     if isinstance(model, PILFR | Lagged | Model):
         if axes:
             raise InputError("[grid] varies a [model] table, and the model is an object; leave one of them out.")
-        found, search = _solver(solver)
-        _check_search(model, search)
-        return (Cell({}, model, search, as_plain({"model": model, "solver": solver})[0]),), found
-    base = {}
+        return (_cell({}, model, {"model": model, "solver": solver}),), validate(SolverTable, solver, "solver").build()
     for name, content in (("model", model), ("solver", solver)):
         if not isinstance(content, Mapping):
             raise InputError(f"{name} is {shown(content)}; give a table.")
-        base[name] = dict(content)
     cells: dict[str, Cell] = {}
-    for values in itertools.product(*axes.values()):
-        cell = dict(zip(axes, values, strict=True))
+    for combination in itertools.product(*axes.values()):
+        values = dict(zip(axes, combination, strict=True))
         said = {
-            "model": base["model"] | {k: v for k, v in cell.items() if k in MODEL_KEYS},
-            "solver": base["solver"] | {k: v for k, v in cell.items() if k in SOLVER_KEYS},
+            "model": {**model, **{k: v for k, v in values.items() if k in MODEL_KEYS}},
+            "solver": {**solver, **{k: v for k, v in values.items() if k in SOLVER_KEYS}},
         }
         idle = _idle_keys(said["model"], axes)
-        said = {table: {k: v for k, v in content.items() if k not in idle} for table, content in said.items()}
-        found, search = _solver(said["solver"])
-        built = _model(said["model"])
-        _check_search(built, search)
-        plain = as_plain(said)[0]
+        said = {name: {k: v for k, v in content.items() if k not in idle} for name, content in said.items()}
+        built = validate(ModelTable, said["model"], "model").build()
+        cell = _cell({k: v for k, v in values.items() if k not in idle}, built, said)
         form = "linear" if _is_linear(said["model"]) else said["model"].get("structure", "lfr")
-        meaning = str({**plain, "model": {**plain["model"], "structure": form}})
-        cells.setdefault(meaning, Cell({k: v for k, v in cell.items() if k not in idle}, built, search, plain))
-    return tuple(cells.values()), found
+        cells.setdefault(str({**cell.said, "model": {**cell.said["model"], "structure": form}}), cell)
+    return tuple(cells.values()), validate(SolverTable, solver, "solver").build()
+
+
+def _cell(values: Mapping[str, Any], model: PILFR | Lagged | Model, said: dict[str, Any]) -> Cell:
+    """Return a cell, whose search has to suit its model."""
+    search = validate(SolverTable, said["solver"], "solver").search
+    if isinstance(model, Lagged) and search["start"] != "grid":
+        raise InputError(
+            f"start = {search['start']!r} is not for a NARX or NOE, whose starts are of their own kind; leave it out."
+        )
+    if "linear" in search and not isinstance(model, PILFR):
+        of = "a NARX or NOE" if isinstance(model, Lagged) else "a Model, which has its own values"
+        raise InputError(f"linear = {search['linear']!r} is not for {of}; leave it out.")
+    return Cell(values, model, search, as_plain(said)[0])
 
 
 def _is_linear(model: Mapping[str, Any]) -> bool:
@@ -477,7 +576,7 @@ def _is_linear(model: Mapping[str, Any]) -> bool:
     return TAKES.get(model.get("structure", "lfr")) == HYSTERETIC and model.get("operators") == 0
 
 
-def _idle_keys(model: Mapping[str, Any], axes: Mapping[str, list[Any]]) -> set[str]:
+def _idle_keys(model: Mapping[str, Any], axes: Mapping[str, Sequence[Any]]) -> set[str]:
     """Return the keys that do not matter to a cell: other structures take them, or the model is the same without."""
     structure, out = model.get("structure", "lfr"), set[str]()
     if "structure" in axes and structure in TAKES:
@@ -498,115 +597,3 @@ def grid_keys(found: Iterable[Mapping[str, Any]]) -> list[str]:
     """Return the keys of the grid that any cell has, in the order of the grid."""
     given = {k for values in found for k in values}
     return [k for k in (*MODEL_KEYS, *SOLVER_KEYS) if k in given]
-
-
-def _check_search(model: PILFR | Lagged | Model, search: Mapping[str, Any]) -> None:
-    if isinstance(model, Lagged) and search["start"] != "grid":
-        raise InputError(
-            f"start = {search['start']!r} is not for a NARX or NOE, whose starts are of their own kind; leave it out."
-        )
-    if "linear" in search and not isinstance(model, PILFR):
-        of = "a NARX or NOE" if isinstance(model, Lagged) else "a Model, which has its own values"
-        raise InputError(f"linear = {search['linear']!r} is not for {of}; leave it out.")
-
-
-def _model(content: Mapping[str, Any]) -> PILFR | Lagged:
-    if content.get("structure") in ("lti", "linear"):
-        raise InputError(
-            f"'structure' in [model] is {content['structure']!r}; for a linear model give 'lfr' with operators = 0."
-        )
-    table = validate(ModelTable, content, "model")
-    given = {key: value for key, value in table if value is not None and key != "structure"}
-    takes = TAKES[table.structure]
-    if takes[0] not in given:
-        raise InputError(f"'{takes[0]}' in [model] is missing; give the number of {SIZE[takes[0]]}.")
-    for key in given:
-        if key not in takes:
-            raise InputError(
-                f"{key!r} in [model] is not for structure = {table.structure!r}, which takes {', '.join(takes)}."
-            )
-    if "neurons" in given and given.get("operator") != "generalized_play":
-        raise InputError("'neurons' in [model] goes with operator = 'generalized_play'; leave it out.")
-    try:
-        return named_structure(table.structure, **given)
-    except InputError as error:
-        raise InputError(f"[model]: {error}") from None
-
-
-def _solver(content: Any) -> tuple[Any, dict[str, Any]]:
-    """Return the solver, and the options of the search."""
-    if isinstance(content, Mapping) and "time_limit" in content:
-        raise InputError(
-            "'time_limit' in [solver] would make the result depend on the machine's load; give max_iterations."
-        )
-    table = validate(SolverTable, content, "solver")
-    search = {"starts": table.starts, "start": table.start}
-    if table.linear == BLA:
-        search["linear"] = BLA
-    given = {k: getattr(table, k) for k in ("max_iterations", "tolerance") if getattr(table, k) is not None}
-    if not isinstance(table.name, str):
-        if given:
-            raise InputError(
-                f"{', '.join(given)} in [solver] goes with a name; the solver is an object that has its own."
-            )
-        return table.name, search
-    if table.name not in ("gauss-newton", "ipopt"):
-        raise InputError(f"'name' in [solver] is {shown(table.name)}; give 'gauss-newton' or 'ipopt'.")
-    if table.name == "ipopt":
-        return Ipopt(**given), search
-    return (GaussNewton(**{"tolerance": POLISH.tolerance, **given}) if given else POLISH), search
-
-
-def _constraints(
-    table: ConstraintsTable, models: Sequence[PILFR | Lagged | Model]
-) -> tuple[bool | float, tuple[Constraint, ...]]:
-    stable, gain, gap, own = table.spectral_radius, table.dc_gain, table.ordered_thresholds, table.own
-    if not isinstance(stable, bool) and not (is_number(stable) and 0 < stable < math.inf):
-        raise InputError(
-            f"'spectral_radius' in [constraints] is {shown(stable)}; give a number above zero, true or false."
-        )
-    if not isinstance(own, list | tuple) or not all(isinstance(c, Constraint) for c in own):
-        raise InputError(f"'own' in [constraints] is {shown(own)}; give a list of Constraint, in a Python run file.")
-    found: list[Constraint] = []
-    try:
-        if gain is not None:
-            given = dict(gain) if isinstance(gain, Mapping) else {"value": gain}
-            found.append(dc_gain(given.pop("value"), **given))
-        if gap is not False:
-            found.append(ordered("r", 0.0 if gap is True else float(gap)))
-        for model in models:
-            check_gain((*found, *own), model.element)
-    except InputError as error:
-        raise InputError(f"[constraints]: {error}") from None
-    except (TypeError, ValueError, KeyError, OverflowError):
-        raise InputError(
-            f"[constraints] holds dc_gain = {shown(gain)} and ordered_thresholds = {shown(gap)}; give a number (or "
-            "value, within and slope) for the first, and true or a least gap for the second."
-        ) from None
-    if found and isinstance(models[0], Model):
-        raise InputError("dc_gain and ordered_thresholds are for a PI-LFR, and the model is your own; use 'own'.")
-    if any(isinstance(model, Lagged) for model in models) and not isinstance(stable, bool):
-        raise InputError(
-            "'spectral_radius' in [constraints] is not for structure = 'narx' or 'noe', whose state is the past."
-        )
-    return stable if isinstance(stable, bool) else float(stable), (*found, *own)
-
-
-def _regularization(table: RegularizationTable, files: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
-    path, l1, prune = table.path, table.l1, table.prune
-    if prune is not None and l1 is None:
-        raise InputError(
-            "'prune' in [regularization] goes with 'l1', a path prunes by itself; give l1, or leave prune out."
-        )
-    if path is not False:
-        usable = isinstance(path, list | tuple) and path and all(is_number(s) and 0 < s < math.inf for s in path)
-        if path is not True and not usable:
-            raise InputError(
-                f"'path' in [regularization] is {shown(path)}; give true, or a list of strengths above zero."
-            )
-        if l1 is not None:
-            raise InputError("'path' and 'l1' in [regularization] exclude each other; leave one out.")
-        if not files["validation"]:
-            raise InputError("'path' in [regularization] is chosen by validation; give [data] a validation recording.")
-        path = () if path is True else tuple(float(s) for s in path)
-    return {"l1": l1, "prune": prune is not False, "path": None if path is False else path, "margin": table.margin}

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,8 +21,8 @@ import numpy as np
 from .._base import InputError
 from ..data import Recording
 from ..models import Model
-from .jobs import Recordings, RunJob
-from .schema import ROLES, Cell, Run, grid_keys
+from .jobs import RunJob
+from .schema import Cell, Run, grid_keys
 
 QUARTILES = ("smallest", "lower_quartile", "median", "upper_quartile", "largest")
 FOLDS = "folds"
@@ -37,13 +37,6 @@ class Score:
     role: str
     recording: str
     nrmse: float
-
-
-def scored_files(run: Run, recordings: Recordings) -> Iterator[tuple[str, str, Recording]]:
-    """Yield role, name and recording of every file of a run."""
-    for role in ROLES:
-        for name, recording in zip(run.files[role], recordings[role], strict=True):
-            yield role, name, recording
 
 
 def choose_job(scores: Sequence[Score], jobs: Sequence[str]) -> str:
@@ -84,21 +77,10 @@ def reasons(entries: Mapping[str, Mapping[str, Any]], ids: Sequence[str]) -> lis
 
 @dataclass(frozen=True)
 class CellSummary:
-    """Errors of one cell's jobs on one recording.
+    """Errors of one cell's jobs on one recording; `held` and `train` on `folds` are those of the cross-validation.
 
-    Attributes
-    ----------
-    cell : dict
-        Values of the cell in the grid.
-    role, recording : str
-        `held` and `train` on `folds` are those of the cross-validation.
-    jobs, failed : int
-        How many there are, and how many of them failed: without a model, with one that explains nothing of the
-        training (an NRMSE of 0.99 or more, that of a constant), or without a finite error there.
-    quartiles : tuple of float
-        Smallest, lower quartile, median, upper quartile and largest NRMSE of all that have a finite one.
-    seconds : float
-        Median time of a job.
+    A job failed if it has no model, one that explains nothing of the training (an NRMSE of 0.99 or more, that of a
+    constant), or no finite error there.
     """
 
     cell: Mapping[str, Any]
@@ -106,8 +88,8 @@ class CellSummary:
     recording: str
     jobs: int
     failed: int
-    quartiles: tuple[float, ...]
-    seconds: float
+    quartiles: tuple[float, ...]  # smallest, lower quartile, median, upper quartile and largest finite NRMSE
+    seconds: float  # median time of a job
 
     @property
     def failure_rate(self) -> float:
@@ -188,30 +170,14 @@ def _label(cell: Cell, keys: Sequence[str]) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Selection:
-    """Errors of the structures on recordings they have not been fitted to, and the structure to take.
+    """Errors of the structures on recordings they have not been fitted to, and the structure to take."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The cells by their values.
-    parameters : tuple of int
-        Free parameters of each.
-    errors : tuple of float
-        NRMSE held out; infinite where no job of the cell, or of one of its folds, gave a model.
-    cell : int
-        Number of the cell recommended.
-    margin : float
-        How much worse than the best it may be, as a share.
-    judge : str
-        The recordings that were held out.
-    """
-
-    names: tuple[str, ...]
-    parameters: tuple[int, ...]
-    errors: tuple[float, ...]
-    cell: int
-    margin: float
-    judge: str
+    names: tuple[str, ...]  # the cells by their values
+    parameters: tuple[int, ...]  # free parameters of each
+    errors: tuple[float, ...]  # NRMSE held out; infinite where no job of the cell, or of one of its folds, gave a model
+    cell: int  # number of the cell recommended
+    margin: float  # how much worse than the best it may be, as a share
+    judge: str  # the recordings that were held out
 
     def __repr__(self) -> str:
         width = max(len(name) for name in (*self.names, "structure"))
@@ -228,23 +194,9 @@ def select(
     entries: Mapping[str, Mapping[str, Any]],
     recording: Recording,
 ) -> Selection:
-    """Compare the cells of a run.
+    """Compare the cells of a run by jobs of the cross-validation, or by the errors on the validation recordings.
 
-    Parameters
-    ----------
-    run : Run
-    jobs : sequence of RunJob
-        Those of the cross-validation, or with models to judge on the validation recordings.
-    scores : sequence of Score
-    entries : mapping
-        Of the jobs, in the manifest.
-    recording : Recording
-        Any of the run, for the number of inputs and outputs.
-
-    Raises
-    ------
-    InputError
-        If no cell can be judged.
+    Any `recording` of the run serves, for the number of inputs and outputs.
     """
     counts, errors = [], []
     judged: dict[str, list[float]] = {}

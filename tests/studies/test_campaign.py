@@ -213,7 +213,7 @@ def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
 
     close = worker_process.close_workers
     monkeypatch.setattr(worker_process.WorkerProcess, "__init__", late)
-    monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.execution"), "close_workers", ends)
+    monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.executor"), "close_workers", ends)
     (folder / "mine.py").write_text(SLOW.replace("TROUBLE", "time.sleep(600)").replace("FOLDER", str(folder)))
     with pytest.raises(RunInterrupted), time_limit(0.5, Clock()):
         pilfr.campaign(folder / "mine.py")

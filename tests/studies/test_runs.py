@@ -1,6 +1,7 @@
 """Run files: the same numbers again, nothing done twice, interrupted runs go on, changes are noticed."""
 
 import json
+import os
 import re
 import shutil
 import signal
@@ -205,7 +206,8 @@ def test_a_missing_model_is_made_again(done):
         ("nx = 1", "nx = 'one'", ("'nx' in [model] is 'one'", "whole number")),
         ("operators = 3", "operators = -3", "-3"),
         ("operators = 3", "operators = true", "True"),
-        ('"train.csv"', '"nowhere.csv"', ("nowhere.csv does not exist",)),
+        ('"train.csv"', '"nowhere.csv"', ("'train' in [data]: there is no file", "nowhere.csv; check the name")),
+        ('"train.csv"', '"pipe.csv"', ("'train' in [data]", "pipe.csv is a pipe or a device")),
         ('test = "test.csv"', 'test = "train.csv"', "given twice"),
         ("seeds = [0, 1, 2]", "seeds = [0, 0]", "different whole numbers"),
         ("seeds = [0, 1, 2]", "seeds = [0, 0.5]", "different whole numbers"),
@@ -245,6 +247,7 @@ def test_a_missing_model_is_made_again(done):
     ],
 )
 def test_bad_input_gets_one_sentence(capsys, folder, old, new, says):
+    os.mkfifo(folder / "pipe.csv")
     refused(capsys, "run", changed(folder, old, new), says=says)
     assert not (folder / "rig-run" / "results.csv").exists()
 
@@ -280,7 +283,10 @@ def test_constraints_that_cannot_be_met_get_one_sentence(capsys, folder):
 
 
 def test_other_bad_places(capsys, folder, tmp_path):
-    refused(capsys, "run", folder / "none.toml", says="cannot be read")
+    refused(capsys, "run", folder / "none.toml", says=("cannot be read", "none.toml; check the name"))
+    for name in ("pipe.toml", "pipe.py"):  # reading one would wait forever
+        os.mkfifo(folder / name)
+        refused(capsys, "run", folder / name, says=f"{name} is a pipe or a device")
     refused(capsys, "run", folder / "rig.toml", "--out", folder / "train.csv", says="train.csv")
     (folder / "mine").mkdir()
     (folder / "mine" / "model.json").write_text("{}")
