@@ -12,7 +12,7 @@ class Magnet(Law):
 
     id, equation = "magnet", "w = -c (1 / (g - z)^2 - 1 / g^2)"
     sentence = "a magnet: a pull that grows steeply as the gap closes"
-    units, strength = {"c": "w*z^2", "g": "z"}, ("c",)  # linear in c; the gap g is a shape
+    units = {"c": "w*z^2", "g": "z"}  # w is linear in c, whose unit begins with w; the gap g is a shape
     starts, ranges = {"g": ("high", 1.2, 1.5, 2.0, 3.0)}, {"g": ("high", 1.05, 10.0)}  # multiples of the largest z
 
     def force(self, z, p):

@@ -11,10 +11,19 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .base import Law as Law, Local as Local, readable_unit as readable_unit
-    from .catalogue import CATALOGUE as CATALOGUE, FINER as FINER, SCALABLE as SCALABLE
-    from .composed import behind_gap as behind_gap, scaled as scaled
+    from .catalogue import (
+        CATALOGUE as CATALOGUE,
+        FINER as FINER,
+        SCALABLE as SCALABLE,
+        behind_gap as behind_gap,
+        scaled as scaled,
+    )
     from .curves import (
+        AsymmetricDeadZone as AsymmetricDeadZone,
+        AsymmetricSaturation as AsymmetricSaturation,
         Cubic as Cubic,
+        DeadZone as DeadZone,
+        GradualSaturation as GradualSaturation,
         Magnitude as Magnitude,
         Orifice as Orifice,
         Polynomial as Polynomial,
@@ -22,6 +31,9 @@ if TYPE_CHECKING:
         PowerWithGain as PowerWithGain,
         Quadratic as Quadratic,
         Root as Root,
+        Saturation as Saturation,
+        SkewSaturation as SkewSaturation,
+        SoftSaturation as SoftSaturation,
     )
     from .dynamic import (
         Attached as Attached,
@@ -62,29 +74,22 @@ if TYPE_CHECKING:
         SmoothHysteresis as SmoothHysteresis,
         StopHysteresis as StopHysteresis,
     )
-    from .periodic import HarmonicForce as HarmonicForce, PeriodicForce as PeriodicForce, Ripple as Ripple
-    from .saturation import (
-        AsymmetricDeadZone as AsymmetricDeadZone,
-        AsymmetricSaturation as AsymmetricSaturation,
-        DeadZone as DeadZone,
-        GradualSaturation as GradualSaturation,
-        Saturation as Saturation,
-        SkewSaturation as SkewSaturation,
-        SoftSaturation as SoftSaturation,
-    )
     from .stiffness import (
         Clearance as Clearance,
         CubicStiffness as CubicStiffness,
         GeometricStiffness as GeometricStiffness,
+        HarmonicForce as HarmonicForce,
         HertzContact as HertzContact,
         LinearStiffness as LinearStiffness,
         OffCentreClearance as OffCentreClearance,
+        PeriodicForce as PeriodicForce,
         PiecewiseStiffness as PiecewiseStiffness,
         PiecewiseStiffnessBelow as PiecewiseStiffnessBelow,
         PowerStiffness as PowerStiffness,
         ProgressiveStiffness as ProgressiveStiffness,
         QuadraticStiffness as QuadraticStiffness,
         QuinticStiffness as QuinticStiffness,
+        Ripple as Ripple,
         SlackCoupling as SlackCoupling,
         SlackSpring as SlackSpring,
         SoftClearance as SoftClearance,

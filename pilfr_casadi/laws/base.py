@@ -4,13 +4,14 @@ A law is a force `w = Σ_i c_i φ_i(z, ż, q, t; shape)`, linear in its *strengt
 (threshold, gap, knee, delay). `q̇ = flow(...)` are states of its own; a law with `step(z, s, p)` has a discrete memory
 instead. In series at an actuator or a sensor the force is the deviation of the signal: `w = law(u) - u`.
 
-How to add a law: state its equation, its sentence, its units and strengths, and write `force`. `starts` and `ranges`
-give the values of the shape parameters that are tried, and their bounds, as multiples of an attribute of `Local`:
+To add a law, state its equation, its sentence and the units of its parameters, and write `force`. The parameters whose
+unit begins with w are its strengths. `starts` and `ranges` give the values of the others that are tried, and their
+bounds, as multiples of an attribute of `Local` or as a function of it:
 
 >>> class RubberBlock(Law):
 ...     id, equation = "rubber_block", "w = k L tan(z / L)"
 ...     sentence = "a rubber block: its stiffness grows without limit as the deflection comes near L"
-...     units, strength = {"k": "w/z", "L": "z"}, ("k",)
+...     units = {"k": "w/z", "L": "z"}
 ...     starts = {"L": ("reach", 0.7, 1.0, 2.0)}  # 0.7, 1 and 2 times the largest |z|
 ...     ranges = {"L": ("reach", 0.65, 10.0)}
 ...
@@ -20,15 +21,16 @@ give the values of the shape parameters that are tried, and their bounds, as mul
 >>> [round(shape["L"], 2) for shape in RubberBlock().shapes(signals)]
 [1.4, 2.0, 3.99]
 
-`diagnose(simulator, recordings, laws=(*CATALOGUE, RubberBlock))` tries it beside the others. To put it into the
-catalogue, add the class to the file of its kind and one line to `catalogue.py`.
+`diagnose(simulator, recordings, laws=(*CATALOGUE, RubberBlock))` tries it beside the others. A class in the file of its
+kind is in the catalogue.
 """
 
 from __future__ import annotations
 
 import inspect
 import itertools
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -41,8 +43,7 @@ from ..models import Parameter
 
 EDGE = 0.05  # width of the onset of a contact, as a share of its gap
 
-# an attribute of `Local` ("" for none) and its multiples, for each shape parameter
-Multiples = Mapping[str, tuple[Any, ...]]
+SIDED = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +93,11 @@ class Local:
         return max(abs(self.low), abs(self.high), 1e-300)
 
     @property
+    def middle(self) -> float:
+        """Middle of the range of z."""
+        return (self.low + self.high) / 2
+
+    @property
     def half(self) -> float:
         """Half the range of z."""
         return max((self.high - self.low) / 2, 1e-300)
@@ -107,6 +113,10 @@ class Local:
         return max(self.lengths) * self.dt
 
 
+# an attribute of `Local` ("" for none) and its multiples, or the values as a function of it
+Tried = tuple[Any, ...] | Callable[[Local], Any]
+
+
 @dataclass(frozen=True)
 class Law:
     """A law; subclasses set the class variables and `force`, and `starts` and `ranges` where there is a shape.
@@ -120,23 +130,25 @@ class Law:
     units : mapping
         Parameter -> unit, in terms of w, z and s: "w/z^3".
     strength : tuple of str
-        Parameters in which the force is linear.
+        Parameters in which the force is linear; left out, those whose unit begins with w.
     starts, ranges : mapping
-        Start values and (lower, upper) bounds of parameters, as multiples of an attribute of `Local`: "reach", "half",
-        "low", "high", "speed", "dt", "duration", "stiffest", or "" for plain numbers. Every combination of start values
-        is tried.
+        Start values and (lower, upper) bounds of parameters: an attribute of `Local` ("reach", "half", "low", "high",
+        "speed", "dt", "duration", "stiffest", or "" for plain numbers) and its multiples, or a function of `Local`.
+        Every combination of start values is tried.
+    defaults : mapping
+        Values of parameters before any are given; otherwise strengths are zero and shapes one.
     places : tuple of {"parallel", "series", "sensor"}
         Allowed places: inside the dynamics, at an actuator or a sensor, or at a sensor alone.
-    dissipative : bool
-        Strengths must oppose motion, except those in `signed`.
-    restoring : bool
-        Strengths must push back.
-    order : int
-        Number of its own states.
-    follows : int
-        Number of these, from the first, that settle at the signal where it stands still; the others settle at zero.
-    shifts : bool
-        Its memory is a shift register, which takes in the signal at the beginning of a step.
+    dissipative, restoring : bool
+        Strengths must oppose motion, except those in `signed`; strengths must push back.
+    two_sided : bool
+        The data carries information only if z is both above and below zero.
+    order, follows : int
+        Number of its own states, and of these, from the first, how many settle at the signal where it stands still;
+        the others settle at zero.
+    memory, shifts : int, bool
+        Length of its discrete memory, and whether that is a shift register, which takes in the signal at the beginning
+        of a step.
     substeps : int
         Smallest number of integration steps per sample.
     knee : str
@@ -147,7 +159,7 @@ class Law:
     Parameters
     ----------
     values : mapping, optional
-        Start values by parameter name; strengths start at zero and shapes at one where not given.
+        Start values by parameter name.
     limits : mapping, optional
         `(lower, upper)` by parameter name.
 
@@ -164,14 +176,17 @@ class Law:
     form: ClassVar[str] = ""
     units: ClassVar[Mapping[str, str]] = {}
     strength: ClassVar[tuple[str, ...]] = ()
-    starts: ClassVar[Multiples] = {}
-    ranges: ClassVar[Multiples] = {}
+    starts: ClassVar[Mapping[str, Tried]] = {}
+    ranges: ClassVar[Mapping[str, Tried]] = {}
+    defaults: ClassVar[Mapping[str, Any]] = {}
     places: ClassVar[tuple[str, ...]] = ("parallel",)
     dissipative: ClassVar[bool] = False
     restoring: ClassVar[bool] = False
+    two_sided: ClassVar[bool] = False
     signed: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[int] = 0
     follows: ClassVar[int] = 0
+    memory: ClassVar[Any] = 0
     shifts: ClassVar[bool] = False
     substeps: ClassVar[int] = 1
     knee: ClassVar[str] = ""
@@ -179,6 +194,10 @@ class Law:
 
     values: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
+
+    def __init_subclass__(cls) -> None:
+        if "units" in vars(cls) and "strength" not in vars(cls):
+            cls.strength = tuple(name for name, unit in cls.units.items() if re.match(r"w\b", unit))
 
     def __post_init__(self) -> None:
         for option, count in (("values", 1), ("limits", 2)):
@@ -200,18 +219,18 @@ class Law:
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         """Generate the values of the shape parameters to try: every combination of `starts`."""
-        yield from grid(**{name: _multiply(local, scale, np.array(of)) for name, (scale, *of) in self.starts.items()})
+        for values in itertools.product(*(_tried(entry, local) for entry in self.starts.values())):
+            yield {name: float(value) for name, value in zip(self.starts, values, strict=True)}
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
         """Bounds of the parameters on which the data carries information: `ranges`."""
-        return {
-            name: (_multiply(local, scale, low), _multiply(local, scale, high))
-            for name, (scale, low, high) in self.ranges.items()
-        }
+        found = {name: _tried(entry, local) for name, entry in self.ranges.items()}
+        return {name: (low, high) for name, (low, high) in found.items()}
 
     def applies(self, local: Local) -> str:
         """Reason why the data carries no information on this law; empty if it does."""
-        return ""
+        hidden = self.two_sided and min(-local.low, local.high) <= SIDED * local.reach
+        return "one side of zero is hardly visited" if hidden else ""
 
     @property
     def lacks(self) -> str:
@@ -244,7 +263,7 @@ class Law:
 
     def standing(self, z: float) -> np.ndarray:
         """States or memory after the signal has stood still at z."""
-        out = np.zeros(int(getattr(self, "memory", 0)) if hasattr(self, "step") else self.order)
+        out = np.zeros(self.memory or self.order)
         out[: len(out) if self.shifts else self.follows] = z
         return out
 
@@ -262,19 +281,16 @@ class Law:
 
     @cached_property
     def _parameters(self) -> dict[str, Parameter]:
+        start = {**dict.fromkeys(self.units, 1.0), **dict.fromkeys(self.strength, 0.0), **self.defaults, **self.values}
         out = {}
         for name, unit in self.units.items():
-            value = np.asarray(self.values.get(name, 0.0 if name in self.strength else 1.0), dtype=float)
             low, high = (np.asarray(end, dtype=float) for end in self.limits.get(name, (-np.inf, np.inf)))
-            value = np.clip(value, low, high)
-            scalar = value.ndim == low.ndim == high.ndim == 0  # with limits that `__post_init__` has checked
-            make = Parameter.trusted if scalar else _checked_parameter
-            out[name] = make(value, unit, low, high)
+            value = np.clip(np.asarray(start[name], dtype=float), low, high)
+            if value.ndim == low.ndim == high.ndim == 0:  # numbers that `__post_init__` has checked
+                out[name] = Parameter.trusted(value, unit, low, high)
+            else:
+                out[name] = Parameter(value, unit=unit, bounds=(low, high))
         return out
-
-
-def _checked_parameter(value: Any, unit: str, lower: Any, upper: Any) -> Parameter:
-    return Parameter(value, unit=unit, bounds=(lower, upper))
 
 
 def _are_numbers(given: Any, count: int) -> bool:
@@ -286,8 +302,12 @@ def _are_numbers(given: Any, count: int) -> bool:
         return False
 
 
-def _multiply(local: Local, scale: str, factor: Any) -> Any:
-    return getattr(local, scale) * factor if scale else factor
+def _tried(entry: Tried, local: Local) -> Any:
+    """Values of an entry of `starts` or `ranges`."""
+    if callable(entry):
+        return entry(local)
+    attribute, *multiples = entry
+    return [getattr(local, attribute) * multiple if attribute else multiple for multiple in multiples]
 
 
 def readable_unit(unit: str, w: str, z: str) -> str:
@@ -305,9 +325,3 @@ def readable_unit(unit: str, w: str, z: str) -> str:
 def beyond(z: Any, g: Any) -> Any:
     """Rise from 0 to 1 where |z| passes a gap g, over a share of the gap, because a jump would have no slope in g."""
     return (1 + ca.tanh((ca.fabs(z) - g) / (EDGE * g))) / 2
-
-
-def grid(**axes: Any) -> Iterator[dict[str, Any]]:
-    """Generate every combination of the axes' values."""
-    for values in itertools.product(*axes.values()):
-        yield {k: float(v) for k, v in zip(axes, values, strict=True)}

@@ -1,78 +1,135 @@
-"""The catalogue of laws that may be missing from a simulator, in the order in which they are tried."""
+"""The catalogue of laws that may be missing from a simulator, and laws made of laws.
+
+Each law that a file of this folder defines is in the catalogue. Two laws in parallel in one port need no class of their
+own: call `Simulator.with_element` twice.
+"""
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Iterator
 from typing import Any
 
-from . import curves, dynamic, friction, hysteresis, periodic, saturation, stiffness
-from .base import Law
-from .composed import behind_gap
+import casadi as ca
 
-CATALOGUE: tuple[type[Law], ...] = (
-    stiffness.LinearStiffness,
-    stiffness.CubicStiffness,
-    stiffness.PowerStiffness,
-    stiffness.GeometricStiffness,
-    stiffness.QuinticStiffness,
-    stiffness.QuadraticStiffness,
-    stiffness.ProgressiveStiffness,
-    stiffness.PiecewiseStiffness,
-    stiffness.PiecewiseStiffnessBelow,
-    stiffness.HertzContact,
-    stiffness.Clearance,
-    stiffness.SlackSpring,
-    stiffness.SlackCoupling,
-    stiffness.SoftClearance,
-    stiffness.OffCentreClearance,
-    friction.CoulombFriction,
-    friction.AsymmetricFriction,
-    friction.DirectionalFriction,
-    behind_gap(friction.CoulombFriction),
-    friction.PreslidingFriction,
-    friction.StribeckFriction,
-    friction.PreslidingStribeckFriction,
-    friction.ViscousDamping,
-    friction.DirectionalDamping,
-    friction.QuadraticDrag,
-    friction.DirectionalDrag,
-    friction.CubicDamping,
-    hysteresis.StopHysteresis,
-    hysteresis.PlayHysteresis,
-    hysteresis.GeneralizedHysteresis,
-    hysteresis.BoucWen,
-    hysteresis.BoucWenActuator,
-    hysteresis.Backlash,
-    saturation.Saturation,
-    saturation.AsymmetricSaturation,
-    saturation.SoftSaturation,
-    saturation.SkewSaturation,
-    saturation.GradualSaturation,
-    saturation.DeadZone,
-    saturation.AsymmetricDeadZone,
-    curves.Quadratic,
-    curves.Cubic,
-    curves.Polynomial,
-    curves.Magnitude,
-    curves.Power,
-    curves.PowerWithGain,
-    curves.Root,
-    curves.Orifice,
-    dynamic.Delay,
-    dynamic.Relaxation,
-    dynamic.TwoStageRelaxation,
-    dynamic.Creep,
-    dynamic.TwoStageCreep,
-    dynamic.Drift,
-    dynamic.Settling,
-    dynamic.Swing,
-    periodic.PeriodicForce,
-    periodic.HarmonicForce,
-    periodic.Ripple,
-    dynamic.Lag,
-    dynamic.Resonance,
-    dynamic.Mode,
-    dynamic.Attached,
-)
+from .._base import InputError
+from . import curves, dynamic, friction, hysteresis, stiffness
+from .base import Law, Local, beyond
+
+GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
+
+
+def scaled(law: type[Law], by: str) -> type[Law]:
+    """Make a law whose strength a signal scales: `w = by law(z, dz/dt)`, such as a yield force set by a voltage.
+
+    Parameters
+    ----------
+    law : class of Law
+        Any law that may act in parallel, as a force.
+    by : str
+        An input of the simulator, which multiplies the strength.
+
+    Raises
+    ------
+    InputError
+        If it is not a law, or acts in series with a signal.
+    """
+    return _scaled(_parallel(law), by)
+
+
+def behind_gap(law: type[Law]) -> type[Law]:
+    """Make a law that acts beyond a gap only: on `z' = z - clip(z, -g, g)` and its rate, such as a stop that rubs.
+
+    A force of the rate sets in over a twentieth of the gap, as a contact does.
+
+    Parameters
+    ----------
+    law : class of Law
+        Any law that may act in parallel, as a force of `z` and `dz` alone.
+
+    Raises
+    ------
+    InputError
+        If it is not a law, acts in series with a signal, has states or a gap of its own, or reads other signals.
+    """
+    base = _parallel(law)
+    if base.order or "g" in base.units:
+        raise InputError(f"The law {base.id!r} has {'states' if base.order else 'a gap'} of its own; take another.")
+    if base.reads() - {"z", "dz"}:
+        raise InputError(f"The law {base.id!r} reads more than z and dz; take another.")
+    return _behind_gap(base)
+
+
+def _parallel(law: Any) -> Any:
+    """Check that a law is a force."""
+    if not (isinstance(law, type) and issubclass(law, Law)):
+        raise InputError(f"A composed law is made of a class of laws, such as CoulombFriction; got {law!r}.")
+    if "parallel" not in law.places:
+        raise InputError(f"The law {law.id!r} stands in series with a signal; only a force can be composed.")
+    return law
+
+
+@functools.cache  # the same class for the same arguments
+def _scaled(base: Any, by: str) -> Any:
+    strengths = {name: f"{unit}/[{by}]" if name in base.strength else unit for name, unit in base.units.items()}
+
+    class Scaled(base):
+        form = f"{base.form}, scaled by {by}".removeprefix(", ")
+        equation = f"w = {by} v,  {base.equation.replace('w =', 'v =', 1)}"
+        sentence = f"{base.sentence}; {by} scales its strength"
+        units, strength = strengths, base.strength
+        places = ("parallel",)
+        dissipative = restoring = False  # the signal may have either sign
+        scaled_by = by
+
+    return _name(Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}.")
+
+
+@functools.cache
+def _behind_gap(base: Any) -> Any:
+    read = inspect.signature(base.step if base.memory else base.force).parameters
+
+    def past(z: Any, dz: Any, p: Any) -> dict[str, Any]:
+        """Arguments of the law's force or step beyond the gap."""
+        signals = {"z": z - ca.fmin(ca.fmax(z, -p["g"]), p["g"]), "dz": beyond(z, p["g"]) * dz}
+        return {"p": p, **{name: value for name, value in signals.items() if name in read}}
+
+    class Behind(base):
+        form = f"{base.form}, behind a gap".removeprefix(", ")
+        equation = f"{base.equation}  with z - clip(z, -g, g) in place of z"
+        sentence = f"{base.sentence}, beyond a gap"
+        units, strength = {**base.units, "g": "z"}, base.strength
+        places = ("parallel",)
+
+        def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+            """Shapes of the law, each with every gap."""
+            for own in super().shapes(local):
+                for share in GAPS:
+                    yield {**own, "g": share * local.reach}
+
+        def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+            """Bounds of the law, and a gap that the signal passes."""
+            return {**super().bounds(local), "g": (0.01 * local.reach, 0.95 * local.reach)}
+
+        if base.memory:
+
+            def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0) -> Any:
+                return super().step(s=s, **past(z, dz, p))
+
+        else:
+
+            def force(self, z: Any, dz: Any, p: Any) -> Any:
+                return super().force(**past(z, dz, p))
+
+    return _name(Behind, f"{base.__name__}BehindGap", f"{base.__doc__}\n\n    It acts beyond a gap.")
+
+
+def _name(law: Any, name: str, doc: str) -> Any:
+    law.__name__ = law.__qualname__ = name
+    law.__doc__ = doc
+    return law
+
 
 # laws that refine a named law, once it is named: they cost more to fit
 FINER: dict[type[Law], tuple[Any, ...]] = {
@@ -80,6 +137,17 @@ FINER: dict[type[Law], tuple[Any, ...]] = {
     hysteresis.PlayHysteresis: (hysteresis.FinePlays,),
     hysteresis.GeneralizedHysteresis: (hysteresis.FineGeneralized,),
 }
+
+# laws in the order in which they are tried: those of the files, in the order in which they are defined
+CATALOGUE: tuple[type[Law], ...] = (
+    *(
+        law
+        for file in (stiffness, friction, hysteresis, curves, dynamic)
+        for law in vars(file).values()
+        if isinstance(law, type) and issubclass(law, Law) and hasattr(law, "id") and (law,) not in FINER.values()
+    ),
+    behind_gap(friction.CoulombFriction),
+)
 
 # laws that may be scaled by an input which the simulator's equations do not read
 SCALABLE: tuple[type[Law], ...] = (

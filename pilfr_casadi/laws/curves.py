@@ -1,17 +1,17 @@
-"""Memoryless curves of an actuator or a sensor."""
+"""Memoryless curves of an actuator or a sensor: powers, saturation and dead zone."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from .base import Law, Local
 
 STRAIGHT = 0.03  # difference of a power from one, below which it is a gain
 NARROW = 0.05  # half the range over its middle, below which any curve is a gain and an offset
-SIDED = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
 
 
 class Polynomial(Law):
@@ -23,7 +23,6 @@ class Polynomial(Law):
     source = "Billings & Fakhouri (1982), Automatica 18(1)"
     sentence = "a memoryless curve: the signal is bent by its own square and cube"
     units = {"a_2": "w/z^2", "a_3": "w/z^3"}
-    strength: ClassVar[tuple[str, ...]] = ("a_2", "a_3")
     places = ("series",)
 
     def force(self, z: Any, p: Any) -> Any:
@@ -31,7 +30,7 @@ class Polynomial(Law):
 
     def applies(self, local: Local) -> str:
         narrow = local.half < NARROW * abs(local.low + local.high) / 2
-        return "the signal stays where any curve is straight" if narrow else ""
+        return "the signal stays where any curve is straight" if narrow else super().applies(local)
 
 
 class Quadratic(Polynomial):
@@ -40,7 +39,6 @@ class Quadratic(Polynomial):
     form = "quadratic"
     equation = "w = a_2 z^2"
     units = {"a_2": "w/z^2"}
-    strength = ("a_2",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a_2 * z**2
@@ -52,7 +50,6 @@ class Cubic(Polynomial):
     form = "cubic"
     equation = "w = a_3 z^3"
     units = {"a_3": "w/z^3"}
-    strength = ("a_3",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a_3 * z**3
@@ -64,15 +61,11 @@ class Magnitude(Polynomial):
     form = "magnitude"
     equation = "w = a |z|"
     units = {"a": "w/z"}
-    strength = ("a",)
     sentence = "a memoryless curve: the gain differs between the two signs"
+    two_sided = True  # on one side alone it is a gain
 
     def force(self, z: Any, p: Any) -> Any:
         return p.a * ca.fabs(z)
-
-    def applies(self, local: Local) -> str:
-        """Reason why the data carries no information: on one side alone it is a gain."""
-        return "" if min(-local.low, local.high) > SIDED * local.reach else "one side is hardly visited"
 
 
 class Power(Polynomial):
@@ -83,7 +76,6 @@ class Power(Polynomial):
     source = "White (2011), Fluid Mechanics, sec. 3.5"
     sentence = "a memoryless curve: a power of the local signal, as in flow through an orifice"
     units = {"a": "w/z^n", "n": ""}
-    strength: ClassVar[tuple[str, ...]] = ("a",)
     starts = {"n": ("", 0.4, 0.5, 0.65, 1.5, 2.5)}
     ranges = {"n": ("", 0.3, 5.0)}
 
@@ -101,7 +93,6 @@ class PowerWithGain(Power):
     form = "power with gain"
     equation = "w = a sign(z) |z|^n + b z"
     units = {**Power.units, "b": "w/z"}
-    strength = ("a", "b")
 
     def force(self, z: Any, p: Any) -> Any:
         return super().force(z, p) + p.b * z
@@ -120,17 +111,128 @@ class Orifice(Root):
     """Flow through an orifice under its own head: laminar at small and a square root at large signals."""
 
     form = "orifice"
-    restoring = True
     equation = "w = a z / (z^2 + z_t^2)^(1/4)"
     source = "Borutzky, Barnard & Thoma (2002), Simulation Modelling Practice and Theory 10"
     sentence = "a memoryless curve: flow through an orifice, laminar below z_t and turbulent beyond"
     units = {"a": "w/z^0.5", "z_t": "z"}
+    restoring = True
     starts = {"z_t": ("reach", 0.02, 0.1, 0.3)}
     ranges = {"z_t": ("reach", 0.001, 1.0)}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.a * z / (z**2 + p.z_t**2) ** 0.25
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Never: its power is known."""
         return False
 
+
+class Saturation(Law):
+    """A hard limit, the same on both sides."""
+
+    id = "saturation"
+    form = "symmetric"
+    equation = "w = clip(u, -L, L) - u"
+    source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
+    sentence = "saturation: beyond a limit the signal does not follow any more"
+    units = {"L": "z"}
+    places = ("series",)
+    starts = {"L": ("reach", 0.3, 0.45, 0.6, 0.75, 0.9)}
+    ranges = {"L": ("reach", 0.1, 0.995)}
+
     def force(self, z: Any, p: Any) -> Any:
-        return p.a * z / (z**2 + p.z_t**2) ** 0.25
+        return ca.fmax(ca.fmin(z, p.L), -p.L) - z
+
+
+class AsymmetricSaturation(Saturation):
+    """A hard limit on either side."""
+
+    form = "asymmetric"
+    equation = "w = clip(u, low, high) - u"
+    units = {"low": "z", "high": "z"}
+    starts = {
+        "low": lambda at: at.middle - at.half * np.array([0.5, 0.75, 0.97]),
+        "high": lambda at: at.middle + at.half * np.array([0.5, 0.75, 0.97]),
+    }
+    ranges = {
+        "low": lambda at: (at.low - 0.1 * at.half, at.middle),
+        "high": lambda at: (at.middle, at.high + 0.1 * at.half),
+    }
+
+    def force(self, z: Any, p: Any) -> Any:
+        return ca.fmax(ca.fmin(z, p.high), p.low) - z
+
+
+class SoftSaturation(Saturation):
+    """A limit that is approached gradually."""
+
+    form = "soft"
+    equation = "w = L tanh(u / L) - u"
+    starts = {"L": ("reach", 0.3, 0.6, 1.0, 2.0)}
+    ranges = {"L": ("reach", 0.1, 10)}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return p.L * ca.tanh(z / p.L) - z
+
+
+class GradualSaturation(Saturation):
+    """A limit whose knee may be sharp or wide."""
+
+    form = "gradual"
+    equation = "w = u / (1 + |u / L|^n)^(1/n) - u"
+    units = {"L": "z", "n": ""}
+    starts = {"L": ("reach", 0.5, 1.0, 2.0), "n": ("", 1.0, 2.0, 5.0)}
+    ranges = {"L": ("reach", 0.1, 20), "n": ("", 0.7, 12.0)}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return z / (1 + (ca.fabs(z / p.L) + 1e-9) ** p.n) ** (1 / p.n) - z
+
+
+class SkewSaturation(AsymmetricSaturation):
+    """A limit on either side that is approached gradually."""
+
+    form = "soft asymmetric"
+    equation = "w = L tanh(u / L) - u,  L = L_1 below zero and L_2 above"
+    units = {"L_1": "z", "L_2": "z"}
+    starts = dict.fromkeys(units, ("reach", 0.4, 0.9, 2.0))
+    ranges = dict.fromkeys(units, ("reach", 0.1, 20))
+
+    def force(self, z: Any, p: Any) -> Any:
+        up, down = ca.fmax(z, 0), ca.fmin(z, 0)
+        return p.L_2 * ca.tanh(up / p.L_2) + p.L_1 * ca.tanh(down / p.L_1) - z
+
+
+class DeadZone(Law):
+    """Small signals have no effect."""
+
+    id = "dead_zone"
+    form = "symmetric"
+    equation = "w = -clip(u, -g, g)"
+    source = "Khalil (2002), Nonlinear Systems, sec. 1.2"
+    sentence = "a dead zone: small signals have no effect"
+    units = {"g": "z"}
+    places = ("series",)
+    starts = {"g": ("reach", 0.02, 0.06, 0.12, 0.25, 0.4)}
+    ranges = {"g": ("reach", 0.001, 0.8)}
+
+    def force(self, z: Any, p: Any) -> Any:
+        return -ca.fmax(ca.fmin(z, p.g), -p.g)
+
+    def applies(self, local: Local) -> str:
+        return "" if np.min(np.abs(local.z)) < 0.1 * local.reach else "the signal is never small"
+
+
+class AsymmetricDeadZone(DeadZone):
+    """A dead zone that reaches further on one side."""
+
+    form = "asymmetric"
+    equation = "w = -clip(u, -g_1, g_2)"
+    units = {"g_1": "z", "g_2": "z"}
+    starts = dict.fromkeys(units, ("reach", 0.02, 0.15, 0.35))
+    ranges = dict.fromkeys(units, ("reach", 0.0, 0.8))
+
+    def force(self, z: Any, p: Any) -> Any:
+        return -ca.fmax(ca.fmin(z, p.g_2), -p.g_1)
+
+    def applies(self, local: Local) -> str:
+        return "" if local.low < 0 < local.high else "one side is never visited"

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ..models import Parameter
-from .base import Law, Local, grid
+from .base import Law, Local
 
 SCREENED = 24  # memory of a delay in the screen, in steps; longer delays are not tried
 DEAF = 0.707  # damping ratio above which a second-order response has no peak
@@ -78,22 +78,16 @@ class Relaxation(Law):
     source = "Findley, Lai & Onaran (1976), Creep and Relaxation, ch. 5"
     sentence = "creep: under a constant load the deflection goes on slowly"
     units = {"k_v": "w/z", "T": "s"}
-    strength: ClassVar[tuple[str, ...]] = ("k_v",)
     dissipative = True
     order = follows = 1
+    starts = {"T": lambda at: np.geomspace(20 * at.dt, at.duration / 2, 7)}
+    ranges = {"T": lambda at: (5 * at.dt, 2 * at.duration)}
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return p.k_v * (z - q)
 
     def flow(self, z: Any, q: Any, p: Any) -> Any:
-        """Rate of the damper's travel."""
         return (z - q) / p.T
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(T=np.geomspace(20 * local.dt, local.duration / 2, 7))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"T": (5 * local.dt, 2 * local.duration)}
 
 
 class _TwoStages(Law):
@@ -102,9 +96,9 @@ class _TwoStages(Law):
     form = "two-stage"
     order = follows = 2
     one_stage: ClassVar[type[Law]]
+    ranges = dict.fromkeys(("T_1", "T_2"), Relaxation.ranges["T"])
 
     def flow(self, z: Any, q: Any, p: Any) -> Any:
-        """Rates of both parts."""
         return ca.vertcat((z - q[0]) / p.T_1, (z - q[1]) / p.T_2)
 
     def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
@@ -125,14 +119,10 @@ class TwoStageRelaxation(_TwoStages, Relaxation):
 
     equation = "w = k_1 (z - q_1) + k_2 (z - q_2),  dq_i/dt = (z - q_i) / T_i"
     units = {"k_1": "w/z", "k_2": "w/z", "T_1": "s", "T_2": "s"}
-    strength = ("k_1", "k_2")
     one_stage = Relaxation
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return p.k_1 * (z - q[0]) + p.k_2 * (z - q[1])
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return dict.fromkeys(("T_1", "T_2"), super().bounds(local)["T"])
 
 
 class Creep(Relaxation):
@@ -145,13 +135,11 @@ class Creep(Relaxation):
     strength: ClassVar[tuple[str, ...]] = ("c",)
     places = ("series",)
     dissipative = False
+    # negative parts would make a filter that comes back; creep goes on in the same direction
+    ranges = {**Relaxation.ranges, "c": ("", 0.0, np.inf)}
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c * q
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        # negative parts would make a filter that comes back; creep goes on in the same direction
-        return super().bounds(local) | {name: (0.0, np.inf) for name in self.strength}
 
 
 class TwoStageCreep(_TwoStages, Creep):
@@ -161,13 +149,10 @@ class TwoStageCreep(_TwoStages, Creep):
     units = {"c_1": "", "c_2": "", "T_1": "s", "T_2": "s"}
     strength = ("c_1", "c_2")
     one_stage = Creep
+    ranges = {**_TwoStages.ranges, "c_1": ("", 0.0, np.inf), "c_2": ("", 0.0, np.inf)}
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c_1 * q[0] + p.c_2 * q[1]
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        both = super().bounds(local)
-        return {**dict.fromkeys(("T_1", "T_2"), both["T"]), **{name: both[name] for name in self.strength}}
 
 
 class Lag(Law):
@@ -182,17 +167,14 @@ class Lag(Law):
     places = ("series",)
     order = follows = 1
     starts = {"T": ("dt", *np.geomspace(0.25, 40, 8))}
+    ranges = {"T": lambda at: (0.15 * at.dt, at.duration / 4)}
     substeps = 4  # a lag may be shorter than a sample
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return q - z
 
     def flow(self, z: Any, q: Any, p: Any) -> Any:
-        """First order."""
         return (z - q) / p.T
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"T": (0.15 * local.dt, local.duration / 4)}
 
 
 class Resonance(Law):
@@ -206,19 +188,14 @@ class Resonance(Law):
     units = {"W": "rad/s", "D": ""}
     places: ClassVar[tuple[str, ...]] = ("series",)
     order, follows = 2, 1
+    starts = {"W": lambda at: np.geomspace(0.015, 1.2, 16) / at.dt, "D": ("", 0.05)}
+    ranges = {"W": lambda at: (8 / at.duration, 1.6 / at.dt), "D": ("", 1e-3, 1.0)}
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
         return q[0] - z
 
     def flow(self, z: Any, q: Any, p: Any) -> Any:
-        """Second order."""
         return ca.vertcat(p.W * q[1], p.W * (z - q[0]) - 2 * p.D * p.W * q[1])
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(W=np.geomspace(0.015, 1.2, 16) / local.dt, D=[0.05])
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"W": (8 / local.duration, 1.6 / local.dt), "D": (1e-3, 1.0)}
 
 
 class Mode(Resonance):
@@ -229,7 +206,6 @@ class Mode(Resonance):
     source = "Preumont (2011), Vibration Control of Active Structures, sec. 2.6"
     sentence = "an unmodelled mode that the signal excites"
     units = {"c_1": "w/z", "c_2": "w/z", "W": "rad/s", "D": ""}
-    strength = ("c_1", "c_2")
     places = ("parallel", "series")
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
@@ -248,12 +224,9 @@ class Attached(Resonance):
     source = "Den Hartog (1956), Mechanical Vibrations, sec. 3.2"
     sentence = "an unmodelled mode: a part on a spring of its own that is carried along"
     units = {"k_a": "w/z", "W": "rad/s", "D": ""}
-    strength = ("k_a",)
     places = ("parallel",)
     dissipative = True
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(W=np.geomspace(0.015, 1.2, 32) / local.dt, D=[0.05])
+    starts = {"W": lambda at: np.geomspace(0.015, 1.2, 32) / at.dt, "D": ("", 0.05)}
 
     def force(self, z: Any, dz: Any, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.k_a * _pull(z, dz, q, p)
@@ -276,7 +249,6 @@ class Drift(Law):
     source = "Ljung (1999), System Identification, sec. 14.1"
     sentence = "a slow trend in time that no input explains"
     units = {"a": "w/s", "b": "w/s^2"}
-    strength: ClassVar[tuple[str, ...]] = ("a", "b")
     places = ("parallel", "series")
 
     def force(self, t: Any, p: Any) -> Any:
@@ -303,7 +275,6 @@ class Swing(Drift):
     form = "swing"
     equation = "w = a cos(2 pi t / T) + b sin(2 pi t / T) + c"
     units = {"a": "w", "b": "w", "c": "w", "T": "s"}
-    strength = ("a", "b", "c")
     starts = {"T": ("duration", 0.4, 0.7, 1.0, 1.5, 2.5)}
     ranges = {"T": ("duration", 0.25, 4)}
 

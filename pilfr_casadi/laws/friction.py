@@ -30,7 +30,6 @@ class CoulombFriction(Law):
     source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7)"
     sentence = "dry friction: a force that opposes motion and hardly depends on speed"
     units = {"F_c": "w", "v_0": "z/s"}
-    strength: ClassVar[tuple[str, ...]] = ("F_c",)
     dissipative = True
     knee = "v_0"
     starts = {"v_0": ("speed", 0.005, 0.02, 0.06, 0.15)}
@@ -53,11 +52,10 @@ class AsymmetricFriction(CoulombFriction):
     equation = "w = F_c tanh(dz/dt / v_0) + F_0"
     sentence = "dry friction that differs between the two directions, or that has a constant load beside it"
     units = {"F_c": "w", "F_0": "w", "v_0": "z/s"}
-    strength: ClassVar[tuple[str, ...]] = ("F_c", "F_0")
     signed: ClassVar[tuple[str, ...]] = ("F_0",)
 
     def force(self, dz: Any, p: Any) -> Any:
-        return p.F_c * ca.tanh(dz / p.v_0) + p.F_0
+        return super().force(dz, p) + p.F_0
 
 
 class DirectionalFriction(AsymmetricFriction):
@@ -69,11 +67,10 @@ class DirectionalFriction(AsymmetricFriction):
         "dry friction, and friction that grows with speed, both different in the two directions (or a constant load)"
     )
     units = {"F_c": "w", "F_0": "w", "c_0": "w*s/z", "v_0": "z/s"}
-    strength = ("F_c", "F_0", "c_0")
     signed = ("F_0", "c_0")
 
     def force(self, dz: Any, p: Any) -> Any:
-        return p.F_c * ca.tanh(dz / p.v_0) + p.F_0 + p.c_0 * ca.fabs(dz)
+        return super().force(dz, p) + p.c_0 * ca.fabs(dz)
 
 
 class PreslidingFriction(Law):
@@ -85,14 +82,12 @@ class PreslidingFriction(Law):
     source = "Jenkins (1962); Al-Bender & Swevers (2008), IEEE Control Syst. 28(6)"
     sentence = "dry friction whose contact springs back a little before it slides"
     units = {"k_t": "w/z", "r": "z"}
-    strength: ClassVar[tuple[str, ...]] = ("k_t",)
     dissipative = True
     memory = 1
     starts = {"r": ("half", 0.003, 0.01, 0.03, 0.1, 0.25)}
     ranges = {"r": ("half", 0.0005, MOST)}
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """One stop."""
         following = play(z, s, p["r"])
         return p["k_t"] * (z - following), following
 
@@ -109,7 +104,6 @@ class StribeckFriction(CoulombFriction):
     equation = "w = (F_c + F_e exp(-(dz/dt / v_s)^2)) tanh(dz/dt / v_0)"
     sentence = "dry friction that is larger at rest than in motion"
     units = {"F_c": "w", "F_e": "w", "v_s": "z/s", "v_0": "z/s"}
-    strength = ("F_c", "F_e")
 
     def force(self, dz: Any, p: Any) -> Any:
         return (p.F_c + p.F_e * ca.exp(-((dz / p.v_s) ** 2))) * ca.tanh(dz / p.v_0)
@@ -135,16 +129,12 @@ class PreslidingStribeckFriction(PreslidingFriction):
     source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7); Jenkins (1962)"
     sentence = "dry friction that is larger at rest than in motion, and whose contact springs back before it slides"
     units = {"k_t": "w/z", "k_e": "w/z", "r": "z", "v_s": "z/s"}
-    strength = ("k_t", "k_e")
     starts = {"r": ("half", 0.003, 0.01, 0.03, 0.1), "v_s": ("speed", 0.05, 0.15, 0.4)}
+    ranges = {**PreslidingFriction.ranges, "v_s": ("speed", 4e-3, 0.8)}
 
     def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0) -> tuple[Any, Any]:
-        """One stop."""
         following = play(z, s, p["r"])
         return (p["k_t"] + p["k_e"] * ca.exp(-((dz / p["v_s"]) ** 2))) * (z - following), following
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {**super().bounds(local), "v_s": (4e-3 * local.speed, 0.8 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the contact springs back over much of the travel, or the fall is negligible."""
@@ -176,7 +166,6 @@ class ViscousDamping(Law):
     source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
     sentence = "a viscous damper: a force in proportion to speed"
     units = {"c_1": "w*s/z"}
-    strength: ClassVar[tuple[str, ...]] = ("c_1",)
     dissipative = True
 
     def force(self, dz: Any, p: Any) -> Any:
@@ -191,11 +180,10 @@ class DirectionalDamping(ViscousDamping):
     source = "Dixon (2007), The Shock Absorber Handbook, ch. 6"
     sentence = "viscous damping that differs between the two directions"
     units = {"c_1": "w*s/z", "c_0": "w*s/z"}
-    strength = ("c_1", "c_0")
     signed = ("c_0",)
 
     def force(self, dz: Any, p: Any) -> Any:
-        return p.c_1 * dz + p.c_0 * ca.fabs(dz)
+        return super().force(dz, p) + p.c_0 * ca.fabs(dz)
 
 
 class QuadraticDrag(Law):
@@ -206,7 +194,6 @@ class QuadraticDrag(Law):
     source = "White (2011), Fluid Mechanics, sec. 7.6"
     sentence = "a drag that grows with the square of speed"
     units = {"c_2": "w*s^2/z^2"}
-    strength: ClassVar[tuple[str, ...]] = ("c_2",)
     dissipative = True
 
     def force(self, dz: Any, p: Any) -> Any:
@@ -220,11 +207,10 @@ class DirectionalDrag(QuadraticDrag):
     equation = "w = c_2 dz/dt |dz/dt| + c_0 (dz/dt)^2"
     sentence = "a drag that grows with the square of speed and differs between the two directions"
     units = {"c_2": "w*s^2/z^2", "c_0": "w*s^2/z^2"}
-    strength = ("c_2", "c_0")
     signed = ("c_0",)
 
     def force(self, dz: Any, p: Any) -> Any:
-        return p.c_2 * dz * ca.fabs(dz) + p.c_0 * dz**2
+        return super().force(dz, p) + p.c_0 * dz**2
 
 
 class CubicDamping(Law):
@@ -235,7 +221,6 @@ class CubicDamping(Law):
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 3.3"
     sentence = "a damping force that grows with the cube of speed"
     units = {"c_3": "w*s^3/z^3"}
-    strength = ("c_3",)
 
     def force(self, dz: Any, p: Any) -> Any:
         return p.c_3 * dz**3

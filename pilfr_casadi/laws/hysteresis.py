@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -42,12 +42,10 @@ class StopHysteresis(Law):
     source = "Krikelis et al. (2024), Eq. 2 and 16"
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"w": "w/z", "r": "z"}
-    strength: ClassVar[tuple[str, ...]] = ("w",)
     dissipative = True
     n = memory = 6
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """Stops side by side."""
         following = [play(z, s[i], p["r"][i]) for i in range(self.n)]
         return sum(p["w"][i] * (z - q) for i, q in enumerate(following)), ca.vertcat(*following)
 
@@ -124,18 +122,12 @@ class GeneralizedHysteresis(PlayHysteresis):
     equation = "w = sum_i w_i play_{r_i}[u + a_2 u^2 + a_3 u^3] + b_2 u^2"
     source = "Al Janaideh, Rakheja & Su (2011), IEEE/ASME Trans. Mechatronics 16(4); Krikelis et al. (2024), Eq. 14"
     units = {"w": "w/z", "b_2": "w/z^2", "r": "z", "a_2": "1/z", "a_3": "1/z^2"}
-    strength = ("w", "b_2")
+    defaults = {"a_2": 0.0, "a_3": 0.0}  # the signal is straight at first
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """Plays of the bent signal."""
         bent = z + p["a_2"] * z**2 + p["a_3"] * z**3
         w, following = super().step(bent, s, p)
         return w + p["b_2"] * z**2, following
-
-    def parameters(self) -> dict[str, Parameter]:
-        """Parameters with start values and limits; the signal is straight at first."""
-        straight = replace(self, values={"a_2": 0.0, "a_3": 0.0, **self.values})
-        return super(GeneralizedHysteresis, straight).parameters()
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         for bend in (-0.2, 0.0, 0.2):
@@ -167,14 +159,12 @@ class SmoothHysteresis(Law):
     source = "Segalman (2005), J. Appl. Mech. 72(5); Krikelis et al. (2024), Eq. 26"
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"k_h": "w/z", "R": "z", "a": ""}
-    strength = ("k_h",)
     dissipative = True
     memory = NODES
     starts = {"R": ("half", 0.02, 0.06, 0.15, 0.4), "a": ("", 1.0)}
     ranges = {"R": ("half", 0.002, 2), "a": ("", 0.3, 12.0)}
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """Stops side by side."""
         share = [ca.exp((p["a"] - 1) * np.log(q) - p["a"] * q) * width for q, width in zip(Q, WIDTH, strict=True)]
         total = sum(share)
         following = [play(z, s[i], p["R"] * q) for i, q in enumerate(Q)]
@@ -197,7 +187,6 @@ class BoucWen(Law):
     source = "Wen (1976), J. Eng. Mech. 102(2); Ismail, Ikhouane & Rodellar (2009)"
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     units = {"k_h": "w/z", "q_0": "z", "s": "", "n": ""}
-    strength: ClassVar[tuple[str, ...]] = ("k_h",)
     dissipative = True
     order = 1
     starts = {"q_0": ("half", 0.03, 0.1, 0.3, 0.8), "s": ("", 0.5, 0.8), "n": ("", 1.0)}
@@ -217,7 +206,6 @@ class BoucWenActuator(BoucWen):
 
     equation = "w = b z + k_h q,  q+ = q + dz (1 - (1 - s + s sign(q dz)) |q/q_0|^n) at each step dz of z"
     units = {"b": "w/z", "k_h": "w/z", "q_0": "z", "s": "", "n": ""}
-    strength = ("b", "k_h")
     places = ("series",)
     dissipative = False
     order = 0
@@ -246,6 +234,5 @@ class Backlash(Law):
     ranges = {"r": ("half", 0.001, 0.9)}
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
-        """One play."""
         following = play(z, s, p["r"])
         return following - z, following

@@ -1,22 +1,19 @@
-"""Memoryless laws of the local coordinate: springs, contacts and gaps."""
+"""Memoryless forces of the local coordinate: springs, contacts, gaps, and forces that repeat with position."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from .base import Law, Local, beyond, grid
+from .base import Law, Local, beyond
+
+SEEN = 2.0  # number of periods within the motion from which a force counts as periodic
 
 
-def one_sided(local: Local) -> str:
-    """Give the reason why a law of both signs of z cannot be identified; empty if it can."""
-    return "" if local.low < -0.05 * local.reach and local.high > 0.05 * local.reach else "one side is never visited"
-
-
-def hardest(local: Local) -> tuple[float, float]:
+def _hardest(local: Local) -> tuple[float, float]:
     """Limit Hertz's strength so that its stiffness, pressed in by a tenth of the travel, is resolved by the steps."""
     k = local.stiffest / (1.5 * float(np.sqrt(0.2 * local.half)))
     return -k, k
@@ -30,7 +27,6 @@ class LinearStiffness(Law):
     source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
     sentence = "a spring (or a leak): a force in proportion to the deflection"
     units = {"k_1": "w/z"}
-    strength = ("k_1",)
     ranges = {"k_1": ("stiffest", -1.0, 1.0)}
 
     def force(self, z: Any, p: Any) -> Any:
@@ -45,7 +41,6 @@ class CubicStiffness(Law):
     source = "Kovacic & Brennan (2011), The Duffing Equation, ch. 1"
     sentence = "a stiffness that grows (or falls) with the square of the deflection, the same in both directions"
     units = {"k_3": "w/z^3"}
-    strength: ClassVar[tuple[str, ...]] = ("k_3",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_3 * z**3
@@ -57,7 +52,6 @@ class PowerStiffness(CubicStiffness):
     form = "power"
     equation = "w = k_n sign(z) |z|^n"
     units = {"k_n": "w/z^n", "n": ""}
-    strength = ("k_n",)
     starts = {"n": ("", 2.0, 2.5, 4.0)}
     ranges = {"n": ("", 1.7, 6.0)}
 
@@ -72,7 +66,6 @@ class GeometricStiffness(CubicStiffness):
     equation = "w = k z (1 - L / sqrt(L^2 + z^2))"
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 2.1"
     units = {"k": "w/z", "L": "z"}
-    strength = ("k",)
     restoring = True  # with either sign it could follow any curve together with a plain spring
     starts = {"L": ("reach", 0.15, 0.4, 1.0)}
     ranges = {"L": ("reach", 0.03, 3)}
@@ -87,14 +80,10 @@ class QuinticStiffness(CubicStiffness):
     form = "quintic"
     equation = "w = k_3 z^3 + k_5 z^5"
     units = {"k_3": "w/z^3", "k_5": "w/z^5"}
-    strength = ("k_3", "k_5")
+    two_sided = True  # on one side alone the powers follow any curve, such as contacts and weirs
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.k_3 * z**3 + p.k_5 * z**5
-
-    def applies(self, local: Local) -> str:
-        # on one side alone the powers follow any curve, such as contacts and weirs
-        return one_sided(local)
+        return super().force(z, p) + p.k_5 * z**5
 
 
 class QuadraticStiffness(Law):
@@ -105,7 +94,6 @@ class QuadraticStiffness(Law):
     source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 4.2"
     sentence = "a stiffness that changes in proportion to the deflection, so that it is stiffer in one direction"
     units = {"k_2": "w/z^2"}
-    strength = ("k_2",)
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_2 * z**2
@@ -116,21 +104,13 @@ class ProgressiveStiffness(QuadraticStiffness):
 
     form = "progressive"
     equation = "w = k_2 (z^2 + b z^3)"
-    source = "Nayfeh & Mook (1979), Nonlinear Oscillations, sec. 4.2"
     units = {"k_2": "w/z^2", "b": "1/z"}
+    two_sided = True
+    starts = {"b": lambda at: (-0.5 / at.reach, 0.5 / at.reach)}
+    ranges = {"b": lambda at: (-1 / at.reach, 1 / at.reach)}  # the cubic part stays below the quadratic one
 
     def force(self, z: Any, p: Any) -> Any:
-        return p.k_2 * z**2 * (1 + p.b * z)
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(b=np.array([-0.5, 0.5]) / local.reach)
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        # the cubic part stays below the quadratic one
-        return {"b": (-1 / local.reach, 1 / local.reach)}
-
-    def applies(self, local: Local) -> str:
-        return one_sided(local)
+        return super().force(z, p) * (1 + p.b * z)
 
 
 class PiecewiseStiffness(Law):
@@ -142,17 +122,14 @@ class PiecewiseStiffness(Law):
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
     sentence = "a contact: beyond a point of the travel another stiffness sets in"
     units = {"k_c": "w/z", "g": "z"}
-    strength = ("k_c",)
+    starts = {"g": lambda at: at.low + 2 * at.half * np.array([0.15, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])}
+    ranges = {
+        "g": lambda at: (at.low + 0.04 * at.half, at.high - 0.04 * at.half),
+        "k_c": ("stiffest", -1.0, 1.0),
+    }
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_c * ca.fmax(z - p.g, 0)
-
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        yield from grid(g=local.low + 2 * local.half * np.array([0.15, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        k = local.stiffest
-        return {"g": (local.low + 0.04 * local.half, local.high - 0.04 * local.half), "k_c": (-k, k)}
 
 
 class PiecewiseStiffnessBelow(PiecewiseStiffness):
@@ -172,13 +149,11 @@ class HertzContact(PiecewiseStiffness):
     equation = "w = k_c max(z - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
     units = {"k_c": "w/z^1.5", "g": "z"}
+    ranges = {**PiecewiseStiffness.ranges, "k_c": _hardest}
 
     def force(self, z: Any, p: Any) -> Any:
         depth = ca.fmax(z - p.g, 0)
         return p.k_c * depth * ca.sqrt(depth + 1e-300)
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {**super().bounds(local), "k_c": hardest(local)}
 
 
 class Clearance(Law):
@@ -190,15 +165,12 @@ class Clearance(Law):
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
     sentence = "a clearance: the spring carries load only beyond a gap on either side"
     units = {"k_g": "w/z", "g": "z"}
-    strength: ClassVar[tuple[str, ...]] = ("k_g",)
+    two_sided = True
     starts = {"g": ("reach", 0.03, 0.08, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8)}
     ranges = {"g": ("reach", 0.001, 0.97), "k_g": ("stiffest", -1.0, 1.0)}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_g * (ca.fmax(z - p.g, 0) - ca.fmax(-z - p.g, 0))
-
-    def applies(self, local: Local) -> str:
-        return one_sided(local)
 
 
 class SlackSpring(Clearance):
@@ -222,7 +194,6 @@ class SlackCoupling(SlackSpring):
         "a clearance in line with a coupling that is modelled: its spring k_g and damper c_g act only beyond a gap"
     )
     units = {"k_g": "w/z", "c_g": "w*s/z", "g": "z"}
-    strength = ("k_g", "c_g")
 
     def force(self, z: Any, dz: Any, p: Any) -> Any:  # type: ignore[override]
         return super().force(z, p) - p.c_g * dz * (1 - beyond(z, p.g))
@@ -239,13 +210,11 @@ class SoftClearance(Clearance):
     equation = "w = k_g sign(z) max(|z| - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
     units = {"k_g": "w/z^1.5", "g": "z"}
+    ranges = {**Clearance.ranges, "k_g": _hardest}
 
     def force(self, z: Any, p: Any) -> Any:
         above, below = ca.fmax(z - p.g, 0), ca.fmax(-z - p.g, 0)
         return p.k_g * (above * ca.sqrt(above + 1e-300) - below * ca.sqrt(below + 1e-300))
-
-    def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {**super().bounds(local), "k_g": hardest(local)}
 
 
 class OffCentreClearance(Clearance):
@@ -254,14 +223,54 @@ class OffCentreClearance(Clearance):
     form = "off-centre"
     equation = "w = k_g (z - clip(z, m - g, m + g))"
     units = {"k_g": "w/z", "g": "z", "m": "z"}
+    starts = {"g": ("half", 0.1, 0.3, 0.6), "m": lambda at: at.middle + at.half * np.array([-0.3, 0.0, 0.3])}
+    ranges = {"g": ("half", 1e-3, 1.0), "m": lambda at: (at.low, at.high), "k_g": ("stiffest", -1.0, 1.0)}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_g * (ca.fmax(z - p.m - p.g, 0) - ca.fmax(p.m - z - p.g, 0))
 
-    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        middle = (local.low + local.high) / 2
-        yield from grid(g=local.half * np.array([0.1, 0.3, 0.6]), m=middle + local.half * np.array([-0.3, 0.0, 0.3]))
+
+class PeriodicForce(Law):
+    """A force that repeats with position: cogging, ripple of a screw or gear (Hanselman 2006)."""
+
+    id = "periodic_force"
+    equation = "w = a sin(2 pi z / L) + b cos(2 pi z / L)"
+    source = "Hanselman (2006), Brushless Permanent Magnet Motor Design, sec. 8.3"
+    sentence = "a force that repeats with position, as from cogging or the pitch of a screw or gear"
+    units = {"a": "w", "b": "w", "L": "z"}
+    fewest = 1.5  # smallest number of periods within the motion that is tried
+    starts = {"L": lambda at: 2 * at.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 60.1, 1.0)])}
+
+    def force(self, z: Any, p: Any) -> Any:
+        angle = 2 * np.pi * z / p.L
+        return p.a * ca.sin(angle) + p.b * ca.cos(angle)
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        k = local.stiffest
-        return {"g": (1e-3 * local.half, local.half), "m": (local.low, local.high), "k_g": (-k, k)}
+        return {"L": (2 * local.half / 60, 2 * local.half / self.fewest)}
+
+    def doubtful(self, values: Mapping[str, Any]) -> bool:
+        """Tell whether the motion holds fewer than two periods, which could be any other curve."""
+        return bool(values["L"] > self.fewest / SEEN * self.parameters()["L"].bounds[1])
+
+
+class HarmonicForce(PeriodicForce):
+    """A force that repeats with position, its second harmonic included."""
+
+    form = "harmonics"
+    equation = "w = a sin(q) + b cos(q) + a_2 sin(2 q) + b_2 cos(2 q),  q = 2 pi z / L"
+    units = {"a": "w", "b": "w", "a_2": "w", "b_2": "w", "L": "z"}
+
+    def force(self, z: Any, p: Any) -> Any:
+        twice = 4 * np.pi * z / p.L
+        return super().force(z, p) + p.a_2 * ca.sin(twice) + p.b_2 * ca.cos(twice)
+
+
+class Ripple(PeriodicForce):
+    """An error that repeats with the signal itself: an encoder off centre, or its interpolation."""
+
+    form = "ripple"
+    source = "Heydemann (1981), Applied Optics 20(19)"
+    sentence = "an error that repeats with the signal itself, as from an encoder off centre or its interpolation"
+    places = ("sensor",)
+    fewest = 3.0
+    starts = {"L": lambda at: 2 * at.half / np.arange(3.0, 60.1, 1.0)}

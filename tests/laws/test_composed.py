@@ -10,6 +10,7 @@ from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
     CoulombFriction,
     CubicStiffness,
+    Drift,
     PreslidingFriction,
     Relaxation,
     Saturation,
@@ -124,6 +125,7 @@ def test_only_inputs_that_no_equation_reads_are_tried_as_scales():
         (lambda: scaled(Saturation, "voltage"), "stands in series"),
         (lambda: behind_gap(Relaxation), "states of its own"),
         (lambda: behind_gap(SoftClearance), "a gap of its own"),
+        (lambda: behind_gap(Drift), "reads more than z and dz"),
     ],
 )
 def test_what_cannot_be_composed_is_said(compose, sentence):

@@ -164,6 +164,21 @@ def test_what_moves_memory_twice_by_the_same_signal_changes_nothing():
             np.testing.assert_allclose(float(again[0]), float(first[0]), rtol=1e-9, atol=1e-12)
 
 
+def test_a_law_needs_no_more_than_its_units_starts_ranges_and_force():
+    class Magnet(laws.Law):
+        id, equation = "magnet", "w = c / (g - z)^2 + b z"
+        units = {"c": "w*z^2", "g": "z", "b": "w/z", "wide": "z"}
+        starts = {"g": ("high", 1.2, 3.0), "wide": lambda at: at.middle + at.half * np.array([0.1, 0.2])}
+        ranges = {"g": ("high", 1.05, 10.0), "wide": lambda at: (0.0, at.high)}
+
+    assert Magnet.strength == ("c", "b")
+    high, middle, half = LOCAL.high, LOCAL.middle, LOCAL.half
+    tried = [(g, wide) for g in (1.2 * high, 3.0 * high) for wide in (middle + half * 0.1, middle + half * 0.2)]
+    assert [(s["g"], s["wide"]) for s in Magnet().shapes(LOCAL)] == tried
+    assert Magnet().bounds(LOCAL) == {"g": (1.05 * high, 10.0 * high), "wide": (0.0, high)}
+    assert {k: float(p.value) for k, p in Magnet().parameters().items()} == {"c": 0.0, "g": 1.0, "b": 0.0, "wide": 1.0}
+
+
 def test_the_catalogue_has_no_law_twice():
     assert len({(kind.id, kind.form, kind.places) for kind in CATALOGUE}) == len(CATALOGUE)
     assert set(laws.__all__) >= {"CATALOGUE", "Law"}
