@@ -16,7 +16,8 @@ from pilfr_casadi import plots
 from pilfr_casadi.cli.demo import FLOOR, PUBLISHED, SETS
 from pilfr_casadi.identify import Fit
 from pilfr_casadi.linear import BLA, frequency_subspace, robust_bla
-from pilfr_casadi.models import play, stop
+from pilfr_casadi.models import generalized_play, play, stop
+from pilfr_casadi.plots.canvas import BLUE, VERMILLION, finish
 
 from .masing_data import FS, Benchmark, benchmark
 
@@ -64,6 +65,33 @@ def _of_loops(data: Benchmark) -> list[Claim]:
         Claim("Fig. 7", "frequency of the widest loop", "approximately 3 Hz", f"{widest:g} Hz"),
         Claim("Fig. 7", "width above 12 Hz over the widest", "almost insignificant", f"{100 * high:.1f} %"),
     ]
+
+
+def _draw_operators(r: float = 1.0, amplitude: float = 4.0, samples: int = 2000) -> Any:
+    """Draw stop, play and generalized play of threshold r from zero memory, over a fading swing, as Fig. 3."""
+    t = np.linspace(0.0, 1.0, samples)
+    u = amplitude * (1 - 0.75 * t) * np.sin(6 * np.pi * t)
+
+    def gamma_l(z: float) -> float:
+        return z / 2 + (z / 4) ** 3
+
+    def gamma_r(z: float) -> float:
+        return gamma_l(z) - 0.1
+
+    laws = {
+        "stop": lambda z, q: (stop(z, q, r), play(z, q, r)),
+        "play": lambda z, q: (play(z, q, r),) * 2,
+        "generalized play": lambda z, q: (generalized_play(z, q, r, gamma_l, gamma_r),) * 2,
+    }
+    figure = plots.new_figure(9.6, 3.4)
+    for ax, (name, law) in zip(figure.subplots(1, 3), laws.items(), strict=True):
+        q, v = 0.0, np.empty(samples)
+        for k, z in enumerate(u):
+            v[k], q = law(z, q)
+        ax.plot(u, v, color=BLUE, linewidth=1.4)
+        ax.plot(u[0], v[0], "o", color=VERMILLION, markersize=5, label="start")
+        finish(ax, "input u", "output", f"{name}, r = {r:g}")
+    return figure
 
 
 def _of_operators() -> list[Claim]:
@@ -138,7 +166,7 @@ def draw(seed: int, found: Mapping[str, Result], folder: Path) -> str:
     bla = robust_bla(data.steady)
     loops = {f"{f:g} Hz": (1e3 * x, force) for f in FREQUENCIES for x, force in [_cycle(data, f)]}
     figures: dict[str, Any] = {
-        "fig03_operators": plots.operators_demo(),
+        "fig03_operators": _draw_operators(),
         "fig07_loops": plots.loops(
             loops, "displacement of mass 1 [mm]", "spring force [N]", title="sweep, truth"
         ).figure,

@@ -11,6 +11,10 @@ from .._base.lazy import lazy_face
 if TYPE_CHECKING:
     from .canvas import new_figure as new_figure
     from .diagnosis import (
+        Signal as Signal,
+        force_cloud as force_cloud,
+        force_left as force_left,
+        force_time as force_time,
         mismatch_bands as mismatch_bands,
         mismatch_growth as mismatch_growth,
         mismatch_level as mismatch_level,
@@ -18,20 +22,21 @@ if TYPE_CHECKING:
         mismatch_time as mismatch_time,
         port_law_map as port_law_map,
     )
-    from .element import loading_curve as loading_curve, loop as loop, virgin_curve as virgin_curve, weights as weights
-    from .overview import convergence as convergence, plot_fit as plot_fit
-    from .proof import (
+    from .fits import (
+        convergence as convergence,
+        loading_curve as loading_curve,
+        loop as loop,
+        plot_fit as plot_fit,
+        virgin_curve as virgin_curve,
+        weights as weights,
+    )
+    from .signals import (
         Simulated as Simulated,
+        amplitude_density as amplitude_density,
+        as_scored as as_scored,
         compared_residuals as compared_residuals,
         compared_spectra as compared_spectra,
         compared_traces as compared_traces,
-        force_cloud as force_cloud,
-        force_left as force_left,
-        force_time as force_time,
-    )
-    from .signals import (
-        amplitude_density as amplitude_density,
-        as_scored as as_scored,
         linear_simulation as linear_simulation,
         output_over_input as output_over_input,
         remains as remains,
@@ -39,12 +44,11 @@ if TYPE_CHECKING:
         time as time,
         traces as traces,
     )
-    from .studies import (
+    from .statistics import (
         best_linear_approximation as best_linear_approximation,
         compared_spread as compared_spread,
         frequency_response as frequency_response,
         loops as loops,
-        operators_demo as operators_demo,
         spread as spread,
     )
 else:

@@ -100,15 +100,16 @@ def scaled(values: np.ndarray, unit: str = "") -> tuple[float, str]:
     return 10.0**exponent, f"{power} {unit}".strip()
 
 
+def scaled_axis(name: str, values: np.ndarray, unit: str = "") -> tuple[float, str]:
+    """Return the power of a thousand that values are divided by on an axis, and the label of that axis."""
+    size, unit = scaled(values, unit)
+    return size, with_unit(name, unit)
+
+
 def thin(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndarray, np.ndarray]:
     """Keep about `most` points that draw the same picture: the smallest and largest of each stretch, in their order.
 
-    Parameters
-    ----------
-    x, y : array, (M,)
-        A line with increasing x.
-    most : int
-        Points to keep; shorter lines come back unchanged. A stretch of gaps (nan) stays a gap.
+    x has to increase; shorter lines come back unchanged, and a stretch of gaps (nan) stays a gap.
     """
     if len(y) <= most:
         return x, y

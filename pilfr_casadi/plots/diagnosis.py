@@ -1,9 +1,10 @@
-"""Figures of a mismatch: over frequency, amplitude and time, and the error that each port and law leaves."""
+"""Figures of a diagnosis: the mismatch, the error that each port and law leaves, the hidden force beside the law."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,19 +20,22 @@ from .canvas import (
     VERMILLION,
     axes_or_new,
     finish,
+    line,
     new_figure,
     noise_line,
     plain,
     scaled,
+    scaled_axis,
     with_unit,
 )
 
+CLOUD_POINTS = 2500  # as many as can be told apart in a figure
 SHADES = "cividis"  # distinct for every kind of colour vision, and in grey
 
 
-def mismatch_map(found: Mapping[str, Any], unit: str = "", *, ax: Axes | None = None) -> Axes:
+def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
     """Draw the residual over frequency and amplitude (`diagnose.mismatch`), in % of the outputs' deviation."""
-    ax = axes_or_new(ax)
+    ax = axes_or_new(None)
     data, (size, label) = found["map"], _size(found, unit)
     edges, rms = np.asarray(data["edges"]) * size, 100 * _with_gaps(data["rms"])
     top = max(float(np.nanmax(rms, initial=0.0)), 1e-12)
@@ -72,9 +76,9 @@ def _with_gaps(values: Any) -> np.ndarray:
     return np.array(values, dtype=float)
 
 
-def mismatch_bands(found: Mapping[str, Any], *, ax: Axes | None = None) -> Axes:
+def mismatch_bands(found: Mapping[str, Any]) -> Axes:
     """Draw the residual in each band of frequency beside the noise floor; bands that hold most of it are filled."""
-    ax = axes_or_new(ax)
+    ax = axes_or_new(None)
     data = found["frequency"]
     low, high = np.asarray(data["low"], dtype=float), np.asarray(data["high"])
     low[0] = low[0] or high[0] / np.sqrt(2)
@@ -94,11 +98,9 @@ def mismatch_bands(found: Mapping[str, Any], *, ax: Axes | None = None) -> Axes:
     return finish(ax, "frequency [Hz]", "rms a band [% of deviation]", "over frequency")
 
 
-def mismatch_growth(
-    found: Mapping[str, Any], unit: str = "", *, kind: str = "amplitude", ax: Axes | None = None
-) -> Axes:
+def mismatch_growth(found: Mapping[str, Any], unit: str = "", kind: str = "amplitude") -> Axes:
     """Draw the residual over the `amplitude` or the `rate` of the output, beside an error in proportion."""
-    ax = axes_or_new(ax)
+    ax = axes_or_new(None)
     data, (size, label) = found[kind], _size(found, unit, kind)
     edges = np.asarray(data["edges"])
     middle = (edges[1:] + edges[:-1]) / 2
@@ -115,23 +117,21 @@ def mismatch_growth(
     return finish(ax, label, "residual [% of deviation]", f"over {kind}", 3)
 
 
-def mismatch_level(found: Mapping[str, Any], unit: str = "", *, ax: Axes | None = None) -> Axes:
+def mismatch_level(found: Mapping[str, Any], unit: str = "") -> Axes:
     """Draw the residual over the value of the output that shows most of it: one side may be worse."""
-    ax = axes_or_new(ax)
+    ax = axes_or_new(None)
     data = found["level"]
-    scale = found["scale"][data["output"]]
-    size, label = scaled(scale * np.asarray(data["edges"]), unit)
+    edges = found["scale"][data["output"]] * np.asarray(data["edges"])
+    size, across = scaled_axis(data["output"], edges, unit)
     rms = 100 * _with_gaps(data["rms"])
-    ax.stairs(
-        rms, scale * np.asarray(data["edges"]) / size, color=VERMILLION, linewidth=1.8, label="residual", baseline=None
-    )
+    ax.stairs(rms, edges / size, color=VERMILLION, linewidth=1.8, label="residual", baseline=None)
     noise_line(ax, 100 * found["floor"])
-    return finish(ax, with_unit(data["output"], label), "residual [% of deviation]", "over level")
+    return finish(ax, across, "residual [% of deviation]", "over level")
 
 
-def mismatch_time(found: Mapping[str, Any], *, ax: Axes | None = None) -> Axes:
+def mismatch_time(found: Mapping[str, Any]) -> Axes:
     """Draw residual and motion over the time of each recording, one after the other."""
-    ax = axes_or_new(ax)
+    ax = axes_or_new(None)
     at = 0.0
     for k, part in enumerate(found["time"]):
         t = np.asarray(part["t"])
@@ -237,3 +237,77 @@ def _frame(j: int, i: int) -> Any:
     from matplotlib.patches import Rectangle
 
     return Rectangle((j + 0.03, i + 0.05), 0.94, 0.9, fill=False, edgecolor=VERMILLION, linewidth=2.2, zorder=5)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Values (K,) with the name and unit that stand at their axis."""
+
+    name: str
+    values: np.ndarray
+    unit: str = ""
+
+
+def force_cloud(
+    x: Signal, force: Signal, law_x: np.ndarray, law: np.ndarray, *, title: str = "", name: str = "fitted law"
+) -> Axes:
+    """Draw a recovered force over a local signal as points, and the named law along the simulation as a line."""
+    ax = axes_or_new(None)
+    sx, sy, across, up = _cloud(ax, x, force, alpha=0.55, label="recovered from the recording")
+    if len(law):
+        ax.plot(law_x / sx, law / sy, color=VERMILLION, linewidth=0.9, alpha=0.9, label=plain(name), rasterized=True)
+    ax.set_ylim(*_span(force.values / sy, law / sy))
+    return finish(ax, across, up, title)
+
+
+def _cloud(ax: Axes, x: Signal, y: Signal, **style: Any) -> tuple[float, float, str, str]:
+    """Draw points; return the scale and the label of both axes."""
+    (sx, across), (sy, up) = (scaled_axis(v.name, v.values, v.unit) for v in (x, y))
+    every = max(len(x.values) // CLOUD_POINTS, 1)
+    ax.plot(x.values[::every] / sx, y.values[::every] / sy, ".", color=BLUE, markersize=2.6, rasterized=True, **style)
+    return sx, sy, across, up
+
+
+def force_time(t: np.ndarray, recovered: Signal, std: np.ndarray, law: np.ndarray, name: str = "law") -> Axes:
+    """Draw a recovered force over time with its uncertainty, around its largest value, and the law's force."""
+    ax, force = axes_or_new(None), recovered.values
+    size, up = scaled_axis(recovered.name, force, recovered.unit)
+    window = max(min(len(force), 400), len(force) // 12)
+    peak = int(np.argmax(np.abs(force)))
+    begin = int(np.clip(peak - window // 2, 0, len(force) - window))
+    part = slice(begin, begin + window)
+    low, high = (force - std)[part] / size, (force + std)[part] / size
+    ax.fill_between(t[part], low, high, color=BLUE, alpha=0.25, linewidth=0, label="± one standard deviation")
+    line(ax, t[part], force[part] / size, "recovered from the recording", BLUE, linewidth=1.6)
+    if len(law):
+        line(ax, t[part], law[: len(t)][part] / size, name, VERMILLION, linewidth=1.3)
+    ax.set_ylim(*_span(force[part] / size, law[: len(t)][part] / size))
+    ax.margins(x=0.01)
+    return finish(ax, "time [s]", up, "", 3)
+
+
+def force_left(x: Signal, left: Signal, std: np.ndarray) -> Axes:
+    """Draw the part of a recovered force that a law leaves, as points over the local coordinate, with the mean."""
+    ax = axes_or_new(None)
+    sx, sy, across, up = _cloud(ax, x, left, alpha=0.4)
+    edges = np.quantile(x.values, np.linspace(0, 1, 21))
+    index = np.clip(np.searchsorted(edges, x.values, side="right") - 1, 0, 19)
+    count = np.bincount(index, minlength=20)
+    known = count > 0
+    mean = np.bincount(index, left.values, minlength=20)[known] / count[known]
+    middle = np.bincount(index, x.values, minlength=20)[known] / count[known]
+    ax.plot(middle / sx, mean / sy, "o-", color=INK, linewidth=1.6, markersize=3.5, label="mean")
+    for side in (1, -1):
+        ax.axhline(side * float(np.median(std)) / sy, color=GREEN, linestyle="--", linewidth=1.3,
+                   label="± one standard deviation" if side > 0 else None)  # fmt: skip
+    ax.set_ylim(*_span(left.values / sy))
+    return finish(ax, across, up, "recovered − law")
+
+
+def _span(values: np.ndarray, law: np.ndarray | None = None) -> tuple[float, float]:
+    """Choose limits that a few stray points do not stretch, and that show the law whole."""
+    low, high = np.quantile(values[np.isfinite(values)], [0.001, 0.999])
+    if law is not None and np.any(np.isfinite(law)):
+        low, high = min(low, np.nanmin(law)), max(high, np.nanmax(law))
+    room = 0.08 * (high - low) or 1.0
+    return float(low - room), float(high + room)

@@ -1,6 +1,6 @@
-"""Figures of a recording beside its simulation: over time, over frequency, over an input.
+"""Figures of a recording beside its simulations: over time, over frequency, over an input.
 
-Krikelis et al. (2024), Fig. 9, 10 and 14.
+The first part draws a fit (Krikelis et al. 2024, Fig. 9, 10 and 14), the second simulations before and after a change.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from .canvas import (
     BLUE,
     GREEN,
     INK,
+    ORANGE,
     PURPLE,
     VERMILLION,
     axes_or_new,
@@ -32,6 +33,7 @@ from .canvas import (
     line,
     plain,
     scaled,
+    scaled_axis,
     with_unit,
 )
 
@@ -87,13 +89,13 @@ def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | N
     ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
     level = _level(y[recording.skip :])
     plain_unit = _unit(fit, recording, recording.outputs[output])
-    size, unit = scaled(y - level, plain_unit)
+    size, axis = scaled_axis(recording.outputs[output], y - level, plain_unit)
     what = "measured output" + (f" less its mean {level:.6g} {plain_unit}".rstrip() if level else "")
     line(ax, t, (y - level) / size, what, BLUE, linewidth=0.9)
     for label, residual, colour in _residuals(fit, recording, output):
         drawn, note = _without_offset(drawable(residual, np.ptp(y)), np.ptp(y), plain_unit)
         line(ax, t, drawn / size, label + note, colour, linewidth=1.1)
-    return _over_time(ax, recording, with_unit(recording.outputs[output], unit))
+    return _over_time(ax, recording, axis)
 
 
 def traces(
@@ -113,16 +115,16 @@ def traces(
             f"From {begin:g} to {end:g} s there are no two samples; the recording lasts {len(y) * recording.dt:g} s."
         )
     plain_unit = _unit(fit, recording, recording.outputs[output])
-    size, unit = scaled(y[part], plain_unit)
+    size, label = scaled_axis(recording.outputs[output], y[part], plain_unit)
     line(ax, recording.t[part], y[part] / size, "measured", BLUE, linewidth=3.2, alpha=0.55)
     models = [("this model", fit.simulate(recording), INK)]
     if _compares(fit):
         models.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
-    for label, simulated, colour in models:
+    for model, simulated, colour in models:
         error, note = _without_offset(drawable((simulated[:, output] - y), np.ptp(y)), np.ptp(y), plain_unit)
-        line(ax, recording.t[part], (y + error)[part] / size, label + note, colour)
+        line(ax, recording.t[part], (y + error)[part] / size, model + note, colour)
     ax.margins(x=0.01)
-    return finish(ax, "time [s]", with_unit(recording.outputs[output], unit), recording.name, 3)
+    return finish(ax, "time [s]", label, recording.name, 3)
 
 
 def busiest(y: np.ndarray, recording: Recording) -> tuple[float, float]:
@@ -143,14 +145,8 @@ def remains(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes 
     residual = drawable(fit.simulate(recording)[:, output] - y, np.ptp(y))
     size, unit = scaled(residual[np.isfinite(residual)], _unit(fit, recording, recording.outputs[output]))
     rms = float(np.sqrt(np.mean((residual[recording.skip :] / size) ** 2)))
-    line(
-        ax,
-        recording.t,
-        residual / size,
-        f"residual, this model (rms {rms:.3g} {unit}".rstrip() + ")",
-        INK,
-        linewidth=0.8,
-    )
+    label = f"residual, this model (rms {rms:.3g} {unit}".rstrip() + ")"
+    line(ax, recording.t, residual / size, label, INK, linewidth=0.8)
     return _over_time(ax, recording, with_unit(f"simulated − measured {recording.outputs[output]}", unit))
 
 
@@ -161,12 +157,12 @@ def output_over_input(
     ax, u, y = axes_or_new(ax), _column(recording.u, input, "input"), _column(recording.y, output, "output")
     name, simulated = recording.outputs[output], fit.simulate(recording)[:, output]
     u, y, simulated = (column[as_scored(fit, recording).skip :] for column in (u, y, simulated))
-    size, unit = scaled(y, _unit(fit, recording, name))
+    size, up = scaled_axis(name, y, _unit(fit, recording, name))
     error, note = _without_offset(drawable(simulated - y, np.ptp(y)), np.ptp(y), _unit(fit, recording, name))
     ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
     ax.plot(u, (y + error) / size, color=INK, linewidth=0.5, label=plain(f"this model{note}"), rasterized=True)
     across = recording.inputs[input]
-    return finish(ax, with_unit(across, _unit(fit, recording, across)), with_unit(name, unit), recording.name)
+    return finish(ax, with_unit(across, _unit(fit, recording, across)), up, recording.name)
 
 
 def spectrum(
@@ -182,25 +178,15 @@ def spectrum(
     All lines are densities (per root hertz) of the signals as recorded, so records of any length and levels from
     periods can be compared: a residual that lies on the noise line cannot be improved.
 
-    Parameters
-    ----------
-    fit, recording, output
-        Model, data and index of the output. A recording with a period is transformed period by period after its `skip`,
-        any other in overlapping windowed stretches.
-    steady : sequence of Recording, optional
-        Periodic steady-state recordings of the same signals under the same kind of input, one for each realization. The
-        noise level is estimated from several periods, the total distortion (noise and nonlinear distortion) from
-        several realizations. By default `recording` itself, if it is periodic.
-    ax : Axes, optional
-        Where to draw.
+    A recording with a period is transformed period by period after its `skip`, any other in overlapping windowed
+    stretches. Levels come from `steady`: periodic steady-state recordings of the same signals under the same kind of
+    input, one for each realization; by default from `recording` itself, if it is periodic. The noise level is estimated
+    from several periods, the total distortion (noise and nonlinear distortion) from several realizations.
     """
     ax, y = axes_or_new(ax), _column(recording.y, output, "output")
     name = recording.outputs[output]
     curves: list[np.ndarray] = []
-    for label, signal, colour in [
-        ("measured output", y, BLUE),
-        *_residuals(fit, recording, output),
-    ]:
+    for label, signal, colour in [("measured output", y, BLUE), *_residuals(fit, recording, output)]:
         f, power = amplitude_density(signal, recording)
         curves.append(decibel(power))
         line(ax, f, curves[-1], label, colour, linewidth=1.1)
@@ -252,13 +238,7 @@ def _levels(periodic: Sequence[Recording], output: int) -> list[tuple[str, np.nd
 
 
 def linear_simulation(fit: PlottedFit, recording: Recording) -> np.ndarray:
-    """Simulate the linear model that the fit began with from its own initial state: outputs (M, n_y).
-
-    Raises
-    ------
-    InputError
-        If the fit holds no linear model.
-    """
+    """Simulate the linear model that the fit began with from its own initial state: outputs (M, n_y)."""
     if fit.linear is None:
         raise InputError("The fit holds no linear model to compare with.")
     given = not isinstance(recording.initial, str)
@@ -327,3 +307,78 @@ def _labelled_residual(model: str, recording: Recording, simulated: np.ndarray, 
 
 def _unit(fit: PlottedFit, recording: Recording, name: str) -> str:
     return recording.units.get(name, fit.units.get(name, ""))
+
+
+Simulated = list[tuple[str, np.ndarray | None]]  # (label, outputs (M, n_y)), before first, after last
+SIMULATED_COLOURS = (ORANGE, INK)
+
+
+def compared_traces(
+    r: Recording, simulated: Simulated, output: int = 0, unit: str = "", *, quiet: bool = False, ax: Axes | None = None
+) -> Axes:
+    """Draw measured output and simulations, a few swings around the largest one, or in a `quiet` stretch."""
+    ax = axes_or_new(ax)
+    y = r.y[:, output]
+    begin, end = busiest(y - np.mean(y), r)
+    first = round(begin / r.dt)
+    part = slice(first, max(round(end / r.dt), first + 2))
+    part = _quiet(y, part.stop - part.start, r.skip) if quiet else part
+    size, up = scaled_axis(r.outputs[output], y[part], unit)
+    line(ax, r.t[part], y[part] / size, "measured", BLUE, linewidth=4.0, alpha=0.45)
+    for (label, values), colour in zip(simulated, SIMULATED_COLOURS, strict=False):
+        if values is not None:
+            line(ax, r.t[part], drawable(values[part, output], np.ptp(y)) / size, label, colour, linewidth=1.4)
+    ax.margins(x=0.01)
+    return finish(ax, "time [s]", up, r.name, 3)
+
+
+def _quiet(y: np.ndarray, length: int, skip: int) -> slice:
+    """Select a stretch with less motion than three quarters of all."""
+    length = min(length, max((len(y) - skip) // 6, 2))
+    starts = np.arange(skip, len(y) - length + 1, max(length // 4, 1))
+    motion = np.array([np.std(y[a : a + length]) for a in starts])
+    a = int(starts[np.argsort(motion)[len(starts) // 4]])
+    return slice(a, a + length)
+
+
+def compared_residuals(
+    r: Recording, simulated: Simulated, output: int, unit: str, floor: float, ax: Axes | None = None
+) -> Axes:
+    """Draw the residuals of simulations over the whole recording; `floor` is the deviation of the noise."""
+    ax = axes_or_new(ax)
+    y = r.y[:, output]
+    kept: list[tuple[str, np.ndarray, Any]] = [
+        (label, drawable(v[:, output] - y, np.ptp(y)), colour)
+        for (label, v), colour in zip(simulated, SIMULATED_COLOURS, strict=False)
+        if v is not None
+    ]
+    size, up = scaled_axis(f"simulated − measured {r.outputs[output]}", np.nan_to_num(kept[0][1]) if kept else y, unit)
+    for label, e, colour in kept:
+        line(ax, r.t, e / size, label, colour, linewidth=0.8)
+    if floor > 0:
+        for side in (2 * floor, -2 * floor):
+            ax.axhline(side / size, color=GREEN, linewidth=1.2, linestyle="--", label="± 2 noise" if side > 0 else None)
+    ax.margins(x=0.01)
+    return finish(ax, "time [s]", up, r.name, 3)
+
+
+def compared_spectra(r: Recording, simulated: Simulated, output: int, unit: str, floor: float) -> Axes:
+    """Draw amplitude densities of the output, of each residual, and of white noise of deviation `floor`."""
+    ax = axes_or_new(None)
+    y, curves = r.y[:, output], []
+    signals = [("measured", y, BLUE)]
+    for (label, v), colour in zip(simulated, SIMULATED_COLOURS, strict=False):
+        if v is not None:
+            signals.append((f"left {label}", v[:, output] - y, colour))
+    f = np.array([0.1, 1.0])
+    for label, signal, colour in signals:
+        f, power = amplitude_density(signal, r)
+        curves.append(decibel(power))
+        line(ax, f, curves[-1], label, colour, linewidth=1.2)
+    if floor > 0:
+        level = np.full(2, 10 * np.log10(2 * r.dt * floor**2))
+        curves.append(level)
+        line(ax, f[[0, -1]], level, "noise floor (white)", GREEN, linestyle="--", linewidth=1.5)
+    ax.set_xscale("log")
+    limit_depth(ax, *curves)
+    return finish(ax, "frequency [Hz]", f"{r.outputs[output]} [dB re {unit or '1'}/√Hz]", r.name)

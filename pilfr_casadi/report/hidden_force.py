@@ -17,6 +17,7 @@ from .._base import InputError
 from ..data import Recording
 from ..diagnose import Constant, Fitted, Workbench
 from ..models import Model, ParameterSet, map_points
+from ..plots import Signal
 from ..simulators import ClosedEquations, Instant, Simulator, discretise, on_grid, signals, states_along
 from .page import Block, Picture, Text
 from .smoother import UnknownForce
@@ -270,35 +271,29 @@ class _Drawing:
     def pictures(self) -> list[Block]:
         """Draw the force over its local coordinate, rate and time, and the part that the law leaves."""
         h, alt = self.hidden, f"Recovered force at {self.hidden.port}"
-        cloud = self._cloud(h.z, h.force, h.law_z, h.law)
-        out: list[Block] = [Picture(cloud, f"{h.port}, over {self.across}.", f"{alt} over its local coordinate.")]
+        x, force = Signal(self.across, h.z, self.across_unit), Signal(self.label, h.force, self.unit)
+        drawn = [(x, force, h.law_z, h.law, f"{h.port}, over {self.across}.", f"{alt} over its local coordinate.")]
         if np.ptp(h.dz) > 0:
-            rate_unit = f"{self.across_unit}/s" if self.across_unit else ""
-            cloud = self._cloud(h.dz, h.force, h.law_dz, h.law, across=f"rate of {self.across}", across_unit=rate_unit)
-            out.append(Picture(cloud, "The same force over the rate.", f"{alt} over its rate."))
+            rate = Signal(f"rate of {self.across}", h.dz, f"{self.across_unit}/s" if self.across_unit else "")
+            drawn.append((rate, force, h.law_dz, h.law, "The same force over the rate.", f"{alt} over its rate."))
         elif self.series and len(h.law):  # a law in series: its output over its input
-            label, unit = f"{self.across} as it acts", self.across_unit
-            cloud = self._cloud(h.z, h.z + h.force, h.law_z, h.law_z + h.law, label=label, unit=unit)
-            out.append(
-                Picture(cloud, "The signal behind the law over the signal before it.", f"{alt}: output over input.")
+            acting = Signal(f"{self.across} as it acts", h.z + h.force, self.across_unit)
+            caption = "The signal behind the law over the signal before it."
+            drawn.append((x, acting, h.law_z, h.law_z + h.law, caption, f"{alt}: output over input."))
+        out: list[Block] = [
+            Picture(
+                plots.force_cloud(x, y, law_x, law, title=h.port, name=self.name).figure,
+                caption,
+                text,
             )
-        over = plots.force_time(h.t, h.force, h.std, h.law, label=self.label, unit=self.unit, name=self.name)
+            for x, y, law_x, law, caption, text in drawn
+        ]
+        over = plots.force_time(h.t, force, h.std, h.law, self.name)
         caption = "The same force over time, around its largest value. The band is the uncertainty due to noise."
         out.append(Picture(over.figure, caption, f"{alt} over time."))
         if len(h.law):
-            left = plots.force_left(
-                h.z, h.force - h.law_held, h.std, across=self.across, label="recovered − law", unit=self.unit,
-                across_unit=self.across_unit,
-            )  # fmt: skip
+            rest = Signal("recovered − law", h.force - h.law_held, self.unit)
+            left = plots.force_left(x, rest, h.std)
             caption = "The recovered force minus the law. Where the mean bends away from zero, the law's form is wrong."
             out.append(Picture(left.figure, caption, f"{alt} without the law."))
         return out
-
-    def _cloud(self, x: np.ndarray, force: np.ndarray, law_x: np.ndarray, law: np.ndarray, **axes: str) -> Any:
-        known: dict[str, Any] = {
-            "across": self.across,
-            "label": self.label,
-            "unit": self.unit,
-            "across_unit": self.across_unit,
-        }
-        return plots.force_cloud(x, force, law_x, law, title=self.hidden.port, name=self.name, **(known | axes)).figure

@@ -387,11 +387,6 @@ def test_studies(fitted):
     assert [ax.get_title(loc="left") for ax in figure.axes] == ["training", "test"]
     assert len(figure.legends) == 1
     pixels(figure)
-    figure = plots.operators_demo()
-    assert len(figure.axes) == 3
-    stop = figure.axes[0].get_lines()[0].get_ydata()
-    assert (stop.min(), stop.max()) == (-1, 1)
-    pixels(figure)
 
 
 @pytest.mark.parametrize(

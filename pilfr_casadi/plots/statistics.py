@@ -1,6 +1,6 @@
-"""Figures of data and studies: best linear approximation, loops at several frequencies, operators, spread of fits.
+"""Figures of what many records or fits say: best linear approximation, loops at several frequencies, spread of fits.
 
-Krikelis et al. (2024), Fig. 3 (operators), 7 (loops), 8 and 13 (best linear approximation), 11 (spread over starts).
+Krikelis et al. (2024), Fig. 7 (loops), 8 and 13 (best linear approximation), 11 (spread over starts).
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from .._base import InputError
-from ..linear import BLA
-from ..models import Model, generalized_play, play, stop
+from ..linear import BLA, resolvent
+from ..models import Model
 from .canvas import (
     BLUE,
     FONT,
     GREEN,
     INK,
+    MOST_POINTS,
     ORANGE,
     PURPLE,
     VERMILLION,
@@ -39,17 +40,9 @@ def best_linear_approximation(
 ) -> Axes:
     """Draw magnitudes of the BLA and a model, their difference, and the estimate's deviations, as Fig. 8.
 
-    Parameters
-    ----------
-    bla : BLA
-        From `robust_bla` or `plain_bla`. Its deviations are those of the mean over realizations: a model whose error is
-        the total deviation is as good as the data can show.
-    model : Model, control.StateSpace or complex array (F, n_y, n_u), optional
-        A linear model (without an element), or its response at `bla.frequency`.
-    output, input : int
-        Which pair of signals.
-    unit : str
-        Output unit per input unit.
+    `model` is linear (a `Model` without an element, or a `control.StateSpace`), or a response at `bla.frequency`,
+    (F, n_y, n_u). The deviations are those of the mean over realizations: a model whose error is the total deviation is
+    as good as the data can show. `unit` is the output's unit per input unit.
     """
     ax = axes_or_new(ax)
     f, G = bla.frequency, bla.G[:, output, input]
@@ -73,13 +66,7 @@ def best_linear_approximation(
 
 
 def frequency_response(model: Any, frequency: np.ndarray, dt: float) -> np.ndarray:
-    """Return the response `C (e^{jω dt} I - A)⁻¹ B + D` of a discrete-time linear model, (F, n_y, n_u), at (F,) Hz.
-
-    Raises
-    ------
-    InputError
-        If the model is not linear or its response has another shape.
-    """
+    """Return the response `C (e^{jω dt} I - A)⁻¹ B + D` of a discrete-time linear model, (F, n_y, n_u), at (F,) Hz."""
     if isinstance(model, Model):
         names = ("A", "B_u", "C_y", "D_yu")
         if model.element is not None or not set(names) <= set(model.parameters):
@@ -92,8 +79,7 @@ def frequency_response(model: Any, frequency: np.ndarray, dt: float) -> np.ndarr
         if response.ndim != 3 or len(response) != len(frequency):
             raise InputError(f"A response of shape {response.shape} was given; expected ({len(frequency)}, n_y, n_u).")
         return response
-    shift = np.exp(2j * np.pi * np.asarray(frequency) * dt)[:, None, None] * np.eye(len(a))
-    return c @ np.linalg.solve(shift - a, np.broadcast_to(b, (len(frequency), *b.shape))) + d
+    return resolvent(a, c, np.exp(2j * np.pi * np.asarray(frequency) * dt)) @ b + d
 
 
 def loops(
@@ -101,21 +87,15 @@ def loops(
 ) -> Axes:
     """Draw loops of one signal over another, for example at several frequencies, dark to light, as Fig. 7.
 
-    Parameters
-    ----------
-    curves : mapping
-        Label to (x, y), each (M,).
-    x, y : str
-        Axis labels with units.
+    `curves` maps labels to (x, y), each (M,); `x` and `y` are axis labels with units.
     """
     from matplotlib import colormaps
 
     ax = axes_or_new(ax)
     for k, (label, (horizontal, vertical)) in enumerate(curves.items()):
         colour = colormaps["viridis"](0.88 * k / max(len(curves) - 1, 1))
-        ax.plot(
-            horizontal, vertical, color=colour, linewidth=1.3, label=plain(label), rasterized=len(horizontal) > 2000
-        )
+        dense = len(horizontal) > MOST_POINTS
+        ax.plot(horizontal, vertical, color=colour, linewidth=1.3, label=plain(label), rasterized=dense)
     return finish(ax, x, y, title, 3)
 
 
@@ -132,16 +112,8 @@ def spread(
 ) -> Axes:
     """Draw box plots of the errors of many fits, as Fig. 11: median, quartiles, whiskers to 1.5 box heights, crosses.
 
-    Parameters
-    ----------
-    errors : mapping
-        Label of the group to its errors; infinite ones (no model, or one that ran away) are counted, not drawn.
-    y, x, title : str
-        Axis labels and title.
-    published : mapping, optional
-        Reference value by group, drawn as a diamond and called `source` in the legend.
-    floor : float, optional
-        Noise floor, drawn as a line.
+    `errors` maps the label of a group to its errors; infinite ones (no model, or one that ran away) are counted, not
+    drawn. `published` has a reference value by group, drawn as a diamond and called `source`; `floor` is a line.
     """
     ax = axes_or_new(ax)
     groups = [np.asarray(e, dtype=float).ravel() for e in errors.values()]
@@ -160,14 +132,8 @@ def spread(
     ax.plot([], [], color=VERMILLION, linewidth=2, label="median; box: quartiles")
     if published:
         at = {name: k for k, name in enumerate(errors)}
-        ax.plot(
-            [at[n] for n in published if n in at],
-            [v for n, v in published.items() if n in at],
-            "D",
-            color=INK,
-            markersize=6,
-            label=plain(source),
-        )
+        known = {at[name]: value for name, value in published.items() if name in at}
+        ax.plot(list(known), list(known.values()), "D", color=INK, markersize=6, label=plain(source))
     noise_line(ax, floor or 0.0)
     ax.set_yscale("log")
     ax.set_xticks(range(len(groups)), [plain(name) for name in errors])
@@ -189,33 +155,6 @@ def _crowded(labels: Iterable[str]) -> bool:
     """Tell whether labels side by side, half an inch each, would overlap."""
     longest = [max(map(len, label.split("\n"))) for label in labels]
     return len(longest) > 3 and max(longest, default=0) > 6
-
-
-def operators_demo(r: float = 1.0, amplitude: float = 4.0, samples: int = 2000) -> Figure:
-    """Draw stop, play and generalized play of threshold r from zero memory, over a fading swing, as Fig. 3."""
-    t = np.linspace(0.0, 1.0, samples)
-    u = amplitude * (1 - 0.75 * t) * np.sin(6 * np.pi * t)
-
-    def gamma_l(z: float) -> float:
-        return z / 2 + (z / 4) ** 3
-
-    def gamma_r(z: float) -> float:
-        return gamma_l(z) - 0.1
-
-    laws = {
-        "stop": lambda z, q: (stop(z, q, r), play(z, q, r)),
-        "play": lambda z, q: (play(z, q, r),) * 2,
-        "generalized play": lambda z, q: (generalized_play(z, q, r, gamma_l, gamma_r),) * 2,
-    }
-    figure = new_figure(9.6, 3.4)
-    for ax, (name, law) in zip(figure.subplots(1, 3), laws.items(), strict=True):
-        q, v = 0.0, np.empty(samples)
-        for k, z in enumerate(u):
-            v[k], q = law(z, q)
-        ax.plot(u, v, color=BLUE, linewidth=1.4)
-        ax.plot(u[0], v[0], "o", color=VERMILLION, markersize=5, label="start")
-        finish(ax, "input u", "output", f"{name}, r = {r:g}")
-    return figure
 
 
 def compared_spread(

@@ -1,4 +1,4 @@
-"""Figures of the identified element: its loop, its loading curve, its weights over thresholds.
+"""Figures of a fit: its element (loop, loading curve, weights over thresholds), its convergence, all in one figure.
 
 Krikelis et al. (2024), Eq. 16 and Fig. 15.
 """
@@ -9,13 +9,16 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from .._base import InputError
 from ..data import Recording, as_recordings
 from ..models import weight_density
-from .canvas import BLUE, INK, SKY, VERMILLION, axes_or_new, finish, with_unit
-from .signals import PlottedFit, as_scored
+from ..optimise import Iteration
+from .canvas import BLUE, GREY, INK, SKY, VERMILLION, axes_or_new, finish, new_figure, with_unit
+from .signals import PlottedFit, as_scored, spectrum, time
 
+Records = Recording | Sequence[Recording]
 Curve = Callable[[np.ndarray], np.ndarray]
 FEWEST_FOR_DENSITY = 4  # operators in use; the weights of fewer do not sample a density
 
@@ -44,7 +47,7 @@ def loop(
 
 def loading_curve(
     fit: PlottedFit,
-    recordings: Recording | Sequence[Recording] | None = None,
+    recordings: Records | None = None,
     *,
     channel: int = 0,
     reference: Curve | None = None,
@@ -78,7 +81,7 @@ def virgin_curve(fit: PlottedFit, z: np.ndarray, channel: int = 0) -> np.ndarray
 
 def weights(
     fit: PlottedFit,
-    recordings: Recording | Sequence[Recording] | None = None,
+    recordings: Records | None = None,
     *,
     channel: int = 0,
     reference: Curve | None = None,
@@ -153,14 +156,61 @@ def _label(fit: PlottedFit, signal: str, channel: int, name: str = "") -> str:
     return f"{name} (model scale)"
 
 
-def _reach(fit: PlottedFit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:
+def _reach(fit: PlottedFit, recordings: Records | None, channel: int) -> float:
     records = () if recordings is None else as_recordings(recordings)
     return max((float(np.nanmax(np.abs(fit.signals(r)["z"][:, channel]))) for r in records), default=0.0)
 
 
-def _range(fit: PlottedFit, recordings: Recording | Sequence[Recording] | None, channel: int) -> float:
+def _range(fit: PlottedFit, recordings: Records | None, channel: int) -> float:
     """Choose how far an element is drawn: the visited range, and thresholds that lie not far beyond."""
     reach, r = _reach(fit, recordings, channel), fit.parameters.get("r")
     far = 0.0 if r is None else float(np.max(r[channel]))
     limit = 1.05 * (max(reach, min(far, 1.5 * reach)) if reach else far)
     return limit if limit > 0 and np.isfinite(limit) else 1.0
+
+
+def plot_fit(fit: PlottedFit, recordings: Records, *, steady: Sequence[Recording] | None = None) -> Figure:
+    """Draw a fit in one figure: time and spectrum of every output, loop, loading curve and weights of every channel.
+
+    Without hysteresis: convergence, beside the curve of an element of one channel.
+
+    Noise and distortion levels are estimated from `steady`; see `spectrum`.
+    """
+    records = as_recordings(recordings)
+    rows = [(r, i) for r in records for i in range(r.n_y)]
+    channels, curve = fit.model.n_w if fit.model.n_s else 0, fit.model.n_w == 1 and not fit.model.n_s
+    figure = new_figure(11.0, 3.4 * (len(rows) + channels + (not channels)))
+    grid = figure.add_gridspec(len(rows) + max(channels, 1), 6)
+    for k, (r, i) in enumerate(rows):
+        time(fit, r, output=i, ax=figure.add_subplot(grid[k, :3]))
+        spectrum(fit, r, output=i, steady=steady, ax=figure.add_subplot(grid[k, 3:]))
+    for c in range(channels):
+        row = len(rows) + c
+        loop(fit, records[0], channel=c, ax=figure.add_subplot(grid[row, :2]))
+        loading_curve(fit, records, channel=c, ax=figure.add_subplot(grid[row, 2:4]))
+        if {"w", "r"} <= set(fit.parameters):
+            weights(fit, records, channel=c, ax=figure.add_subplot(grid[row, 4:]))
+    if not channels:
+        convergence(fit, ax=figure.add_subplot(grid[len(rows), 2 * curve :]))
+    if curve:
+        loop(fit, records[0], ax=figure.add_subplot(grid[len(rows), :2]))
+    return figure
+
+
+def convergence(fit: PlottedFit, *, ax: Axes | None = None) -> Axes:
+    """Draw the training error over iterations, of every start and of the winning solve."""
+    ax = axes_or_new(ax)
+    starts = [c.solution.history for c in fit.candidates if c.solution.history]
+    for k, history in enumerate(starts):
+        label = "starts" if k == 0 else None
+        ax.plot(*_training_errors(history), color=GREY, linewidth=0.9, alpha=0.7, label=label)
+    if fit.solution.history:
+        label = "last solve of the best"
+        ax.plot(*_training_errors(fit.solution.history), color=VERMILLION, linewidth=2.0, label=label)
+    ax.set_yscale("log")
+    return finish(ax, "iteration", "training error √(2 · cost)", "convergence")
+
+
+def _training_errors(history: Sequence[Iteration]) -> tuple[list[int], np.ndarray]:
+    """Return the numbers and errors of the iterations."""
+    return [h.number for h in history], np.sqrt(2 * np.maximum([h.cost for h in history], 0.0))
