@@ -79,12 +79,18 @@ def noise_table(data: Sequence[Sequence[Recording]]) -> list[str]:
 
 
 def improved(
-    structure: PILFR, values: dict[str, Any], train: Sequence[Recording], options: dict[str, Any], iterations: int
+    structure: PILFR,
+    values: dict[str, Any],
+    train: Sequence[Recording],
+    options: dict[str, Any],
+    iterations: int,
+    threads: int,
 ) -> dict[str, Any]:
     """Values after some iterations over some of the recordings, without what a `Fit` brings."""
     first = train[0]
     model = structure.model(3, 3, values, inputs=first.inputs, outputs=first.outputs)
     problem = Problem(model, train, constraints=[stable(RADIUS)], **options)
+    problem.threads = threads
     solution = GaussNewton(max_iterations=iterations, tolerance=1e-3, damping=1e-3).solve(problem)
     return {k: p.value for k, p in model.parameters.at(problem.parameters(solution.theta)).items()}
 
@@ -109,7 +115,7 @@ class Mirror:
         """Training recordings of these realizations, and options with their weights."""
         chosen = [self.train[level][r] for level in range(len(LEVELS)) for r in realizations]
         weights = [self.weights[level][r] for level in range(len(LEVELS)) for r in realizations]
-        return chosen, {"weights": weights, "threads": self.threads}
+        return chosen, {"weights": weights}
 
     def linear_errors(self, family: Any, theta: np.ndarray, levels: Sequence[int]) -> list[float]:
         """Errors of the linear family on the held-back realizations."""
@@ -166,7 +172,7 @@ def run(
 
 def hysteretic(mirror: Mirror, structure: PILFR, values: dict[str, Any], steps: tuple[int, int]) -> Fit:
     """A model fitted to some of the realizations first, then to all."""
-    values = improved(structure, values, *mirror.chosen((0, 4)), steps[0])
+    values = improved(structure, values, *mirror.chosen((0, 4)), steps[0], mirror.threads)
     train, options = mirror.chosen(range(len(TRAINING)))
     solver = GaussNewton(max_iterations=steps[1], tolerance=1e-3, damping=1e-3)
     fixed = {"weights": options["weights"], "workers": mirror.threads}

@@ -114,7 +114,7 @@ def growth(folder: Path, samples: int) -> Figures:
 def one_start(folder: Path, engine: str) -> Figures:
     """One start run to the end, as the pipeline would: with its constraints, code generation and building included."""
     from pilfr_casadi.optimise import GaussNewton, Problem
-    from pilfr_casadi.optimise.spectral_radius import stability
+    from pilfr_casadi.optimise.constraints import stability
 
     model = load(folder, "vm", 200).model
     record = load(folder, "vm").recordings

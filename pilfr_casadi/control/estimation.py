@@ -4,7 +4,7 @@ With `F(x, u) = (f, h)`, `C = ∂h/∂x` at the prediction and `A = ∂f/∂x` a
 
     x̂ = x + K (y - h(x, u)),   x⁺ = f(x̂, u),   P⁺ = A P̂ A' + Q,
 
-with the gain K and the covariance P̂ of `simulators.measurement_update`. The Jacobian of min and max is that of the
+with the gain K and the covariance P̂ of `linear.measurement_update`. The Jacobian of min and max is that of the
 active branch, so the filter switches with the operators: a play that sticks keeps the variance of its memory, one that
 slips takes over the variance of the signal that drives it. Memory has process noise, because a filter that has become
 sure of it would stop correcting it. Anderson & Moore (1979), Optimal Filtering, Sec. 8.2. An unscented filter predicts
@@ -23,7 +23,8 @@ from .._base import LARGEST, InputError, numbers
 from ..data import Recording
 from ..export import Exported, exported
 from ..identify import Fit
-from ..simulators import Simulator, measurement_update
+from ..linear import measurement_update
+from ..simulators import Simulator
 
 Array = np.ndarray
 SAME_STEP = 1e-4  # relative difference up to which two sampling intervals are the same

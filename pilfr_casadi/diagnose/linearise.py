@@ -21,8 +21,9 @@ import numpy as np
 
 from .._base import one_at_a_time
 from ..laws import Law, Local
+from ..linear import steady_state_gain, with_output_injection
 from ..models import Model, map_points
-from ..simulators import Simulator, discretise, signals, states_along, steady_state_gain, with_output_injection
+from ..simulators import Simulator, discretise, signals, states_along
 from .workbench import FINER, Fitted, Workbench
 
 WALL = 1.0  # largest |λ| h of a contact on the finest steps

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..data import Recording, nrmse
 from ..engine import Engine, make_engine
-from ..models import Model, ParameterSet
+from ..models import Model
 from ..optimise import first_state, samples_for_state
 from ..simulators import Simulator
 from .floor import effective_size
@@ -139,7 +139,7 @@ def parameter_table(
 ) -> dict[str, dict[str, Any]]:
     """Nominal, refitted without and with the effects, for diagnosis.json."""
     out = {}
-    for name, p in ParameterSet(dict(simulator.parameters)).items():
+    for name, p in simulator.parameter_set.items():
         error = np.asarray(std.get(name, np.nan))
         out[name] = {
             "nominal": p.value,

@@ -12,10 +12,10 @@ from .._base import InputError, one_at_a_time
 from ..data import Recording
 from ..engine import Engine, make_engine
 from ..identify import FitContext, match_channels, solve_within_bounds
-from ..models import Model, ParameterSet
+from ..linear import INJECTION, with_output_injection
+from ..models import Model
 from ..optimise import GaussNewton, Problem, Status
 from ..simulators import (
-    INJECTION,
     LARGEST_STEP,
     MOST_SUBSTEPS,
     Simulator,
@@ -25,7 +25,6 @@ from ..simulators import (
     growth_rate,
     needed_substeps,
     rate_at_start,
-    with_output_injection,
 )
 from .standing import standing, stands
 
@@ -84,7 +83,7 @@ class Fitted:
 
     def corrected(self) -> Simulator:
         """The simulator with the fitted values as start values."""
-        own = ParameterSet(dict(self.simulator.parameters))
+        own = self.simulator.parameter_set
         vector = own.pack({k: v for k, v in self.values.items() if k in own})
         return self.simulator.with_parameters(own.at(vector))
 
@@ -144,7 +143,7 @@ class Workbench:
         if any(getattr(e.law, "knee", "") for e in simulator.elements):  # passed at every reversal, if not stood on
             wanted = max(wanted, int(np.ceil(rate_at_start(simulator, self.recordings[0]) * self.dt / LARGEST_STEP)))
         if self.typical is not None:  # a contact is not felt at rest
-            p = ParameterSet(dict(simulator.parameters)).start
+            p = simulator.parameter_set.start
             rates = fastest_rates(simulator, *self.typical, p)
             if np.any(np.isfinite(rates)):
                 wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / LARGEST_STEP)))

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError
-from ..models import Model, ParameterSet, PrandtlIshlinskii
+from ..models import Model, PrandtlIshlinskii
 from ..simulators import ClosedEquations, Instant, Simulator, on_grid
 
 INLINE = 4  # sub-steps written out one after the other; more become a loop, which keeps generated C short
@@ -179,7 +179,7 @@ def right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
     """
     if simulator.discrete:
         return None
-    equations = ClosedEquations(simulator, ca.SX(ParameterSet(dict(simulator.parameters)).start))
+    equations = ClosedEquations(simulator, ca.SX(simulator.parameter_set.start))
     if sum(equations.n_s):
         return None
     n_u = len(simulator.inputs)
@@ -207,7 +207,7 @@ def _name_element_states(model: Model) -> tuple[list[str], dict[str, float], lis
 def _name_law_states(model: Model, dt: float, simulator: Simulator) -> tuple[list[str], dict[str, float], list[str]]:
     """Name a simulator's states, then its laws' own states and memory: `ground.q1`, `ground.memory1`."""
     simulator = on_grid(simulator, dt / model.substeps)
-    equations = ClosedEquations(simulator, ca.SX(ParameterSet(dict(simulator.parameters)).start))
+    equations = ClosedEquations(simulator, ca.SX(simulator.parameter_set.start))
     flows, memory, held = list[str](), list[str](), list[str]()
     thresholds: dict[str, float] = {}
     for element, n_q, n_s in zip(simulator.elements, equations.n_q, equations.n_s, strict=True):

@@ -84,8 +84,10 @@ class FitContext:
     def problem(self, model: Model, noise: float = 1.0, **others: Any) -> Problem:
         """Simulation-error problem of a model; `others` replace options of `Problem`."""
         given: dict[str, Any] = {"constraints": self.constraints, "noise": self.options.noise or noise}
-        given |= {"engine": self.engine, "weights": self.weights, "threads": self.threads, **others}
-        return Problem(model, self.recordings, **given)
+        given |= {"engine": self.engine, "weights": self.weights, **others}
+        problem = Problem(model, self.recordings, **given)
+        problem.threads = self.threads
+        return problem
 
     def solve(self, problem: Problem, stage: str, start: np.ndarray | None = None) -> Solution:
         """Solve a problem inside its bounds on spectral radii; see `solve_within_bounds`."""

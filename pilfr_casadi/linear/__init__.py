@@ -1,4 +1,4 @@
-"""Linear identification: best linear approximation, subspace methods in time and frequency, order selection."""
+"""Linear models: best linear approximation, subspace methods in time and frequency, order selection, Kalman gains."""
 
 from typing import TYPE_CHECKING
 
@@ -6,9 +6,18 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .bla import BLA as BLA, output_spectra as output_spectra, plain_bla as plain_bla, robust_bla as robust_bla
-    from .modal_form import in_modal_coordinates as in_modal_coordinates, is_modal as is_modal, modal as modal
     from .order_selection import select_order as select_order
-    from .statespace import propagate as propagate, resolvent as resolvent
+    from .statespace import (
+        INJECTION as INJECTION,
+        in_modal_coordinates as in_modal_coordinates,
+        is_modal as is_modal,
+        measurement_update as measurement_update,
+        modal as modal,
+        propagate as propagate,
+        resolvent as resolvent,
+        steady_state_gain as steady_state_gain,
+        with_output_injection as with_output_injection,
+    )
     from .subspace import (
         FrequencyProblem as FrequencyProblem,
         frequency_subspace as frequency_subspace,

@@ -9,10 +9,11 @@ is one smooth inequality that guarantees the bound, at any point where it holds.
 out after each step keeps the numbers in range. Where eigenvalues coincide (a double integrator) the powers grow as
 m^(n-1) and the left-hand side exceeds `log ρ(A)` by up to `(n - 1) log(m) / m`, 1.3e-5 (n - 1) here, with slopes of the
 size of m. `stable` therefore has a slack, and a violation as small as that slack is no failure of a solver.
+`stability_limits` names the matrices of a PI-LFR that a fit bounds: `A`, and `A` with the element moving along its
+slope.
 
 Asked for as `exact`, a constraint has no slack and no tolerance: it is checked on the numbers of the result, the
-spectral radius by its eigenvalues. Where a check fails the result is moved (`exact_constraints`); at a tight bound a
-radius is held by rows that are smooth where eigenvalues meet (`spectral_radius`).
+spectral radius by its eigenvalues. `exact_limits` solves with such constraints.
 """
 
 from __future__ import annotations
@@ -25,7 +26,16 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, filled, numbers
-from ..models import ParameterSet, Play, PrandtlIshlinskii, Stop
+from ..models import (
+    PILFR,
+    GeneralizedPlay,
+    ParameterSet,
+    Play,
+    PrandtlIshlinskii,
+    Stop,
+    element_slopes,
+    unknown_slope,
+)
 from ..simulators import numbers_or_nan
 
 TOLERATED = 1e-6  # violation, in units of a constraint, that counts as met
@@ -150,35 +160,153 @@ def loosened(constraints: Sequence[Constraint], least: float = 0.0) -> tuple[Con
     )
 
 
-class Rows:
-    """The constraints of a problem as one Function of the full parameter vector p, shape (n_p,).
+@dataclass(frozen=True)
+class WithElement:
+    """`A + B_w S C_z` with one of an element's slopes S; a class, so that it can be sent to other processes."""
 
-    Attributes
-    ----------
-    function : casadi.Function
-        `p -> g`.
-    lower, upper, units : array, shape (n_g,)
-        Limits, and the units as given, nan where not.
-    labels : tuple of str
-        One an entry.
-    sizes : tuple of int
-        Number of entries of each constraint.
+    element: Any
+    slope: str
+
+    def __call__(self, p: Mapping[str, Any]) -> Any:
+        """Return the expression for named parameters p."""
+        return p["A"] + p["B_w"] @ element_slopes(self.element, p)[self.slope] @ p["C_z"]
+
+
+def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tuple[Constraint, ...]:
+    """Bound the spectral radius of A, and of `A + B_w S C_z` for each slope S that the element can have.
+
+    For plays the two cases are that no operator slips, or all do (for stops: all stick).
+    """
+    if structure.nx == 0:
+        return ()
+    limits: tuple[Constraint, ...] = (stable(radius, exact=exact),)
+    element = structure.element
+    if element is not None:
+        symbols = {name: ca.MX.sym(name, *p.shape) for name, p in element.parameters().items()}
+        for slope in element_slopes(element, symbols):
+            name = f"spectral radius with the element's {slope}"
+            limits += (stable(radius, WithElement(element, slope), name, exact=exact),)
+    return limits
+
+
+def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
+    """Return the constraints that `stable=bound` of a fit stands for."""
+    if bound is False:
+        return ()
+    if not isinstance(bound, bool | int | float | np.number) or not np.isfinite(bound):
+        raise InputError(f"stable = {bound!r} was given; give True, False or the largest spectral radius, above zero.")
+    return stability(structure, float(bound), exact=True)
+
+
+def unbounded_sentence(structure: PILFR | None, constraints: Iterable[Constraint], p: Mapping[str, Any]) -> str:
+    """Say what the bounds leave open about an element in feedback, given named numbers p; empty if nothing."""
+    radii = [c.check.radius for c in constraints if isinstance(c.check, BeyondRadius)]
+    element = structure.element if structure else None
+    if element is None or not radii or not np.any(np.sum(np.abs(p["C_z"]), axis=1) * np.sum(np.abs(p["B_w"]), axis=0)):
+        return ""
+    if unknown_slope(element, p):
+        return (
+            "the spectral radius is bounded for the linear part alone: how steep the element is that is fed back is "
+            "not known, as with envelopes of your own, so judge stability by simulations beyond the recorded amplitudes"
+        )
+    if not isinstance(element, PrandtlIshlinskii) or not isinstance(element.operator, GeneralizedPlay):
+        return ""
+    worst = 0.0
+    for side in "lr":
+        slope = np.diag(np.sum(p["w"], axis=1) * element.operator.steepest(side, p))
+        worst = max(worst, float(np.max(np.abs(np.linalg.eigvals(p["A"] + p["B_w"] @ slope @ p["C_z"])))))
+    if worst <= min(radii):
+        return ""
+    return (
+        f"where an envelope is steepest the spectral radius is {worst:.4g}, above its bound of {min(radii):g}, which "
+        "holds far out: small motions there may grow until the envelope is flatter"
+    )
+
+
+def check_room(parameters: ParameterSet, limits: Iterable[Constraint]) -> None:
+    """Refuse bounds on the entries of A under which no A has the required spectral radius.
 
     Raises
     ------
     InputError
-        As `compile_constraints` and `_check_free`.
+        With the bounds, the least radius that they allow and the required one.
+    """
+    radii = [c.check.radius for c in limits if isinstance(c.check, BeyondRadius) and c.check.matrix is linear_part]
+    if not radii or "A" not in parameters or np.all(parameters["A"].fixed):
+        return
+    a = parameters["A"]
+    low, high = (np.where(a.fixed, a.value, bound) for bound in a.bounds)
+    least = least_radius(low, high)
+    if least > min(radii):
+        entries = low[~a.fixed], high[~a.fixed]
+        raise InputError(
+            f"The bounds of A, {np.min(entries[0]):g} to {np.max(entries[1]):g}, allow no spectral radius below "
+            f"{least:g}, and it is to be at most {min(radii):g} so that the model is stable; widen the bounds of A, or "
+            "in Python give stable=False for a model that may grow without end."
+        )
+
+
+def least_radius(low: np.ndarray, high: np.ndarray) -> float:
+    """Bound from below the spectral radius of every matrix between `low` and `high` (n, n), entry by entry.
+
+    Uses `ρ(A) >= |trace A| / n` and, where `low >= 0`, `ρ(A) >= ρ(low)` (Perron and Frobenius).
+    """
+    low_trace, high_trace = float(np.trace(low)), float(np.trace(high))
+    least = max(low_trace, -high_trace, 0.0) / max(len(low), 1)
+    for bound, sign in ((low, 1.0), (high, -1.0)):
+        if np.all(np.isfinite(bound)) and np.all(sign * bound >= 0):
+            least = max(least, float(np.max(np.abs(np.linalg.eigvals(bound)), initial=0.0)))
+    return least
+
+
+class Rows:
+    """The constraints of a problem as one Function `p -> g` of the full parameter vector p, shape (n_p,).
+
+    `lower`, `upper` and `units` (as given, nan where not) have shape (n_g,), `labels` one name an entry, `sizes` the
+    number of entries of each constraint.
     """
 
     def __init__(self, constraints: tuple[Constraint, ...], parameters: ParameterSet) -> None:
-        compiled = compile_constraints(constraints, parameters)
-        self.function, self._slope, self.lower, self.upper, self.labels, self.units = compiled
-        self.sizes = constraint_sizes(constraints, parameters)
-        p = parameters.start
-        named = parameters.unpack(p)
-        held = np.repeat([c.check is not None and c.check(named) <= 0 for c in constraints], self.sizes).astype(bool)
-        logs = np.repeat([isinstance(c.expression, LogRadius) for c in constraints], self.sizes).astype(bool)
-        _check_free(self, parameters.free, p, held, logs)
+        vector, p = ca.MX.sym("p", parameters.size), parameters.start
+        symbols, values = parameters.symbols(vector), parameters.unpack(p)
+        parts, bounds = [ca.MX(0, 1)], [np.zeros((3, 0))]
+        self.labels: tuple[str, ...] = ()
+        for c in constraints:
+            part = _expression(c, symbols)
+            size = int(part.shape[0])
+            parts.append(part)
+            bounds.append(_limits(c, size))
+            self.labels += (c.name,) if size == 1 else tuple(f"{c.name}[{i}]" for i in range(size))
+        self.sizes = tuple(int(part.shape[0]) for part in parts[1:])
+        self.lower, self.upper, self.units = np.hstack(bounds)
+        g = ca.densify(ca.vertcat(*parts))
+        self.function = ca.Function("g", [vector], [g], ["p"], ["g"])
+        self._slope = ca.Function("g_slope", [vector], [ca.densify(ca.jacobian(g, vector))], ["p"], ["jac"])
+        held = np.repeat([c.check is not None and c.check(values) <= 0 for c in constraints], self.sizes)
+        logs = np.repeat([isinstance(c.expression, LogRadius) for c in constraints], self.sizes)
+        self._check_start(p, parameters.free, held.astype(bool), logs.astype(bool))
+
+    def _check_start(self, p: np.ndarray, free: np.ndarray, held: np.ndarray, logs: np.ndarray) -> None:
+        """Refuse a constraint that is no number at the start, or that no free parameter enters and that does not hold.
+
+        `held` marks entries whose own check says that they hold, `logs` entries that are logarithms of the shown value.
+        """
+        value, slope = self.values(p), self.slope(p)[:, free]
+        for i in np.flatnonzero(~np.isfinite(value) | ~np.all(np.isfinite(slope), axis=1)):
+            what, shown = ("slope", np.nan) if np.isfinite(value[i]) else ("value", value[i])
+            raise InputError(
+                f"The constraint {self.labels[i]!r} has no finite {what} at the start values of the parameters (it is "
+                f"{shown}); give an expression that is finite there, or other start values."
+            )
+        reach = np.asarray(ca.DM(self.function.jac_sparsity(0, 0), 1).full(), dtype=bool)[:, free]
+        room = TOLERATED * np.maximum(np.abs(value), 1.0)
+        missed = (value < self.lower - room) | (value > self.upper + room)
+        for i in np.flatnonzero(missed & ~np.any(reach, axis=1) & ~held):
+            found, low, high = (np.exp(v) if logs[i] else v for v in (value[i], self.lower[i], self.upper[i]))
+            raise InputError(
+                f"The constraint {self.labels[i]!r} is infeasible: all that enters it is fixed and gives {found:g}, "
+                f"limits {low:g} and {high:g}; free a parameter or loosen it."
+            )
 
     def units_from(self, change: np.ndarray) -> np.ndarray:
         """Units as given, or from the largest change of each entry (n_g,), no larger than its limits warrant."""
@@ -193,62 +321,39 @@ class Rows:
 
     def slope(self, p: np.ndarray) -> np.ndarray:
         """Shape (n_g, n_p)."""
-        return numbers_or_nan(self._slope, p)
+        return numbers_or_nan(self._slope, p).reshape(len(self.labels), len(p))
 
 
-def compile_constraints(
-    constraints: tuple[Constraint, ...], parameters: ParameterSet
-) -> tuple[ca.Function, ca.Function, np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:
-    """One Function `p -> g`, its Jacobian, the bounds, a label and a unit an entry (nan: not given).
-
-    Raises
-    ------
-    InputError
-        If an expression fails, names an unknown parameter, its bounds are infeasible, or its unit is not positive.
-    """
-    vector = ca.MX.sym("p", parameters.size)
-    named = parameters.symbols(vector)
-    parts, lower, upper, labels, units = [], [np.zeros(0)], [np.zeros(0)], [], [np.zeros(0)]
-    for c in constraints:
-        g = _expression(c, named, parameters)
-        size = int(g.shape[0])
-        try:
-            low, high = (np.broadcast_to(np.asarray(b, dtype=float).ravel(), (size,)) for b in (c.lower, c.upper))
-        except ValueError:
-            raise InputError(
-                f"The bounds of the constraint {c.name!r} do not fit its {size} entries; give one or {size} of each."
-            ) from None
-        if not np.all(low <= high):
-            raise InputError(f"The constraint {c.name!r} is infeasible: its lower bound exceeds its upper bound.")
-        if c.exact and np.any(low == high):
-            raise InputError(
-                f"The constraint {c.name!r} is an equation and asked for as exact, which rounding does not allow; "
-                "leave exact out, or give a lower and an upper limit."
-            )
-        if c.unit is not None and not 0 < c.unit < np.inf:
-            raise InputError(f"The unit of the constraint {c.name!r} is {c.unit!r}; give a positive number, or none.")
-        units.append(np.full(size, np.nan if c.unit is None else float(c.unit)))
-        parts.append(g)
-        lower.append(low)
-        upper.append(high)
-        labels += [c.name if size == 1 else f"{c.name}[{i}]" for i in range(size)]
-    g = ca.densify(ca.vertcat(*parts)) if parts else ca.MX(0, 1)
-    value = ca.Function("g", [vector], [g], ["p"], ["g"])
-    slope = ca.Function("g_slope", [vector], [ca.densify(ca.jacobian(g, vector))], ["p"], ["jac"])
-    return value, slope, np.concatenate(lower), np.concatenate(upper), tuple(labels), np.concatenate(units)
-
-
-def _expression(c: Constraint, named: Mapping[str, Any], parameters: ParameterSet) -> Any:
-    """The constraint's expression as a column; an `InputError` if it fails or names an unknown parameter."""
+def _limits(c: Constraint, size: int) -> np.ndarray:
+    """Check the limits and the unit (nan where none is given) of a constraint's entries: (3, size)."""
     try:
-        g = ca.vec(c.expression(named))
-        if not isinstance(g, ca.MX):
-            g = ca.MX(ca.DM(g))
+        low, high = (np.broadcast_to(np.asarray(b, dtype=float).ravel(), (size,)) for b in (c.lower, c.upper))
+    except ValueError:
+        raise InputError(
+            f"The bounds of the constraint {c.name!r} do not fit its {size} entries; give one or {size} of each."
+        ) from None
+    if not np.all(low <= high):
+        raise InputError(f"The constraint {c.name!r} is infeasible: its lower bound exceeds its upper bound.")
+    if c.exact and np.any(low == high):
+        raise InputError(
+            f"The constraint {c.name!r} is an equation and asked for as exact, which rounding does not allow; "
+            "leave exact out, or give a lower and an upper limit."
+        )
+    if c.unit is not None and not 0 < c.unit < np.inf:
+        raise InputError(f"The unit of the constraint {c.name!r} is {c.unit!r}; give a positive number, or none.")
+    return np.array([low, high, np.full(size, np.nan if c.unit is None else float(c.unit))])
+
+
+def _expression(c: Constraint, symbols: Mapping[str, Any]) -> Any:
+    """Evaluate a constraint's expression as a column."""
+    try:
+        g = ca.vec(c.expression(symbols))
+        return g if isinstance(g, ca.MX) else ca.MX(ca.DM(g))
     except InputError:
         raise
     except KeyError as e:
         raise InputError(
-            f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(parameters)}."
+            f"The constraint {c.name!r} reads a parameter {e} that the model lacks; it has {', '.join(symbols)}."
         ) from e
     except Exception as e:
         why = str(e).strip().splitlines()[-1].strip() if str(e).strip() else type(e).__name__
@@ -258,43 +363,6 @@ def _expression(c: Constraint, named: Mapping[str, Any], parameters: ParameterSe
             f"The expression of the constraint {c.name!r} cannot be formed ({why}); use CasADi functions of the named "
             "parameters, such as casadi.if_else, fmin and fmax."
         ) from e
-    return g
-
-
-def constraint_sizes(constraints: tuple[Constraint, ...], parameters: ParameterSet) -> tuple[int, ...]:
-    """Return the number of entries of each constraint."""
-    named = parameters.symbols(ca.MX.sym("p", parameters.size))
-    return tuple(int(_expression(c, named, parameters).shape[0]) for c in constraints)
-
-
-def _check_free(rows: Rows, free: np.ndarray, p: np.ndarray, held: np.ndarray, logs: np.ndarray) -> None:
-    """Refuse a constraint that is no number at the start, or that does not hold and that no free parameter enters.
-
-    `held` marks entries whose own check says that they hold, `logs` entries that are logarithms of the shown value.
-
-    Raises
-    ------
-    InputError
-        With its name, its value and its limits.
-    """
-    lower, upper, labels = rows.lower, rows.upper, rows.labels
-    reach = np.asarray(ca.DM(rows.function.jac_sparsity(0, 0), 1).full(), dtype=bool).reshape(len(labels), len(p))
-    value = rows.values(p)
-    steep = rows.slope(p).reshape(len(labels), len(p))[:, free]
-    for i in np.flatnonzero(~np.isfinite(value) | ~np.all(np.isfinite(steep), axis=1)):
-        what, shown = ("value", value[i]) if not np.isfinite(value[i]) else ("slope", np.nan)
-        raise InputError(
-            f"The constraint {labels[i]!r} has no finite {what} at the start values of the parameters (it is {shown}); "
-            "give an expression that is finite there, or other start values."
-        )
-    for i in np.flatnonzero(~np.any(reach[:, free], axis=1) & ~held):
-        room = TOLERATED * max(abs(value[i]), 1.0)
-        if not lower[i] - room <= value[i] <= upper[i] + room:
-            found, low, high = (np.exp(v) if logs[i] else v for v in (value[i], lower[i], upper[i]))
-            raise InputError(
-                f"The constraint {labels[i]!r} is infeasible: all that enters it is fixed and gives {found:g}, "
-                f"limits {low:g} and {high:g}; free a parameter or loosen it."
-            )
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ General constraints enter an exact penalty `μ Σ violation` (`ExactPenalty`), w
 along their tangent violates them. A run may stray to where violating the constraints pays and linear steps do not lead
 back. A run that ends worse than its cheapest feasible point (`BestFeasible`) goes on from there, with more damping and
 a larger penalty.
+
+`first_state` fits with it the state at the beginning of a recording, of a model whose parameters are known.
 """
 
 from __future__ import annotations
@@ -30,23 +32,36 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError
-from ..models import Neighbours
+from ..data import Recording
+from ..engine import Engine
+from ..models import Model, Neighbours
 from .constraints import TOLERATED
+from .problem import STATE_NOISE, Penalties, Problem, given_state, settled, state_precision
 from .solution import Iteration, Progress, Solution, Status
 
 FEASIBLE = 1e-9  # violation, in units of the constraints, that counts as none
+ROUNDED = 1e-12  # violation that rounding alone makes
 RETURNS = 4  # times that a run which has strayed goes on from its best feasible point
 ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # the run got as far as it can
+STATE_ROUNDS = 20  # solves for a first state, at most, with wider and wider priors
+WIDE = 1.1  # mean square of a first state in units of its prior up to which the prior stays
 KINK = 1e-3  # share of the cost promised in vain from which the point is a kink and multipliers mean nothing
 NOTHING = 1e-24  # cost that is rounding: outputs are off by 1e-12 of their size
 ROUNDING = 1e-20  # squared column norm, next to the largest of its matrix, that is rounding
 NONE = 1e-100  # size of a variable that was driven to zero
 SHRUNK = 1e-2  # share of its first unit below which the unit of a constraint is taken anew
+ACCEPTED = 1e-4  # share of the predicted improvement from which a step is taken: any real descent (Moré 1978)
+IDLE = 1e-3  # share of the tolerance below which a predicted improvement is no reason to damp further
+LEAST_DAMPING, MOST_DAMPING = 1e-12, 1e12  # λ beyond which H + λ D is H, or D, to rounding
+RESTART = 10.0  # factor on the first λ of each return to the best feasible point
+PENALTY = 1.5  # times the largest multiplier: an exact penalty needs more than 1 (Powell 1978)
+SHARES = (1.0, 0.5, 0.1, 0.01, 0.0)  # of the violation that a step removes, where the quadratic program allows no more
+NO_DIVISOR = 1e-300  # keeps quotients of numbers that may be zero finite
 Watch = Callable[[np.ndarray], bool]
 
 
 class Minimisation(Protocol):
-    """Problem as the solver sees it: a `Problem`, or one with extra unknowns (`spectral_radius.SchurProblem`)."""
+    """Problem as the solver sees it: a `Problem`, or one with extra unknowns (`exact_limits.SchurProblem`)."""
 
     labels: tuple[str, ...]
     start: np.ndarray
@@ -145,7 +160,7 @@ class QuadraticProgram:
         row = np.where(row > 0, row, 1.0)
         low, high = lba / row, uba / row
         size = float(np.max(np.abs(g))) or float(np.max(np.maximum(low, -high), initial=0.0))
-        size = max(size, 1e-300)
+        size = max(size, NO_DIVISOR)
         rows = a / row[:, None], low / size, high / size
         d, multipliers, good = self._solve(
             h * unit * unit[:, None], g / size, lbx / unit / size, ubx / unit / size, *rows
@@ -184,14 +199,8 @@ class ExactPenalty:
     """General constraints in their units, and the exact penalty `μ Σ violation` by which steps are judged.
 
     The weight μ follows the multipliers by Powell's rule (1978): 1.5 times the largest, or half-way down to that from
-    its last value. A weight that only grows keeps what multipliers far from the solution required, and crawls.
-
-    Attributes
-    ----------
-    unit : numpy.ndarray
-        Shape (n_g,), see `Problem.constraint_units`; taken where a constraint first has a slope.
-    weight, least : float
-        μ and its lower bound.
+    its last value, and `least` at least. A weight that only grows keeps what multipliers far from the solution
+    required, and crawls. The units (n_g,) are taken where a constraint first has a slope (`Problem.constraint_units`).
     """
 
     def __init__(self, problem: Minimisation) -> None:
@@ -245,7 +254,7 @@ class ExactPenalty:
     def follow(self, multipliers: np.ndarray) -> None:
         """Let the weight follow the constraints' multipliers (n_g,)."""
         if len(multipliers):
-            needed = 1.5 * float(np.max(np.abs(multipliers)))
+            needed = PENALTY * float(np.max(np.abs(multipliers)))
             self.weight = max(needed, 0.5 * (self.weight + needed), self.least)
 
     def raise_to(self, weight: float) -> None:
@@ -260,10 +269,7 @@ class BestFeasible:
 
         μ > max (cost of the best - cost) / violation.
 
-    Parameters
-    ----------
-    tolerance : float
-        Share of its cost by which another feasible point must be dearer to count as worse.
+    Another feasible point is worse if it is dearer by more than the share `tolerance` of its cost.
     """
 
     def __init__(self, tolerance: float) -> None:
@@ -399,7 +405,7 @@ class _Run:
                         self.penalty.raise_to(2.0 * self.best.tempting)
                     else:
                         break
-                    self.damping = Damping(self.options.damping * 10.0**k)
+                    self.damping = Damping(self.options.damping * RESTART**k)
                     status = self._iterate()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
@@ -460,17 +466,19 @@ class _Run:
             predicted = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d)
             trial, cost, improvement = self._judge(step, damped, gradient, slope)
             expected = predicted + self.penalty.weight * violation
-            fresh = bool(step.good and improvement > 1e-4 * expected and improvement > 0)
+            fresh = bool(step.good and improvement > ACCEPTED * expected and improvement > 0)
             length = float(np.max(np.abs(step.d) * np.sqrt(floor))) if step.good else 0.0
             if fresh:
                 self.theta, self.cost = trial, cost
-                self.damping = self.damping.after_success(improvement / max(expected, 1e-300)).within(1e-12, np.inf)
+                self.damping = self.damping.after_success(improvement / max(expected, NO_DIVISOR)).within(
+                    LEAST_DAMPING, np.inf
+                )
                 self._record(length)
                 continue
-            if step.good and expected < 1e-3 * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
+            if step.good and expected < IDLE * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
                 return self._stalled(hessian, floor, gradient, slope)
             self.damping = self.damping.after_failure()
-            if self.damping.value > 1e12:
+            if self.damping.value > MOST_DAMPING:
                 stalled = self._stalled(hessian, floor, gradient, slope)
                 return Status.INFEASIBLE if violation > TOLERATED else stalled
         return Status.MAX_ITERATIONS
@@ -505,7 +513,7 @@ class _Run:
         """Solve the quadratic program, removing less of the violation where it is infeasible."""
         problem = self.problem
         low, high = self.penalty.room(self.penalty.values(self.theta) if correction is None else correction)
-        for share in (1.0, 0.5, 0.1, 0.01, 0.0) if self.n_g else (1.0,):
+        for share in SHARES if self.n_g else SHARES[:1]:
             d, multipliers, good = self.qp(
                 damped,
                 gradient,
@@ -528,7 +536,7 @@ class _Run:
         problem, here = self.problem, self.penalty.violation(self.theta)
         trial = self._end_of(step)
         there = self.penalty.violation(trial)
-        if self.n_g and there > max(here, 1e-12):
+        if self.n_g and there > max(here, ROUNDED):
             corrected = self._step(damped, gradient, slope, self.penalty.values(trial) - slope @ step.d)
             if corrected.good:
                 candidate = self._end_of(corrected)
@@ -555,3 +563,49 @@ class _Run:
             multipliers=self.multipliers / np.concatenate([np.ones(self.problem.size), self.penalty.unit]),
             history=tuple(self.history),
         )
+
+
+def samples_for_state(model: Model) -> int:
+    """Samples that an unknown initial state is fitted to: ten a state, at least 50."""
+    return max(10 * model.n_state, 50)
+
+
+def first_state(
+    model: Model, engine: Engine, recording: Recording, samples: int | None = None, *, state_prior: bool = False
+) -> np.ndarray:
+    """State with memory at a recording's first sample, as its `initial` says; the model's parameters are held.
+
+    Where it is to be estimated, it is fitted to the first `samples` outputs, and later outputs are not looked at. With
+    `state_prior` it has a prior around rest, whose scale is that of a run over all inputs (`state_precision`).
+
+    Raises
+    ------
+    InputError
+        If a given state has another number of entries.
+    """
+    n, values, state = model.n_state, model.parameters.start, given_state(model, recording)
+    if recording.begins == "periodic":
+        period = model.drive(recording)[: (recording.period or 1) * model.substeps]
+        return settled(engine, period, values, state)
+    if recording.begins != "estimate" or not n:
+        return state
+    head = recording.slice(0, max(min(len(recording), samples or samples_for_state(model)), 2)).with_(skip=0)
+    spread = np.std(head.y, axis=0)
+    spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
+    held = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
+    problem, solver = (
+        Problem(model.with_parameters(held), head, engine=engine, scale=spread),
+        GaussNewton(max_iterations=50),
+    )
+    square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None
+    if square is None:
+        return solver.solve(problem).theta
+    state, wider = problem.start, 1.0
+    for _ in range(STATE_ROUNDS):  # a machine that is let go from afar is no machine in forced motion
+        problem.penalties = Penalties(held, {}, 1.0, problem.residuals, problem.size, [(0, square / wider)])
+        state = solver.solve(problem, state).theta
+        size = float(state @ square @ state) / STATE_NOISE**2 / n
+        if size <= WIDE * wider:
+            break
+        wider = size
+    return state

@@ -23,7 +23,15 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError
-from .gauss_newton import ROUNDING, Damping, handled_interrupt
+from .gauss_newton import (
+    ACCEPTED,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    NO_DIVISOR,
+    ROUNDING,
+    Damping,
+    handled_interrupt,
+)
 from .problem import Problem
 from .solution import Iteration, Progress, Solution, Status
 
@@ -49,44 +57,26 @@ ENDINGS = {
     "Maximum_Iterations_Exceeded": Status.MAX_ITERATIONS,
     "Infeasible_Problem_Detected": Status.INFEASIBLE,
 }
+Sparsities = dict[str, ca.Sparsity]
+FEASIBLE = 1e-8  # violation of a constraint, in units of the change that one scaled variable makes
+MISSED = 1e-6  # the same at the end of a run, from which it counts as infeasible
+ROUNDS = 4  # solves: where IPOPT's line search fails, the next one starts from the best point with more damping
+MORE_DAMPING, LEAST_RAISED = 100.0, 1e-2  # factor on λ for the next solve, and the λ that is raised at least
+RAISED, MOST_RAISED = (
+    4.0,
+    100.0,
+)  # factor on λ for each step that the line search shortened, and for all of them at most
+STEPS = 20  # rejected first steps at most, from which norms of the Jacobian's columns are taken
+ONTO = 3  # Newton steps back onto the constraints after variables were put onto their bounds
+SLOWER = 4  # times the patience with a quasi-Newton Hessian, whose steps gain less
 
 
-def check_settings(options: Any) -> None:
-    """Let IPOPT itself judge its options, on a problem of one variable.
+class _Callback(ca.Callback):
+    """CasADi Function around a Python function, with its inputs and outputs by name.
 
-    Raises
-    ------
-    InputError
-        If it does not take one.
-    """
-    if not isinstance(options, Mapping):
-        raise InputError(f'IPOPT\'s options were given as {options!r}; give them by name, like {{"print_level": 5}}.')
-    x = ca.MX.sym("x")
-    for name, value in options.items():
-        try:
-            ca.nlpsol("check", "ipopt", {"x": x, "f": x**2}, {"ipopt": {name: value, "sb": "yes"}, "print_time": False})
-        except (RuntimeError, TypeError, NotImplementedError):
-            raise InputError(
-                f"IPOPT does not take the option {name!r} with the value {value!r}; see its own list of options."
-            ) from None
-
-
-class Callback(ca.Callback):
-    """CasADi Function around a Python function.
-
-    An exception must not cross a solver's C++ frames: CasADi would turn it into a failed evaluation and forget it.
-    It is handed to `failed` instead, and the solver sees NaN.
-
-    Parameters
-    ----------
-    name : str
-        Name of the Function.
-    inputs, outputs : mapping of str to casadi.Sparsity
-        Names and shapes; the order counts.
-    function : callable
-        Takes one flat array an input, returns one value an output.
-    failed : callable
-        Takes what `function` raised.
+    The function takes one flat array an input and returns one value an output. An exception must not cross a solver's
+    C++ frames: CasADi would turn it into a failed evaluation and forget it. `failed` takes it instead, and the solver
+    sees NaN.
     """
 
     def __init__(
@@ -103,31 +93,24 @@ class Callback(ca.Callback):
         self.construct(name, {})
 
     def get_n_in(self) -> int:
-        """Number of inputs."""
         return len(self._inputs)
 
     def get_n_out(self) -> int:
-        """Number of outputs."""
         return len(self._outputs)
 
     def get_name_in(self, i: int) -> str:
-        """Name of input i."""
         return self._inputs[i][0]
 
     def get_name_out(self, i: int) -> str:
-        """Name of output i."""
         return self._outputs[i][0]
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Shape of input i."""
         return self._inputs[i][1]
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Shape of output i."""
         return self._outputs[i][1]
 
     def eval(self, arguments: Sequence[Any]) -> Sequence[Any]:
-        """Values of the outputs, NaN where the function raised."""
         try:
             return self._function(*(np.asarray(a).ravel() for a in arguments))
         except BaseException as error:
@@ -154,13 +137,6 @@ class DampedHessian:
     λ follows how well the last step was predicted (`Damping`). The Hessian predicts the Lagrangian, so the curvature of
     constraints, which H leaves out, counts as a miss and raises λ as well; without this, iterates cycle along curved
     constraints. Where the line search had to shorten a step, λ grows.
-
-    Parameters
-    ----------
-    first : float
-        λ of the first Hessian.
-    size : int
-        Number of variables n.
     """
 
     def __init__(self, first: float, size: int) -> None:
@@ -168,22 +144,17 @@ class DampedHessian:
         self.before: Point | None = None
         self.damped = np.zeros((size, size))
 
-    @property
-    def value(self) -> float:
-        """Present λ."""
-        return self.damping.value
-
     def at(self, point: Point, multipliers: np.ndarray, trials: int) -> np.ndarray:
         """Return `H + λ D` at a new iterate, reached after `trials` evaluations; multipliers (n_g,)."""
         if self.before is not None and np.any(point.x != self.before.x):
             if trials > 1:
-                raised = self.damping.value * min(4.0 ** (trials - 1), 100.0)
+                raised = self.damping.value * min(RAISED ** (trials - 1), MOST_RAISED)
                 self.damping = Damping(raised, self.damping.growth)
             else:
                 ratio = self._ratio(self.before, point, multipliers)
-                poor = ratio < 1e-4
+                poor = ratio < ACCEPTED
                 self.damping = self.damping.after_failure() if poor else self.damping.after_success(ratio)
-            self.damping = self.damping.within(1e-12, 1e12)
+            self.damping = self.damping.within(LEAST_DAMPING, MOST_DAMPING)
         self.largest = np.maximum(self.largest, np.diag(point.hessian))
         # the variables are scaled to order 1: smaller entries have been zero or rounding so far
         diagonal = np.where(self.largest > ROUNDING, self.largest, 1.0)
@@ -197,7 +168,7 @@ class DampedHessian:
         curvature = 0.5 * float(d @ before.hessian @ d)
         predicted = float((before.gradient + multipliers @ before.slope) @ d) + curvature
         change = after.value - before.value + float(multipliers @ (after.constraints - before.constraints))
-        return 1.0 + (predicted - change) / max(float(d @ self.damped @ d) - curvature, 1e-300)
+        return 1.0 + (predicted - change) / max(float(d @ self.damped @ d) - curvature, NO_DIVISOR)
 
 
 class Scaled:
@@ -208,21 +179,8 @@ class Scaled:
     s are the column norms of the Jacobian over the root of the first cost: a unit of any variable changes the residuals
     by about their own size. u are the largest entries of each row of ∇g, so results do not depend on anybody's units.
     At the usual start (`B_w = 0`, Krikelis et al. (2024), Eq. 24) whole columns vanish; norms are therefore the larger
-    ones of the start and of one damped Gauss-Newton step from it.
-
-    Parameters
-    ----------
-    problem : Problem
-        What is scaled.
-    start : array, shape (n,)
-        Where, inside the bounds and with a finite cost.
-    damping : float
-        λ of the step; raised until the step lowers the cost.
-
-    Raises
-    ------
-    FloatingPointError
-        If the derivatives at the start are not finite.
+    ones of the start, inside the bounds and with a finite cost, and of one damped Gauss-Newton step from it, whose λ is
+    raised until it lowers the cost. Derivatives at the start that are not finite raise a FloatingPointError.
     """
 
     def __init__(self, problem: Problem, start: np.ndarray, damping: float) -> None:
@@ -232,14 +190,14 @@ class Scaled:
         if not (np.all(np.isfinite(h)) and np.all(np.isfinite(g))):
             raise FloatingPointError("the derivatives at the start are not finite")
         unit, trial = 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0)), start
-        for _ in range(20):
+        for _ in range(STEPS):
             step = -unit * np.linalg.solve(h * unit * unit[:, None] + self.damping * np.eye(len(g)), g * unit)
             trial = np.clip(start + step, problem.lower, problem.upper)
             there = np.diag(problem.normal(trial)[2]) if problem.cost(trial) <= cost else np.full(len(g), np.nan)
             if np.all(np.isfinite(there)):
                 squares = np.maximum(squares, there)
                 break
-            self.damping *= 4.0
+            self.damping *= RAISED
         self.unit = cost if cost > 0 else 1.0
         self.s = np.sqrt(_filled(squares, problem.labels, start, self.unit) / self.unit)
         rows = np.max(np.abs(problem.constraint_jacobian(trial) / self.s), axis=1, initial=0.0)
@@ -304,11 +262,6 @@ def _filled(squares: np.ndarray, labels: tuple[str, ...], start: np.ndarray, uni
     return out
 
 
-Sparsities = dict[str, ca.Sparsity]
-FEASIBLE = 1e-8  # violation of a constraint, in units of the change that one scaled variable makes
-ROUNDS = 4  # solves: where IPOPT's line search fails, the next one starts from the best point with more damping
-
-
 @dataclass(frozen=True)
 class Ipopt:
     """Options of the solver through `casadi.nlpsol("ipopt")`.
@@ -331,7 +284,7 @@ class Ipopt:
     Raises
     ------
     InputError
-        If the Hessian is unknown.
+        If the Hessian is unknown, or IPOPT does not take an option.
     """
 
     hessian: str = "gauss-newton"
@@ -345,7 +298,19 @@ class Ipopt:
     def __post_init__(self) -> None:
         if self.hessian not in ("gauss-newton", "limited-memory"):
             raise InputError(f"The Hessian {self.hessian!r} is unknown; use 'gauss-newton' or 'limited-memory'.")
-        check_settings(self.options)
+        if not isinstance(self.options, Mapping):
+            raise InputError(
+                f'IPOPT\'s options were given as {self.options!r}; give them by name, like {{"print_level": 5}}.'
+            )
+        x = ca.MX.sym("x")
+        for name, value in self.options.items():  # IPOPT itself judges them, on a problem of one variable
+            settings = {"ipopt": {name: value, "sb": "yes"}, "print_time": False}
+            try:
+                ca.nlpsol("check", "ipopt", {"x": x, "f": x**2}, settings)
+            except (RuntimeError, TypeError, NotImplementedError):
+                raise InputError(
+                    f"IPOPT does not take the option {name!r} with the value {value!r}; see its own list of options."
+                ) from None
 
     def solve(self, problem: Problem, start: np.ndarray | None = None, progress: Progress | None = None) -> Solution:
         """Minimise from `start` (n,), by default the problem's own."""
@@ -388,7 +353,7 @@ class _Run:
                 status = self._ending(message, *before)
                 if status is not None:
                     break
-                damping = 100.0 * max(self.hessian.value, 1e-2)
+                damping = MORE_DAMPING * max(self.hessian.damping.value, LEAST_RAISED)
             if self.error is None:
                 self._onto_bounds()
         except KeyboardInterrupt as interrupt:
@@ -398,7 +363,7 @@ class _Run:
         elif self.error is not None:
             raise self.error
         stopped = status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
-        if self.violation > 1e-6 and not stopped:
+        if self.violation > MISSED and not stopped:
             status = Status.INFEASIBLE
         return self._solution(status or Status.SOLVER_FAILED, message)
 
@@ -432,7 +397,7 @@ class _Run:
             del parts["hess_lag"]
         if not n_g:
             del parts["jac_g"]
-        made = {key: Callback(*part, self._failed) for key, part in parts.items()}
+        made = {key: _Callback(*part, self._failed) for key, part in parts.items()}
         oracle, ipopt = made.pop("oracle"), {**settings, **self.options.options}
         quiet = {"print_time": False, "show_eval_warnings": False, "calc_lam_p": False, "no_nlp_grad": True}
         solver = ca.nlpsol("ipopt", "ipopt", oracle, {**made, **quiet, "ipopt": ipopt})
@@ -492,14 +457,14 @@ class _Run:
         step = float(np.max(np.abs(x - self.x)) * np.sqrt(scaled.unit)) if self.history else 0.0
         self.x = x
         seconds = time.perf_counter() - self.began
-        self.history.append(Iteration(len(self.history), cost, seconds, step, self.hessian.value))
+        self.history.append(Iteration(len(self.history), cost, seconds, step, self.hessian.damping.value))
         if self.progress:
             self.progress(self.history[-1])
         value, multipliers = np.concatenate([x, g]), np.concatenate([lam_x, lam_g])
         low, high = np.concatenate([scaled.lower, scaled.g_lower]), np.concatenate([scaled.upper, scaled.g_upper])
         gap = np.where(multipliers < 0, value - low, high - value)
         barrier = float(np.sum(np.abs(multipliers * np.where(np.isfinite(gap), gap, 0.0)))) * scaled.unit
-        span = options.patience * (1 if options.hessian == "gauss-newton" else 4)
+        span = options.patience * (1 if options.hessian == "gauss-newton" else SLOWER)
         recent = [entry.cost for entry in self.history[-1 - span :]]
         calm = len(recent) > span and max(recent) - min(recent) < options.tolerance * cost
         feasible = np.max(np.abs(scaled.excess(g)), initial=0.0) <= FEASIBLE
@@ -515,7 +480,7 @@ class _Run:
             near = np.abs(theta - bound) * scaled.s <= np.maximum(pull, 0.0)
             theta[near] = bound[near]
         loose = (theta > problem.lower) & (theta < problem.upper)
-        for _ in range(3):
+        for _ in range(ONTO):
             excess = scaled.excess(scaled.constraints(theta))
             rows = np.abs(excess) > 0.1 * FEASIBLE
             if not np.any(rows):

@@ -264,7 +264,7 @@ def check_table(diagnosis: Diagnosis) -> Table | None:
 def usage(diagnosis: Diagnosis) -> str:
     """Write the lines of Python that make the corrected simulator from the user's own and simulate a recording."""
     simulator = diagnosis.corrected
-    fitted = {k: plain(np.asarray(p.value)) for k, p in ParameterSet(dict(simulator.parameters)).items()}
+    fitted = {k: plain(np.asarray(p.value)) for k, p in simulator.parameter_set.items()}
     values = {k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters}
     laws: dict[str, set[str]] = {}
     for e in simulator.elements:

@@ -99,7 +99,7 @@ def _law_signals(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute local coordinate, rate and force, (M,) each, of an element along a run."""
     simulator = on_grid(fitted.simulator, bench.dt / fitted.model.substeps)
-    own = ParameterSet(dict(simulator.parameters))
+    own = simulator.parameter_set
     vector = ca.SX.sym("p", own.size)
     equations = ClosedEquations(simulator, vector)
     n_s, n_u = sum(equations.n_s), len(simulator.inputs)
@@ -120,7 +120,7 @@ def _without(fitted: Fitted, number: int | None, start: np.ndarray, h: float) ->
     simulator = fitted.simulator
     if number is None:
         return simulator, start
-    own = ParameterSet(dict(simulator.parameters))
+    own = simulator.parameter_set
     equations = ClosedEquations(on_grid(simulator, h), ca.SX.sym("p", own.size))
     at_q = np.cumsum([len(simulator.states), *equations.n_q])
     at_s = np.cumsum([at_q[-1], *equations.n_s])
@@ -212,7 +212,7 @@ def _local(
     bench: Workbench, base: Simulator, values: dict[str, Any], port: str, states: np.ndarray, r: Recording
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute local coordinate and rate, (M,) each, of a port along states (M, n_x)."""
-    own = ParameterSet(dict(base.parameters))
+    own = base.parameter_set
     vector = own.pack({k: v for k, v in values.items() if k in own})
     rows = signals(base)(states.T, r.u.T, _slope(bench, r).T, r.t[None], np.tile(vector[:, None], (1, len(r))))
     index = [known.name for known in base.all_ports()].index(port)

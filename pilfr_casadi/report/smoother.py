@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..diagnose import over_samples
-from ..simulators import measurement_update
+from ..linear import measurement_update
 
 LOUDER = (1.0, 3.0, 9.0)  # factors on the noise
 TRIED = np.logspace(-4.0, 0.5, 10)  # random steps of the force, in units of what the residual calls for

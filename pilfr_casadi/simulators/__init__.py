@@ -1,8 +1,7 @@
 """The user's equations with ports for missing physics.
 
 `equations` evaluates them with their laws, `integration` makes them a discrete-time `Model`, `simulator` holds the
-class `Simulator`, `adapters` accept a Python file, a state space or a fitted model in its place, and `observer` holds
-Kalman gains and output injection.
+class `Simulator`, and `adapters` accept a Python file, a state space or a fitted model in its place.
 """
 
 from typing import TYPE_CHECKING
@@ -37,12 +36,6 @@ if TYPE_CHECKING:
         rate_at_start as rate_at_start,
         signals as signals,
         states_along as states_along,
-    )
-    from .observer import (
-        INJECTION as INJECTION,
-        measurement_update as measurement_update,
-        steady_state_gain as steady_state_gain,
-        with_output_injection as with_output_injection,
     )
     from .simulator import Simulator as Simulator
 else:

@@ -35,6 +35,12 @@ VERY_FAST = 8 * LARGEST_STEP  # |λ| times the sampling interval above which a r
 INFINITE = 1e12  # rate that stands for an infinite one, rad/s
 ENDLESS = 1e100  # size of a state above which it has diverged
 FINE = 20  # sub-steps per sample of the run that looks for the rates
+BEGINNING, SETTLING, EVERY = (
+    400,
+    40,
+    20,
+)  # its samples at most, those left out first, and the spacing of those looked at
+HIGH, FEWEST = 0.9, 5  # quantile of the rates along it that counts, and the rates that are too few to tell
 SHOWN = 8  # values named in a message
 
 E = TypeVar("E", bound=Equations)
@@ -147,17 +153,10 @@ def on_grid(simulator: E, h: float) -> E:
 
 
 def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: int = 1) -> Model:
-    """Make the simulator with its laws a closed discrete-time model.
+    """Make the simulator with its laws a closed discrete-time model for samples dt apart, s.
 
-    Parameters
-    ----------
-    simulator : Simulator
-    dt : float
-        Sampling interval, s.
-    hold : {"zero", "linear"}
-        Inputs between samples.
-    substeps : int
-        Runge-Kutta steps per sample; see `choose_substeps`.
+    `hold` says whether inputs are held between samples ("zero") or interpolated ("linear"); `substeps` counts the
+    Runge-Kutta steps per sample (`choose_substeps`).
     """
     simulator = on_grid(simulator, dt / substeps)
     step = _SubStep(simulator, dt / substeps, hold)
@@ -292,9 +291,9 @@ def signals(simulator: Equations) -> ca.Function:
     return ca.Function("signals", [xs, us, slope, t, vector], columns, names, ["z", "dz", "lift", "push"])
 
 
-def _flow(simulator: Equations, n_p: int) -> ca.Function:
+def _flow(simulator: Equations) -> ca.Function:
     """Make `(x, u, p) -> (f, ∂f/∂x)` of [x; laws' states], memory at rest."""
-    vector = ca.SX.sym("p", n_p)
+    vector = ca.SX.sym("p", simulator.parameter_set.size)
     equations = ClosedEquations(simulator, vector)
     n_x = len(simulator.states) + sum(equations.n_q)
     x, u = ca.SX.sym("x", n_x), ca.SX.sym("u", len(simulator.inputs))
@@ -303,36 +302,37 @@ def _flow(simulator: Equations, n_p: int) -> ca.Function:
     return ca.Function("flow", [x, u, vector], [f, ca.densify(ca.jacobian(f, x))])
 
 
+def _eigenvalues(simulator: Equations, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Eigenvalues of ∂f/∂x at x (K, n_x) and u (K, n_u), (K, n); nan where ∂f/∂x is not finite."""
+    flow = _flow(simulator)
+    out = np.full((len(x), flow.size1_in(0)), np.nan, dtype=complex)
+    for k, (row, inputs) in enumerate(zip(x, u, strict=True)):
+        a = np.asarray(flow(_padded(row, out.shape[1]), inputs, p)[1])
+        if np.all(np.isfinite(a)):
+            out[k] = np.linalg.eigvals(a)
+    return out
+
+
 def fastest_rates(simulator: Equations, x: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Compute the largest |eigenvalue| of ∂f/∂x, rad/s, at x (K, n_x) and u (K, n_u), shape (K,); nan if infinite."""
     if not simulator.states or simulator.discrete:
         return np.zeros(len(x))
-    flow = _flow(simulator, len(p))
-    n_x, out = flow.size1_in(0), np.full(len(x), np.nan)
-    for k, (row, inputs) in enumerate(zip(x, u, strict=True)):
-        full = np.concatenate([row, np.zeros(n_x - len(row))]) if len(row) < n_x else row[:n_x]
-        a = np.asarray(flow(full, inputs, p)[1])
-        if np.all(np.isfinite(a)):
-            out[k] = float(np.max(np.abs(np.linalg.eigvals(a))))
-    return out
+    return np.asarray(np.max(np.abs(_eigenvalues(simulator, x, u, p)), axis=1))
 
 
 def growth_rate(simulator: Equations, recording: Recording) -> float:
     """Compute the largest real part of the eigenvalues of ∂f/∂x where a recording begins, 1/s; 0 without a state."""
     if not simulator.states or simulator.discrete:
         return 0.0
-    p = simulator.parameter_set.start
-    flow, start = _flow(simulator, len(p)), _start(simulator, recording)
-    a = np.asarray(flow(np.append(start, np.zeros(flow.size1_in(0) - len(start))), recording.u[0], p)[1])
-    return float(np.max(np.linalg.eigvals(a).real)) if np.all(np.isfinite(a)) else 0.0
+    begin, p = _start(simulator, recording), simulator.parameter_set.start
+    return float(np.max(np.nan_to_num(_eigenvalues(simulator, begin[None], recording.u[:1], p).real)))
 
 
 def needed_substeps(simulator: Equations, recordings: Sequence[Recording]) -> tuple[int, float]:
     """Count the sub-steps per sample that keep |λ| h below `LARGEST_STEP`, and give the largest |λ|, rad/s."""
     rate, first = rate_at_start(simulator, recordings[0]), recordings[0]
     if rate * first.dt > VERY_FAST:
-        p = simulator.parameter_set.start
-        rate = _along_a_run(simulator, first, p, _start(simulator, first), rate)
+        rate = _along_a_run(simulator, first, rate)
     return max(1, int(np.ceil(rate * first.dt / LARGEST_STEP))), rate
 
 
@@ -346,12 +346,8 @@ def rate_at_start(simulator: Equations, recording: Recording) -> float:
 def choose_substeps(simulator: Equations, recordings: Sequence[Recording]) -> int:
     """Choose the sub-steps per sample that keep |λ| h below `LARGEST_STEP` where the first recording begins.
 
-    Where a rate is very fast, the rates along a run decide (a square root is infinitely steep at zero).
-
-    Raises
-    ------
-    InputError
-        If more than `MOST_SUBSTEPS` would be needed, or a derivative is not finite.
+    Where a rate is very fast, the rates along a run decide (a square root is infinitely steep at zero). More than
+    `MOST_SUBSTEPS`, or a derivative that is not finite, is refused.
     """
     needed, rate = needed_substeps(simulator, recordings)
     if needed <= MOST_SUBSTEPS:
@@ -370,36 +366,41 @@ def _start(simulator: Equations, recording: Recording) -> np.ndarray:
     return given[:n_x] if len(given) >= n_x else np.zeros(n_x)
 
 
-def _run(simulator: Equations, recording: Recording, p: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Compute the states at every sub-step, `FINE` per sample, at the beginning of a recording."""
+def _padded(x: np.ndarray, n: int) -> np.ndarray:
+    """Give n entries of x, zeros behind its own."""
+    return np.append(x[:n], np.zeros(max(n - len(x), 0)))
+
+
+def _short_run(simulator: Equations, recording: Recording) -> tuple[Recording, np.ndarray]:
+    """Give the beginning of a recording, and the states at every sub-step of a run over it, `FINE` per sample."""
+    short = recording.slice(0, min(len(recording), BEGINNING))
     model = discretise(simulator, recording.dt, "zero", substeps=FINE)
-    first = np.append(start, np.zeros(model.n_state - len(start)))
-    return states_along(model, model.drive(recording), p, first)
+    first = _padded(_start(simulator, recording), model.n_state)
+    return short, states_along(model, model.drive(short), simulator.parameter_set.start, first)
 
 
-def _along_a_run(simulator: Equations, recording: Recording, p: np.ndarray, start: np.ndarray, rate: float) -> float:
+def _along_a_run(simulator: Equations, recording: Recording, rate: float) -> float:
     """Compute a high quantile of the rates along a run; the given rate where the run diverges."""
-    short = recording.slice(0, min(len(recording), 400))
-    states = _run(simulator, short, p, start)[::FINE]
-    found = fastest_rates(simulator, states[40::20], short.u[40::20], p)
+    short, states = _short_run(simulator, recording)
+    x, u = states[::FINE][SETTLING::EVERY], short.u[SETTLING::EVERY]
+    found = fastest_rates(simulator, x, u, simulator.parameter_set.start)
     found = found[np.isfinite(found)]
-    return min(rate, float(np.quantile(found, 0.9))) if len(found) > 5 else rate
+    return min(rate, float(np.quantile(found, HIGH))) if len(found) > FEWEST else rate
 
 
 def _not_finite(simulator: Equations, recording: Recording) -> str:
     """Say which state's derivative, or its slope, is not finite, and where; empty if all are finite."""
-    p, start = simulator.parameter_set.start, _start(simulator, recording)
-    flow = _flow(simulator, len(p))
-    n_x, names = flow.size1_in(0), simulator.states
+    p, flow, names = simulator.parameter_set.start, _flow(simulator), simulator.states
+    n_x = flow.size1_in(0)
 
     def derivative(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         return np.asarray(flow(x, u, p)[0]).ravel()
 
-    begun = np.append(start, np.zeros(n_x - len(start)))
+    begun = _padded(_start(simulator, recording), n_x)
     points = [(begun, recording.u[0]), (begun, np.mean(recording.u, axis=0))]
     if all(np.all(np.isfinite(derivative(*point))) for point in points):  # the run meets it later
-        short = recording.slice(0, min(len(recording), 400))
-        states = _run(simulator, short, p, start)[:, :n_x]
+        short, states = _short_run(simulator, recording)
+        states = states[:, :n_x]
         last = int(np.argmin(np.append(np.all(np.abs(states) < ENDLESS, axis=1), False))) - 1
         x, u = states[last], short.u[last // FINE]
         points += [(x + share * recording.dt / FINE * derivative(x, u), u) for share in (0.0, 0.5, 1.0)]

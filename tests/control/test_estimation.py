@@ -13,8 +13,8 @@ from pilfr_casadi.cli.demo import demo_recordings
 from pilfr_casadi.control import PredictiveController, ekf_step, feedforward, kalman_filter, visibility
 from pilfr_casadi.diagnose import Diagnosis
 from pilfr_casadi.laws import Delay, StopHysteresis
+from pilfr_casadi.linear import steady_state_gain
 from pilfr_casadi.models import play
-from pilfr_casadi.simulators import steady_state_gain
 from problems import observer as observer_problem
 
 LAW = StopHysteresis().at({"w": 80.0, "r": np.geomspace(0.001, 0.04, 6)})

@@ -23,7 +23,7 @@ from pilfr_casadi.identify import (
 )
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import GaussNewton, Solution, Status
-from pilfr_casadi.optimise.spectral_radius import stability
+from pilfr_casadi.optimise.constraints import stability
 
 
 @dataclass

@@ -13,7 +13,7 @@ from pilfr_casadi.identify import fit, grid_start, network_start, paper_start, r
 from pilfr_casadi.linear import frequency_subspace, robust_bla, time_subspace
 from pilfr_casadi.models import NARX, PILFR, Play, PrandtlIshlinskii, hammerstein, network_lfr, ssnn, wiener
 from pilfr_casadi.optimise import GaussNewton, Problem
-from pilfr_casadi.optimise.spectral_radius import stability
+from pilfr_casadi.optimise.constraints import stability
 
 NX, N = 2, 5
 LINEAR = {

@@ -30,7 +30,8 @@ from pilfr_casadi.laws import (
     readable_unit,
     unit_forces,
 )
-from pilfr_casadi.simulators import discretise, with_output_injection
+from pilfr_casadi.linear import with_output_injection
+from pilfr_casadi.simulators import discretise
 
 DT, M, RUN = 0.01, 240, 120  # step, samples of the local signals, samples of a simulation
 EVERY = (*CATALOGUE, *(finer for kinds in FINER.values() for finer in kinds))

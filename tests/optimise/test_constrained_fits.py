@@ -24,7 +24,7 @@ from pilfr_casadi.optimise import (
     stable,
 )
 from pilfr_casadi.optimise.constraints import BeyondRadius
-from pilfr_casadi.optimise.spectral_radius import unsolved
+from pilfr_casadi.optimise.exact_limits import unsolved
 from problems.constrained import infeasible_sentences, radius, slowest_pole, sparse_plays, stability_table, three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)

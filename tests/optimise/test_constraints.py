@@ -10,7 +10,7 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
 from pilfr_casadi.models import PILFR, Parameter, ParameterSet
 from pilfr_casadi.optimise import Constraint, Problem, stable
-from pilfr_casadi.optimise.constraints import SLACK, compile_constraints, log_norm_of_power
+from pilfr_casadi.optimise.constraints import SLACK, Rows, log_norm_of_power
 
 matrices = st.integers(1, 5).flatmap(lambda n: hnp.arrays(float, (n, n), elements=st.floats(-2, 2, width=32)))
 
@@ -78,50 +78,45 @@ def system():
 
 
 def test_stable_bounds_any_square_expression():
-    g, slope, lower, upper, labels, _ = compile_constraints(
-        (stable(0.95, slack=0.0), stable(1.0, lambda p: p["A"] * p["gain"], name="closed loop")), system()
-    )
-    value = np.asarray(g(system().start)).ravel()
-    np.testing.assert_allclose(np.exp(value), [0.9, 1.8], rtol=1e-4)
-    np.testing.assert_allclose(upper, [np.log(0.95), np.log(1 + SLACK)])
-    assert np.all(np.isinf(lower))
-    assert labels == ("spectral radius <= 0.95", "closed loop <= 1")
-    assert np.asarray(slope(system().start)).shape == (2, 5)
+    rows = Rows((stable(0.95, slack=0.0), stable(1.0, lambda p: p["A"] * p["gain"], name="closed loop")), system())
+    np.testing.assert_allclose(np.exp(rows.values(system().start)), [0.9, 1.8], rtol=1e-4)
+    np.testing.assert_allclose(rows.upper, [np.log(0.95), np.log(1 + SLACK)])
+    assert np.all(np.isinf(rows.lower))
+    assert rows.labels == ("spectral radius <= 0.95", "closed loop <= 1")
+    assert rows.slope(system().start).shape == (2, 5)
 
 
 def test_own_expressions_of_named_parameters():
     mine = Constraint(lambda p: ca.vertcat(p["A"][0, 1] * p["gain"], ca.trace(p["A"])), [-1.0, 0.0], [1.0, 2.0], "mine")
     tied = Constraint(lambda p: p["gain"] - 2, 0.0, 0.0)
-    g, slope, lower, upper, labels, _ = compile_constraints((mine, tied), system())
-    np.testing.assert_allclose(np.asarray(g(system().start)).ravel(), [0.4, 1.4, 0.0])
-    assert labels == ("mine[0]", "mine[1]", "constraint")
-    assert lower.tolist() == [-1, 0, 0]
-    assert upper.tolist() == [1, 2, 0]
+    rows = Rows((mine, tied), system())
+    np.testing.assert_allclose(rows.values(system().start), [0.4, 1.4, 0.0])
+    assert rows.labels == ("mine[0]", "mine[1]", "constraint")
+    assert rows.lower.tolist() == [-1, 0, 0]
+    assert rows.upper.tolist() == [1, 2, 0]
     expected = [[0, 0, 2.0, 0, 0.2], [1, 0, 0, 1, 0], [0, 0, 0, 0, 1]]
-    np.testing.assert_allclose(np.asarray(slope(system().start)), expected)
+    np.testing.assert_allclose(rows.slope(system().start), expected)
 
 
 def test_no_constraints():
-    g, slope, lower, _, labels, _ = compile_constraints((), system())
-    assert (
-        np.asarray(g(system().start)).size == np.asarray(slope(system().start)).size == lower.size == len(labels) == 0
-    )
+    rows, start = Rows((), system()), system().start
+    assert rows.values(start).size == rows.slope(start).size == rows.lower.size == len(rows.labels) == 0
 
 
 @pytest.mark.parametrize(
     "make, words",
     [
         (lambda: stable(slack=-1e-6), "slack of -1e-06; give zero or more"),
-        (lambda: compile_constraints((Constraint(lambda p: p["gain"], unit=0.0),), system()), "unit of the constraint"),
+        (lambda: Rows((Constraint(lambda p: p["gain"], unit=0.0),), system()), "unit of the constraint"),
         (lambda: stable(0.0), "bound of 0.0 on the spectral radius was given; give a number above zero"),
         (
-            lambda: compile_constraints((Constraint(lambda p: p["mass"], name="m"),), system()),
+            lambda: Rows((Constraint(lambda p: p["mass"], name="m"),), system()),
             "'m' reads a parameter 'mass'",
         ),
-        (lambda: compile_constraints((Constraint(lambda p: p["gain"], 2.0, 1.0),), system()), "infeasible"),
-        (lambda: compile_constraints((Constraint(lambda p: p["gain"], upper=np.nan),), system()), "infeasible"),
+        (lambda: Rows((Constraint(lambda p: p["gain"], 2.0, 1.0),), system()), "infeasible"),
+        (lambda: Rows((Constraint(lambda p: p["gain"], upper=np.nan),), system()), "infeasible"),
         (
-            lambda: compile_constraints((Constraint(lambda p: p["A"], [0.0, 1.0]),), system()),
+            lambda: Rows((Constraint(lambda p: p["A"], [0.0, 1.0]),), system()),
             "do not fit its 4 entries",
         ),
     ],
@@ -142,7 +137,7 @@ def test_what_cannot_be_a_constraint(make, words):
 )
 def test_what_is_no_expression_gets_one_sentence(expression, words):
     with pytest.raises(InputError, match=words) as refused:
-        compile_constraints((Constraint(expression, upper=1.0, name="mine"),), system())
+        Rows((Constraint(expression, upper=1.0, name="mine"),), system())
     assert "'mine'" in str(refused.value) and "\n" not in str(refused.value)
 
 

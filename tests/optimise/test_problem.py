@@ -107,13 +107,6 @@ def test_initial_states_are_what_the_recording_says(kind):
     assert len(p.labels) == p.size
 
 
-def test_a_number_of_periods_of_ones_own():
-    r = recording(0, period=40, initial="periodic")
-    p, values = problem(r, options={"periods": 3})
-    state = reference(Play, values, np.tile(r.u[:40], (3, 1)), np.zeros(7))[3]
-    np.testing.assert_allclose(p.first_states(p.start)[0], state, atol=1e-12)
-
-
 def test_labels_name_the_variables():
     p, _ = problem([recording(0, initial="zero"), recording(1)], changes={"A": {"fixed": True}}, n=2)
     assert p.labels[0] == "B_u[0,0]"

@@ -13,14 +13,8 @@ from scipy.optimize import minimize
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.optimise import Problem, Status, stable, unbounded_sentence, within_bounds
-from pilfr_casadi.optimise.spectral_radius import (
-    SchurProblem,
-    below_blocks,
-    jury_rows,
-    least_radius,
-    schur_basis,
-    stability,
-)
+from pilfr_casadi.optimise.constraints import least_radius, stability
+from pilfr_casadi.optimise.exact_limits import SchurProblem, below_blocks, jury_rows, schur_basis
 from problems.constrained import radius, three_plays
 
 PLAYS = pilfr.PrandtlIshlinskii(pilfr.Play, 3)

@@ -22,10 +22,16 @@ def steady(seed=0, length=80, **options):
 def test_the_fixed_point_is_where_many_periods_lead(operator):
     structure, values = random_lfr(0, operator=operator)
     model, records = structure.model(1, 1, values), [steady(0), steady(1, skip=10)]
-    exact, warm = (Problem(model, records, engine="vm", periods=n) for n in (None, 60))
+    before = [[np.tile(x[:40], (60, 1)) for x in (r.u, r.y)] for r in records]
+    led = [
+        Recording(np.vstack([u, r.u]), np.vstack([y, r.y]), 0.1, initial="zero", skip=2400 + r.skip)
+        for r, (u, y) in zip(records, before, strict=True)
+    ]
+    exact, warm = (Problem(model, given, engine="vm") for given in (records, led))
     theta = exact.start + 1e-3 * np.random.default_rng(1).normal(size=exact.size)
     theta = np.clip(theta, exact.lower, exact.upper)
-    for a, b in zip(exact.first_states(theta), warm.first_states(theta), strict=True):
+    for a, (u, _), zero in zip(exact.first_states(theta), before, warm.first_states(theta), strict=True):
+        b = warm.engine.simulate(u, warm.parameters(theta), zero)[1]
         np.testing.assert_allclose(a, b, atol=1e-8)
     for a, b in zip(exact.normal(theta), warm.normal(theta), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-7 * np.max(np.abs(b)))
@@ -42,7 +48,8 @@ def test_memory_that_never_moves_has_no_slope():
 def test_weights_scale_residuals_and_threads_change_nothing():
     structure, values = random_lfr(0)
     model, records = structure.model(1, 1, values), [steady(0), steady(1), steady(2, initial="zero")]
-    plain, weighted = (Problem(model, records, weights=w, threads=n) for w, n in ((None, 1), ([1.0, 3.0, 0.5], 2)))
+    plain, weighted = (Problem(model, records, weights=w) for w in (None, [1.0, 3.0, 0.5]))
+    weighted.threads = 2
     e, f = (p.residual(p.start).reshape(3, -1) for p in (plain, weighted))
     np.testing.assert_allclose(f, e * np.array([[1.0], [3.0], [0.5]]), atol=1e-14)
     again = Problem(model, records, weights=[1.0, 3.0, 0.5])

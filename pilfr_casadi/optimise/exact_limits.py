@@ -1,4 +1,4 @@
-r"""Bounds on spectral radii: which matrices `stable` bounds, and the solve at a tight bound.
+r"""Solve inside exact limits: bounds on spectral radii, and the last step of a result onto its limits.
 
 With a real Schur form `M / c = Q T Q'` at some point and `S = I + X`, X strictly block lower triangular,
 
@@ -19,25 +19,30 @@ starts outside ends in poor points. `within_bounds` therefore
 
 Radii stop a share of `MARGINS` inside, so that the eigenvalues of the result, computed in floating point, never exceed
 the bound: three digits of it are used. The result is a local minimum.
+
+A solver meets other constraints up to a tolerance. Where an exact one fails on the numbers of the result, `exactly`
+moves the point by the smallest step, in the metric of the outputs, that meets it and keeps all others to first order:
+
+    minimise  1/2 d'(H + λ D)d   subject to  lower <= θ + d <= upper,  lower_g + m <= g(θ) + ∇g d <= upper_g - m
+
+with `H` the Gauss-Newton Hessian of the simulation error (Eq. 20 there) and a margin m on the exact ones that doubles
+until every check holds in floating point. What is fixed stays fixed.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
-from ..models import PILFR, GeneralizedPlay, ParameterSet, PrandtlIshlinskii, element_slopes, unknown_slope
-from .constraints import BeyondRadius, Constraint, linear_part, loosened, stable
-from .exact_constraints import beyond, missed
-from .gauss_newton import GaussNewton
+from ..models import Neighbours
+from .constraints import TOLERATED, BeyondRadius, Constraint, loosened
+from .gauss_newton import GaussNewton, QuadraticProgram, without_rounding
 from .problem import Problem
 from .solution import FELT, Progress, Solution, Status
 
@@ -50,113 +55,15 @@ ROUNDS = 6  # Schur forms taken at the bound, at most
 GAIN = 1e-4  # relative fall of the cost for which another round is worth it
 STEP = GaussNewton(max_iterations=100, tolerance=1e-4)
 ROW_UNIT = 1e-2  # unit of Jury's rows, next to which their violation is judged
-CURVATURE = (
-    1e-2  # curvature of the objective along X: damps X next to a cost of order 1 (calibrated on three tight fits)
-)
+CURVATURE = 1e-2  # of the objective along X: damps X next to a cost of order 1 (calibrated on three tight fits)
+MOVES = 40  # steps onto exact limits, with margins doubled from `FIRST` to more than any constraint needs
+FIRST = 1e-9  # margin of the first of these steps, in units of a constraint
+MOVE_DAMPING = 1e-6  # λ of these steps, only large enough that their Hessian is positive definite
 
 
-@dataclass(frozen=True)
-class WithElement:
-    """`A + B_w S C_z` with one of an element's slopes S; a class, so that it can be sent to other processes."""
-
-    element: Any
-    slope: str
-
-    def __call__(self, p: Mapping[str, Any]) -> Any:
-        """Return the expression for named parameters p."""
-        return p["A"] + p["B_w"] @ element_slopes(self.element, p)[self.slope] @ p["C_z"]
-
-
-def stability(structure: PILFR, radius: float = 1.0, exact: bool = False) -> tuple[Constraint, ...]:
-    """Bound the spectral radius of A, and of `A + B_w S C_z` for each slope S that the element can have.
-
-    For plays the two cases are that no operator slips, or all do (for stops: all stick).
-    """
-    if structure.nx == 0:
-        return ()
-    limits: tuple[Constraint, ...] = (stable(radius, exact=exact),)
-    element = structure.element
-    if element is not None:
-        symbols = {name: ca.MX.sym(name, *p.shape) for name, p in element.parameters().items()}
-        for slope in element_slopes(element, symbols):
-            name = f"spectral radius with the element's {slope}"
-            limits += (stable(radius, WithElement(element, slope), name, exact=exact),)
-    return limits
-
-
-def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint, ...]:
-    """Return the constraints that `stable=bound` of a fit stands for."""
-    if bound is False:
-        return ()
-    if not isinstance(bound, bool | int | float | np.number) or not np.isfinite(bound):
-        raise InputError(f"stable = {bound!r} was given; give True, False or the largest spectral radius, above zero.")
-    return stability(structure, float(bound), exact=True)
-
-
-def unbounded_sentence(structure: PILFR | None, constraints: Iterable[Constraint], p: Mapping[str, Any]) -> str:
-    """Say what the bounds leave open about an element in feedback, given named numbers p; empty if nothing."""
-    radii = [c.check.radius for c in constraints if isinstance(c.check, BeyondRadius)]
-    element = structure.element if structure else None
-    if element is None or not radii or not np.any(np.sum(np.abs(p["C_z"]), axis=1) * np.sum(np.abs(p["B_w"]), axis=0)):
-        return ""
-    if unknown_slope(element, p):
-        return (
-            "the spectral radius is bounded for the linear part alone: how steep the element is that is fed back is "
-            "not known, as with envelopes of your own, so judge stability by simulations beyond the recorded amplitudes"
-        )
-    if not isinstance(element, PrandtlIshlinskii) or not isinstance(element.operator, GeneralizedPlay):
-        return ""
-    worst = 0.0
-    for side in "lr":
-        slope = np.diag(np.sum(p["w"], axis=1) * element.operator.steepest(side, p))
-        worst = max(worst, float(np.max(np.abs(np.linalg.eigvals(p["A"] + p["B_w"] @ slope @ p["C_z"])))))
-    if worst <= min(radii):
-        return ""
-    return (
-        f"where an envelope is steepest the spectral radius is {worst:.4g}, above its bound of {min(radii):g}, which "
-        "holds far out: small motions there may grow until the envelope is flatter"
-    )
-
-
-def check_room(parameters: ParameterSet, limits: Iterable[Constraint]) -> None:
-    """Refuse bounds on the entries of A under which no A has the required spectral radius.
-
-    Raises
-    ------
-    InputError
-        With the bounds, the least radius that they allow and the required one.
-    """
-    radii = [c.check.radius for c in limits if isinstance(c.check, BeyondRadius) and c.check.matrix is linear_part]
-    if not radii or "A" not in parameters or np.all(parameters["A"].fixed):
-        return
-    a = parameters["A"]
-    low, high = (np.where(a.fixed, a.value, bound) for bound in a.bounds)
-    least = least_radius(low, high)
-    if least > min(radii):
-        entries = low[~a.fixed], high[~a.fixed]
-        raise InputError(
-            f"The bounds of A, {np.min(entries[0]):g} to {np.max(entries[1]):g}, allow no spectral radius below "
-            f"{least:g}, and it is to be at most {min(radii):g} so that the model is stable; widen the bounds of A, or "
-            "in Python give stable=False for a model that may grow without end."
-        )
-
-
-def least_radius(low: Array, high: Array) -> float:
-    """Bound from below the spectral radius of every matrix between `low` and `high` (n, n), entry by entry.
-
-    Uses `ρ(A) >= |trace A| / n` and, where `low >= 0`, `ρ(A) >= ρ(low)` (Perron and Frobenius).
-    """
-    low_trace, high_trace = float(np.trace(low)), float(np.trace(high))
-    least = max(low_trace, -high_trace, 0.0) / max(len(low), 1)
-    for bound, sign in ((low, 1.0), (high, -1.0)):
-        if np.all(np.isfinite(bound)) and np.all(sign * bound >= 0):
-            least = max(least, float(np.max(np.abs(np.linalg.eigvals(bound)), initial=0.0)))
-    return least
-
-
-def radius_limits(problem: Problem) -> list[Constraint]:
-    """Return the constraints of a problem that are exact bounds on a spectral radius."""
-    return [c for c in problem.constraints if c.exact and isinstance(c.check, BeyondRadius)]
+def radius_limits(problem: Problem) -> dict[Constraint, BeyondRadius]:
+    """Return the exact bounds on spectral radii of a problem with their checks."""
+    return {c: c.check for c in problem.constraints if c.exact and isinstance(c.check, BeyondRadius)}
 
 
 def below_blocks(n: int) -> Array:
@@ -228,9 +135,8 @@ def _first_pair(t: Array) -> tuple[int, int]:
 class _Bound:
     """One bounded matrix: M over its radius as a Function of p, the Schur basis Q, and Jury's rows with slopes."""
 
-    def __init__(self, problem: Problem, limit: Constraint, theta: Array, margin: float) -> None:
-        check, parameters = limit.check, problem.model.parameters
-        assert isinstance(check, BeyondRadius)
+    def __init__(self, problem: Problem, limit: Constraint, check: BeyondRadius, theta: Array, margin: float) -> None:
+        parameters = problem.model.parameters
         p = ca.MX.sym("p", parameters.size)
         scaled = ca.densify(check.matrix(parameters.symbols(p))) / (check.radius * (1.0 - margin))
         self.limit = limit
@@ -240,7 +146,7 @@ class _Bound:
         self.rows = jury_rows(len(self.basis))
         self.rows_slope = self.rows.jacobian()
         self.unknowns = self.rows.size1_in(1)
-        self.held, self.low = self.rows.size1_out(0), self.rows.size1_out(1)
+        self.upper = np.concatenate([np.full(self.rows.size1_out(0), np.inf), np.zeros(self.rows.size1_out(1))])
 
     def turned(self, p: Array) -> Array:
         """Return `Q' M Q`."""
@@ -252,28 +158,22 @@ class _Bound:
 
     def slopes(self, p: Array, x: Array) -> tuple[Array, Array]:
         """Return the rows' Jacobians with respect to `vec(Q' M Q)` and to X."""
-        held_m, held_x, low_m, low_x = self.rows_slope(self.turned(p), x, 0, 0)
-        return np.vstack([np.asarray(held_m), np.asarray(low_m)]), np.vstack([np.asarray(held_x), np.asarray(low_x)])
+        held_m, held_x, low_m, low_x = map(np.asarray, self.rows_slope(self.turned(p), x, 0, 0))
+        return np.vstack([held_m, low_m]), np.vstack([held_x, low_x])
 
 
 class SchurProblem:
-    """A problem whose exact bounds on spectral radii are Jury's rows in extra unknowns X.
+    """Problem whose exact bounds on spectral radii are Jury's rows in extra unknowns X; see `Minimisation`.
 
-    Parameters
-    ----------
-    problem : Problem
-        Problem with such bounds; its simulation error does not depend on X.
-    theta : array, shape (n,)
-        Point at which the Schur forms are taken.
-    margin : float
-        Share by which the radii are held below their bounds and other exact constraints, in their units, inside.
+    The Schur forms are taken at θ. Radii stay a share `margin` below their bounds, and other exact constraints as far
+    inside in their units.
     """
 
     def __init__(self, problem: Problem, theta: Array, margin: float) -> None:
         self.problem = problem
         limits = radius_limits(problem)
         self.kept = np.flatnonzero(np.repeat([c not in limits for c in problem.constraints], problem.g_sizes))
-        self.bounds = [_Bound(problem, c, theta, margin) for c in limits]
+        self.bounds = [_Bound(problem, c, check, theta, margin) for c, check in limits.items()]
         extra = [b.unknowns for b in self.bounds]
         self.places = [slice(a, b) for a, b in pairwise(problem.size + np.cumsum([0, *extra]))]
         self.labels = (*problem.labels, *(f"X{k}[{i},0]" for k, m in enumerate(extra) for i in range(m)))
@@ -283,7 +183,7 @@ class SchurProblem:
         exact = np.repeat([c.exact for c in problem.constraints], problem.g_sizes).astype(bool)
         room = np.where(exact, margin * problem.constraint_units(theta), 0.0)
         room = np.minimum(room, 0.25 * (problem.g_upper - problem.g_lower))[self.kept]
-        top = [np.concatenate([np.full(b.held, np.inf), np.zeros(b.low)]) for b in self.bounds]
+        top = [b.upper for b in self.bounds]
         self.g_lower = np.concatenate([problem.g_lower[self.kept] + room, np.zeros(sum(map(len, top)))])
         self.g_upper = np.concatenate([problem.g_upper[self.kept] - room, *top])
 
@@ -331,18 +231,14 @@ class SchurProblem:
 
     def constraint_units(self, x: Array, squares: Array | None = None) -> Array:
         """Return the units of the constraints."""
-        n = self.problem.size
-        units = self.problem.constraint_units(self.theta(x), None if squares is None else squares[:n])
+        units = self.problem.constraint_units(self.theta(x), None if squares is None else self.theta(squares))
         return np.concatenate([units[self.kept], np.full(len(self.g_lower) - len(self.kept), ROW_UNIT)])
 
     def multipliers(self, x: Array, found: Array) -> Array:
         """Return multipliers of the problem's own limits; of a radius with respect to its logarithm."""
         problem, n = self.problem, self.problem.size
-        out = np.zeros(n + len(problem.g_lower))
-        if len(found) != self.size + len(self.g_lower):
-            return out
-        out[:n], rows = found[:n], found[self.size :]
-        out[n + self.kept] = rows[: len(self.kept)]
+        out, rows = np.zeros(n + len(problem.g_lower)), found[self.size :]
+        out[:n], out[n + self.kept] = found[:n], rows[: len(self.kept)]
         p, row, first = problem.parameters(self.theta(x)), len(self.kept), np.cumsum([0, *problem.g_sizes])
         for bound, at in zip(self.bounds, self.places, strict=True):
             by_m = bound.slopes(p, x[at])[0]
@@ -362,26 +258,16 @@ def within_bounds(
 ) -> Solution:
     """Solve a problem that may have exact bounds on spectral radii.
 
-    Parameters
-    ----------
-    problem : Problem
-    start : array, shape (n,), optional
-        By default the problem's own.
-    solve : callable
-        Solves a problem from a start; any solver.
-    last : GaussNewton
-        Options of the solves at the bounds themselves.
-    held : bool
-        Whether the bounds are known to hold the solution; the solve without them is then left out.
-    progress : callable
-        Receives the iterations of `last`.
+    `solve` solves a problem from a start, by default the problem's own; any solver. `last` holds the options of the
+    solves at the bounds themselves, and `progress` receives their iterations. With `held` the bounds are known to hold
+    the solution, and the solve without them is left out.
     """
     if not radius_limits(problem):
         return solve(problem, start)
     ends = time.perf_counter() + last.time_limit
     given = begin = problem.start if start is None else start
     if not held:
-        found = solve(with_constraints(problem, loosened(problem.constraints)), start)
+        found = solve(problem.with_constraints(loosened(problem.constraints)), start)
         if found.status in (Status.INTERRUPTED, Status.DIVERGED_START) or _room(problem, found.theta) >= 0:
             return found
         begin = begin if at_bounds(problem, begin) else found.theta
@@ -412,7 +298,7 @@ def tighten(problem: Problem, theta: Array, last: GaussNewton, progress: Progres
         return unsolved(problem, theta, Status.DIVERGED_START)
     ends = time.perf_counter() + last.time_limit
     for constraints in _path(problem, theta):
-        step = with_constraints(problem, constraints)
+        step = problem.with_constraints(constraints)
         found = _solve_rows(step, _scaled(step, theta), _until(ends, STEP), MARGINS[0], progress)
         if found.status is Status.INTERRUPTED:
             return found
@@ -438,13 +324,6 @@ def tighten(problem: Problem, theta: Array, last: GaussNewton, progress: Progres
     return replace(best, iterations=iterations)
 
 
-def with_constraints(problem: Problem, constraints: tuple[Constraint, ...]) -> Problem:
-    """Return the same problem under other constraints."""
-    names = ("engine", "l1", "noise", "scale", "weights", "threads")
-    given: dict[str, Any] = {name: getattr(problem, name) for name in names}
-    return Problem(problem.model, problem.recordings, constraints=constraints, **given)
-
-
 def unsolved(problem: Problem, theta: Array, status: Status) -> Solution:
     """Return a point to which no step of a solver has led: its multipliers are not known."""
     return Solution(theta, problem.cost(theta), status, 0, 0.0)
@@ -452,23 +331,17 @@ def unsolved(problem: Problem, theta: Array, status: Status) -> Solution:
 
 def _path(problem: Problem, theta: Array) -> list[tuple[Constraint, ...]]:
     """Return the constraints with the bounds on their way from the radii at θ, the wanted bounds left out."""
-    values, ways = problem.model.parameters.unpack(problem.parameters(theta)), {}
-    for c in radius_limits(problem):
-        assert isinstance(c.check, BeyondRadius)
-        first = max(-np.log(max(c.check(values) + c.check.radius, 1e-300)), CLOSEST)
-        ways[c] = first, max(-np.log(c.check.radius), first)
+    values, limits, ways = problem.model.parameters.unpack(problem.parameters(theta)), radius_limits(problem), {}
+    for c, check in limits.items():
+        first = max(-np.log(max(check(values) + check.radius, 1e-300)), CLOSEST)
+        ways[c] = first, max(-np.log(check.radius), first)
     count = max(1, int(np.ceil(np.log2(max(b / a for a, b in ways.values())))))
     steps = []
     for k in range(1, count):
         radii = {c: float(np.exp(-(a ** (1 - k / count)) * b ** (k / count))) for c, (a, b) in ways.items()}
-        steps.append(tuple(_loosen(c, radii[c]) if c in radii else c for c in problem.constraints))
+        looser = {c: replace(check, radius=max(radii[c], check.radius)) for c, check in limits.items()}
+        steps.append(tuple(replace(c, check=looser[c]) if c in looser else c for c in problem.constraints))
     return steps
-
-
-def _loosen(c: Constraint, radius: float) -> Constraint:
-    """Move a bound to a larger radius."""
-    assert isinstance(c.check, BeyondRadius)
-    return replace(c, check=replace(c.check, radius=max(radius, c.check.radius)))
 
 
 def _scaled(problem: Problem, theta: Array) -> Array:
@@ -487,18 +360,17 @@ def _scaled(problem: Problem, theta: Array) -> Array:
 
 def _room(problem: Problem, theta: Array) -> float:
     """Return the least distance of the log radii from their bounds; negative outside."""
-    values, out = problem.model.parameters.unpack(problem.parameters(theta)), np.inf
-    for c in radius_limits(problem):
-        assert isinstance(c.check, BeyondRadius)
-        excess = c.check(values)
-        out = min(out, -float(np.log1p(max(excess / c.check.radius, -1.0 + 1e-300))) if excess else 0.0)
-    return out
+    values = problem.model.parameters.unpack(problem.parameters(theta))
+    with np.errstate(divide="ignore"):
+        return min(-float(np.log1p(check(values) / check.radius)) for check in radius_limits(problem).values())
 
 
 def _met(problem: Problem, theta: Array) -> bool:
     """Whether θ meets every constraint."""
+    g, unit = problem.constraint(theta), problem.constraint_units(theta)
+    over = np.maximum(problem.g_lower - g, g - problem.g_upper) - TOLERATED * np.where(unit > 0, unit, 1.0)
     own = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)  # these have a check of their own
-    return not beyond(problem, theta) and not np.any(missed(problem, theta) & ~own)
+    return not beyond(problem, theta) and bool(np.all((over <= 0) | own))
 
 
 def _beats(problem: Problem, theta: Array, found: Solution) -> bool:
@@ -537,3 +409,61 @@ def _solve_rows(
     found = solver.solve(schur, schur.start, progress, unfinished=True)
     multipliers = schur.multipliers(found.theta, found.multipliers)
     return replace(found, theta=schur.theta(found.theta), multipliers=multipliers)
+
+
+def beyond(problem: Problem, theta: Array) -> list[str]:
+    """Return the names of the exact constraints that do not hold at the numbers θ."""
+    if not any(c.exact for c in problem.constraints):
+        return []
+    g, first = problem.constraint(theta), np.cumsum([0, *problem.g_sizes])
+    held = (g >= problem.g_lower) & (g <= problem.g_upper)
+    values = problem.model.parameters.unpack(problem.parameters(theta))
+    return [
+        c.name
+        for c, (a, b) in zip(problem.constraints, pairwise(first), strict=True)
+        if c.exact and not (np.all(held[a:b]) if c.check is None else c.check(values) <= 0)
+    ]
+
+
+def exactly(problem: Problem, solution: Solution) -> Solution:
+    """Move a solution inside its exact constraints; its status is infeasible where no small step does it."""
+    theta = solution.theta
+    if solution.status is Status.INFEASIBLE or not np.isfinite(solution.cost) or not beyond(problem, theta):
+        return solution
+    exact = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)
+    hessian = problem.normal(theta)[2]
+    floor = without_rounding(np.diag(hessian), theta, Neighbours(problem.labels))
+    unit = problem.constraint_units(theta, floor)
+    unit = np.where(unit > 0, unit, 1.0)
+    damped = hessian + MOVE_DAMPING * np.diag(floor)
+    damped += np.diag(np.where(np.diag(damped) > 0, 0.0, 1.0))
+    qp, margin = QuadraticProgram(problem.size, len(unit), "daqp"), FIRST
+
+    def excess(point: Array) -> Array:
+        g = problem.constraint(point)
+        return np.maximum(problem.g_lower - g, g - problem.g_upper)
+
+    for _ in range(MOVES):
+        g = problem.constraint(theta)
+        room = np.where(exact, np.minimum(margin * unit, 0.25 * (problem.g_upper - problem.g_lower)), 0.0)
+        d, _, good = qp(
+            damped,
+            np.zeros(problem.size),
+            problem.lower - theta,
+            problem.upper - theta,
+            problem.constraint_jacobian(theta),
+            problem.g_lower + room - g,
+            problem.g_upper - room - g,
+        )
+        trial = np.clip(theta + d, problem.lower, problem.upper)
+        if not good or not np.all(excess(trial) <= unit):  # the step has led astray
+            break
+        theta = trial
+        if not beyond(problem, theta):
+            break
+        margin *= 2.0
+    cost, over = problem.cost(theta), np.maximum(excess(theta), 0.0)
+    if beyond(problem, theta) or not np.isfinite(cost) or np.any(over > TOLERATED * unit):
+        failed = Status.INFEASIBLE if solution.status.converged else solution.status
+        return replace(solution, status=failed)
+    return replace(solution, theta=theta, cost=cost, violation=float(np.max(over, initial=0.0)))
