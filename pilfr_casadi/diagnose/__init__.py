@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from .._base import Progress
     from ..data import Recording
     from ..laws import Law
-    from .linearise import Constant as Constant, over_samples as over_samples
+    from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
     from .mismatch_map import mismatch as mismatch
     from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect, plain as plain
     from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 from collections.abc import Sequence
@@ -13,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from .. import plots
-from .._base import make_folder, write_atomically
-from ..diagnose import Comparison, Diagnosis, Fitted, Workbench
+from .._base import InputError, make_folder, write_atomically
+from ..diagnose import Comparison, Diagnosis, Fitted, HiddenForce, Workbench, hidden_force
+from ..plots import Signal
+from ..simulators import Port
 from . import diagnosis_tables as tables
 from .diagnosis_tables import words
-from .hidden_force import force_blocks
 from .page import Block, Code, Page, Picture, Section, Text
 
 MOST_DRAWN = 3  # outputs and recordings that are drawn; the tables have all of them
@@ -25,25 +27,9 @@ WIDE_MAP = 6  # ports from which the map of ports and laws fills the page
 
 
 def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
-    """Write `report.html`, `diagnosis.json` and `figures/*.png` of a diagnosis into a folder.
+    """Write `report.html`, `diagnosis.json` and `figures/*.png` of a diagnosis into a folder; return the page's path.
 
     Each file is written atomically, the page last. Figures of an earlier diagnosis are removed.
-
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-    folder : path
-        Made where it does not exist.
-
-    Returns
-    -------
-    Path
-        The page.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be written.
     """
     page, figures = _draw(diagnosis_page(diagnosis))
     html = page.html()
@@ -187,7 +173,7 @@ def _mismatch(case: _Case) -> list[Block]:
             "Error over the value of the output.",
         ),
     )
-    return [*out, *(Picture(axes.figure, caption, alt) for axes, caption, alt in drawn)]
+    return [*out, *(Picture(*picture) for picture in drawn)]
 
 
 def _hidden(case: _Case) -> list[Block]:
@@ -196,7 +182,7 @@ def _hidden(case: _Case) -> list[Block]:
     for e in d.effects:
         number = next((i for i, p in enumerate(d.corrected.elements) if (p.port, p.law.id) == (e.port, e.law)), None)
         if number is not None:
-            out += force_blocks(case.bench, case.noise, case.after, e.port, number, words(e.law))
+            out += _force_blocks(case, case.after, e.port, number, words(e.law))
     if d.verdict != "unexplained":
         return out
     search, rows = d.evidence.get("search"), tables.candidates_by_pass(d)
@@ -204,16 +190,59 @@ def _hidden(case: _Case) -> list[Block]:
     if nearest is not None:
         fitted, port = nearest.winner.fitted, nearest.winner.port
         number, name = len(fitted.simulator.elements) - 1, f"{words(nearest.winner.law.id)} (the nearest law)"
-        out += force_blocks(case.bench, case.noise, fitted, port, number, name)
+        out += _force_blocks(case, fitted, port, number, name)
     elif rows:
-        out += force_blocks(case.bench, case.noise, case.before, rows[0][0]["port"], None, "")
+        out += _force_blocks(case, case.before, rows[0][0]["port"], None, "")
     table = tables.flexible_table(d)
     if table is not None:
         out.append(table)
         freest = str(table.rows[0][0])
         if nearest is None or freest != nearest.winner.port:
-            out += force_blocks(case.bench, case.noise, case.before, freest, None, "")
+            out += _force_blocks(case, case.before, freest, None, "")
     return out
+
+
+def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, name: str) -> list[Block]:
+    """Recover the force in a port along the loudest recording and draw it; `name` is the law's, empty without a law."""
+    bench, records = case.bench, case.bench.recordings
+    loud = int(np.argmax([np.std(r.y[r.skip :] / bench.scale) * np.sqrt(len(r)) for r in records]))
+    try:
+        hidden = hidden_force(bench, fitted, port, number, case.noise, loud)
+    except (InputError, np.linalg.LinAlgError, RuntimeError):
+        hidden = None
+    if hidden is None:
+        return [Text(f"The outputs do not show the force at {port}, so it cannot be recovered.")]
+    recording = hidden.recording or (f"training recording {loud + 1}" if len(records) > 1 else "the recording")
+    how = (
+        f"The blue points are the force at {port} that makes the simulator follow {recording}. A smoother found it: it "
+        "keeps the fitted parameters and assumes only that the force wanders in random steps; it knows no law."
+    )
+    how += f" The orange line is the fitted {name} along the simulation." if name else ""
+    return [Text(how), *_force_pictures(hidden, bench.simulator.port(port), name)]
+
+
+def _force_pictures(h: HiddenForce, port: Port, name: str) -> list[Block]:
+    """Draw a force over its local coordinate, rate and time, and the part that the law leaves."""
+    kind, _, channel = h.port.partition(":")
+    label = {"actuator": "added to the input", "sensor": "added to the output"}.get(kind, "force w")
+    across, alt = channel if port.series and channel else "local coordinate z", f"Recovered force at {h.port}"
+    x, force = Signal(across, h.z, port.across_unit), Signal(label, h.force, port.unit)
+    cloud = functools.partial(plots.force_cloud, title=h.port, name=name)
+    drawn = [(cloud(x, force, h.law_z, h.law), f"{h.port}, over {across}.", f"{alt} over its local coordinate.")]
+    if np.ptp(h.dz) > 0:
+        rate = Signal(f"rate of {across}", h.dz, f"{port.across_unit}/s" if port.across_unit else "")
+        drawn.append((cloud(rate, force, h.law_dz, h.law), "The same force over the rate.", f"{alt} over its rate."))
+    elif port.series and len(h.law):  # a law in series: its output over its input
+        acting = Signal(f"{across} as it acts", h.z + h.force, port.across_unit)
+        caption = "The signal behind the law over the signal before it."
+        drawn.append((cloud(x, acting, h.law_z, h.law_z + h.law), caption, f"{alt}: output over input."))
+    caption = "The same force over time, around its largest value. The band is the uncertainty due to noise."
+    drawn.append((plots.force_time(h.t, force, h.std, h.law, name), caption, f"{alt} over time."))
+    if len(h.law):
+        left = plots.force_left(x, Signal("recovered − law", h.force - h.law_held, port.unit), h.std)
+        caption = "The recovered force minus the law. Where the mean bends away from zero, the law's form is wrong."
+        drawn.append((left, caption, f"{alt} without the law."))
+    return [Picture(*picture) for picture in drawn]
 
 
 def _tried(d: Diagnosis) -> list[Block]:
@@ -233,7 +262,7 @@ def _tried(d: Diagnosis) -> list[Block]:
             "(best form). Grey: left out by the quick test before the fits."
         )
         wide = len({r["port"] for r in rows}) > WIDE_MAP
-        out += [Picture(axes.figure, caption, "Errors by port and law.", wide)]
+        out += [Picture(axes, caption, "Errors by port and law.", wide)]
         out += tables.candidate_tables(rows, chosen, title)
     return out
 
@@ -289,7 +318,7 @@ def _compared(case: _Case, c: Comparison, i: int) -> list[Block]:
             f"Spectra of {where}.",
         ),
     )
-    return [Picture(axes.figure, caption, alt) for axes, caption, alt in drawn]
+    return [Picture(*picture) for picture in drawn]
 
 
 def _next_experiment(d: Diagnosis) -> list[Block]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pprint
-import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -12,7 +10,7 @@ import numpy as np
 
 from ..diagnose import Diagnosis, plain
 from ..models import Parameter, ParameterSet
-from .page import Block, Code, Table, Text, number_text, uncertain_text
+from .page import Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
 ALIKE = 1.03  # ratio of two errors up to which two laws do equally well
@@ -265,35 +263,20 @@ def usage(diagnosis: Diagnosis) -> str:
     """Write the lines of Python that make the corrected simulator from the user's own and simulate a recording."""
     simulator = diagnosis.corrected
     fitted = {k: plain(np.asarray(p.value)) for k, p in simulator.parameter_set.items()}
-    values = {k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters}
-    laws: dict[str, set[str]] = {}
+    modules: dict[str, set[str]] = {}
     for e in simulator.elements:
-        laws.setdefault(_home(type(e.law)), set()).add(type(e.law).__name__)
-    lines = ["import numpy as np", "import pilfr_casadi as pilfr"]
-    lines += [f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(laws.items())]
-    lines += ["from your_file import simulator  # the one that was diagnosed", ""]
-    for e in simulator.elements:
-        own = e.own(fitted)
-        limits = {k: tuple(map(_literal, v)) for k, v in e.law.limits.items()}
-        lines.append(f"law = {type(e.law).__name__}(")
-        for key, value in (("values", own), ("limits", limits)):
-            text = pprint.pformat(value, width=90, sort_dicts=False, compact=True)
-            text = re.sub(r"(?<![\w'])inf(?![\w'])", "np.inf", text)
-            lines.append(f"    {key}={text},".replace("\n", "\n" + " " * (len(key) + 5)))
-        lines += [")", f"simulator = simulator.with_element({e.port!r}, law)"]
-    shown = pprint.pformat(values, width=100, sort_dicts=False)
-    lines += [f"values = {shown}".replace("\n", "\n" + " " * 9), "own = simulator.parameters"]
-    lines += ["corrected = simulator.with_parameters(own.at(own.pack(values)))", ""]
-    inputs = f"inputs={list(simulator.inputs)!r}, outputs={list(simulator.output_names)!r}"
-    lines += [f'recording = pilfr.read_csv("new.csv", {inputs})']
-    exact = f"dt=recording.dt, hold={diagnosis.hold!r}, substeps={diagnosis.substeps}"
-    lines += [f"step = pilfr.exported(corrected, {exact}).step  # casadi.Function (x, u) -> (x_next, y)"]
-    linear = diagnosis.hold == "linear"
-    lines += [
-        "u = np.hstack([recording.u, np.vstack([recording.u[1:], recording.u[-1:]])])" if linear else "u = recording.u"
-    ]
-    lines += ["x0 = np.zeros(step.numel_in(0))  # states, then the laws' own"]
-    return "\n".join([*lines, 'y = np.array(step.mapaccum("run", len(u))(x0, u.T)[1]).T'])
+        modules.setdefault(_home(type(e.law)), set()).add(type(e.law).__name__)
+    return render(
+        "use_diagnosis.txt",
+        diagnosis=diagnosis,
+        simulator=simulator,
+        modules=modules,
+        elements=[
+            (e, e.own(fitted), {k: tuple(map(_literal, v)) for k, v in e.law.limits.items()})
+            for e in simulator.elements
+        ],
+        values={k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters},
+    )
 
 
 def _home(law: type) -> str:

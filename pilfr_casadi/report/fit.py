@@ -24,41 +24,23 @@ from .fit_sections import (
     linear_part,
     output_pictures,
     parameter_blocks,
-    usage,
 )
-from .page import Block, Code, Page, Picture, Section, Table, Text
+from .page import Block, Code, Page, Picture, Section, Table, Text, render
 
+Records = Recording | Sequence[Recording]
 RUNAWAY = 1e3  # NRMSE from which the page says that the simulation runs away
 
 
 def fit_report(
     fit: Fit,
-    train: Recording | Sequence[Recording],
-    tests: Recording | Sequence[Recording],
+    train: Records,
+    tests: Records,
     folder: str | os.PathLike[str],
 ) -> Path:
-    """Write `report.html` and `model.json` of a fit into a folder.
+    """Write `report.html` and `model.json` of a fit into a folder; return the page's path.
 
-    Parameters
-    ----------
-    fit : Fit
-        The fitted model.
-    train : Recording or sequence of Recording
-        The recordings that it was fitted to.
-    tests : Recording or sequence of Recording
-        The recordings that it is judged on; may be empty.
-    folder : path
-        Made where it does not exist.
-
-    Returns
-    -------
-    Path
-        The page.
-
-    Raises
-    ------
-    InputError
-        If a recording does not fit the model, or the folder cannot be written.
+    `train` are the recordings that it was fitted to, `tests` those that it is judged on; there may be none. An
+    `InputError` says that a recording does not fit the model, or why the folder cannot be written.
     """
     page = fit_page(fit, train, tests, model_file="model.json")
     target = make_folder(folder)
@@ -68,8 +50,8 @@ def fit_report(
 
 def fit_page(
     fit: Fit,
-    train: Recording | Sequence[Recording],
-    tests: Recording | Sequence[Recording],
+    train: Records,
+    tests: Records,
     *,
     model_file: str = "model.json",
 ) -> Page:
@@ -87,7 +69,7 @@ def fit_page(
         Section("Constraints and active bounds", limit_blocks(fit)),
         Section("How it was found", _search(fit)),
         Section("Parameters", parameter_blocks(fit)),
-        Section("How to use it", [Code(usage(fit, model_file))]),
+        Section("How to use it", [Code(render("use_fit.txt", fit=fit, model_file=model_file))]),
     ]
     status = fit.status
     return Page(
@@ -134,42 +116,31 @@ def _errors(fit: Fit, recording: Recording, role: str) -> list[dict[str, Any]]:
 
 
 def _error_table(rows: list[dict[str, Any]]) -> Table:
-    outputs, compared = len({r["output"] for r in rows}) > 1, any(np.isfinite(r["linear"]) for r in rows)
-    columns = [
-        "recording",
-        *(["output"] if outputs else []),
-        "NRMSE, this model",
-        *(["NRMSE, linear model"] if compared else []),
-    ]
     units = {r["unit"] for r in rows}
     unit = f" [{units.pop()}]" if len(units) == 1 and "" not in units else ""
-    cells = [
-        [
-            r["recording"],
-            *([r["output"]] if outputs else []),
-            r["nrmse"],
-            *([r["linear"]] if compared else []),
-            r["rms"],
-            r["range"],
-            r["seconds"],
-            r["role"],
-        ]
-        for r in rows
-    ]
+    columns = {  # title: key
+        "recording": "recording",
+        "output": "output",
+        "NRMSE, this model": "nrmse",
+        "NRMSE, linear model": "linear",
+        f"rms error{unit}": "rms",
+        "rms error, % of range": "range",
+        "length [s]": "seconds",
+        "used for": "role",
+    }
+    if len({r["output"] for r in rows}) == 1:
+        del columns["output"]
+    if not any(np.isfinite(r["linear"]) for r in rows):
+        del columns["NRMSE, linear model"]
     note = (
         "NRMSE: rms error of the free-run simulation over the standard deviation of the measured output "
         "(0 is perfect, 1 is no better than its mean)."
     )
     if any(r["role"] == "test" for r in rows):
         note += " Test recordings were not used to fit or to choose; samples that a state was fitted to are left out."
+    cells = [[r[key] for key in columns.values()] for r in rows]
     emphasis = [i for i, r in enumerate(rows) if r["role"] == "test"]
-    return Table(
-        [*columns, f"rms error{unit}", "rms error, % of range", "length [s]", "used for"],
-        cells,
-        note=note,
-        emphasis=emphasis,
-        digits=3,
-    )
+    return Table(list(columns), cells, note=note, emphasis=emphasis, digits=3)
 
 
 def _verdict(rows: list[dict[str, Any]]) -> str:
@@ -226,13 +197,8 @@ def _search(fit: Fit) -> list[Block]:
     lines = [line for line in str(fit).splitlines()[1:] if line]
     out: list[Block] = [Text(". ".join(line[0].upper() + line[1:] for line in lines) + ".")]
     if fit.solution.history or any(c.solution.history for c in fit.candidates):
-        out.append(
-            Picture(
-                plots.convergence(fit).figure,
-                "Training error over iterations, for every start and for the last solve of the best.",
-                "Convergence of the starts.",
-            )
-        )
+        caption = "Training error over iterations, for every start and for the last solve of the best."
+        out.append(Picture(plots.convergence(fit), caption, "Convergence of the starts."))
     if fit.candidates:
         timed = any(c.solution.seconds for c in fit.candidates)
         rows = [
@@ -240,14 +206,6 @@ def _search(fit: Fit) -> list[Block]:
             for c in sorted(fit.candidates, key=lambda c: c.error)
         ]
         note = "Errors at the end of the exploration, before the best ones are polished."
-        out.append(
-            Table(
-                ["start", "training error", "iterations", *["time [s]"] * timed, "status"],
-                rows,
-                caption="All starts, best first",
-                note=note,
-                folded=True,
-                digits=3,
-            )
-        )
+        columns = ["start", "training error", "iterations", *["time [s]"] * timed, "status"]
+        out.append(Table(columns, rows, "All starts, best first", note, folded=True, digits=3))
     return out

@@ -36,40 +36,29 @@ def _draw_output(fit: Fit, r: Recording, i: int) -> list[Block]:
     likeness = [abs(np.corrcoef(u, r.y[:, i])[0, 1]) if np.ptp(u) > 0 else 0.0 for u in r.u.T]
     j = int(np.argmax(likeness))
     if likeness[j] > ALIKE:
-        whole = Picture(
-            plots.output_over_input(fit, r, input=j, output=i).figure,
-            f"{name}, over {r.inputs[j]}.",
-            f"Measured and simulated {name} over {r.inputs[j]}.",
-        )
+        across = r.inputs[j]
+        drawn = plots.output_over_input(fit, r, input=j, output=i)
+        whole = Picture(drawn, f"{name}, over {across}.", f"Measured and simulated {name} over {across}.")
     else:
-        whole = Picture(
-            plots.time(fit, r, output=i).figure,
-            f"{name}: the whole recording, with the errors of the models.",
-            f"Output and errors of {name} over time.",
-        )
+        caption = f"{name}: the whole recording, with the errors of the models."
+        whole = Picture(plots.time(fit, r, output=i), caption, f"Output and errors of {name} over time.")
+    around = f"{name}, measured and simulated, around the largest excursion."
+    over = f"{name}: output and errors over frequency."
     return [
-        Picture(
-            plots.traces(fit, r, output=i).figure,
-            f"{name}, measured and simulated, around the largest excursion.",
-            f"Simulated over measured {name}.",
-        ),
+        Picture(plots.traces(fit, r, output=i), around, f"Simulated over measured {name}."),
         whole,
         Picture(
-            plots.remains(fit, r, output=i).figure,
+            plots.remains(fit, r, output=i),
             f"{name}: the error of this model, enlarged.",
             f"Error of {name} over time.",
         ),
-        Picture(
-            plots.spectrum(fit, r, output=i).figure,
-            f"{name}: output and errors over frequency.",
-            f"Amplitude densities of output and errors of {name}.",
-        ),
+        Picture(plots.spectrum(fit, r, output=i), over, f"Amplitude densities of output and errors of {name}."),
     ]
 
 
 def curve(fit: Fit, recording: Recording) -> list[Block]:
     """Draw the curve of an element without memory."""
-    drawn = plots.loop(fit, recording).figure
+    drawn = plots.loop(fit, recording)
     return [Picture(drawn, "The element has no memory: w is a curve over z.", "Curve of the element, w over z.")]
 
 
@@ -82,36 +71,18 @@ def hysteresis(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
     out: list[Block] = [Text(intro)]
     for c in range(fit.model.n_w):
         of = f" of channel {c + 1}" if fit.model.n_w > 1 else ""
-        out.append(
-            Picture(
-                plots.loop(fit, recordings[0], channel=c).figure,
-                f"The identified loop{of}: w over z.",
-                f"Hysteresis loop{of}, w over z.",
-            )
-        )
-        out.append(
-            Picture(
-                plots.loading_curve(fit, recordings, channel=c).figure,
-                f"Loading curve{of}: w while z grows from rest.",
-                f"Loading curve{of}.",
-            )
-        )
-        out.insert(
-            -1,
-            Picture(
-                plots.loop(fit, recordings[0], channel=c, bare=True).figure,
-                f"The same{of} without its mean slope: the hysteresis alone.",
-                f"Hysteresis loop{of} without its slope.",
-            ),
-        )
+        loop, bare = (plots.loop(fit, recordings[0], channel=c, bare=k) for k in (False, True))
+        curve = plots.loading_curve(fit, recordings, channel=c)
+        without = f"The same{of} without its mean slope: the hysteresis alone."
+        out += [
+            Picture(loop, f"The identified loop{of}: w over z.", f"Hysteresis loop{of}, w over z."),
+            Picture(bare, without, f"Hysteresis loop{of} without its slope."),
+            Picture(curve, f"Loading curve{of}: w while z grows from rest.", f"Loading curve{of}."),
+        ]
         if {"r", "w"} <= set(fit.parameters):
-            out.append(
-                Picture(
-                    plots.weights(fit, recordings, channel=c).figure,
-                    f"Weights of the operators{of} over their thresholds, with standard errors where known.",
-                    f"Weights{of} over thresholds.",
-                )
-            )
+            caption = f"Weights of the operators{of} over their thresholds, with standard errors where known."
+            drawn = plots.weights(fit, recordings, channel=c)
+            out.append(Picture(drawn, caption, f"Weights{of} over thresholds."))
     return out
 
 
@@ -131,9 +102,8 @@ def linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
             if bla.var_total is not None and np.mean(bla.var_total[:, i, j] < np.abs(bla.G[:, i, j]) ** 2) < 0.5:
                 continue  # the training data excites too few frequencies for this one
             units = [fit.units.get(n, "") for n in (fit.model.outputs[i], fit.model.inputs[j])]
-            figure = plots.best_linear_approximation(
-                bla, linear, output=i, input=j, unit="/".join(units) if all(units) else ""
-            ).figure
+            unit = "/".join(units) if all(units) else ""
+            figure = plots.best_linear_approximation(bla, linear, output=i, input=j, unit=unit)
             of = f"{fit.model.outputs[i]} over {fit.model.inputs[j]}"
             caption = f"Best linear approximation of {of} in the training data, and the linear model of the start."
             out.append(Picture(figure, caption, f"Frequency response, {of}."))
@@ -265,27 +235,3 @@ def limit_blocks(fit: Fit) -> list[Block]:
     )
     columns = ["limit", "state", "value", "lower", "upper", "multiplier", "kind"]
     return [Table(columns, rows, note=note, emphasis=[i for i, v in enumerate(fit.limits) if not v.met], digits=9)]
-
-
-def usage(fit: Fit, model_file: str) -> str:
-    """Write the lines of Python that load the model and simulate with it."""
-    load = (
-        f"pilfr.load({model_file!r})"
-        if fit.structure is not None
-        else f"pilfr.load({model_file!r}, model=model)  # model: your equations"
-    )
-    names = f"inputs={list(fit.model.inputs)!r}, outputs={list(fit.model.outputs)!r}"
-    return "\n".join(
-        [
-            "import pilfr_casadi as pilfr",
-            "",
-            f"fit = {load}",
-            f'recording = pilfr.read_csv("new.csv", {names})',
-            "print(fit.nrmse(recording))         # error in free-run simulation",
-            "y = fit.simulate(recording)         # simulated outputs, (samples, outputs)",
-            "",
-            "step = fit.to_casadi()              # casadi.Function (x, u) -> (x_next, y), for controllers",
-            "x = fit.initial_state(recording)    # linear states, then the operators' memory",
-            "x, y0 = step(x, recording.u[0])",
-        ]
-    )

@@ -11,6 +11,8 @@ import base64
 import io
 import math
 import os
+import pprint
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -65,23 +67,9 @@ class Code:
 class Table:
     """A table; the first column names the rows.
 
-    Parameters
-    ----------
-    columns : sequence of str
-        Head of each column.
-    rows : sequence of sequences
-        Cells: text, or numbers, which are written with `digits` significant digits; None and nan become a dash.
-    caption, note : str
-        Text above and below the table.
-    emphasis : sequence of int
-        Rows in bold type, counted from 0.
-    folded : bool
-        Whether the table is closed until the reader opens it.
-
-    Raises
-    ------
-    InputError
-        If a row has not as many cells as there are columns.
+    Cells are text, or numbers, which are written with `digits` significant digits; None and nan become a dash. Rows
+    whose index is in `emphasis` are bold. `caption` stands above the table, `note` below; a `folded` table is closed
+    until the reader opens it. A row that has not as many cells as there are columns raises an `InputError`.
     """
 
     columns: Sequence[str]
@@ -117,18 +105,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure with its caption.
+    """A figure (of matplotlib, its axes, or the bytes of a PNG file) with its caption.
 
-    Parameters
-    ----------
-    figure : matplotlib Figure or bytes
-        The figure, or the bytes of a PNG file.
-    caption : str
-        Text below the figure.
-    alt : str
-        Description for readers who cannot see the figure.
-    wide : bool
-        Whether it fills the width of the page; otherwise two pictures stand side by side where there is room.
+    `alt` describes it to readers who cannot see it. A `wide` picture fills the width of the page; others stand side by
+    side where there is room.
     """
 
     figure: Any
@@ -143,7 +123,8 @@ class Picture:
         if isinstance(self.figure, bytes):
             return self.figure
         buffer = io.BytesIO()
-        self.figure.savefig(buffer, format="png", dpi=DPI)
+        figure = self.figure if hasattr(self.figure, "savefig") else self.figure.figure
+        figure.savefig(buffer, format="png", dpi=DPI)
         return buffer.getvalue()
 
     @property
@@ -182,27 +163,9 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A report.
+    """A report: its headline `status` states the result in one sentence, coloured by `tone` (of `TONES`).
 
-    Parameters
-    ----------
-    title, subtitle : str
-        Head of the page.
-    sections : sequence of Section
-        Body of the page.
-    status : str
-        Headline: one sentence that states the result.
-    tone : {"plain", "good", "warning", "bad"}
-        Colour of the headline.
-    facts : mapping of str to str
-        A few figures of merit by name.
-    footer : str
-        Last line.
-
-    Raises
-    ------
-    InputError
-        If the tone is unknown.
+    `facts` are a few figures of merit by name; the `footer` is the last line.
     """
 
     title: str
@@ -221,38 +184,35 @@ class Page:
         """The page as one HTML document."""
         from .._base import __version__
 
-        return str(_template().render(page=self, version=__version__))
+        return render("page.html", page=self, version=__version__)
+
+
+def render(template: str, **values: Any) -> str:
+    """Fill a template of the folder `templates`; text is escaped in HTML alone."""
+    return str(_templates().get_template(template).render(**values)).rstrip("\n")
 
 
 @cache
-def _template() -> Any:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+def _templates() -> Any:
+    from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-    loader = PackageLoader(__package__, "templates")
     environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader(__package__, "templates"),
+        autoescape=select_autoescape(["html"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    return environment.get_template("page.html")
+    environment.filters["literal"] = python_literal
+    return environment
+
+
+def python_literal(value: Any, width: int = 80) -> str:
+    """Write a value as Python that `import numpy as np` reads back."""
+    text = pprint.pformat(value, width=width, sort_dicts=False, compact=True)
+    return re.sub(r"(?<![\w'])inf(?![\w'])", "np.inf", text)
 
 
 def write_report(path: str | os.PathLike[str], title: str, sections: Sequence[Section], **more: Any) -> Path:
-    """Write a page, atomically.
-
-    Parameters
-    ----------
-    path : path
-        The HTML file.
-    title, sections, **more
-        See `Page`.
-
-    Returns
-    -------
-    Path
-        Where it is.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Write a `Page` to an HTML file, atomically; return its path."""
     return write_atomically(path, Page(title, sections, **more).html())

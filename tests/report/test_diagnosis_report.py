@@ -16,10 +16,8 @@ from test_report import EVIL, Reader
 from pilfr_casadi._base import InputError
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Gate
-from pilfr_casadi.laws import CubicStiffness
 from pilfr_casadi.report import diagnosis_report, diagnosis_report as same
 from pilfr_casadi.report.diagnosis_tables import usage
-from pilfr_casadi.report.hidden_force import hidden_force
 
 
 def test_the_checker_can_fail():
@@ -135,30 +133,6 @@ def test_users_text_is_text(tmp_path):
     assert reader.text.count("alert(1)") > 10
     assert all("<" not in f.name and "/" not in f.name for f in (tmp_path / "figures").iterdir())
     assert not re.search(r"https?://|@import|url\(", html.replace("data:", ""))
-
-
-@pytest.mark.parametrize(("port", "law"), PAIRS)
-def test_the_recovered_force_is_the_hidden_one(port, law):
-    d = example(port=port, law=law)
-    bench = Workbench.of(d.refitted, d.train, d.hold)
-    fitted = as_it_stands(bench, d.corrected)
-    hidden = hidden_force(bench, fitted, port, 0, NOISE * bench.scale)
-    assert np.std(hidden.force - hidden.law_held) < 0.2 * np.std(hidden.law)
-    assert np.corrcoef(hidden.force, hidden.law_held)[0, 1] > 0.98
-    assert np.median(np.abs(hidden.force - hidden.law_held) / hidden.std) < 2
-
-
-def test_the_recovered_force_owes_nothing_to_the_law():
-    d = example()
-    bench = Workbench.of(d.refitted, d.train, d.hold)
-    blind = as_it_stands(bench, rig())
-    hidden = hidden_force(bench, blind, "ground", None, NOISE * bench.scale)
-    true = 2.0e4 * hidden.z**3
-    assert len(hidden.law) == 0
-    assert np.std(hidden.force - true) < 0.25 * np.std(true)
-    wrong = rig().with_element("ground", CubicStiffness().at({"k_3": 1.0e4}))
-    other = hidden_force(bench, as_it_stands(bench, wrong), "ground", 0, NOISE * bench.scale)
-    assert np.std(other.force - hidden.force) < 0.1 * np.std(hidden.force)
 
 
 @pytest.mark.parametrize(("port", "law"), PAIRS)

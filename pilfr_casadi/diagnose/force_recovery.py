@@ -1,7 +1,13 @@
-"""The hidden force in a port: recovered from recordings without the help of a law, and drawn.
+"""The hidden force in a port, recovered from recordings without the help of a law.
 
-The corrected simulator without the law, linearised along the corrected run, is driven by an unknown force and smoothed
-(see `smoother.py`). A nonlinear simulator is linearised again along the result.
+The corrected simulator without the law, linearised along the corrected run, is driven by an unknown force that may
+change by a random step each sample,
+
+    Δx⁺ = A Δx + B Δw,   w⁺ = w + ε,   y_measured - y = C Δx + D Δw + noise,
+
+and everything is estimated from all outputs, past and future (Rauch, Tung & Striebel 1965, AIAA J. 3(8)). The
+variances of ε and of the noise (the given one or more) are the likeliest of a few. A nonlinear simulator is linearised
+again along the result.
 """
 
 from __future__ import annotations
@@ -12,45 +18,140 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .. import plots
-from .._base import InputError
 from ..data import Recording
-from ..diagnose import Constant, Fitted, Workbench
+from ..linear import measurement_update
 from ..models import Model, ParameterSet, map_points
-from ..plots import Signal
-from ..simulators import ClosedEquations, Instant, Simulator, discretise, on_grid, signals, states_along
-from .page import Block, Picture, Text
-from .smoother import UnknownForce
+from ..simulators import (
+    ClosedEquations,
+    Instant,
+    Simulator,
+    discretise,
+    on_grid,
+    signals,
+    states_along,
+)
+from .linearise import Constant, over_samples
+from .workbench import Fitted, Workbench
 
+LOUDER = (1.0, 3.0, 9.0)  # factors on the noise
 MOST_SAMPLES = 4000  # samples of a recording that are smoothed: the stretch with the most to see
 PASSES = 3  # linearisations at most
+TRIED = np.logspace(-4.0, 0.5, 10)  # random steps of the force, in units of what the residual calls for
+
+
+@dataclass(frozen=True, eq=False)
+class _Smoother:
+    """The linear system that is smoothed, state [Δx; Δw] in units of its own size.
+
+    f (M, n, n), h (M, n_y, n), outputs e (M, n_y) in units of the noise; w's known change `steps` (M,); `unit` (n,).
+    """
+
+    f: np.ndarray
+    h: np.ndarray
+    e: np.ndarray
+    steps: np.ndarray
+    unit: np.ndarray
+    constant: bool
+
+    @classmethod
+    def of(
+        cls,
+        blocks: list[np.ndarray],
+        error: np.ndarray,
+        noise: np.ndarray,
+        held: np.ndarray,
+        states: np.ndarray,
+        n: int,
+    ) -> _Smoother:
+        """Compose the sub-steps of each sample, the force held over it."""
+        m, n_x, n_y = len(error), states.shape[1], error.shape[1]
+        a, b, c, d = blocks
+        constant = np.allclose(a, a[0], rtol=1e-9, atol=1e-12)
+        f, g = over_samples(a, b, n)
+        g, c, d = g[:, :, 0], c[::n], d[::n, :, 0]
+        noise = np.maximum(noise, 1e-6 * np.std(error, axis=0) + 1e-300)
+        x, total = np.zeros(n_x), 0.0  # how strongly a lasting unit force shows
+        for _ in range(min(m, 500)):
+            total += float(np.sum(((c[0] @ x + d[0]) / noise) ** 2))
+            x = f[0] @ x + g[0]
+        response = np.sqrt(total / min(m, 500)) if np.isfinite(total) else 0.0
+        spread = float(np.sqrt(np.mean((error / noise) ** 2)))
+        size = max(spread / response if response > 0 else 0.0, float(np.std(held)), 1e-300)
+        size = size if response > 0 else 0.0
+        unit = np.append(np.maximum(np.std(states, axis=0), 1e-12), size)
+        whole, seen = np.zeros((m, n_x + 1, n_x + 1)), np.zeros((m, n_y, n_x + 1))
+        whole[:, :n_x, :n_x], whole[:, :n_x, n_x], whole[:, n_x, n_x] = f, g, 1.0
+        seen[:, :, :n_x], seen[:, :, n_x] = c, d
+        divided = np.where(unit > 0, unit, 1.0)
+        return cls(
+            whole / divided[:, None] * unit,
+            seen * unit / noise[:, None],
+            error / noise,
+            np.append(-np.diff(held), 0.0) / divided[-1],
+            unit,
+            bool(constant),
+        )
+
+    def likeliest(self) -> tuple[float, float] | None:
+        """Random step of the force and factor on the noise that make the errors likeliest; None where it is unseen."""
+        if not self.unit[-1] > 0:
+            return None
+        length = min(len(self.e), 1200)
+        found = [(self._filter(q, r, length)[0], (float(q), r)) for q in TRIED for r in LOUDER]
+        usable = [v for v in found if np.isfinite(v[0])]
+        return min(usable)[1] if usable else None
+
+    def _filter(self, q: float, r: float, length: int) -> tuple[float, list[tuple[Any, ...]]]:
+        """Minus twice the log likelihood, and predicted and filtered means and covariances."""
+        n = len(self.unit)
+        s, p = np.zeros(n), np.diag(np.append(np.full(n - 1, 0.01), 25.0))
+        cost = 0.0
+        kept: list[tuple[Any, ...]] = []
+        for k in range(length):
+            h = self.h[k]
+            v, gain, p_at = measurement_update(p, h, r**2 * np.eye(len(h)))
+            innovation = self.e[k] - h @ s
+            cost += float(innovation @ np.linalg.solve(v, innovation)) + float(np.linalg.slogdet(v)[1])
+            s_at = s + gain @ innovation
+            p_at = (p_at + p_at.T) / 2
+            kept.append((s, p, s_at, p_at))
+            f = self.f[k]
+            s, p = f @ s_at, f @ p_at @ f.T
+            s[-1] += self.steps[k]
+            p[-1, -1] += q**2
+        return cost, kept
+
+    def smooth(self, q: float, r: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Changes of states (M, n_x) and force (M,), and the force's standard deviation (M,)."""
+        kept = self._filter(q, r, len(self.e))[1]
+        m, n = len(kept), len(self.unit)
+        mean, variance = np.empty((m, n)), np.empty(m)
+        s, p = kept[-1][2], kept[-1][3]
+        mean[-1], variance[-1] = s, p[-1, -1]
+        for k in range(m - 2, -1, -1):
+            ahead, p_ahead, at, p_at = kept[k + 1][0], kept[k + 1][1], kept[k][2], kept[k][3]
+            gain = np.linalg.lstsq(p_ahead, self.f[k] @ p_at, rcond=1e-13)[0].T
+            s, p = at + gain @ (s - ahead), p_at + gain @ (p - p_ahead) @ gain.T
+            mean[k], variance[k] = s, p[-1, -1]
+        mean *= self.unit
+        return mean[:, :-1], mean[:, -1], np.sqrt(np.maximum(variance, 0.0)) * self.unit[-1]
 
 
 @dataclass(frozen=True, eq=False)
 class HiddenForce:
-    """The force in a port along one recording.
-
-    Attributes
-    ----------
-    t, z, dz, force, std : array, shape (K,)
-        Time in s, local coordinate, its rate, the recovered force, and its standard deviation due to noise.
-    law_z, law_dz, law : array, shape (K + 1,)
-        Local coordinate, rate and force of the law along the corrected run, at the samples; empty without a law.
-    instant : bool
-        True: the force holds at a sample. False: it is the mean from one sample to the next.
-    """
+    """The force in a port along one recording; arrays have the shape (K,), those of the law (K + 1,)."""
 
     port: str
     recording: str
-    t: np.ndarray
-    z: np.ndarray
-    dz: np.ndarray
+    t: np.ndarray  # s
+    z: np.ndarray  # local coordinate
+    dz: np.ndarray  # its rate
     force: np.ndarray
-    std: np.ndarray
-    law_z: np.ndarray
+    std: np.ndarray  # of the force, due to noise
+    law_z: np.ndarray  # of the law along the corrected run, at the samples; empty without a law
     law_dz: np.ndarray
     law: np.ndarray
-    instant: bool
+    instant: bool  # whether the force holds at a sample, or is the mean from one sample to the next
 
     @property
     def law_held(self) -> np.ndarray:
@@ -63,16 +164,8 @@ def hidden_force(
 ) -> HiddenForce | None:
     """Recover the force in a port along one recording; None where the outputs do not show it.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        The corrected simulator, run on the bench's recordings.
-    number : int, optional
-        Index of the element whose force is recovered; None recovers a force at `port` beside all elements.
-    noise : array, shape (n_y,)
-        Standard deviation of the outputs' noise.
-    i : int
-        Index of the recording.
+    The force is that of the element `number` of the corrected simulator, or without a number one at `port` beside all
+    elements; `noise` (n_y,) is the standard deviation of the outputs' noise.
     """
     r, n = bench.recordings[i], fitted.model.substeps
     drive, start = fitted.model.drive(r), np.asarray(fitted.initial[i], dtype=float)
@@ -178,7 +271,7 @@ def _recover(
         error = r.y[window] - simulated[::n, :, 0]
         if not np.all(np.isfinite(error)):
             break
-        system = UnknownForce.of(blocks, error, target.noise, held[window], states[cut][::n], n)
+        system = _Smoother.of(blocks, error, target.noise, held[window], states[cut][::n], n)
         size = size or system.likeliest()
         if size is None:
             return None
@@ -217,83 +310,3 @@ def _local(
     rows = signals(base)(states.T, r.u.T, _slope(bench, r).T, r.t[None], np.tile(vector[:, None], (1, len(r))))
     index = [known.name for known in base.all_ports()].index(port)
     return np.asarray(rows[0])[index], np.asarray(rows[1])[index]
-
-
-def force_blocks(
-    bench: Workbench, noise: np.ndarray, fitted: Fitted, port: str, number: int | None, name: str
-) -> list[Block]:
-    """Recover the force in a port along the loudest recording, and draw it.
-
-    Parameters
-    ----------
-    bench, noise, fitted, port, number
-        See `hidden_force`.
-    name : str
-        Name of the law in the pictures; empty without a law.
-    """
-    records = bench.recordings
-    loud = int(np.argmax([np.std(r.y[r.skip :] / bench.scale) * np.sqrt(len(r)) for r in records]))
-    try:
-        hidden = hidden_force(bench, fitted, port, number, noise, loud)
-    except (InputError, np.linalg.LinAlgError, RuntimeError):
-        hidden = None
-    if hidden is None:
-        return [Text(f"The outputs do not show the force at {port}, so it cannot be recovered.")]
-    recording = hidden.recording or (f"training recording {loud + 1}" if len(records) > 1 else "the recording")
-    how = (
-        f"The blue points are the force at {port} that makes the simulator follow {recording}. A smoother found it: it "
-        "keeps the fitted parameters and assumes only that the force wanders in random steps; it knows no law."
-    )
-    how += f" The orange line is the fitted {name} along the simulation." if name else ""
-    return [Text(how), *_Drawing.of(hidden, bench, name).pictures()]
-
-
-@dataclass(frozen=True, eq=False)
-class _Drawing:
-    """A hidden force with the names and units of its axes."""
-
-    hidden: HiddenForce
-    name: str
-    label: str  # of the force
-    across: str  # of the local coordinate
-    unit: str
-    across_unit: str
-    series: bool
-
-    @classmethod
-    def of(cls, hidden: HiddenForce, bench: Workbench, name: str) -> _Drawing:
-        port = bench.simulator.port(hidden.port)
-        kind, _, channel = hidden.port.partition(":")
-        label = {"actuator": "added to the input", "sensor": "added to the output"}.get(kind, "force w")
-        across = channel if port.series and channel else "local coordinate z"
-        return cls(hidden, name, label, across, port.unit, port.across_unit, port.series)
-
-    def pictures(self) -> list[Block]:
-        """Draw the force over its local coordinate, rate and time, and the part that the law leaves."""
-        h, alt = self.hidden, f"Recovered force at {self.hidden.port}"
-        x, force = Signal(self.across, h.z, self.across_unit), Signal(self.label, h.force, self.unit)
-        drawn = [(x, force, h.law_z, h.law, f"{h.port}, over {self.across}.", f"{alt} over its local coordinate.")]
-        if np.ptp(h.dz) > 0:
-            rate = Signal(f"rate of {self.across}", h.dz, f"{self.across_unit}/s" if self.across_unit else "")
-            drawn.append((rate, force, h.law_dz, h.law, "The same force over the rate.", f"{alt} over its rate."))
-        elif self.series and len(h.law):  # a law in series: its output over its input
-            acting = Signal(f"{self.across} as it acts", h.z + h.force, self.across_unit)
-            caption = "The signal behind the law over the signal before it."
-            drawn.append((x, acting, h.law_z, h.law_z + h.law, caption, f"{alt}: output over input."))
-        out: list[Block] = [
-            Picture(
-                plots.force_cloud(x, y, law_x, law, title=h.port, name=self.name).figure,
-                caption,
-                text,
-            )
-            for x, y, law_x, law, caption, text in drawn
-        ]
-        over = plots.force_time(h.t, force, h.std, h.law, self.name)
-        caption = "The same force over time, around its largest value. The band is the uncertainty due to noise."
-        out.append(Picture(over.figure, caption, f"{alt} over time."))
-        if len(h.law):
-            rest = Signal("recovered − law", h.force - h.law_held, self.unit)
-            left = plots.force_left(x, rest, h.std)
-            caption = "The recovered force minus the law. Where the mean bends away from zero, the law's form is wrong."
-            out.append(Picture(left.figure, caption, f"{alt} without the law."))
-        return out
