@@ -112,6 +112,13 @@ class DataOptions:
                 "state from its first sample, or --initial estimate for one that settles first."
             )
 
+    def names(self, inputs: Sequence[str] = (), outputs: Sequence[str] = ()) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the names of inputs and outputs that were given, else these."""
+        return (
+            tuple(inputs) if self.inputs is None else name_list(self.inputs, "--inputs"),
+            tuple(outputs) if self.outputs is None else name_list(self.outputs, "--outputs"),
+        )
+
     def columns(self, path: str) -> dict[str, str]:
         """Return the column of each name in a file."""
         return pairs(self.column, "--column")

@@ -12,7 +12,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
@@ -95,22 +95,20 @@ def _program(wanted: str) -> typer.Typer:
     return program
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"pilfr {__version__}")
+        raise typer.Exit
+
+
 def _options_of_the_program(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=lambda on: _show_version(on))
-    ] = False,
+    version: bool = typer.Option(False, "--version", help="Print the version.", is_eager=True, callback=_show_version),
 ) -> None:
     pass
 
 
 def _placeholder() -> None:
     pass
-
-
-def _show_version(wanted: bool) -> None:
-    if wanted:
-        print(f"pilfr {__version__}")
-        raise typer.Exit
 
 
 def _usage_sentence(error: Any) -> str:

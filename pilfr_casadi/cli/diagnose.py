@@ -25,7 +25,6 @@ from ._common import (
     describe,
     flag,
     make_folder,
-    name_list,
     new_file,
     numbers_of,
     option,
@@ -213,7 +212,7 @@ def _surrogate(
 def _simulated_names(options: DiagnoseOptions) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return inputs and outputs as given, else the columns that the files share, told apart by their values."""
     if options.inputs and options.outputs:
-        return name_list(options.inputs, "--inputs"), name_list(options.outputs, "--outputs")
+        return options.names()
     if options.inputs or options.outputs:
         raise InputError("Only one of --inputs and --outputs was given; give both.")
     files = options.recordings

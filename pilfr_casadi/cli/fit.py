@@ -29,7 +29,6 @@ from ._common import (
     describe,
     flag,
     make_folder,
-    name_list,
     new_file,
     number,
     numbers_of,
@@ -91,7 +90,7 @@ class FitOptions(DataOptions):
 def fit_command(options: FitOptions) -> int:
     """The model goes to DIR/model.json, the report to DIR/report.html."""
     target = _check(options)
-    inputs, outputs = name_list(options.inputs, "--inputs"), name_list(options.outputs, "--outputs")
+    inputs, outputs = options.names()
     saved = load(options.start_from) if options.start_from else None
     if saved is not None:
         check_names(saved, inputs, outputs)
@@ -154,11 +153,7 @@ def _identify(
         engine = announced_engine(task, train[0], options.engine)
         search: dict[str, Any] = {}
         if saved is None:
-            search = {
-                "starts": 8 if options.starts is None else options.starts,
-                "seed": options.seed or 0,
-                "executor": pool,
-            }
+            search = {"starts": options.starts or 8, "seed": options.seed or 0, "executor": pool}
         result = fit(task, train, solver=solver, engine=engine, progress=progress, **search)
     return task, replace(result, engine=engine)
 

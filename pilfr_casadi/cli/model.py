@@ -17,7 +17,7 @@ from ..data import Recording, column_names, nrmse, read_stack, written_times
 from ..export import NAMES, exported
 from ..identify import Fit, load
 from ..simulators import load_simulator
-from ._common import DONE, NO_RESULT, DataOptions, check_names, flag, name_list, option, pairs, say, takes_options
+from ._common import DONE, NO_RESULT, DataOptions, check_names, flag, option, pairs, say, takes_options
 from .fit import announced_engine
 
 ARRAYS = (".npz", ".npy")
@@ -39,8 +39,7 @@ def simulate_command(options: SimulateOptions) -> int:
     """Where the file has the outputs too, the error of the simulation is printed."""
     _check_out(options)
     fitted = load(options.model)
-    inputs = name_list(options.inputs, "--inputs") if options.inputs else fitted.model.inputs
-    outputs = name_list(options.outputs, "--outputs") if options.outputs else fitted.model.outputs
+    inputs, outputs = options.names(fitted.model.inputs, fitted.model.outputs)
     kind = Path(options.data).suffix.lower()
     if kind in ARRAYS:
         stack = read_stack(Path(options.data), inputs, outputs)
@@ -86,12 +85,16 @@ def _measured(options: SimulateOptions, inputs: Sequence[str], outputs: Sequence
     there = column_names(options.data, [columns.get(name, name) for name in (*inputs, *outputs)])
     if options.outputs or any(name in columns or name in there for name in outputs):
         return columns, True
+    _check_initial(options, f"no column {listed(outputs)}")
+    return {k: v for k, v in columns.items() if k not in outputs}, False
+
+
+def _check_initial(options: SimulateOptions, lack: str) -> None:
     if options.initial == "estimate":
         raise InputError(
-            f"--initial estimate needs measured outputs, but {options.data} has no column {listed(outputs)}; "
-            "give --initial zero, or --initial periodic with --period SAMPLES."
+            f"--initial estimate needs measured outputs, but {options.data} has {lack}; give --initial zero, or "
+            "--initial periodic with --period SAMPLES."
         )
-    return {k: v for k, v in columns.items() if k not in outputs}, False
 
 
 def _table(options: SimulateOptions, fitted: Fit, recording: Recording, y: np.ndarray, columns: dict[str, str]) -> str:
@@ -106,11 +109,8 @@ def _table(options: SimulateOptions, fitted: Fit, recording: Recording, y: np.nd
 def _simulate_stack(options: SimulateOptions, fitted: Fit, u: np.ndarray, y: np.ndarray | None) -> int:
     """Simulate records (samples, channels, further axes), one after the other, each from its own initial state."""
     axes, initial = u.shape[2:], options.initial or ("zero" if y is None else "estimate")
-    if y is None and initial == "estimate":
-        raise InputError(
-            f"--initial estimate needs measured outputs, but {options.data} has none; give --initial zero, or "
-            "--initial periodic with --period SAMPLES."
-        )
+    if y is None:
+        _check_initial(options, "none")
     if options.dt is None:
         raise InputError(f"{options.data} has no time column; state the step with --dt SECONDS.")
     more: dict[str, Any] = {key: getattr(options, key) for key in ("period", "hold", "skip")}

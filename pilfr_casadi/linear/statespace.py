@@ -18,7 +18,7 @@ model on (Sec. 5.3).
     S = C P C' + R,   K = A P C' S⁻¹,   P̂ = (I - K C) P (I - K C)' + K R K'   (A = I).
 
 `A = I` gives the gain of a filter, which corrects the present state; any other A the gain of a one-step predictor. The
-extended Kalman filter (`control.kalman_filter`) and the smoother of an unknown force (`report`) call the update in
+extended Kalman filter (`control.kalman_filter`) and the smoother of an unknown force (`diagnose`) call the update in
 every sample. With the steady-state gain the predictor is a model itself,
 
     x⁺ = f(x, u, p) + γ K (y_measured - y),

@@ -404,8 +404,8 @@ def _sentence(error: ValidationError, kind: type[Table], name: str) -> str:
     found = error.errors(include_url=False)
     first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
     own = first.get("ctx", {}).get("error")
-    if isinstance(own, InputError):
-        return str(own)
+    if isinstance(own, InputError):  # of a key in a table it says what is wrong, and not where
+        return f"[{first['loc'][0]}]: {own}" if len(first["loc"]) > 1 else str(own)
     if not first["loc"]:
         return f"{name or 'the run'} is {shown(first['input'])}; give a table."
     key, *inner = map(str, first["loc"])

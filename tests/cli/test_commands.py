@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -63,6 +64,25 @@ def test_fit_simulate_and_export_run_end_to_end(capsys, tmp_path, fitted):
     assert status == 0
     f = ca.Function.load(str(tmp_path / "model.casadi"))
     assert f.name_in() == ["x", "u"] and f.name_out() == ["x_next", "y"]
+
+
+def test_fit_tells_its_stages_in_plain_lines(capsys, tmp_path, train, monkeypatch):
+    """Piped, each line has the stage, what is done of it, the best error so far, which never rises, and the time."""
+    for pause in ("NEW_STAGE_LINE", "LINE"):
+        monkeypatch.setattr(f"pilfr_casadi._base.progress.{pause}", 0.0)
+    status, _, err = run(capsys, *fit_arguments(train, tmp_path))
+    assert status == 0 and "\r" not in err and "\x1b" not in err
+    count, best = r"( (?P<done>\d+)/(?P<total>\d+))?", r"(, best NRMSE (?P<best>[\d.]+))?"
+    line = re.compile(rf"(?P<stage>\D+?){count}{best}, ((?P<minutes>\d+) min )?(?P<seconds>\d+) s")
+    told = [line.fullmatch(text) for text in err.splitlines()]
+    assert len(told) > 5 and all(told), err
+    stages = list(dict.fromkeys(match["stage"] for match in told))
+    assert stages[0] == "building the engine" and stages[-1] == "writing the report" and len(stages) >= 4, stages
+    assert any(match["total"] and int(match["done"]) == int(match["total"]) for match in told)
+    best = [float(match["best"]) for match in told if match["best"]]
+    assert best and best == sorted(best, reverse=True)
+    spent = [60 * int(m["minutes"] or 0) + int(m["seconds"]) for m in told if m["stage"] != "writing the report"]
+    assert spent == sorted(spent)
 
 
 def test_a_saved_model_can_be_fitted_further(capsys, tmp_path, train, model):

@@ -12,6 +12,7 @@ import time
 import numpy as np
 import pytest
 from command_line import refused, run
+from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 from pilfr_casadi import multisine
@@ -93,7 +94,30 @@ def arguments(folder, *more, simulator="rig.py", train="train.csv", test="test.c
     )
 
 
-def test_a_whole_diagnosis(capsys, files):
+@pytest.fixture
+def drawn(monkeypatch):
+    """Every figure that is written."""
+    figures, save = [], Figure.savefig
+
+    def savefig(figure, *arguments, **options):
+        figures.append(figure)
+        save(figure, *arguments, **options)
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    return figures
+
+
+def heat_maps(figures):
+    """The numbers of every map of ports and laws: {(port, law): text}."""
+    for figure in figures:
+        ax, *bar = figure.axes
+        if bar and bar[0].get_ylabel() == "error on data not fitted [%]":
+            ports = [t.get_text().replace("\n", "") for t in ax.get_xticklabels()]
+            laws = [t.get_text().lower().replace(" ", "_") for t in ax.get_yticklabels()]
+            yield {(ports[int(t.get_position()[0])], laws[int(t.get_position()[1])]): t.get_text() for t in ax.texts}
+
+
+def test_a_whole_diagnosis(capsys, files, drawn):
     given = arguments(files, "--hold", "zero", "--initial", "zero")
     status, out, err = run(capsys, *given)
     assert status == 0 and "pilfr: " not in err
@@ -112,6 +136,13 @@ def test_a_whole_diagnosis(capsys, files):
     assert f"report: {files / 'out' / 'report.html'}" in out
     assert "<html" in (files / "out" / "report.html").read_text().lower()
     assert not list(files.rglob("__pycache__"))
+    tried = [c for c in found["candidates"] if c["nrmse_validation"] is not None]
+    shown = [(pair, float(text)) for numbers in heat_maps(drawn) for pair, text in numbers.items()]
+    assert {pair for pair, _ in shown} == {(c["port"], c["law"]) for c in tried} and len(shown) > 5
+    for kind in ("nrmse_validation", "nrmse_train"):  # the errors on what was not fitted are drawn, and no others
+        errors = [[c[kind] for c in tried if (c["port"], c["law"]) == pair] for pair, _ in shown]
+        near = [np.min(np.abs(100 * np.array(e) / v - 1)) for e, (_, v) in zip(errors, shown, strict=True)]
+        assert (max(near) < 0.06) == (kind == "nrmse_validation")
     before = (files / "out" / "diagnosis.json").read_text()
     refused(capsys, *given, says=("diagnosis.json exists", "--overwrite"))
     assert (files / "out" / "diagnosis.json").read_text() == before

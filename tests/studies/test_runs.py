@@ -241,6 +241,7 @@ def test_a_missing_model_is_made_again(done):
         ("[solver]", "[constraints]\ndc_gain = [1.0, 2.0]\n[solver]", "dc_gain have the shape (2,)"),
         ("[solver]", "[constraints]\ndc_gain = { value = 1.0, slope = 'a' }\n[solver]", "slope of a dc_gain is a"),
         ("[solver]", "[constraints]\nordered_thresholds = [1]\n[solver]", "ordered_thresholds"),
+        ("[solver]", "[constraints]\nordered_thresholds = -1\n[solver]", "[constraints]: A gap of -1"),
         ('validation = ["held.csv"]', "regularisation = 3", "unknown key 'regularisation'"),
         ("operators = 3", "operators = 3\nbounds = { w = [2, 1] }", "infeasible"),
         ("operators = 3", "operators = 3\nfix = { E = 1.0 }", "'E'"),
