@@ -31,11 +31,13 @@ if TYPE_CHECKING:
         same_input as same_input,
     )
     from .readers import (
+        TIME_NAMES as TIME_NAMES,
         column_names as column_names,
         read as read,
         read_csv as read_csv,
         read_mat as read_mat,
         read_npz as read_npz,
+        step_of as step_of,
         written_times as written_times,
     )
     from .recording import (
@@ -46,6 +48,5 @@ if TYPE_CHECKING:
         fingerprint as fingerprint,
     )
     from .tables import read_stack as read_stack
-    from .timebase import TIME_NAMES as TIME_NAMES, step_of as step_of
 
 __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

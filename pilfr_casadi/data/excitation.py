@@ -12,7 +12,7 @@ Meas. 55, 2006), whose input matrix is well conditioned at each bin.
 """
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -32,27 +32,9 @@ def excited_bins(
     grid: Grid = "full",
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """Return the bins ``n`` (frequencies ``n fs / n_samples``) that a multisine excites.
+    """Return the bins ``n`` (frequencies ``n fs / n_samples``) that a multisine excites; see :func:`multisine`.
 
-    Parameters
-    ----------
-    n_samples : int
-        Samples per period.
-    f_max, fs, f_min : float
-        Band and sampling frequency, Hz; the band is rounded to the nearest bins. Bin 0 and ``fs / 2`` are left out.
-    grid : {"full", "odd", "odd-random"} or array of int
-        All bins, the odd ones, the odd ones with one left out at random in every group of four, or the bins themselves.
-    rng : numpy.random.Generator, optional
-        Needed for ``"odd-random"``, which draws from it.
-
-    Returns
-    -------
-    bins : array of int, sorted
-
-    Raises
-    ------
-    InputError
-        If the band holds no bin or reaches beyond ``fs / 2``, or the grid is unknown.
+    The band is rounded to the nearest bins; bin 0 and ``fs / 2`` are left out. A random grid is drawn from `rng`.
     """
     if n_samples < 3 or not fs > 0 or not 0 <= f_min <= f_max <= fs / 2:
         raise InputError(
@@ -126,9 +108,8 @@ def multisine(
     InputError
         If band, grid, amplitude, periods or rms cannot be used.
     """
-    bins = excited_bins(n_samples, f_max, fs, f_min=f_min, grid=grid, rng=rng)
-    phasors = _amplitudes(bins, n_samples, fs, amplitude, rms) * _random_phasors(rng, bins.shape)
-    return np.tile(_from_spectrum(phasors, bins, n_samples), whole(periods, "periods", 1))
+    options: dict[str, Any] = dict(f_min=f_min, amplitude=amplitude, grid=grid, periods=periods, rms=rms)
+    return orthogonal_multisine(1, n_samples, f_max, fs, rng, **options)[0, :, 0]
 
 
 def orthogonal_multisine(
@@ -171,9 +152,11 @@ def orthogonal_multisine(
     """
     n_u = whole(n_u, "n_u", 1)
     bins = excited_bins(n_samples, f_max, fs, f_min=f_min, grid=grid, rng=rng)
-    phasors = _amplitudes(bins, n_samples, fs, amplitude, rms) * _random_phasors(rng, (n_u, bins.size))
-    spectra = _orthogonal(n_u, matrix)[:, :, None] * phasors[None, :, :]  # experiments, inputs, bins
-    u = np.swapaxes(_from_spectrum(spectra, bins, n_samples), 1, 2)
+    phases = np.exp(1j * rng.uniform(0.0, 2.0 * np.pi, (n_u, bins.size)))
+    phasors = _amplitudes(bins, n_samples, fs, amplitude, rms) * phases
+    spectrum = np.zeros((n_u, n_u, n_samples // 2 + 1), dtype=complex)  # experiments, inputs, bins
+    spectrum[..., bins] = -0.5j * n_samples * (_orthogonal(n_u, matrix)[:, :, None] * phasors[None, :, :])
+    u = np.swapaxes(np.fft.irfft(spectrum, n_samples), 1, 2)
     return np.tile(u, (1, whole(periods, "periods", 1), 1))
 
 
@@ -184,10 +167,8 @@ def tukey_realizations(
     fs: float,
     rng: np.random.Generator,
     *,
-    f_min: float = 0.0,
-    amplitude: Amplitude = None,
-    grid: Grid = "full",
     normalize: Literal["record", "steady"] = "record",
+    **options: Any,
 ) -> np.ndarray:
     """Make the training signal of Krikelis et al. (2024), Sec. 6.2.1: realizations of a multisine that fade in and out.
 
@@ -200,8 +181,8 @@ def tukey_realizations(
         Number of realizations, each with its own phases (and random grid).
     n_period : int
         Samples per period; even.
-    f_max, fs, rng, f_min, amplitude, grid
-        As for :func:`multisine`.
+    f_max, fs, rng, **options
+        As for :func:`multisine`: `f_min`, `amplitude` and `grid`.
     normalize : {"record", "steady"}
         Part that gets unit standard deviation: the whole record, ramps included, or each steady period.
 
@@ -227,7 +208,7 @@ def tukey_realizations(
     window = np.concatenate([ramp, np.ones(n_period), 1.0 - ramp])
     pieces = []
     for _ in range(whole(n_realizations, "n_realizations", 1)):
-        period = multisine(n_period, f_max, fs, rng, f_min=f_min, amplitude=amplitude, grid=grid)
+        period = multisine(n_period, f_max, fs, rng, **options)
         pieces.append(window * np.concatenate([period[half:], period, period[:half]]))
     u = np.concatenate(pieces)
     return u / u.std() if normalize == "record" else u
@@ -319,10 +300,6 @@ def prbs(
     return amplitude * np.repeat(2.0 * values - 1.0, hold)[:n_samples]
 
 
-def _random_phasors(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    return np.exp(1j * rng.uniform(0.0, 2.0 * np.pi, shape))
-
-
 def _amplitudes(bins: np.ndarray, n_samples: int, fs: float, amplitude: Amplitude, rms: float | None) -> np.ndarray:
     """Return the amplitude of the sine at each bin, (n_bins,)."""
     given = np.ones(bins.size) if amplitude is None else amplitude
@@ -336,13 +313,6 @@ def _amplitudes(bins: np.ndarray, n_samples: int, fs: float, amplitude: Amplitud
         return a / np.sqrt(n_samples)
     positive(rms, "rms", "the root mean square of the signal (None for the scale of the amplitudes)")
     return a * (rms / np.sqrt(np.sum(a**2) / 2))
-
-
-def _from_spectrum(phasors: np.ndarray, bins: np.ndarray, n_samples: int) -> np.ndarray:
-    """Sum ``|phasor| sin(2πkn/N + arg phasor)`` over the bins (last axis), one period."""
-    spectrum = np.zeros((*phasors.shape[:-1], n_samples // 2 + 1), dtype=complex)
-    spectrum[..., bins] = -0.5j * n_samples * phasors
-    return np.fft.irfft(spectrum, n_samples)
 
 
 def _orthogonal(n: int, kind: str) -> np.ndarray:

@@ -53,16 +53,8 @@ def rmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
 def nrmse(y: np.ndarray, y_hat: np.ndarray, skip: int = 0) -> float:
     """Return the error relative to the standard deviation of the output, averaged over outputs.
 
-    Krikelis et al. (2024), Eq. 27; 0 is perfect, 1 is as good as the mean of the output.
-
-    Parameters
-    ----------
-    y : array, (M, n_y) or (M,)
-        Measured outputs.
-    y_hat : array, of the shape of `y`
-        Simulated outputs.
-    skip : int
-        Leading samples that are not scored.
+    Krikelis et al. (2024), Eq. 27; 0 is perfect, 1 is as good as the mean of the output. Parameters are those of
+    :func:`rmse_per_output`.
 
     Raises
     ------

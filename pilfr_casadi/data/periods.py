@@ -94,10 +94,8 @@ def repeats_itself(recording: Recording) -> bool:
     n = np.arange(m, 0, -1)
     power = np.concatenate([[0.0], np.cumsum(np.sum(u**2, axis=1))])
     apart = (power[-1] - power[:m] + power[m - np.arange(m)] - 2 * _correlate(u, u)[:m]) / n  # (1/n) Σ |u(t+p) - u(t)|²
-    size = u.shape[1] * 1.0
-    away = np.argmax(
-        apart > size
-    )  # a slow input resembles itself a moment later: skip to the first lag where it does not
+    size = float(u.shape[1])
+    away = np.argmax(apart > size)  # a slow input resembles itself a moment later: the first lag where it does not
     last = int(LARGEST_LAG * m)
     return bool(away and away < last and np.min(apart[away : last + 1]) <= ALIKE**2 * size)
 

@@ -5,8 +5,8 @@ input and output by name; other columns are ignored. Any fault of a file is repo
 file, the column and the line.
 """
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, overload
 
@@ -14,13 +14,16 @@ import numpy as np
 
 from .._base import InputError, existing_file, listed, positive
 from .recording import Recording
-from .tables import ArrayTable, CsvTable, read_csv_table, read_mat_table, read_npz_table
-from .timebase import TIME_NAMES, refuse_other_unit, step_of, time_column
+from .tables import ArrayTable, CsvTable, open_table
 
 PathLike = str | Path
 Names = Sequence[str] | str
-Table = CsvTable | ArrayTable
-CSV_SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+
+TIME_NAMES = ("t", "t_s", "time")
+TOLERANCE = 1e-4  # steps that a sample may lie off the grid; the clocks of recorders do not drift by more in a record
+AGREEMENT = 1e-3  # relative difference between a stated step and the written times; another unit differs by far more
+_UNITS = r"ns|us|µs|μs|ms|min|h|d|nanoseconds?|microseconds?|milliseconds?|minutes?|hours?|days?"
+_OTHER_UNIT = re.compile(rf"(?:t|time)[\s_\-\[(]+({_UNITS})[\])]?", re.IGNORECASE)
 
 
 @overload
@@ -67,8 +70,8 @@ def read_csv(
     InputError
         If a file, a column or a cell cannot be used.
     """
-    request = Request(inputs, outputs, columns, dt, time_tolerance, recording_options)
-    return _read_each(path, request, lambda p: read_csv_table(p, request.wanted))
+    options = dict(columns=columns, dt=dt, time_tolerance=time_tolerance, **recording_options)
+    return _read_each(path, _Request(inputs, outputs, **options), ".csv")
 
 
 @overload
@@ -83,7 +86,7 @@ def read_mat(
     Parameters, returned values and errors are those of :func:`read_csv`. A matrix with a row for each sample gives the
     channels ``name1, name2, ...``.
     """
-    return _read_each(path, Request.from_options(inputs, outputs, options), read_mat_table)
+    return _read_each(path, _Request(inputs, outputs, **options), ".mat")
 
 
 @overload
@@ -98,7 +101,7 @@ def read_npz(
     Parameters, returned values and errors are those of :func:`read_csv`. A matrix with a row for each sample gives the
     channels ``name1, name2, ...``.
     """
-    return _read_each(path, Request.from_options(inputs, outputs, options), read_npz_table)
+    return _read_each(path, _Request(inputs, outputs, **options), ".npz")
 
 
 @overload
@@ -112,79 +115,56 @@ def read(
 
     Parameters, returned values and errors are those of :func:`read_csv`; files of different kinds may be mixed.
     """
-    request = Request.from_options(inputs, outputs, options)
-    return _read_each(path, request, lambda p: _open_table(p, request.wanted))
+    return _read_each(path, _Request(inputs, outputs, **options))
 
 
 def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the names of a file's columns or variables; `wanted` helps to find the delimiter of a CSV file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
-    return _open_table(Path(path), wanted).names
+    """Return the names of a file's columns or variables; `wanted` helps to find the delimiter of a CSV file."""
+    return open_table(Path(path), wanted).names
 
 
 def written_times(path: PathLike, columns: Mapping[str, str] | None = None) -> list[str] | None:
-    """Return the times of a file as they are written there (an array's to the last digit); None without a time column.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
+    """Return the times of a file as they are written there (an array's to the last digit); None without a time column."""
     columns = columns or {}
     chosen = next((columns[name] for name in TIME_NAMES if name in columns), None)
-    table = _open_table(Path(path), [chosen or "t"])
-    time = time_column(table.names, chosen, str(path))
+    table = open_table(Path(path), [chosen or "t"])
+    time = _time_column(table.names, chosen, str(path))
     return table.texts(time) if time else None
 
 
-@dataclass(frozen=True)
-class Request:
+class _Request:
     """The columns and options that a reader was called with, checked by themselves and against a file's columns."""
 
-    inputs: Names
-    outputs: Names
-    columns: Mapping[str, str] | None = None
-    dt: float | None = None
-    time_tolerance: float | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for role in ("inputs", "outputs"):
-            given = getattr(self, role)
-            names = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
-            if not all(isinstance(name, str) for name in names):
-                raise InputError(f"{role}={given!r} was given; give the names of the columns.")
-            object.__setattr__(self, role, names)
+    def __init__(
+        self,
+        inputs: Names,
+        outputs: Names,
+        columns: Mapping[str, str] | None = None,
+        dt: float | None = None,
+        time_tolerance: float | None = None,
+        **options: Any,
+    ) -> None:
+        self.inputs, self.outputs = _names(inputs, "inputs"), _names(outputs, "outputs")
+        self.dt, self.time_tolerance, self.options = dt, time_tolerance, options
         if not self.inputs:
             raise InputError("a recording needs at least one input; name its column.")
-        if not isinstance(self.columns or {}, Mapping):
-            raise InputError(f"columns={self.columns!r} was given; give columns={{'NAME': 'COLUMN'}}.")
-        for name in self.columns or {}:
+        if not isinstance(columns or {}, Mapping):
+            raise InputError(f"columns={columns!r} was given; give columns={{'NAME': 'COLUMN'}}.")
+        self.columns = columns or {}
+        for name in self.columns:
             if name not in {*self.inputs, *self.outputs, *TIME_NAMES}:
                 raise InputError(
                     f"a column is given for {name!r}, which is none of the inputs {listed(self.inputs)}, the "
                     f"outputs {listed(self.outputs)}, or t; correct the name."
                 )
-        if self.dt is not None:
-            positive(self.dt, "dt", "the seconds from one sample to the next")
-        if self.time_tolerance is not None:
-            positive(self.time_tolerance, "time_tolerance", "the steps that samples may lie off the grid", zero=True)
-
-    @classmethod
-    def from_options(cls, inputs: Names, outputs: Names, options: Mapping[str, Any]) -> "Request":
-        """Make a request from a reader's keyword arguments."""
-        own = ("columns", "dt", "time_tolerance")
-        rest = {key: value for key, value in options.items() if key not in own}
-        return cls(inputs, outputs, options=rest, **{key: options[key] for key in own if key in options})
+        if dt is not None:
+            positive(dt, "dt", "the seconds from one sample to the next")
+        if time_tolerance is not None:
+            positive(time_tolerance, "time_tolerance", "the steps that samples may lie off the grid", zero=True)
 
     def column(self, name: str) -> str:
-        """Return the column of an input, an output or the time."""
-        return (self.columns or {}).get(name, name)
+        """Return the column of an input or an output."""
+        return self.columns.get(name, name)
 
     @property
     def wanted(self) -> list[str]:
@@ -193,8 +173,8 @@ class Request:
 
     def locate(self, names: Sequence[str], source: str) -> tuple[str | None, list[str]]:
         """Return the time column, if any, and those of the inputs and outputs."""
-        mapped = [column for name, column in (self.columns or {}).items() if name in TIME_NAMES]
-        time = time_column(names, mapped[0] if mapped else None, source)
+        mapped = [column for name, column in self.columns.items() if name in TIME_NAMES]
+        time = _time_column(names, mapped[0] if mapped else None, source)
         wanted = self.wanted
         both = sorted({*map(self.column, self.inputs)} & {*map(self.column, self.outputs)})
         if both:
@@ -214,14 +194,14 @@ class Request:
             if list(names).count(name) > 1:
                 raise InputError(f"{source} has {list(names).count(name)} columns named {name!r}; rename all but one.")
         if time is None and self.dt is None:
-            refuse_other_unit(names, source)
+            _refuse_other_unit(names, source)
             raise InputError(
                 f"{source} has no time column; it has {listed(names)}: name one {' or '.join(TIME_NAMES)}, in "
                 "seconds, or state the step with dt=STEP."
             )
         return time, wanted
 
-    def recording(self, table: Table) -> Recording:
+    def recording(self, table: CsvTable | ArrayTable) -> Recording:
         """Make the recording from the columns of a file."""
         time, wanted = self.locate(table.names, str(table.path))
         parts = table.columns([*wanted, time] if time else wanted)
@@ -240,32 +220,136 @@ class Request:
             raise InputError(f"{table.path}: {error}") from None
 
 
+def _names(given: Any, role: str) -> tuple[str, ...]:
+    names = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+    if not all(isinstance(name, str) for name in names):
+        raise InputError(f"{role}={given!r} was given; give the names of the columns.")
+    return names
+
+
 def _read_each(
-    path: PathLike | Iterable[PathLike], request: Request, open_table: Callable[[Path], Table]
+    path: PathLike | Iterable[PathLike], request: _Request, suffix: str = ""
 ) -> Recording | tuple[Recording, ...]:
+    """Read one file, or several into a tuple; with a `suffix`, whatever their own are."""
     if isinstance(path, PathLike):
-        return request.recording(open_table(Path(path)))
+        return request.recording(open_table(Path(path), request.wanted, suffix))
     paths = tuple(path) if isinstance(path, Iterable) else (path,)
     if not all(isinstance(p, PathLike) for p in paths):
         raise InputError(f"the file {path!r} was given; give its path as text, or a list of paths.")
-    return tuple(request.recording(open_table(Path(p))) for p in paths)
-
-
-def _open_table(path: Path, wanted: Sequence[str]) -> Table:
-    """Open a file by its suffix."""
-    suffix = path.suffix.lower()
-    if suffix in CSV_SUFFIXES:
-        return read_csv_table(path, wanted)
-    if suffix == ".mat":
-        return read_mat_table(path)
-    if suffix == ".npz":
-        return read_npz_table(path)
-    existing_file(path)
-    suffixes = ", ".join((*CSV_SUFFIXES, ".mat", ".npz"))
-    raise InputError(f"{path} has the suffix {suffix!r}; files named {suffixes} can be read.")
+    return tuple(request.recording(open_table(Path(p), request.wanted, suffix)) for p in paths)
 
 
 def _channel_names(names: Sequence[str], parts: Sequence[np.ndarray]) -> tuple[str, ...]:
     """Number the channels of a matrix: `u1, u2` for `u`."""
     pairs = zip(names, parts, strict=True)
     return tuple(f"{n}{i + 1}" if p.shape[1] > 1 else n for n, p in pairs for i in range(p.shape[1]))
+
+
+def _time_column(names: Sequence[str], chosen: str | None, source: str) -> str | None:
+    """Find the time column among the names: the chosen one, or one of `TIME_NAMES`; None where there is none."""
+    found = [chosen] if chosen is not None else [name for name in TIME_NAMES if name in names]
+    if not found:
+        return None
+    if len(found) > 1:
+        raise InputError(
+            f"{source} has several time columns ({', '.join(found)}); say which one, as in "
+            f"columns={{'t': '{found[0]}'}}."
+        )
+    if found[0] not in names:
+        raise InputError(f"{source} has no column {found[0]!r} for the time; its columns are {listed(names)}.")
+    _refuse_other_unit(found, source)
+    return found[0]
+
+
+def _refuse_other_unit(names: Sequence[str], source: str) -> None:
+    """Raise :class:`InputError` if a name such as ``t_ms`` or ``Time [min]`` states a unit other than seconds."""
+    for name in names:
+        unit = _OTHER_UNIT.fullmatch(name.strip())
+        if unit:
+            raise InputError(
+                f"{source}: column {name!r} is time in {unit.group(1)} by its name, but time must be in seconds; "
+                "convert it and name it t_s, or leave it out and state the step in seconds with dt=STEP."
+            )
+
+
+def step_of(
+    t: np.ndarray,
+    column: str,
+    place: Callable[[int], str],
+    *,
+    dt: float | None = None,
+    tolerance: float | None = None,
+) -> float:
+    """Return the step of a uniform time grid, in seconds.
+
+    A grid is uniform if no sample is further than `tolerance` steps from ``t(0) + k dt``, beyond the rounding to the
+    digits written: a grid of 1/120 s written with six decimals is uniform.
+
+    Parameters
+    ----------
+    t : array, (M,)
+        Times in seconds, finite.
+    column : str
+        Name of the column, with its file, for messages.
+    place : callable
+        Returns the place of sample ``k`` in the file, e.g. ``"line 17"``.
+    dt : float, optional
+        Stated step; it must agree with the times and is returned in their place.
+    tolerance : float, optional
+        `TOLERANCE` by default.
+    """
+    if len(t) < 2:
+        raise InputError(f"{column} has only one sample; at least 2 are needed.")
+    gaps = np.diff(t)
+    back = np.flatnonzero(gaps <= 0)
+    if back.size:
+        k = int(back[0]) + 1
+        raise InputError(
+            f"{column}: {place(k)} is {t[k]:.10g} s, after {t[k - 1]:.10g} s; time must increase from sample to sample."
+        )
+    step = (t[-1] - t[0]) / (len(t) - 1)
+    deviation = np.abs(t - t[0] - np.arange(len(t)) * step)
+    allowed = (TOLERANCE if tolerance is None else tolerance) * step
+    if (deviation > allowed).any() and (deviation > allowed + _rounding(t, step)).any():
+        usual = float(np.median(gaps))
+        odd = np.abs(gaps - usual)
+        k = int(np.argmax(odd > 0.5 * odd.max())) + 1
+        raise InputError(
+            f"{column} is not uniform: {place(k)} comes {gaps[k - 1]:.6g} s after the sample before it where "
+            f"{usual:.6g} s is usual, and samples lie up to {deviation.max() / step:.2g} steps off a uniform grid; "
+            "resample, or allow more with time_tolerance=STEPS."
+        )
+    step = float(f"{step:.12g}")
+    if dt is None:
+        return step
+    if abs(step - dt) > AGREEMENT * dt:
+        raise InputError(
+            f"{column} has a step of {step:.6g} s, but dt={dt:.6g} was stated, a ratio of {step / dt:.4g}; "
+            "time must be in seconds, so check its unit."
+        )
+    return float(dt)
+
+
+def _rounding(t: np.ndarray, step: float) -> np.ndarray:
+    """Bound how far samples may lie off the grid because written times are rounded, (M,), in seconds.
+
+    Times are rounded to D decimals or to S significant digits, whichever is coarser at a sample; the error of the last
+    time turns the grid. The bound is at most a tenth of a step, so that it never hides a missing sample.
+    """
+    size = np.abs(t)
+    exponent = np.floor(np.log10(size, where=size > 0, out=np.full(len(t), -np.inf)))
+    exponent[~np.isfinite(exponent)] = exponent[np.isfinite(exponent)].min()
+    digits = _fewest(lambda n: size * 10.0 ** (n - 1 - exponent))
+    decimals = _fewest(lambda n: size * 10.0**n)
+    own = 0.5 * np.maximum(10.0 ** (exponent + 1 - digits), 10.0**-decimals)
+    return np.minimum(own + own[0] + own[-1], 0.1 * step)
+
+
+def _fewest(scaled: Callable[[float], np.ndarray]) -> float:
+    """Return the smallest n for which all scaled times are whole numbers; infinite where they are not rounded."""
+    for n in range(15):
+        times = scaled(float(n))
+        near = np.abs(times - np.rint(times)) <= 4 * np.finfo(float).eps * np.abs(times)
+        if near.all():
+            return float(n)
+    return np.inf

@@ -183,19 +183,13 @@ def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, .
     InputError
         If there is none, or one of them is not a recording.
     """
-    if isinstance(data, Recording):
-        return (data,)
-    if isinstance(data, Mapping | np.ndarray) or not isinstance(data, Iterable):
-        raise InputError(
-            f"a Recording or a list of them is needed, not {type(data).__name__}; Recording(u, y, dt) makes one from "
-            "arrays, read_csv from a file."
-        )
-    recordings = tuple(data)
+    several = isinstance(data, Iterable) and not isinstance(data, Mapping | np.ndarray)
+    recordings: tuple[Any, ...] = tuple(data) if several else (data,)
     for item in recordings:
         if not isinstance(item, Recording):
             raise InputError(
-                f"every item must be a Recording, not {type(item).__name__}; Recording(u, y, dt) makes one from "
-                "arrays, read_csv from a file."
+                f"a Recording or a list of them is needed, not {type(item).__name__}; Recording(u, y, dt) makes one "
+                "from arrays, read_csv from a file."
             )
     if not recordings:
         raise InputError("no recording was given; give at least one.")

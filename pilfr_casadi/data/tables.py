@@ -5,8 +5,9 @@ tabs separate cells; a byte-order mark, Windows line ends, quoted cells and blan
 as an editor does, so the header is line 1. No code in a ``.mat`` or ``.npz`` file is run.
 """
 
+import contextlib
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from .._base import LARGEST, InputError, existing_file, usable
 
 Array = np.ndarray
 
+CSV_SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+SUFFIXES = (*CSV_SUFFIXES, ".mat", ".npz")
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
 REPAIR = "only finite numbers up to {:g} can be used: repair or cut out that piece, or give it in another unit."
 KINDS = {
@@ -31,21 +34,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class CsvTable:
-    """The text of a CSV file and its header.
-
-    Attributes
-    ----------
-    path : Path
-        The file, for messages.
-    names : tuple of str
-        Header, without surrounding blanks.
-    delimiter : str
-        The character between cells.
-    lines : list of str
-        All lines below the header, without line ends.
-    first_line : int
-        Number of the first of these lines in the file.
-    """
+    """The text of a CSV file, with the lines below its header and the number of the first of them in the file."""
 
     path: Path
     names: tuple[str, ...]
@@ -54,13 +43,7 @@ class CsvTable:
     first_line: int
 
     def columns(self, names: Sequence[str]) -> list[Array]:
-        """Return each named column as numbers, (M, 1).
-
-        Raises
-        ------
-        InputError
-            For a cell that is empty, not a number, not finite or too large, and for a row of the wrong length.
-        """
+        """Return each named column as finite numbers, (M, 1)."""
         where = [self.names.index(name) for name in names]
         numbers = self._read_at_once(where)
         if numbers is None or not usable(numbers).all():
@@ -117,30 +100,14 @@ class CsvTable:
 
 @dataclass(frozen=True)
 class ArrayTable:
-    """The variables of a ``.mat`` or ``.npz`` file.
-
-    Attributes
-    ----------
-    path : Path
-        The file, for messages.
-    names : tuple of str
-        Names of the variables.
-    arrays : mapping of str to array
-        Each variable, or the error that reading it raised: it matters only if the variable is used.
-    """
+    """The variables of a ``.mat`` or ``.npz`` file, or the error that reading one raised: it matters only if used."""
 
     path: Path
     names: tuple[str, ...]
     arrays: Mapping[str, Any]
 
     def columns(self, names: Sequence[str]) -> list[Array]:
-        """Return each named variable as finite numbers, (M, channels); a row vector becomes a column.
-
-        Raises
-        ------
-        InputError
-            If a variable cannot be read, is no vector or matrix of finite real numbers, or their lengths differ.
-        """
+        """Return each named variable as finite numbers, (M, channels); a row vector becomes a column."""
         parts = [self._samples(name) for name in names]
         if len({len(part) for part in parts}) > 1:
             counts = ", ".join(f"{name} {len(part)}" for name, part in zip(names, parts, strict=True))
@@ -156,13 +123,7 @@ class ArrayTable:
         return f"sample {row}"
 
     def array(self, name: str) -> Array:
-        """Return a variable as it is in the file.
-
-        Raises
-        ------
-        InputError
-            If it cannot be read or is no full array.
-        """
+        """Return a variable as it is in the file."""
         values = self.arrays[name]
         if isinstance(values, Exception):
             raise InputError(f"{self.path}: variable {name!r} cannot be read ({_reason(values)}); write it again.")
@@ -189,14 +150,21 @@ class ArrayTable:
         return column
 
 
-def read_csv_table(path: Path, wanted: Sequence[str]) -> CsvTable:
-    """Open a CSV file and read its header; the delimiter is the one that yields most of the `wanted` columns.
+def open_table(path: Path, wanted: Sequence[str] = (), suffix: str = "") -> CsvTable | ArrayTable:
+    """Open a file by its suffix, or as a file with another one; `wanted` columns tell the delimiter of a CSV file."""
+    suffix = suffix or path.suffix.lower()
+    if suffix in CSV_SUFFIXES:
+        return _open_csv(path, wanted)
+    if suffix == ".mat":
+        return _open_mat(path)
+    if suffix == ".npz":
+        return _open_npz(path)
+    existing_file(path)
+    raise InputError(f"{path} has the suffix {suffix!r}; files named {', '.join(SUFFIXES)} can be read.")
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read as text, or has no header or no data.
-    """
+
+def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
+    """Read the header; the delimiter is the one that yields most of the `wanted` columns."""
     lines = _text(path).split("\n")
     top = next((i for i, line in enumerate(lines) if line.strip()), None)
     if top is None:
@@ -214,83 +182,59 @@ def read_csv_table(path: Path, wanted: Sequence[str]) -> CsvTable:
     return CsvTable(path, names, delimiter, below, top + 2)
 
 
-def read_mat_table(path: Path) -> ArrayTable:
-    """Read the variables of a MATLAB file (up to version 7.2).
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read as one.
-    """
+def _open_mat(path: Path) -> ArrayTable:
+    """Read the variables of a MATLAB file (up to version 7.2)."""
     from scipy.io import loadmat
 
-    existing_file(path)
-    try:
-        content = loadmat(path)
-    except NotImplementedError:
-        raise InputError(f"{path} is a MATLAB file of version 7.3; save it with the option -v7.") from None
-    except Exception as error:  # the parser raises many kinds on damaged files
-        raise InputError(
-            f"{path} cannot be read as a MATLAB file ({_reason(error)}); save it again with the option -v7."
-        ) from None
+    with _parsing(path, "a MATLAB file", "save it again with the option -v7"):
+        try:
+            content = loadmat(path)
+        except NotImplementedError:
+            raise InputError(f"{path} is a MATLAB file of version 7.3; save it with the option -v7.") from None
     arrays = {name: value for name, value in content.items() if not name.startswith("__")}
     return ArrayTable(path, tuple(arrays), arrays)
 
 
-def read_npz_table(path: Path) -> ArrayTable:
-    """Read the variables of a NumPy archive.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read as one.
-    """
-    existing_file(path)
+def _open_npz(path: Path) -> ArrayTable:
     arrays: dict[str, Any] = {}
+    with _parsing(path, "a NumPy archive", "write it with numpy.savez"), path.open("rb") as file:
+        content = np.load(file, allow_pickle=False)
+        if isinstance(content, np.ndarray):
+            raise ValueError("it holds a single array")
+        for name in content.files:
+            try:
+                arrays[name] = content[name]
+            except Exception as error:  # damaged, encrypted or odd members raise many kinds
+                arrays[name] = error
+    return ArrayTable(path, tuple(arrays), arrays)
+
+
+@contextlib.contextmanager
+def _parsing(path: Path, kind: str, remedy: str) -> Iterator[None]:
+    """Turn the errors of a parser, which are of many kinds on damaged files, into a sentence."""
+    existing_file(path)
     try:
-        with path.open("rb") as file:
-            content = np.load(file, allow_pickle=False)
-            if isinstance(content, np.ndarray):
-                raise ValueError("it holds a single array")
-            for name in content.files:
-                try:
-                    arrays[name] = content[name]
-                except Exception as error:  # damaged, encrypted or odd members raise many kinds
-                    arrays[name] = error
+        yield
+    except InputError:
+        raise
     except Exception as error:
-        raise InputError(
-            f"{path} cannot be read as a NumPy archive ({_reason(error)}); write it with numpy.savez."
-        ) from None
-    return ArrayTable(path, tuple(content.files), arrays)
+        raise InputError(f"{path} cannot be read as {kind} ({_reason(error)}); {remedy}.") from None
 
 
 def read_stack(path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[Array, Array | None] | None:
     """Read several records in one array: samples, channels, and further axes such as realizations and periods.
 
-    Parameters
-    ----------
-    path : Path
-        An .npz file, whose arrays are found by one name for all channels, `u` for `u1, u2, u3`, outputs being optional;
-        or an .npy file, which holds the inputs alone.
-    inputs, outputs : sequence of str
-        Names of the channels, or the one name of the array.
-
-    Returns
-    -------
-    tuple or None
-        Inputs (M, n_u, ...) and outputs (M, n_y, ...) or None; None alone where the file holds a single record.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or the arrays do not fit each other or hold anything but finite numbers.
+    An .npz file holds arrays with one name for all channels, `u` for `u1, u2, u3`, the outputs being optional; an .npy
+    file holds the inputs alone. Return the inputs (M, n_u, ...) and the outputs (M, n_y, ...) or None; None alone where
+    the file holds a single record.
     """
     y: Array | None = None
     if path.suffix.lower() == ".npy":
-        u = _read_npy(path)
+        with _parsing(path, "a NumPy array", "write it with numpy.save"), path.open("rb") as file:
+            u = np.asarray(np.load(file, allow_pickle=False))
         u = u if u.ndim > 2 else u.reshape(*u.shape, *(1,) * (3 - u.ndim))
     else:
-        table = read_npz_table(path)
+        table = _open_npz(path)
         found = [table.array(name) if name in table.arrays else None for name in map(_stem, (inputs, outputs))]
         if found[0] is None or found[0].ndim < 3:
             return None
@@ -306,17 +250,6 @@ def read_stack(path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> tup
                 f"...) with the axes of the inputs, {u.shape}."
             )
     return u.astype(float), None if y is None else y.astype(float)
-
-
-def _read_npy(path: Path) -> Array:
-    existing_file(path)
-    try:
-        with path.open("rb") as file:
-            return np.asarray(np.load(file, allow_pickle=False))
-    except Exception as error:  # damaged files raise many kinds
-        raise InputError(
-            f"{path} cannot be read as a NumPy array ({_reason(error)}); write it with numpy.save."
-        ) from None
 
 
 def _stem(names: Sequence[str]) -> str:
