@@ -24,8 +24,8 @@ holds.
 
 from typing import TYPE_CHECKING
 
+from ._base import __version__ as __version__
 from ._base.lazy import lazy_face
-from ._base.version import __version__ as __version__
 from .diagnose import diagnose as diagnose
 
 if TYPE_CHECKING:

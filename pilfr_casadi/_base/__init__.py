@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING
 
 from .lazy import lazy_face
 
+__version__ = "0.1.0"
+
 if TYPE_CHECKING:
     from .errors import (
         LARGEST as LARGEST,
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
         listed as listed,
         numbers as numbers,
         positive as positive,
+        real_array as real_array,
         usable as usable,
         whole as whole,
     )
@@ -33,12 +36,13 @@ if TYPE_CHECKING:
         time_limit as time_limit,
     )
     from .progress import Progress as Progress, progress_bar as progress_bar
-    from .version import __version__ as __version__
-    from .worker_process import Reply as Reply, close_workers as close_workers, run_in_worker as run_in_worker
     from .workers import (
+        Reply as Reply,
+        close_workers as close_workers,
         one_at_a_time as one_at_a_time,
         one_blas_thread as one_blas_thread,
         processors as processors,
+        run_in_worker as run_in_worker,
         side_by_side as side_by_side,
         worker_pool as worker_pool,
     )

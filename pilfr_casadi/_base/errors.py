@@ -29,13 +29,7 @@ def is_whole(value: Any, least: int, most: float = np.inf) -> bool:
 
 
 def whole(value: Any, what: str, least: int) -> int:
-    """Return a whole number of `least` or more.
-
-    Raises
-    ------
-    InputError
-        If something else is given.
-    """
+    """Return a whole number of `least` or more, or raise InputError."""
     if not is_whole(value, least):
         raise InputError(f"{what} is {value!r}; give a whole number, {least} or more.")
     return int(value)
@@ -59,6 +53,15 @@ def positive(value: Any, what: str, meaning: str = "a number", zero: bool = Fals
     return float(value)
 
 
+def real_array(values: Any) -> np.ndarray | None:
+    """Return real numbers as a new array of floats; None if something else is given."""
+    try:
+        given = np.asarray(values)
+        return np.array(given, dtype=float) if given.dtype.kind in "biufO" else None
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
 def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infinite: bool = False) -> np.ndarray:
     """Return finite real numbers as an array, broadcast to `shape` where that is given.
 
@@ -67,15 +70,15 @@ def numbers(values: Any, what: str, shape: tuple[int, ...] | None = None, infini
     InputError
         If something else is given, or one of them is not finite (with `infinite`: is nan).
     """
-    try:
-        given = np.asarray(values)
-        if given.dtype.kind not in "biufO":
-            raise TypeError
-        found = given.astype(float)
-        found = found if shape is None else np.broadcast_to(found, shape)
-    except (TypeError, ValueError, OverflowError):
+    found = real_array(values)
+    if found is not None and shape is not None:
+        try:
+            found = np.broadcast_to(found, shape)
+        except ValueError:
+            found = None
+    if found is None:
         fit = "" if shape is None else f" that fit the shape {shape}"
-        raise InputError(f"{what} cannot be {str(values)[:60]!r}; give numbers{fit}.") from None
+        raise InputError(f"{what} cannot be {str(values)[:60]!r}; give numbers{fit}.")
     if np.any(np.isnan(found)) or not (infinite or np.all(np.isfinite(found))):
         raise InputError(f"{what} holds a value that is not finite (nan or infinite); give finite numbers.")
     return found
@@ -86,36 +89,24 @@ def filled(
 ) -> np.ndarray:
     """Return an array of a shape from one number for all of it, or from an array of exactly this shape.
 
-    Nothing else is broadcast: a row given for a matrix is more likely a mistake than meant for every row.
-
-    Parameters
-    ----------
-    values : float or array
-    what : str
-        Begins the message.
-    shape : tuple
-        A name in place of a length stands for an unknown length; a single number then stays a single number.
-    nan, infinite : bool
-        Whether such entries are allowed.
+    Nothing else is broadcast: a row given for a matrix is more likely a mistake than meant for every row. A name in
+    place of a length stands for an unknown length; a single number then stays a single number.
 
     Raises
     ------
     InputError
-        If something else is given.
+        If something else is given; `what` begins the message.
     """
     wanted = f"a number or an array of shape ({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
-    try:
-        given = np.asarray(values)
-        if given.dtype.kind not in "biuf":
-            raise TypeError
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{what} is {str(values)[:60]}; give {wanted if shape else 'a number'}.") from None
-    found = given.astype(float)
+    wanted = wanted if shape else "a number"
+    found = real_array(values)
+    if found is None:
+        raise InputError(f"{what} is {str(values)[:60]}; give {wanted}.")
     known = tuple(k if isinstance(n, str) else n for n, k in zip(shape, found.shape, strict=False))
     if found.ndim and (len(shape), known) != (found.ndim, found.shape):
-        raise InputError(f"{what} has the shape {found.shape}; give {wanted if shape else 'a number'}.")
+        raise InputError(f"{what} has the shape {found.shape}; give {wanted}.")
     if (np.any(np.isnan(found)) and not nan) or (np.any(np.isinf(found)) and not infinite):
-        raise InputError(f"{what} holds a value that is not finite; give {wanted if shape else 'a number'}, finite.")
+        raise InputError(f"{what} holds a value that is not finite; give {wanted}, finite.")
     lengths = [n for n in shape if not isinstance(n, str)]
     return np.broadcast_to(found, lengths) if len(lengths) == len(shape) else found
 

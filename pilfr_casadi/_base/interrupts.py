@@ -10,26 +10,18 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 
 
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[None]:
     """Defer Ctrl-C to the end of the context: for imports and short writes."""
-    before = signal.getsignal(signal.SIGINT)
-    if not _in_main_thread() or not callable(before):
+    if not _in_main_thread() or not callable(signal.getsignal(signal.SIGINT)):
         yield
         return
-    pressed = False
-
-    def note(*_: object) -> None:
-        nonlocal pressed
-        pressed = True
-
-    signal.signal(signal.SIGINT, note)
-    try:
+    pressed: list[bool] = []
+    with _handler(signal.SIGINT, lambda *_: pressed.append(True)):
         yield
-    finally:
-        signal.signal(signal.SIGINT, before)
     if pressed:
         signal.raise_signal(signal.SIGINT)
 
@@ -40,47 +32,33 @@ def repeated_interrupt() -> Iterator[Callable[[], None]]:
 
     CasADi may swallow a KeyboardInterrupt that is raised inside one of its callbacks.
     """
-    before = signal.getsignal(signal.SIGINT)
-    if not _in_main_thread() or before is not signal.default_int_handler:
-        yield lambda: None
-        return
-    pressed = False
+    pressed: list[bool] = []
 
-    def note(number: int, frame: object) -> None:
-        nonlocal pressed
-        pressed = True
+    def note(*_: object) -> None:
+        pressed.append(True)
         raise KeyboardInterrupt
 
     def repeat() -> None:
-        nonlocal pressed
         if pressed:
-            pressed = False
+            pressed.clear()
             raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, note)
-    try:
+    own = _in_main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with _handler(signal.SIGINT, note) if own else contextlib.nullcontext():
         yield repeat
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
     """Let SIGTERM do what Ctrl-C does."""
-    if not _in_main_thread():
-        yield
-        return
 
     def terminate(*_: object) -> None:
         if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a script
             raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)
 
-    before = signal.signal(signal.SIGTERM, terminate)
-    try:
+    with _handler(signal.SIGTERM, terminate) if _in_main_thread() else contextlib.nullcontext():
         yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 class Clock:
@@ -97,10 +75,6 @@ def time_limit(seconds: float | None, clock: Clock) -> Iterator[None]:
         return
     lock = threading.Lock()
     ended = False
-    # in the background of a script Ctrl-C is ignored, and the interrupt of the clock would be too
-    ignored = _in_main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    if ignored:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def interrupt() -> None:
         with lock:
@@ -116,15 +90,26 @@ def time_limit(seconds: float | None, clock: Clock) -> Iterator[None]:
 
     timer = threading.Timer(seconds, interrupt)
     timer.daemon = True
-    timer.start()
+    # in the background of a script Ctrl-C is ignored, and the interrupt of the clock would be too
+    ignored = _in_main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    with _handler(signal.SIGINT, signal.default_int_handler) if ignored else contextlib.nullcontext():
+        timer.start()
+        try:
+            yield
+        finally:
+            with deferred_interrupt(), lock:
+                ended = True
+            timer.cancel()
+
+
+@contextlib.contextmanager
+def _handler(number: signal.Signals, handler: Callable[..., Any]) -> Iterator[None]:
+    """Handle a signal in another way inside the context."""
+    before = signal.signal(number, handler)
     try:
         yield
     finally:
-        with deferred_interrupt(), lock:
-            ended = True
-        timer.cancel()
-        if ignored:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(number, before)
 
 
 def _in_main_thread() -> bool:

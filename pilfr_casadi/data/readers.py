@@ -12,7 +12,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from .._base import InputError, existing_file, listed, positive
+from .._base import InputError, listed, positive
 from .recording import Recording
 from .tables import ArrayTable, CsvTable, open_table
 
@@ -124,7 +124,7 @@ def column_names(path: PathLike, wanted: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def written_times(path: PathLike, columns: Mapping[str, str] | None = None) -> list[str] | None:
-    """Return the times of a file as they are written there (an array's to the last digit); None without a time column."""
+    """Return the times of a file as they are written there, an array's to the last digit; None without times."""
     columns = columns or {}
     chosen = next((columns[name] for name in TIME_NAMES if name in columns), None)
     table = open_table(Path(path), [chosen or "t"])

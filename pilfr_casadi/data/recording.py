@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from .._base import LARGEST, InputError, is_whole, listed, positive, usable
+from .._base import LARGEST, InputError, is_whole, listed, positive, real_array, usable
 
 SAME_STEP = 1e-4  # relative difference in `dt` between recordings fitted together; written times have few digits
 HOLDS = ("zero", "linear", None)
@@ -183,8 +183,9 @@ def as_recordings(data: "Recording | Iterable[Recording]") -> tuple[Recording, .
     InputError
         If there is none, or one of them is not a recording.
     """
-    several = isinstance(data, Iterable) and not isinstance(data, Mapping | np.ndarray)
-    recordings: tuple[Any, ...] = tuple(data) if several else (data,)
+    recordings: tuple[Any, ...] = (data,)
+    if isinstance(data, Iterable) and not isinstance(data, Mapping | np.ndarray):
+        recordings = tuple(data)
     for item in recordings:
         if not isinstance(item, Recording):
             raise InputError(
@@ -300,11 +301,7 @@ def _signal(values: Any, letter: str, label: str) -> np.ndarray:
         )
     if hasattr(values, "toarray"):
         raise InputError(f"{letter} of {label} is a sparse matrix; give a full array, as its toarray() makes one.")
-    try:
-        given = np.asarray(values)
-        array = np.array(given, dtype=float) if given.dtype.kind in "biufO" else None
-    except (TypeError, ValueError, OverflowError):
-        array = None
+    array = real_array(values)
     if array is None:
         raise InputError(f"{letter} of {label} is not an array of real numbers; give one of shape (samples, channels).")
     if array.ndim not in (1, 2):
@@ -317,11 +314,8 @@ def _signal(values: Any, letter: str, label: str) -> np.ndarray:
 
 def _initial_state(values: Any, label: str) -> np.ndarray:
     """Return the state at the first sample as a read-only vector."""
-    try:
-        state = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        state = np.empty(0)
-    if state.ndim != 1 or state.size == 0 or not np.isfinite(state).all():
+    state = real_array(values)
+    if state is None or state.ndim != 1 or state.size == 0 or not np.isfinite(state).all():
         raise InputError(
             f"the initial state of {label} must be a vector of finite numbers, or one of {listed(INITIALS)}."
         )

@@ -317,7 +317,7 @@ def test_no_code_is_run_from_a_model_file(tmp_path, monkeypatch, text):
 
 
 RUNS_PROGRAMS = ("adapters.py",)  # simulators/adapters runs the user's simulator file
-TALKS_TO_ITS_CHILD = ("worker_process.py", "workers.py")
+TALKS_TO_ITS_CHILD = ("workers.py",)
 
 
 def test_the_package_runs_no_text_but_the_users_own_program():

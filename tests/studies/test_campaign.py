@@ -17,7 +17,7 @@ from command_line import sentence, write_csv
 from run_files import PYTHON, changed, command, contents, prepared
 
 import pilfr_casadi as pilfr
-from pilfr_casadi._base import Clock, InputError, close_workers, time_limit, worker_process
+from pilfr_casadi._base import Clock, InputError, close_workers, time_limit, workers
 from pilfr_casadi.cli import main
 from pilfr_casadi.studies import Manifest, RunInterrupted
 
@@ -201,7 +201,7 @@ def test_ctrl_c_after_the_jobs_says_that_they_are_done(folder, monkeypatch, caps
 
 @pytest.mark.usefixtures("heard")
 def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
-    begin, ended = worker_process.WorkerProcess.__init__, threading.Event()
+    begin, ended = workers.WorkerProcess.__init__, threading.Event()
 
     def late(self):
         assert ended.wait(60)
@@ -211,13 +211,13 @@ def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
         close()
         ended.set()
 
-    close = worker_process.close_workers
-    monkeypatch.setattr(worker_process.WorkerProcess, "__init__", late)
+    close = workers.close_workers
+    monkeypatch.setattr(workers.WorkerProcess, "__init__", late)
     monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.executor"), "close_workers", ends)
     (folder / "mine.py").write_text(SLOW.replace("TROUBLE", "time.sleep(600)").replace("FOLDER", str(folder)))
     with pytest.raises(RunInterrupted), time_limit(0.5, Clock()):
         pilfr.campaign(folder / "mine.py")
-    assert ended.is_set() and not worker_process._children
+    assert ended.is_set() and not workers._children
     assert not [t for t in threading.enumerate() if t.name.startswith("ThreadPoolExecutor")]  # nor can one begin later
 
 
