@@ -48,15 +48,10 @@ _VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "c", "computed")
 class _Code:
     """Code of a step, and where the kernel finds the nonzeros of each block.
 
-    Attributes
-    ----------
-    functions : dict
-        `fixed` (p -> f), what depends on parameters alone, evaluated once a run; `step`; and `computed`, the nonzeros
-        that are neither constants nor parameters nor signals, each once.
-    at : dict
-        Where each of `_VALUES` begins in the stack of values, and its `end`.
-    entries : dict
-        The place in the stack of each nonzero, in the order of the block's pattern.
+    The functions are `fixed` (p -> f), expressions of parameters alone, evaluated once a run; `step`; and `computed`,
+    the nonzeros that are neither constants nor parameters nor signals, each once. `at` says where each of `_VALUES`
+    begins in the stack of values and where it ends, `entries` the place in the stack of each nonzero, in the order of
+    the block's pattern.
     """
 
     functions: dict[str, ca.Function]
@@ -278,13 +273,6 @@ def _shelf(key: str) -> Path:
     return cache_directory() / key[:2]
 
 
-def _thin(shelf: Path) -> None:
-    """Keep a folder's most recently used libraries; one that is loaded stays so without its file."""
-    with contextlib.suppress(OSError):
-        for library in sorted(shelf.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
-            library.unlink()
-
-
 def _compile(cc: str, source: str, key: str, level: tuple[str, ...]) -> Path:
     """Compile under another name first, so that a library is never half there."""
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
@@ -297,19 +285,15 @@ def _compile(cc: str, source: str, key: str, level: tuple[str, ...]) -> Path:
                 library = _shelf(key) / f"{key}-{_digest(partial)}.so"
                 library.parent.mkdir(mode=0o700, exist_ok=True)
                 os.replace(partial, library)
-                _thin(library.parent)
+                with contextlib.suppress(OSError):  # keep the folder's most recently used; loaded ones need no file
+                    for old in sorted(library.parent.glob("*.so"), key=lambda p: p.stat().st_mtime)[:-KEPT]:
+                        old.unlink()
                 return library
     raise OSError((done.stderr.strip().splitlines() or ["it wrote no library"])[0][:300])
 
 
 def build(source: str, level: tuple[str, ...] = PLAIN) -> Path:
-    """Return the library of a source, from the cache or compiled.
-
-    Raises
-    ------
-    InputError
-        If there is no compiler, or it does not work.
-    """
+    """Return the library of a source, from the cache or compiled."""
     cc = compiler()
     if cc is None:
         raise InputError("No C compiler was found; install one (cc, gcc or clang) or use engine='vm'.")
@@ -393,13 +377,7 @@ class Compiled:
 
 
 def make_engine(model: Model, engine: str = "auto") -> Engine:
-    """Make the engine for a closed model: "c", "vm", or "auto" (C where there is a compiler that works).
-
-    Raises
-    ------
-    InputError
-        If the engine is unknown, or "c" is asked for without a compiler that works.
-    """
+    """Make the engine for a closed model: "c", "vm", or "auto" (C where there is a compiler that works)."""
     if engine not in ("auto", "c", "vm"):
         raise InputError(f"The engine {engine!r} is unknown; use 'auto', 'c' or 'vm'.")
     if engine == "vm" or (engine == "auto" and compiler() is None):

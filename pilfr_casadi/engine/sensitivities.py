@@ -40,24 +40,12 @@ BLOCKS = tuple((target, source) for target, sources in TARGETS.items() for sourc
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Step of a model with all its partial derivatives.
+    """Step of a model with all its partial derivatives."""
 
-    Attributes
-    ----------
-    step : casadi.Function
-        `(x, s, u, p) -> (x_next, s_next, y, z, w, c)`.
-    partial : casadi.Function
-        `(x, s, z, w, c, u, p) -> z_x, z_p, w_z, ...`: one sparse matrix for each of `BLOCKS`, (target, source).
-    sizes : dict
-        Length of x, s, z, w, c, u, p and y.
-    substeps : int
-        Steps a sample.
-    """
-
-    step: ca.Function
-    partial: ca.Function
-    sizes: dict[str, int]
-    substeps: int = 1
+    step: ca.Function  # (x, s, u, p) -> (x_next, s_next, y, z, w, c)
+    partial: ca.Function  # (x, s, z, w, c, u, p) -> z_x, z_p, ...: a sparse matrix for each (target, source) of BLOCKS
+    sizes: dict[str, int]  # of x, s, z, w, c, u, p and y
+    substeps: int = 1  # steps a sample
 
     def symbols(self) -> dict[str, Any]:
         """Make symbols x, s, z, w, c, u, p."""

@@ -111,16 +111,9 @@ class BLA:
 class OutputSpectra:
     """Spectra of the outputs at the excited lines, at the level of one experiment with its periods averaged.
 
-    Parameters
-    ----------
-    frequency : array, (F,)
-        Frequencies in Hz.
-    power : array, (F, n_y)
-        Mean squared modulus of the output's Fourier coefficients over the experiments.
-    var_noise : array, (F, n_y), optional
-        Part of it due to noise; ``None`` with a single period.
-    var_total : array, (F, n_y), optional
-        Part of it due to noise and nonlinear distortion; ``None`` with a single realization.
+    `power` (F, n_y) is the mean squared modulus of the output's Fourier coefficients over the experiments at each
+    `frequency` (F,) in Hz; `var_noise` is the part of it due to noise (``None`` with a single period) and `var_total`
+    the part due to noise and nonlinear distortion (``None`` with a single realization).
     """
 
     frequency: Array
@@ -202,20 +195,8 @@ def output_spectra(
 ) -> OutputSpectra:
     """Estimate the spectra of the outputs, of their noise, and of noise and nonlinear distortion together.
 
-    Parameters
-    ----------
-    recordings, period, lines
-        As for :func:`robust_bla`.
-
-    Returns
-    -------
-    OutputSpectra
-        The distortion is the scatter of ``Y - G U`` over the realizations, `G` being the BLA.
-
-    Raises
-    ------
-    InputError
-        As :func:`robust_bla`.
+    Arguments are those of :func:`robust_bla`. The distortion is the scatter of ``Y - G U`` over the realizations, `G`
+    being the BLA.
     """
     spectra = _periodic_spectra(recordings, period, lines)
     G, _ = spectra.frf()

@@ -136,23 +136,9 @@ def subspace_matrices(
     block_rows: int | None = None,
     progress: Progress | None = None,
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the matrices of :func:`time_subspace`, without importing the control package.
+    """Return the matrices A, B, C, D of :func:`time_subspace`, without importing the control package.
 
-    Parameters
-    ----------
-    recordings, nx, offset, block_rows
-        As for :func:`time_subspace`; order 0, a static gain, is allowed here.
-    progress : callable, optional
-        Called with ("subspace", done, total, smallest error so far).
-
-    Returns
-    -------
-    A, B, C, D : array, (nx, nx), (nx, n_u), (n_y, nx), (n_y, n_u)
-
-    Raises
-    ------
-    InputError
-        As :func:`time_subspace`.
+    Order 0, a static gain, is allowed here. `progress` is called with ("subspace", done, total, smallest error so far).
     """
     if nx == 0:
         return _static_gain(as_recordings(recordings), offset)
@@ -177,12 +163,12 @@ class Matrices:
 
 
 class RangeSpace(NamedTuple):
-    """Hold the four arrays of :meth:`SubspaceProblem.range_space`."""
+    """Range of an extended observability matrix, with as many columns as singular values."""
 
-    rows: Array
-    shifted: Array
-    C: Array
-    values: Array
+    rows: Array  # without the last block row
+    shifted: Array  # the same shifted by one step, weighted alike
+    C: Array  # the first block row, in outputs divided by `y_scale`
+    values: Array  # singular values
 
 
 class SubspaceProblem:
@@ -200,14 +186,7 @@ class SubspaceProblem:
     too_few: str
 
     def range_space(self, r: int) -> RangeSpace:
-        """Return the range space of `r` block rows, with as many columns as singular values.
-
-        Returns
-        -------
-        RangeSpace
-            The observability matrix without its last block row, the same shifted by one step (both weighted alike), its
-            first block row `C` in outputs divided by `y_scale`, and the singular values.
-        """
+        """Return the range space of `r` block rows."""
         raise NotImplementedError
 
     def reduced(self, A: Array, C: Array) -> list[Array]:

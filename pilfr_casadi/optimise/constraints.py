@@ -36,7 +36,6 @@ from ..models import (
     element_slopes,
     unknown_slope,
 )
-from ..simulators import numbers_or_nan
 
 TOLERATED = 1e-6  # violation, in units of a constraint, that counts as met
 AT_MOST, AT_LEAST = 100.0, 1e-6  # limits that a unit comes to at most; share of the largest change, at least
@@ -224,13 +223,7 @@ def unbounded_sentence(structure: PILFR | None, constraints: Iterable[Constraint
 
 
 def check_room(parameters: ParameterSet, limits: Iterable[Constraint]) -> None:
-    """Refuse bounds on the entries of A under which no A has the required spectral radius.
-
-    Raises
-    ------
-    InputError
-        With the bounds, the least radius that they allow and the required one.
-    """
+    """Refuse bounds on the entries of A under which no A has the required spectral radius."""
     radii = [c.check.radius for c in limits if isinstance(c.check, BeyondRadius) and c.check.matrix is linear_part]
     if not radii or "A" not in parameters or np.all(parameters["A"].fixed):
         return
@@ -257,6 +250,14 @@ def least_radius(low: np.ndarray, high: np.ndarray) -> float:
         if np.all(np.isfinite(bound)) and np.all(sign * bound >= 0):
             least = max(least, float(np.max(np.abs(np.linalg.eigvals(bound)), initial=0.0)))
     return least
+
+
+def _numbers_or_nan(function: ca.Function, *arguments: Any) -> np.ndarray:
+    """Evaluate the first output of a function; nan where CasADi's linear solvers raise at a singular matrix."""
+    try:
+        return np.asarray(function.call(arguments)[0])
+    except RuntimeError:
+        return np.full(function.size_out(0), np.nan)
 
 
 class Rows:
@@ -317,11 +318,11 @@ class Rows:
 
     def values(self, p: np.ndarray) -> np.ndarray:
         """Shape (n_g,); nan where they cannot be computed, such as a gain where a pole is 1 to the last digit."""
-        return numbers_or_nan(self.function, p).ravel()
+        return _numbers_or_nan(self.function, p).ravel()
 
     def slope(self, p: np.ndarray) -> np.ndarray:
         """Shape (n_g, n_p)."""
-        return numbers_or_nan(self._slope, p).reshape(len(self.labels), len(p))
+        return _numbers_or_nan(self._slope, p).reshape(len(self.labels), len(p))
 
 
 def _limits(c: Constraint, size: int) -> np.ndarray:
@@ -440,13 +441,7 @@ def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
 
 
 def check_gain(constraints: Iterable[Constraint], element: Any) -> None:
-    """Refuse a DC gain for an element to which the formula of `Gain` does not apply.
-
-    Raises
-    ------
-    InputError
-        If the element is neither none nor a Prandtl-Ishlinskii one of plays or stops.
-    """
+    """Refuse a DC gain for an element to which the formula of `Gain` does not apply."""
     if element is None or (isinstance(element, PrandtlIshlinskii) and isinstance(element.operator, Play | Stop)):
         return
     if any(isinstance(c.expression, Gain) for c in constraints):

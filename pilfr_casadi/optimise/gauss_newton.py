@@ -577,11 +577,6 @@ def first_state(
 
     Where it is to be estimated, it is fitted to the first `samples` outputs, and later outputs are not looked at. With
     `state_prior` it has a prior around rest, whose scale is that of a run over all inputs (`state_precision`).
-
-    Raises
-    ------
-    InputError
-        If a given state has another number of entries.
     """
     n, values, state = model.n_state, model.parameters.start, given_state(model, recording)
     if recording.begins == "periodic":

@@ -15,13 +15,7 @@ if TYPE_CHECKING:
         simulator_variable as simulator_variable,
         user_variable as user_variable,
     )
-    from .equations import (
-        Named as Named,
-        Placed as Placed,
-        Port as Port,
-        in_series as in_series,
-        numbers_or_nan as numbers_or_nan,
-    )
+    from .equations import Named as Named, Placed as Placed, Port as Port, in_series as in_series
     from .integration import (
         LARGEST_STEP as LARGEST_STEP,
         MOST_SUBSTEPS as MOST_SUBSTEPS,

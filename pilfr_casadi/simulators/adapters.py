@@ -136,13 +136,7 @@ def linear_simulator(
     outputs: tuple[str, ...],
     discrete: bool = False,
 ) -> Simulator:
-    """Make `ẋ = A x + B u, y = C x + D u` (or `x⁺`) with a parameter for every entry that is not 0, 1 or -1.
-
-    Parameters
-    ----------
-    matrices : mapping
-        A (n_x, n_x), B (n_x, n_u), C (n_y, n_x), D (n_y, n_u).
-    """
+    """Make `ẋ = A x + B u, y = C x + D u` (or `x⁺`) with a parameter for every entry that is not 0, 1 or -1."""
     parameters: dict[str, Parameter] = {}
     entries: dict[str, list[list[Any]]] = {}
     for letter, matrix in matrices.items():
@@ -216,13 +210,7 @@ def load_simulator(path: str | os.PathLike[str]) -> Simulator:
 
 
 def simulator_variable(path: str | os.PathLike[str]) -> Any:
-    """Run a simulator file and return its variable `simulator` as it is; see `load_simulator`.
-
-    Raises
-    ------
-    InputError
-        As `load_simulator`.
-    """
+    """Run a simulator file and return its variable `simulator` as it is; see `load_simulator`."""
 
     def checked(path: Path, module: types.ModuleType) -> None:
         names = [n for n, v in vars(module).items() if isinstance(v, Simulator) and not n.startswith("_")]
@@ -243,13 +231,7 @@ def user_variable(
     what: str,
     check: Callable[[Path, types.ModuleType], None] | None = None,
 ) -> Any:
-    """Run a user's Python file and return its variable `name`; messages call it `what`.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, does not run, does not set the variable, or `check` refuses it.
-    """
+    """Run a user's Python file and return its variable `name`; messages call it `what`."""
     path = Path(path)
     code = _compile(path, _read(path, what), what)
     module = types.ModuleType(f"_{name}_{''.join(c if c.isalnum() else '_' for c in path.stem)}")
@@ -329,22 +311,16 @@ def _sentence(path: Path, error: BaseException, what: str) -> str:
     return f"{place}: {type(error).__name__}{f': {said}' if said else ''}; correct the file."
 
 
-def _line(path: Path, error: BaseException) -> int | None:
+def _line(path: Path, error: BaseException | None) -> int | None:
     """Find the deepest line of the file in the traceback of an error, or of its first cause."""
     found, seen = None, set[int]()
     while error is not None and id(error) not in seen:
         seen.add(id(error))
-        lines = [number for frame, number in traceback.walk_tb(error.__traceback__) if _inside(frame, path)]
+        steps = traceback.walk_tb(error.__traceback__)
+        lines = [number for frame, number in steps if frame.f_code.co_filename == str(path)]
         found = lines[-1] if lines else found
-        following = error.__cause__ or error.__context__
-        if following is None:
-            break
-        error = following
+        error = error.__cause__ or error.__context__
     return found
-
-
-def _inside(frame: Any, path: Path) -> bool:
-    return bool(frame.f_code.co_filename == str(path))
 
 
 def _tidy(text: str) -> str:

@@ -16,7 +16,6 @@ from functools import cached_property
 from typing import Any, Self
 
 import casadi as ca
-import numpy as np
 
 from .._base import InputError, listed
 from ..models import Parameter, ParameterSet
@@ -50,13 +49,7 @@ class Named:
 
 
 def call(function: Expression, name: str, **available: Any) -> Any:
-    """Call a user's function, called `name` in messages, with those of the available symbols that it names.
-
-    Raises
-    ------
-    InputError
-        If it is not a function, names something else, or fails.
-    """
+    """Call a user's function, called `name` in messages, with those of the available symbols that it names."""
     try:
         arguments = inspect.signature(function).parameters.items()
     except (TypeError, ValueError):
@@ -78,14 +71,6 @@ def call(function: Expression, name: str, **available: Any) -> Any:
                 "use casadi.if_else, casadi.fmin and casadi.fmax."
             ) from error
         raise InputError(f"The {name} fails: {type(error).__name__}: {error}.") from error
-
-
-def numbers_or_nan(function: ca.Function, *arguments: Any) -> np.ndarray:
-    """Evaluate the first output of a function; nan where CasADi's linear solvers raise at a singular matrix."""
-    try:
-        return np.asarray(function.call(arguments)[0])
-    except RuntimeError:
-        return np.full(function.size_out(0), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
