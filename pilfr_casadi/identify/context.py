@@ -1,15 +1,27 @@
-"""The context of one fit: recordings, solver and options, and the solves that every way to a fit makes.
+"""The context of one fit: recordings, solver, options, the solves, and the result with its note.
 
-An initial state that is free in a search lets it pay for a better fit with memories that no machine had. A prior does
-not prevent this, because the units of states and memories are free too. So a search begins with the state at rest where
-the recordings do not contradict it: where freeing the state would lower the cost by less than the Bayesian information
-criterion charges for the new variables (`FitContext.agrees_with_rest`).
+**A search begins at rest.** A free initial state lets a search pay for a better fit with memories that no machine had.
+A prior does not prevent this, because the units of states and memories are free too. So a search begins with the state
+at rest unless the recordings contradict it, that is, unless freeing the state would lower the cost by more than the
+Bayesian information criterion charges for the new variables (`FitContext.agrees_with_rest`).
+
+**The note of a result** says two things that the recordings leave open. An operator that never slips in a periodic
+steady state keeps its memory, whatever it is: its row of the state's slope over a period is that of the identity, every
+value in an interval is a steady state, and the outputs differ by a constant. The memory that periods from rest lead to
+is taken.
+
+The gain of a `dc_gain` constraint belongs to motions so large that every play slips (`slope` 1), or so small that every
+one sticks (0), after an infinite time. A fit may meet it where no data contradict it, by operators whose thresholds lie
+beyond all motions, or by a slow pole. So the gain is computed a second time, over the samples of the longest recording
+and without the operators that never slip (for small motions: with the operators that have no threshold),
+
+    gain_M = C' (Σ_{k<M} A'^k) B' + D',   with the blocks of the constraint at S = diag(Σ_j w_ij), j slipping.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -18,10 +30,11 @@ import numpy as np
 
 from .._base import Progress, deferred_interrupt
 from ..data import Recording, as_recordings, fingerprint
-from ..models import LAYER, PILFR, Model
+from ..models import LAYER, PILFR, Model, PrandtlIshlinskii, Stop
 from ..optimise import (
     STEP,
     Constraint,
+    Gain,
     GaussNewton,
     Ipopt,
     Iteration,
@@ -33,37 +46,25 @@ from ..optimise import (
     unbounded_sentence,
     within_bounds,
 )
-from .options import FitOptions
-from .result import PRIOR, Fit, describe_open_memory, describe_reached_gain, with_solution
+from .result import DENSITY_PRIOR, Fit, FitOptions, with_solution
 from .uncertainty import standard_errors
 
 Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
-AT_BOUND = GaussNewton()  # solves at a bound on a spectral radius for solvers other than Gauss-Newton
+Array = np.ndarray
+BOUND_SOLVER = GaussNewton()  # solves at a bound on a spectral radius for solvers other than Gauss-Newton
 DIVERGES = 1e3  # times the error of a model without outputs, from which a model diverges
 NOISE_ROUNDS, NOISE_AGREES = 5, 0.05  # most estimates of the noise, and the relative change that ends them
+CHUNK = 512  # samples of a period whose slopes are held in memory at a time
+STILL = 1e-12  # differences from the identity below this count as none
+APART = 0.05  # difference of gains, relative to the largest one asked for, that is reported
 
 
 @dataclass(frozen=True, eq=False)
 class FitContext:
-    """What all ways to a fit share.
+    """The recordings, solver and options that every kind of fit shares.
 
-    Attributes
-    ----------
-    recordings : tuple of Recording
-        Training data.
-    solver : object
-        `GaussNewton`, `Ipopt`, or any object with `solve(problem, start)`.
-    constraints : tuple of Constraint
-        All constraints, bounds on spectral radii included.
-    l1 : dict
-        Weight of an L1 penalty by parameter name.
-    engine : str
-    progress : callable or None
-    threads : int
-        Recordings that are run at a time.
-    options : FitOptions
-    began : float
-        When the work began (`time.perf_counter`), s.
+    `constraints` hold the bounds on spectral radii too; `threads` recordings are run at a time; `began` is the time of
+    `time.perf_counter` at which the work began.
     """
 
     recordings: tuple[Recording, ...]
@@ -78,11 +79,11 @@ class FitContext:
 
     @cached_property
     def weights(self) -> np.ndarray | None:
-        """Weight of each recording, or None."""
+        """The weight of each recording, or None."""
         return self.options.weights_of(self.recordings)
 
     def problem(self, model: Model, noise: float = 1.0, **others: Any) -> Problem:
-        """Simulation-error problem of a model; `others` replace options of `Problem`."""
+        """Make the simulation-error problem of a model; `others` replace options of `Problem`."""
         given: dict[str, Any] = {"constraints": self.constraints, "noise": self.options.noise or noise}
         given |= {"engine": self.engine, "weights": self.weights, **others}
         problem = Problem(model, self.recordings, **given)
@@ -94,7 +95,7 @@ class FitContext:
         if not isinstance(self.solver, GaussNewton | Ipopt):
             solution: Solution = self.solver.solve(problem, start)
             return solution
-        last = self.solver if isinstance(self.solver, GaussNewton) else AT_BOUND
+        last = self.solver if isinstance(self.solver, GaussNewton) else BOUND_SOLVER
         return solve_within_bounds(problem, start, self.solver, stage, self.progress, last)
 
     def settle_noise(self, problem: Problem, solution: Solution, stage: str, **others: Any) -> tuple[Problem, Solution]:
@@ -116,11 +117,10 @@ class FitContext:
         return replace(self, recordings=tuple(recordings))
 
     def agrees_with_rest(self, problem: Problem, theta: np.ndarray, correlated: float = 1.0) -> bool:
-        """Whether the recordings agree with a beginning at rest, given the solution θ of the problem from rest.
+        """Tell whether the recordings agree with a beginning at rest, given the solution θ of the problem from rest.
 
-        `correlated` is the number of residuals that count as one, because a model's errors change slowly.
-        True also for problems that have initial states of their own. Only the states are freed, in a linearised step,
-        which foretells the largest decrease of the cost.
+        `correlated` residuals count as one, because a model's errors change slowly. Only the states are freed, in a
+        linearised step, which predicts the largest decrease of the cost. True also if θ has initial states already.
         """
         if problem.size > int(problem.free.sum()) or not any(r.begins == "estimate" for r in self.recordings):
             return True
@@ -143,14 +143,14 @@ class FitContext:
     ) -> Fit:
         """Build the `Fit` of a solution; Ctrl-C waits until it is complete and shows in its status.
 
-        `fields` are further fields of the `Fit`; `errors={}` spares the standard errors of what is no minimum.
+        `fields` are further fields of the `Fit`; `errors={}` skips the standard errors.
         """
         found: list[Fit] = []
         try:
             with deferred_interrupt():
                 found.append(self._result(model, structure, problem, exactly(problem, solution), note, fields))
             if self.progress:
-                self.progress("standard errors", 1, 1, np.nan)
+                self.progress("standard errors", 1, 1, float(np.mean(found[0].train_nrmse)))
         except KeyboardInterrupt:
             if not found:
                 raise
@@ -162,11 +162,11 @@ class FitContext:
     ) -> Fit:
         """Build the `Fit`; its note also says what the recordings leave open.
 
-        Where the search has put priors of its own (`PRIOR`) on weights and thresholds, neither the model nor the
-        standard errors know of them.
+        Priors that the search has put on weights and thresholds (`DENSITY_PRIOR`) leave the model and its standard
+        errors here.
         """
         fitted, judged, theta = with_solution(model, problem, solution), problem, solution.theta
-        if note == PRIOR:
+        if note == DENSITY_PRIOR:
             priors = structure.priors if structure else {}
             own = {name: {"prior": priors.get(name)} for name in LAYER}
             fitted = fitted.with_parameters(fitted.parameters.change(**own))
@@ -211,7 +211,7 @@ class FitContext:
 
 
 def _nrmse_of_zero(problem: Problem) -> float:
-    """Largest NRMSE of any output that a model without outputs has, at least 1."""
+    """Compute the largest NRMSE of any output for a model whose outputs are zero, at least 1."""
     return max(1.0, *(float(np.max(np.sqrt(np.mean(r.y**2, axis=0)) / problem.scale)) for r in problem.recordings))
 
 
@@ -224,34 +224,26 @@ def solve_within_bounds(
     last: GaussNewton = STEP,
     held: bool = False,
 ) -> Solution:
-    """Solve a problem inside exact bounds on spectral radii, reporting the solver's steps (`within_bounds`).
+    """Solve a problem inside exact bounds on spectral radii with any solver (`within_bounds`).
 
-    Parameters
-    ----------
-    problem, start, last, held
-        See `within_bounds`; `last` gets the solver's limit on time.
-    solver : object
-        Has `solve(problem, start)`. Solvers of the package take a limit on time and report their steps.
-    stage : str
-        Name under which the steps are reported.
-    progress : callable
-        Gets (stage, step, largest number of steps, error).
+    Solvers of the package report their steps under the name `stage`; `last` gets their limit on time.
     """
     start = problem.start if start is None else start
     if not isinstance(solver, GaussNewton | Ipopt):
         return within_bounds(problem, start, solver.solve, last, held)
-    report, last = (
-        report_iterations(progress, stage, solver.max_iterations),
-        replace(last, time_limit=solver.time_limit),
-    )
+    report = report_iterations(progress, stage, solver.max_iterations)
+    last = replace(last, time_limit=solver.time_limit)
     return within_bounds(problem, start, lambda p, s: solver.solve(p, s, report), last, held, report)
 
 
 def report_iterations(progress: Progress | None, stage: str, most: int) -> Callable[[Iteration], None] | None:
-    """Turn a progress function into one of a solver's iterations, which reports the error that a cost stands for."""
+    """Turn a progress function into one of a solver's iterations.
+
+    A cost holds priors and weights of recordings too, so it says nothing about the NRMSE: the error reported is nan.
+    """
     if progress is None:
         return None
-    return lambda i: progress(stage, min(i.number, most), most, float(np.sqrt(2 * max(i.cost, 0.0))))
+    return lambda i: progress(stage, min(i.number, most), most, np.nan)
 
 
 def context_of_fit(
@@ -265,7 +257,7 @@ def context_of_fit(
     weights: Any = None,
     engine: str = "auto",
 ) -> FitContext:
-    """Context of a fit made from an earlier one, whose options hold where no others are given."""
+    """Make the context of a fit made from an earlier one, whose options hold where no others are given."""
     recordings = as_recordings(train)
     options = fit.options.updated(stable, constraints, noise, weights, recordings)
     return FitContext(recordings, solver, options.all_constraints(fit.structure), engine=engine, options=options)
@@ -277,6 +269,122 @@ def mark_interrupted(model: Model, problem: Problem, solution: Solution, note: s
 
 
 def rms_error(problem: Problem, solution: Solution) -> float:
-    """Root mean square of the normalised residuals."""
+    """Compute the root mean square of the normalised residuals."""
     e = problem.residual(solution.theta)
     return float(np.sqrt(np.mean(e**2)))
+
+
+def find_open_memory(problem: Problem, theta: Array, recording: Recording, state: Array) -> Array:
+    """Find the memories (indices, (k,)) that a period from a steady state does not change though outputs see them."""
+    engine, p, n_x = problem.engine, problem.parameters(theta), problem.model.n_x
+    rows = CHUNK * problem.model.substeps
+    period = problem.model.drive(recording)[: (recording.period or 1) * problem.model.substeps]
+    slope, after, seen = np.eye(len(state)), state, np.zeros(len(state))
+    for a in range(0, len(period), rows):
+        _, jac, after, slope = engine.sensitivity(period[a : a + rows], p, after, slope, np.full(len(p), -1))
+        seen = np.maximum(seen, np.max(np.abs(jac / problem.scale[:, None]), axis=(0, 1), initial=0.0))
+    still = np.max(np.abs(slope - np.eye(len(state))), axis=1, initial=0.0) <= STILL
+    return np.flatnonzero(still[n_x:] & (seen[n_x:] > STILL * np.max(seen, initial=0.0)))
+
+
+def describe_open_memory(problem: Problem, theta: Array) -> str:
+    """Name the recordings in which memories stay undecided; empty where there are none."""
+    counts = {}
+    for k, (r, state) in enumerate(zip(problem.recordings, problem.first_states(theta), strict=True)):
+        periodic = r.begins == "periodic"
+        if periodic and problem.model.n_s and np.all(np.isfinite(state)):
+            counts[r.label if len(problem.recordings) == 1 or r.name else f"recording {k + 1}"] = len(
+                find_open_memory(problem, theta, r, state)
+            )
+    found = [f"{count} in {label}" for label, count in counts.items() if count]
+    if not found:
+        return ""
+    return (
+        f"operators that never slip in a steady period: {', '.join(found)}; the period does not tell their memory, "
+        "which shifts the outputs and is taken as periods from rest with zero memory leave it"
+    )
+
+
+def describe_reached_gain(problem: Problem, theta: Array) -> str:
+    """Name the gains that hold only beyond the recordings, and why; empty where there are none."""
+    found, at = [], 0
+    values, moved = problem.model.parameters.unpack(problem.parameters(theta)), None
+    samples = max(len(r) for r in problem.recordings)
+    for c, size in zip(problem.constraints, problem.g_sizes, strict=True):
+        rows, at = slice(at, at + size), at + size
+        if not isinstance(c.expression, Gain):
+            continue
+        if moved is None:
+            moved = find_slipping(problem, theta, values)
+        low, high = problem.g_lower[rows], problem.g_upper[rows]
+        room = APART * float(np.max(np.abs(np.concatenate([low, high])), initial=0.0))
+
+        def far(gain: Array, low: Array = low, high: Array = high, room: float = room) -> bool:
+            return bool(np.any(~((low - room <= gain) & (gain <= high + room))))
+
+        whole, within, odd = channel_weights(problem.model.element, values, c.expression.slope, moved)
+        if far(gain_over(values, whole, None)):
+            continue  # not met at all, which the limits say
+        reached = gain_over(values, within, samples)
+        if not far(reached):
+            continue
+        range_alone, time_alone = far(gain_over(values, within, None)), far(gain_over(values, whole, samples))
+        both = not range_alone and not time_alone
+        why = [odd] if (range_alone or both) and odd else []
+        why += [f"it settles over more than their {samples} samples"] if time_alone or both else []
+        shown = ", ".join(f"{g:.3g}" for g in reached)
+        found.append(f"{c.name} holds only beyond the recordings: {' and '.join(why)}; within them it comes to {shown}")
+    return "; ".join(found)
+
+
+def find_slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -> Array:
+    """Find the operators that slip in some recording, (channels, N); none without an element."""
+    element = problem.model.element
+    if not isinstance(element, PrandtlIshlinskii):
+        return np.zeros((0, 0), dtype=bool)
+    r, n_x, p = values["r"], problem.model.n_x, problem.parameters(theta)
+    moved = np.zeros(r.shape, dtype=bool)
+    for recording, state in zip(problem.recordings, problem.first_states(theta), strict=True):
+        z = problem.engine.simulate(problem.model.drive(recording), p, state, True)[2]
+        q = state[n_x:].reshape(r.shape)
+        for row in z:
+            after = np.clip(q, row[:, None] - r, row[:, None] + r)
+            moved |= after != q
+            q = after
+    return moved
+
+
+def channel_weights(
+    element: object, values: Mapping[str, Array], slope: float, moved: Array
+) -> tuple[Array, Array, str]:
+    """Sum the weights of each channel (n_w,) in all and within the recordings; say how the operators differ there."""
+    if not isinstance(element, PrandtlIshlinskii):
+        return np.zeros(0), np.zeros(0), ""
+    w, stops = values["w"], isinstance(element.operator, Stop)
+    whole = slope * w.sum(axis=1)
+    if slope not in (0.0, 1.0):
+        return whole, whole, ""
+    if (slope == 1.0) != stops:  # large motions
+        odd, what = ~moved, "never slip in them"
+    else:
+        odd, what = values["r"] <= 0, "have no threshold below which they stick"
+    odd = odd & (w > 0)
+    active = odd if slope == 0.0 else ~odd
+    return whole, (w * active).sum(axis=1), f"{int(odd.sum())} of {w.size} operators {what}" if np.any(odd) else ""
+
+
+def gain_over(values: Mapping[str, Array], weight: Array, samples: int | None) -> Array:
+    """Compute the gain (n_y n_u,), row by row, for Σw of each channel, after some samples or (None) in the end."""
+    a, b, c, d = (values[k] for k in ("A", "B_u", "C_y", "D_yu"))
+    if len(weight):
+        s = np.diag(weight)
+        a, b = a + values["B_w"] @ s @ values["C_z"], b + values["B_w"] @ s @ values["D_zu"]
+        c, d = c + values["D_yw"] @ s @ values["C_z"], d + values["D_yw"] @ s @ values["D_zu"]
+    n = len(a)
+    with np.errstate(over="ignore", invalid="ignore"):
+        if samples is None:
+            state = np.linalg.lstsq(np.eye(n) - a, b, rcond=None)[0] if n else b
+        else:
+            step = np.block([[a, b], [np.zeros((b.shape[1], n)), np.eye(b.shape[1])]])
+            state = np.linalg.matrix_power(step, samples)[:n, n:]
+        return np.asarray(c @ state + d).ravel()

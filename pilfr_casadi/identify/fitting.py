@@ -1,24 +1,23 @@
 """`fit`: identify a model from recordings.
 
-The verb checks its arguments and takes one of four ways: from values (an earlier fit, a closed model, a simulator, or a
-structure with values by name), a linear model alone, many starts (`multistart`), or the training of NARX and NOE models
-(`lagged`). With an L1 penalty a last solve follows (`penalty`).
+`fit` checks its arguments and chooses one of four methods: from values (an earlier fit, a closed model, a simulator, or
+a structure with values by name), a linear model alone, many starts (`multistart`), or the training of NARX and NOE
+models (`lagged`). With an L1 penalty a last solve follows (`penalty`).
 """
 
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, filled, one_blas_thread, progress_bar
+from .._base import InputError, Progress, filled, one_blas_thread, progress_bar, whole, worker_pool
 from ..data import Recording, as_recordings, check_for_identification
 from ..models import PILFR, Lagged, Model, PrandtlIshlinskii, StaticNetwork
 from ..optimise import (
@@ -35,11 +34,10 @@ from ..optimise import (
 from ..simulators import Simulator, choose_substeps, discretise
 from .context import FitContext, Stage, mark_interrupted, rms_error
 from .lagged import check_lagged_options, fit_lagged
-from .linear_start import known_entries, linear_model, transform_to_known_basis
-from .multistart import KEEP, POLISH, STARTS, StartSearch, search_starts
-from .options import FitOptions
+from .multistart import DEFAULT_SOLVER, KEEP, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
-from .result import Candidate, Fit, match_channels, with_solution
+from .result import Candidate, Fit, FitOptions, match_channels, with_solution
+from .start import known_entries, linear_model, transform_to_known_basis
 
 DEAD_WORKER = (
     "A worker process ended before it returned a result (it may have run out of memory); use fewer workers, or "
@@ -49,8 +47,6 @@ NO_GUARD = (
     "The worker processes could not begin: where processes are spawned, each runs the script again from its top, so "
     'put the call of fit below `if __name__ == "__main__":`, or use workers=1.'
 )
-
-
 CORRELATED_SAMPLES = 10  # residuals that count as one: a fit's errors change slowly; calibrated on the paper's rig
 
 
@@ -90,10 +86,10 @@ def fit(
     ----------
     model : PILFR, NARX, NOE, Model, Simulator or Fit
         A structure (start values are found), a closed model or a simulator of your own, or an earlier fit. The last
-        three start at their values. A simulator is integrated on the recordings' grid with its own, or the recordings',
-        `hold`.
+        three start at their values. A simulator is integrated on the recordings' grid, with the `hold` of the
+        recordings or else its own.
     train : Recording or sequence of Recording
-        Training data; nothing else is used.
+        Training data.
     solver : GaussNewton or Ipopt
         Solver of the final problem, by default `GaussNewton(tolerance=1e-4)`. At an exact bound on a spectral radius
         a Gauss-Newton SQP makes the last solve.
@@ -137,8 +133,9 @@ def fit(
         A fit from values runs as many recordings side by side. On systems that spawn processes, put the call below
         `if __name__ == "__main__":`.
     progress : bool or callable
-        True shows a bar on the terminal; a callable gets (stage, done, total, smallest training error so far). The
-        stage "steps" reports the iterations of a start; starts in other processes do not report it.
+        True shows a bar on the terminal; a callable gets (stage, done, total, error). The error is the smallest
+        `train_nrmse` reached so far, averaged over the recordings, and nan while a solver runs. The stage "steps"
+        reports the iterations of a start; starts in other processes do not report it.
 
     Returns
     -------
@@ -154,9 +151,9 @@ def fit(
     InputError
         If recordings and model do not fit each other, hold too little, the start is not usable, or an option is unfit.
     """
-    solver = solver or POLISH
+    solver = solver or DEFAULT_SOLVER
     _check_arguments(model, solver, starts, seed, workers, progress)
-    if not isinstance(start, Mapping) and start not in STARTS:
+    if not isinstance(start, Mapping) and start not in START_KINDS:
         raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper' or 'plain', or values by name.")
     searches = isinstance(model, PILFR | Lagged) and not isinstance(start, Mapping)
     if weights is not None and searches:
@@ -168,19 +165,15 @@ def fit(
         raise InputError(f'l1 = {l1!r} was given; give weights by name, like {{"w": 1e-4}}.')
     options = model.options if isinstance(model, Fit) else FitOptions()
     options = options.updated(stable, constraints, noise, weights, train)
-    pool = ProcessPoolExecutor(workers, initializer=_ignore_interrupts) if own_pool and searches else None
-    shown: Any = progress_bar() if progress is True else nullcontext(progress or None)
-    with shown as report:
-        threads = 1 if searches else workers
-        context = FitContext((), solver, (), dict(l1 or {}), engine, report, threads, options)
+    with ExitStack() as stack:
+        report = stack.enter_context(progress_bar()) if progress is True else progress or None
+        context = FitContext((), solver, (), dict(l1 or {}), engine, report, 1 if searches else workers, options)
         try:
-            return _fit(model, train, context, StartOptions(starts, seed, start, linear, executor or pool))
+            pool = stack.enter_context(worker_pool(workers)) if own_pool and searches else executor
+            return _fit(model, train, context, StartOptions(starts, seed, start, linear, pool))
         except BrokenProcessPool:
-            spawned = pool is not None and multiprocessing.get_start_method() != "fork"
+            spawned = own_pool and multiprocessing.get_start_method() != "fork"
             raise InputError(NO_GUARD if spawned else DEAD_WORKER) from None
-        finally:
-            if pool is not None:
-                pool.shutdown(cancel_futures=True)
 
 
 def _check_arguments(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:
@@ -192,15 +185,9 @@ def _check_arguments(model: Any, solver: Any, starts: Any, seed: Any, workers: A
     if isinstance(solver, type) or not hasattr(solver, "solve"):
         raise InputError(f"The solver is {solver!r}; give an object such as GaussNewton() or Ipopt().")
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("workers", workers, 1)):
-        if not isinstance(value, int | np.integer) or value < least:
-            raise InputError(f"{name} = {value!r} was given; give a whole number, {least} or more.")
+        whole(value, name, least)
     if progress is not None and not isinstance(progress, bool) and not callable(progress):
         raise InputError(f"progress = {progress!r} was given; give True, or a function of (stage, done, total, error).")
-
-
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C to the process that waits for this worker's results."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @one_blas_thread
@@ -210,97 +197,91 @@ def _fit(
     context: FitContext,
     starts: StartOptions,
 ) -> Fit:
-    """Take the way that the kind of model and start ask for."""
+    """Choose the method for the kind of model and start."""
     if starts.linear is not None and not isinstance(model, PILFR):
         raise InputError("A linear model to begin with goes with a PILFR; any other model has its own values.")
     if isinstance(starts.kind, Mapping) and not isinstance(model, PILFR):
         raise InputError("Values to start from go with a PILFR; a Model and a Fit have their own.")
-    if isinstance(model, Simulator):
-        return _fit_simulator(model, train, context)
     options = context.options
-    check_gain(options.constraints, (model.model if isinstance(model, Fit) else model).element)
     if isinstance(model, Lagged):
+        check_gain(options.constraints, model.element)
         check_lagged_options(model, options.stable, starts.kind)
         context = replace(context, constraints=options.constraints)
         return fit_lagged(model, train, context, starts.count, starts.seed, starts.executor)
-    structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
-    context = replace(context, constraints=options.all_constraints(structure))
     if isinstance(model, PILFR) and not isinstance(starts.kind, Mapping):
-        return _fit_structure(model, train, context, starts)
-    closed: Model
-    if isinstance(model, PILFR):
-        assert isinstance(starts.kind, Mapping)
-        closed = model_at_values(model, as_recordings(train)[0], starts.kind)
-    else:
-        closed = model.model if isinstance(model, Fit) else model
-    if isinstance(model, Fit) and model.simulator is not None:
-        train = tuple(match_channels(model.simulator, r) for r in as_recordings(train))
+        return _fit_structure(model, train, replace(context, constraints=options.all_constraints(model)), starts)
+    simulator = model if isinstance(model, Simulator) else model.simulator if isinstance(model, Fit) else None
+    structure = model if isinstance(model, PILFR) else model.structure if isinstance(model, Fit) else None
+    recordings = as_recordings(train)
+    if simulator is not None:
+        recordings = tuple(match_channels(simulator, r) for r in recordings)
+    closed = _closed_model(model, recordings, starts.kind)
+    check_gain(options.constraints, closed.element)
+    context = replace(context, constraints=options.all_constraints(structure))
     check_room(closed.parameters, context.constraints)
-    context = replace(context, recordings=check_for_identification(train, int(closed.parameters.free.sum()) + 2))
-    return fit_from_values(closed, structure, context, model if isinstance(model, Fit) else None)
+    context = replace(context, recordings=check_for_identification(recordings, int(closed.parameters.free.sum()) + 2))
+    found = fit_from_values(closed, structure, context, model if isinstance(model, Fit) else None)
+    return found if simulator is None else found.with_simulator(simulator)
 
 
-def _fit_simulator(simulator: Simulator, train: Recording | Sequence[Recording], context: FitContext) -> Fit:
-    """Fit the free parameters of a simulator from its values."""
-    recordings = tuple(match_channels(simulator, r) for r in as_recordings(train))
-    holds = {r.hold or simulator.hold or "zero" for r in recordings}
+def _closed_model(model: PILFR | Model | Simulator | Fit, recordings: Sequence[Recording], values: Any) -> Model:
+    """Make the closed model that a fit from values starts with."""
+    if isinstance(model, PILFR):
+        return model_at_values(model, recordings[0], values)
+    if not isinstance(model, Simulator):
+        return model.model if isinstance(model, Fit) else model
+    holds = {r.hold or model.hold or "zero" for r in recordings}
     if len(holds) > 1:
         raise InputError("The recordings differ in `hold`, which is one for a simulator; fit them one by one.")
-    model = discretise(simulator, recordings[0].dt, holds.pop(), choose_substeps(simulator, recordings))
-    check_gain(context.options.constraints, model.element)
-    checked = check_for_identification(recordings, int(model.parameters.free.sum()) + 2)
-    context = replace(context, recordings=checked, constraints=context.options.constraints)
-    check_room(model.parameters, context.constraints)
-    return fit_from_values(model, None, context, None).with_simulator(simulator)
+    return discretise(model, recordings[0].dt, holds.pop(), choose_substeps(model, recordings))
 
 
 def _fit_structure(
     structure: PILFR, train: Recording | Sequence[Recording], context: FitContext, starts: StartOptions
 ) -> Fit:
-    """Fit a PI-LFR whose start values are to be found."""
+    """Fit a PI-LFR without start values; begin at rest unless the recordings contradict it."""
+    check_gain(context.options.constraints, structure.element)
     if not isinstance(structure.element, PrandtlIshlinskii | StaticNetwork | None):
         raise InputError(
             "A start is found for PrandtlIshlinskii and StaticNetwork; for others give start={name: value} or a Model."
         )
     first = as_recordings(train)[0]
-    fewest = max(structure.count(first.n_u, first.n_y), 10 * structure.nx) + 2
-    context = replace(context, recordings=check_for_identification(train, fewest))
     shape = structure.model(first.n_u, first.n_y).parameters
+    fewest = max(int(shape.free.sum()), 10 * structure.nx) + 2
+    context = replace(context, recordings=check_for_identification(train, fewest))
     check_room(shape, context.constraints)
     if context.l1:
         check_penalty(context.l1, shape, structure.element is None)
     rest = context.at_rest() if structure.element is not None else context
-    return _search_from_linear(structure, rest, context, starts)
+    found = _search(structure, rest, context, starts)
+    return found or _search(structure, context, context, starts)  # type: ignore[return-value]
 
 
-def _search_from_linear(structure: PILFR, context: FitContext, given: FitContext, starts: StartOptions) -> Fit:
-    """Find the linear model, then search from it; `context` may begin at rest where `given` does not."""
-    linear, problem, solution = _fit_linear_start(structure, context, starts.linear)
-    stopped = solution.status is Status.INTERRUPTED
-    if context is not given and not stopped and not given.agrees_with_rest(problem, solution.theta):
-        return _search_from_linear(structure, given, given, starts)
-    if solution.status is Status.INTERRUPTED:
-        return given.result(linear, structure.linear(), problem, solution)
-    fitted = transform_to_known_basis(structure, with_solution(linear, problem, solution), context)
-    if structure.element is None:
-        bounded = Problem(linear, context.recordings, engine=problem.engine, constraints=context.constraints)
-        own = structure.fixed or structure.bounds or structure.priors or context.options.constraints
-        changed = own or solution.status is Status.INFEASIBLE or beyond(bounded, solution.theta)
-        if not changed and context.solver == POLISH:
-            return context.result(linear, structure, bounded, solution)  # the linear start is the answer
-        return _fit_linear(structure, fitted, context)
-    return _fit_from_starts(structure, fitted, (problem, solution), context, given, starts)
+def _search(structure: PILFR, context: FitContext, given: FitContext, starts: StartOptions) -> Fit | None:
+    """Find the linear model, then search from it.
 
-
-def _fit_linear_start(structure: PILFR, context: FitContext, given: Any) -> tuple[Model, Problem, Solution]:
-    """Find the linear model that a fit begins with, its bound on the spectral radius loosened."""
+    `context` may begin at rest where `given` does not; None if the recordings contradict such a beginning.
+    """
     radius = loosened(stability_limits(structure, context.options.stable)[:1])
     options: dict[str, Any] = {"engine": context.engine, "constraints": radius, "progress": context.progress}
-    return linear_model(context.recordings, structure, given=given, **options)
+    linear, problem, solution = linear_model(context.recordings, structure, given=starts.linear, **options)
+    if solution.status is Status.INTERRUPTED:
+        return given.result(linear, structure.linear(), problem, solution)
+    if context is not given and not given.agrees_with_rest(problem, solution.theta):
+        return None
+    fitted = transform_to_known_basis(structure, with_solution(linear, problem, solution), context)
+    if structure.element is not None:
+        return _fit_from_starts(structure, fitted, (problem, solution), context, given, starts)
+    bounded = Problem(linear, context.recordings, engine=problem.engine, constraints=context.constraints)
+    own = structure.fixed or structure.bounds or structure.priors or context.options.constraints
+    changed = own or solution.status is Status.INFEASIBLE or beyond(bounded, solution.theta)
+    if not changed and context.solver == DEFAULT_SOLVER:
+        return context.result(linear, structure, bounded, solution)  # the linear start is the answer
+    return _fit_linear(structure, fitted, context)
 
 
 def model_at_values(structure: PILFR, first: Recording, values: Mapping[str, Any]) -> Model:
-    """Return the model of a structure at values given by name, with a recording's names of inputs and outputs."""
+    """Make the model of a structure at values by name, with a recording's names of inputs and outputs."""
     model = structure.model(first.n_u, first.n_y, inputs=first.inputs, outputs=first.outputs)
     unknown = sorted(set(values) - set(model.parameters))
     if unknown:
@@ -333,12 +314,11 @@ def fit_from_values(model: Model, structure: PILFR | None, context: FitContext, 
         problem, solution = context.settle_noise(problem, latest[2], "solve", **options)
         latest = model, problem, solution, ""
         if context.l1 and structure:
-            latest = solve_with_penalty(model, problem, solution, context, problem.noise)
+            latest = solve_with_penalty(model, problem, solution, context)
     except KeyboardInterrupt:
         latest = mark_interrupted(*latest)
     model, problem, solution, note = latest
-    found = context.result(model, structure, problem, solution, note)
-    return found if earlier is None or earlier.simulator is None else found.with_simulator(earlier.simulator)
+    return context.result(model, structure, problem, solution, note)
 
 
 def _fit_linear(structure: PILFR, fitted: Model, context: FitContext) -> Fit:
@@ -362,33 +342,33 @@ def _fit_from_starts(
     context: FitContext,
     given: FitContext,
     starts: StartOptions,
-) -> Fit:
-    """Fit a PI-LFR from many starts.
-
-    `solved` are problem and solution of the linear model. Where `context` begins at rest and `given` does not, the
-    search is repeated with free initial states if its fit contradicts a beginning at rest.
-    """
+) -> Fit | None:
+    """Fit a PI-LFR from many starts, given the linear model with its problem and solution; None as for `_search`."""
     problem, solution = solved
-    blocks = {k: p.value for k, p in linear.parameters.items()}
-    heard = context.progress if starts.executor is None else None  # a callable stays in its process
-    shared = {"level": rms_error(problem, solution), "coordinates": not known_entries(structure), "progress": heard}
-    search = StartSearch.of(context, structure, blocks, start=starts.kind, **shared)
-    least: list[float] = [np.inf]
+    progress, least = context.progress, np.inf
 
     def report(stage: str, found: list[Candidate], total: int) -> None:
-        least.append(min([least[-1], *(c.error for c in found)]))
-        if context.progress:
-            context.progress(stage, len(found), total, least[-1] if np.isfinite(least[-1]) else np.nan)
+        nonlocal least
+        least = min([least, *(c.nrmse for c in found)])
+        if progress:
+            progress(stage, len(found), total, least if np.isfinite(least) else np.nan)
 
+    search = StartSearch(
+        context if starts.executor is None else replace(context, progress=None),  # a callable stays in its process
+        structure,
+        {k: p.value for k, p in linear.parameters.items()},
+        start=str(starts.kind),
+        level=rms_error(problem, solution),
+        coordinates=not known_entries(structure),
+    )
     candidates, best, stopped = search_starts(search, starts.count, starts.seed, starts.executor, report)
     if best is None:
         return given.result(linear, structure.linear(), problem, replace(solution, status=Status.INTERRUPTED))
     compared: dict[str, Any] = {"linear": linear, "linear_nrmse": tuple(problem.nrmse(solution.theta))}
-    latest = _finish(structure, candidates, best, stopped, context, starts.kind == "grid")
-    model, problem, result, note = latest
+    model, problem, result, note = _finish(structure, candidates, best, stopped, context, starts.kind == "grid")
     stopped = result.status is Status.INTERRUPTED
     if context is not given and not stopped and not given.agrees_with_rest(problem, result.theta, CORRELATED_SAMPLES):
-        return _search_from_linear(structure, given, given, starts)
+        return None
     return given.result(model, structure, problem, result, note, candidates=tuple(candidates), **compared)
 
 
@@ -417,7 +397,7 @@ def _finish(
             problem, result = context.settle_noise(problem, result, "solve")
             latest = model, problem, result, note
         if l1:
-            latest = solve_with_penalty(model, problem, latest[2], context, problem.noise)
+            latest = solve_with_penalty(model, problem, latest[2], context)
     except KeyboardInterrupt:
         latest = mark_interrupted(*latest)
     return latest

@@ -4,9 +4,10 @@ A NARX is trained to predict one step, reading the measured outputs. A NOE begin
 smaller share of them, down to none: simulation errors over a long record have many minima, and a model that is guided
 by the data passes most of them. Both are judged and chosen by the simulation error over the training data.
 
-With early stopping a part of the training data is held back, and the point with the smallest error there is taken. Of
-one recording the end is held back and simulated from the beginning; of several recordings the last ones, with all that
-have the same inputs. The end of a periodic recording has the input of its beginning, so its mean period is cut in time.
+With early stopping a part of the training data is held back, and the point with the smallest error on it is taken. For
+one recording the end is held back, and the simulation runs from the beginning; for several recordings the last ones are
+held back, with all that have the same inputs. The end of a periodic recording has the input of its beginning, so its
+mean period is cut in time.
 """
 
 from __future__ import annotations
@@ -28,11 +29,20 @@ from .multistart import EXPLORE, run_tasks
 from .result import Candidate, Fit, with_solution
 
 SHARES = (1.0, 0.3, 0.1, 0.0)  # of the measured output that a NOE reads while it is trained, stage by stage
+PATIENCE = 20  # points in a row that do not improve on the best
+CUT_NOTE = (
+    "the input repeats, so of the mean period the last {:.0f} % stopped the training and the rest was trained on; "
+    "validation=0 trains on all, another realization is better"
+)
+SAME_INPUT_NOTE = (
+    "the input repeats, so what stopped the training has the input of what was trained on, which proves little; give "
+    "another realization"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class LaggedSearch:
-    """All that the starts of one identification share."""
+    """The model, options and data that all starts of one fit share."""
 
     wanted: Lagged
     structure: PILFR
@@ -41,18 +51,12 @@ class LaggedSearch:
     held: tuple[Recording, ...]
 
     def problem(self, model: Model, engine: Engine | None) -> Problem:
-        """The error of a model over what is trained on."""
+        """Make the problem of a model over the recordings that it is trained on."""
         return replace(self.context, recordings=self.kept).problem(model, engine=engine or self.context.engine)
 
 
 def check_lagged_options(wanted: Lagged, stable: bool | float, start: Any) -> None:
-    """Refuse what a NARX or NOE would leave unheard: a bound on a spectral radius, a start of another kind.
-
-    Raises
-    ------
-    InputError
-        That says which.
-    """
+    """Refuse options that a NARX or NOE would ignore: a bound on a spectral radius, a start of another kind."""
     kind = type(wanted).__name__
     if not isinstance(stable, bool):
         raise InputError(
@@ -71,13 +75,7 @@ def fit_lagged(
     seed: int,
     executor: Executor | None,
 ) -> Fit:
-    """The fit of a NARX or NOE: every start to its end, the smallest simulation error over the training data.
-
-    Raises
-    ------
-    InputError
-        If the recordings hold too little, no start gives a finite simulation, or an option is unfit.
-    """
+    """Fit a NARX or NOE: run every start to its end, take the smallest simulation error over the training data."""
     if context.l1:
         raise InputError("An L1 penalty is for the weights of an element; leave l1 out, or give a PILFR.")
     if not isinstance(context.solver, GaussNewton) and wanted.validation:
@@ -87,12 +85,12 @@ def fit_lagged(
     structure = wanted.structure(first.n_u, first.n_y)
     whole = context.recordings, (), ""
     kept, held, note = split_validation(context.recordings, wanted.validation) if wanted.validation else whole
-    told = context.progress if executor is None else None  # a callable stays in its process
-    search = LaggedSearch(wanted, structure, replace(context, progress=told), kept, held)
+    shared = context if executor is None else replace(context, progress=None)  # a callable stays in its process
+    search = LaggedSearch(wanted, structure, shared, kept, held)
 
     def report(found: list[Candidate], total: int) -> None:
         if context.progress:
-            context.progress("starts", len(found), total, min((c.error for c in found), default=np.nan))
+            context.progress("starts", len(found), total, min((c.nrmse for c in found), default=np.nan))
 
     sequences = np.random.SeedSequence(seed).spawn(starts)
     found, stopped = run_tasks(explore_lagged, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
@@ -111,7 +109,7 @@ def fit_lagged(
 
 @one_blas_thread
 def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequence) -> Candidate:
-    """One start, run to its end."""
+    """Run one start to its end."""
     first = search.kept[0]
     values = lagged_start(search.wanted, search.structure, search.kept, np.random.default_rng(sequence))
     names = {"inputs": first.inputs, "outputs": first.outputs}
@@ -126,14 +124,14 @@ def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequ
         if solution is not None and not np.isfinite(problem.cost(begin)):
             break
         solver = EXPLORE if share != shares[-1] else search.context.solver
-        told: dict[str, Any] = {}
+        options: dict[str, Any] = {}
         if isinstance(solver, GaussNewton | Ipopt):
-            told["progress"] = report_iterations(search.context.progress, "steps", solver.max_iterations)
+            options["progress"] = report_iterations(search.context.progress, "steps", solver.max_iterations)
         if search.held and solver is search.context.solver:
-            held = validation_problem(trained, search.held, problem)
-            solution = solve_with_early_stopping(solver, problem, held, begin, **told)
+            held = Problem(trained, search.held, engine=problem.engine, scale=problem.scale)
+            solution = solve_with_early_stopping(solver, problem, held, begin, **options)
         else:
-            solution = solver.solve(problem, begin, **told)
+            solution = solver.solve(problem, begin, **options)
         if solution.status is Status.INTERRUPTED:
             break
     assert solution is not None
@@ -141,7 +139,7 @@ def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequ
 
 
 def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution) -> Candidate:
-    """What a start has led to, judged in free run over all the training data."""
+    """Judge the solution of a start in free run over all the training data."""
     engine = make_engine(model, search.context.engine)
     problem = Problem(model, search.context.recordings, engine=engine)
     theta = solution.theta
@@ -159,21 +157,22 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
         e = problem.residual(theta)
         error = float(np.sqrt(np.mean(e**2)))
     error = error if np.isfinite(error) else np.inf
-    return Candidate(seed, model, theta, error, replace(solution, theta=theta))
+    nrmse = float(np.mean(problem.nrmse(theta))) if np.isfinite(error) else np.inf
+    return Candidate(seed, model, theta, error, replace(solution, theta=theta), nrmse=nrmse)
 
 
 def _begins_alike(kept: Recording, given: Recording) -> bool:
-    """Whether what was trained on is a recording, or the beginning of one."""
+    """Tell whether the data trained on are a recording, or the beginning of one."""
     return kept.begins == given.begins and np.array_equal(kept.y, given.y[: len(kept)])
 
 
 def one_step(fit: Any, recording: Recording) -> np.ndarray:
-    """Predictions of a fitted NARX or NOE one step ahead, reading the measured outputs up to the sample before.
+    """Predict with a fitted NARX or NOE one step ahead, from the measured outputs up to the sample before.
 
     Parameters
     ----------
     fit : Fit
-        Of a `NARX` or `NOE`.
+        A fit of a `NARX` or `NOE`.
     recording : Recording
         Inputs and outputs.
 
@@ -191,29 +190,10 @@ def one_step(fit: Any, recording: Recording) -> np.ndarray:
     return make_engine(model, fit.engine).simulate(model.drive(recording), model.parameters.start, state)[0]
 
 
-PATIENCE = 20  # points in a row that do not improve on the best
-CUT = (
-    "the input repeats, so of the mean period the last {:.0f} % stopped the training and the rest was trained on; "
-    "validation=0 trains on all, another realization is better"
-)
-SAME = (
-    "the input repeats, so what stopped the training has the input of what was trained on, which proves little; give "
-    "another realization"
-)
-
-
 def split_validation(
     recordings: Sequence[Recording], share: float
 ) -> tuple[tuple[Recording, ...], tuple[Recording, ...], str]:
-    """What is trained on, what is looked at only to stop (scored on the part held back), and a sentence to tell, or "".
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Training data.
-    share : float
-        Share to hold back, above 0 and below 1.
-    """
+    """Split training data into the part to train on and the share held back (scored there alone); add a note, or ""."""
     groups = group_by_input(recordings)
     if len(groups) > 1:
         wanted, last = max(1, round(share * len(recordings))), set(groups[-1])
@@ -222,46 +202,48 @@ def split_validation(
         kept = tuple(r for i, r in enumerate(recordings) if i not in last)
         return kept, tuple(_from_rest(recordings[i]) for i in sorted(last)), ""
     pairs = [_cut(r, share) for r in recordings]
-    told = ""
+    note = ""
     if any(repeats_itself(r) or (r.begins == "periodic" and r.period) for r in recordings):
-        told = CUT.format(100 * share) if all(r.begins == "periodic" for r in recordings) else SAME
-    return tuple(kept for kept, _ in pairs), tuple(held for _, held in pairs), told
+        note = CUT_NOTE.format(100 * share) if all(r.begins == "periodic" for r in recordings) else SAME_INPUT_NOTE
+    return tuple(kept for kept, _ in pairs), tuple(held for _, held in pairs), note
 
 
 def _cut(r: Recording, share: float) -> tuple[Recording, Recording]:
-    """One recording cut in time: what comes first, and the whole scored behind the cut."""
+    """Cut one recording in time: return its beginning, and the whole scored after the cut."""
     if r.begins == "periodic" and r.period:
         whole = (len(r) - r.skip) // r.period * r.period
         mean = mean_period(r.slice(r.skip, r.skip + whole))
         cut = min(max(round((1 - share) * len(mean)), 2), len(mean) - 1)
         twice = mean.with_(u=np.tile(mean.u, (2, 1)), y=np.tile(mean.y, (2, 1)), initial="zero")
-        return mean.slice(0, cut), _scored_from(twice, len(mean) + cut)  # a period from rest, and then what is scored
+        return mean.slice(0, cut), _scored_from(
+            twice, len(mean) + cut
+        )  # a period from rest before the part that is scored
     cut = min(max(r.skip + round((1 - share) * (len(r) - r.skip)), r.skip + 2), len(r) - 1)
     return r.slice(0, cut), _scored_from(r, cut)
 
 
 def _from_rest(recording: Recording) -> Recording:
-    """Where the initial state is to be estimated, zero, and the first fifth is not scored."""
+    """Begin at zero where the initial state is to be estimated, and do not score the first fifth."""
     if recording.begins != "estimate":
         return recording
     return _scored_from(recording.with_(initial="zero"), max(recording.skip, len(recording) // 5))
 
 
 def _scored_from(recording: Recording, skip: int) -> Recording:
-    """The recording with more samples that are not scored: behind them there need be no whole period."""
+    """Leave more samples unscored; drop the period if no whole one is left after them."""
     kept = recording.period if recording.period and len(recording) - skip >= recording.period else None
     return recording.with_(skip=skip, period=kept)
 
 
 class Watch:
-    """Looks at every point of a solve and remembers the one with the smallest error on what is held back."""
+    """Remember the point of a solve with the smallest error on the data held back."""
 
     def __init__(self, problem: Problem, patience: int = PATIENCE) -> None:
         self.problem, self.patience = problem, patience
         self.best, self.theta, self.failed = np.inf, np.zeros(0), 0
 
     def __call__(self, theta: np.ndarray) -> bool:
-        """Whether it is time to stop."""
+        """Tell whether it is time to stop."""
         cost = self.problem.cost(theta[: self.problem.size])
         if cost < self.best or not self.theta.size:
             self.best, self.theta, self.failed = cost, theta.copy(), 0
@@ -273,7 +255,7 @@ class Watch:
 def solve_with_early_stopping(
     solver: GaussNewton, problem: Problem, held: Problem, start: np.ndarray, progress: Progress | None = None
 ) -> Solution:
-    """The solver's solution, moved back to the point with the smallest error on `held`."""
+    """Solve, and go back to the point with the smallest error on `held`."""
     watch = Watch(held)
     solution = solver.solve(problem, start, progress, watch)
     if not watch.theta.size or solution.status is Status.INTERRUPTED:
@@ -282,8 +264,3 @@ def solve_with_early_stopping(
         cost = problem.cost(watch.theta)
         return replace(solution, theta=watch.theta, cost=cost, status=Status.STOPPED_EARLY)
     return solution
-
-
-def validation_problem(model: Model, held: Sequence[Recording], problem: Problem) -> Problem:
-    """The problem that scores what is held back, with the engine and scale of the one that trains."""
-    return Problem(model, held, engine=problem.engine, scale=problem.scale)

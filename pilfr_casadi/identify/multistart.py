@@ -1,20 +1,19 @@
-"""From recordings to a PI-LFR: linear model, many starts, and a careful polish of the best.
+"""From a linear model to a PI-LFR: many starts, and a careful polish of the best.
 
-1. `linear_model`: subspace identification refined by output error, states scaled to unit variance (Krikelis et al.,
-   Sec. 5.3).
-2. Exploration: from each start a short Gauss-Newton run. Most of what a start will ever reach shows within some forty
-   steps. The first two have the element at the output and at the input, the others anywhere (`start.grid_start`);
-   where the structure says its place, the thresholds are a grid in the first and drawn in the others.
-3. The best few are re-gridded (`start.regrid`) and run again: thresholds that have clustered or fallen asleep are
-   spread along the density the fit has found. This is done twice, the second time with thresholds beyond the visited
-   range and a weak prior that holds the weights to the smoothed density, which decides what the data leaves open; a
-   last run without the prior shows what it costs. With the prior wins over without when it is within 10 %.
+1. Exploration (`explore`): from each start a short Gauss-Newton run. Most of what a start will ever reach shows within
+   some forty steps. The first two starts have the element at the output and at the input, the others anywhere
+   (`grid_start`); where the structure fixes the place, the thresholds are a grid in the first and drawn in the others.
+2. Polish (`polish`): the best few are re-gridded (`regrid`) and run again, which spreads thresholds that have clustered
+   or fallen asleep along the density that the fit has found. This is done twice, the second time with thresholds beyond
+   the visited range and a weak prior that holds the weights near the smoothed density and so decides what the data
+   leave open; a last run without the prior shows what it costs. The fit with the prior wins when its error is within
+   10 % of the one without.
 
-With the paper's start every start goes through 2 (to the end) and 3, so that each result stands for one start.
-With "plain" it goes through 2 alone: the paper's protocol where the linear model that is given is the best linear
-approximation (the paper's beginning), while 1 begins at the minimum of the output error, where more starts get stuck.
-Elements without memory have their
-own start values (`start.network_start`) and nothing to re-grid; with either of these each start is run to the end.
+With the paper's start every start goes through 1 (to the end) and 2, so that each result stands for one start. With
+"plain" it goes through 1 alone. This is the paper's protocol if the linear model is the best linear approximation, as
+in the paper; the refined linear model is at the minimum of the output error, where more starts get stuck. Elements
+without memory have their own start values (`network_start`) and nothing to re-grid; each of their starts is run to the
+end too unless the start is "grid".
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
 """
@@ -22,77 +21,108 @@ Every task depends on its own seed alone, so the numbers are the same for any ex
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, one_blas_thread
-from ..data import Recording
+from .._base import InputError, one_blas_thread
 from ..engine import Engine, make_engine
-from ..models import PILFR, Model, PrandtlIshlinskii, StaticNetwork, direction_fixed, fixed_whole, places
-from ..optimise import Constraint, GaussNewton, Problem, Solution, Status, held_at_bounds, loosened
-from .context import FitContext, solve_within_bounds
-from .result import PRIOR, Candidate
-from .start import (
-    Blocks,
-    envelope_start,
-    grid_start,
-    has_networks,
-    network_start,
-    paper_start,
-    regrid_channels,
-    unit_states,
+from ..models import (
+    PILFR,
+    Model,
+    PrandtlIshlinskii,
+    StaticNetwork,
+    direction_fixed,
+    fixed_whole,
+    places,
+    weight_density,
 )
+from ..optimise import GaussNewton, Problem, Solution, Status, held_at_bounds, loosened
+from .context import FitContext, solve_within_bounds
+from .result import DENSITY_PRIOR, Candidate
+from .start import Blocks, envelope_start, grid_start, has_networks, network_start, paper_start, unit_states
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
-POLISH = GaussNewton(max_iterations=200, tolerance=1e-4)
-STARTS = ("grid", "paper", "plain")
+DEFAULT_SOLVER: GaussNewton = GaussNewton(max_iterations=200, tolerance=1e-4)  # of `fit`, and of every polish
+START_KINDS: tuple[str, ...] = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
 MARGIN = 1.1  # times the smallest error, for the weights of a smooth density
 
 
+@dataclass(frozen=True, eq=False)
+class StartSearch:
+    """The options that all starts of one fit share; `level` is the error that the linear model reaches."""
+
+    context: FitContext
+    structure: PILFR
+    linear: Blocks
+    start: str = "grid"
+    level: float = 1.0
+    coordinates: bool = True  # whether the states' coordinates are free to choose
+
+    def problem(self, model: Model, engine: Engine | None = None, noise: float | None = None) -> Problem:
+        """Make the simulation-error problem of a model, its bounds on spectral radii loosened.
+
+        Priors are weighed against the noise that the user gave, else the error `noise` that was reached, else `level`.
+        """
+        constraints = loosened(self.context.constraints, least=1.0)
+        engines = {} if engine is None else {"engine": engine}
+        return self.context.problem(model, noise or self.level, constraints=constraints, **engines)
+
+    def solve(self, problem: Problem, start: np.ndarray | None, solver: Any, held: bool = False) -> Solution:
+        """Solve inside exact bounds on spectral radii; `held` says that they hold the start."""
+        return solve_within_bounds(problem, start, solver, "steps", self.context.progress, held=held)
+
+    def model(self, values: dict[str, Any]) -> Model:
+        """Make the closed model that starts at `values`."""
+        first = self.context.recordings[0]
+        return self.structure.model(first.n_u, first.n_y, values, inputs=first.inputs, outputs=first.outputs)
+
+
 @one_blas_thread
 def explore(search: StartSearch, seed: int, sequence: np.random.SeedSequence) -> Candidate:
-    """One start, run until it has shown what it is worth; with the paper's start to the end, polish included or not.
+    """Run one start until it has shown what it is worth; with the paper's start to the end, polish included.
 
     The paper's start draws thresholds far smaller than z, which end in clusters and beyond the visited range: a solver
     alone does not bring them back.
     """
-    rng = np.random.default_rng(sequence)
-    inputs = [r.u for r in search.recordings]
-    scaled, states = unit_states(search.linear, inputs, search.coordinates)
-    solver = EXPLORE if search.start == "grid" else search.solver
-    if isinstance(search.structure.element, StaticNetwork):
-        values = network_start(search.structure, scaled, inputs, states, rng)
-    elif search.start == "grid":
-        place = dict(enumerate(places(search.structure))).get(seed, "random")
-        values = grid_start(search.structure, scaled, inputs, states, rng, place)
-        if has_networks(search.structure):
-            values = envelope_start(search.structure, scaled, values, search.recordings, states, place)
-    else:
-        values = paper_start(search.structure, scaled, inputs, states, rng)
-    model = search.model(values)
+    model, solver = search.model(start_values(search, seed, sequence)), search.context.solver
     problem = search.problem(model)
-    candidate = _candidate(seed, model, problem, search.solve(problem, None, solver))
-    candidate = replace(candidate, drawn=is_drawn(search.structure, search.start, seed))
-    done = candidate.solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error)
-    if search.start != "paper" or done:
+    solution = search.solve(problem, None, EXPLORE if search.start == "grid" else solver)
+    candidate = replace(
+        _candidate(seed, model, problem, solution), drawn=is_drawn(search.structure, search.start, seed)
+    )
+    if search.start != "paper" or solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error):
         return candidate
     polished = polish(search, candidate)
-    if search.solver == POLISH or polished is candidate:
+    if solver == DEFAULT_SOLVER or polished is candidate:
         return polished
     # the user's solver has the last word
     problem = search.problem(polished.model, problem.engine, noise=polished.error)
-    solution = search.solve(problem, polished.theta, search.solver)
+    solution = search.solve(problem, polished.theta, solver)
     return _candidate(seed, polished.model, problem, solution, polished.note)
 
 
+def start_values(search: StartSearch, seed: int, sequence: np.random.SeedSequence) -> Blocks:
+    """Choose the values of one start."""
+    structure, recordings = search.structure, search.context.recordings
+    rng, inputs = np.random.default_rng(sequence), [r.u for r in recordings]
+    linear, states = unit_states(search.linear, inputs, search.coordinates)
+    if isinstance(structure.element, StaticNetwork):
+        return network_start(structure, linear, inputs, states, rng)
+    if search.start != "grid":
+        return paper_start(structure, linear, inputs, states, rng)
+    place = dict(enumerate(places(structure))).get(seed, "random")
+    values = grid_start(structure, linear, inputs, states, rng, place)
+    return envelope_start(structure, linear, values, recordings, states, place) if has_networks(structure) else values
+
+
 def is_drawn(structure: Any, start: str, seed: int) -> bool:
-    """Whether a start has anything random in it: with the grid, the direction of z where it is free, or thresholds."""
+    """Tell whether a start depends on the seed: with the grid, by a free direction of z, or by drawn thresholds."""
     element = structure.element
     if start != "grid" or isinstance(element, StaticNetwork):
         return True
@@ -105,66 +135,69 @@ def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, no
     with np.errstate(over="ignore", invalid="ignore"):
         error = float(np.sqrt(e @ e / e.size))
     error = error if np.isfinite(error) else np.inf
-    return Candidate(seed, model, solution.theta, error, solution, note)
+    nrmse = float(np.mean(problem.nrmse(solution.theta))) if np.isfinite(error) else np.inf
+    return Candidate(seed, model, solution.theta, error, solution, note, nrmse=nrmse)
 
 
 @one_blas_thread
 def polish(search: StartSearch, candidate: Candidate) -> Candidate:
-    """Re-grid a candidate and run it further, with and without a prior that holds the weights to a smooth density.
+    """Re-grid a candidate and run it further, with and without a prior that holds the weights near a smooth density.
 
-    The one with the prior (its `note` says so) is returned where its training error is hardly above the smallest.
+    The candidate with the prior (its `note` says so) is returned if its training error is hardly above the smallest.
     """
-    parameters = candidate.model.parameters
+    parameters, recordings = candidate.model.parameters, search.context.recordings
     regular = isinstance(search.structure.element, PrandtlIshlinskii)
     if not regular or not np.all(np.concatenate([parameters.free[parameters.position(name)] for name in ("r", "w")])):
         return candidate
-    engine = make_engine(candidate.model, search.engine)
+    engine = make_engine(candidate.model, search.context.engine)
     n_free = int(parameters.free.sum())
-    held = _held(search, candidate)
-
-    def solve(problem: Problem, start: np.ndarray) -> Solution:
-        return search.solve(problem, start, POLISH, held)
-
+    held = _is_held(search, candidate)
     found = [candidate]
     for beyond, spread in ((1.0, 0.0), (1.3, 0.02)):
         best = min(found, key=_merit)
         problem = search.problem(best.model, engine)
         values, states = problem.parameters(best.theta), problem.first_states(best.theta)
-        runs = [engine.simulate(r.u, values, s, True) for r, s in zip(search.recordings, states, strict=True)]
-        moved = regrid_channels(
-            search.structure, parameters.unpack(values), np.concatenate([run[2] for run in runs]), beyond
-        )
+        runs = [engine.simulate(r.u, values, s, True) for r, s in zip(recordings, states, strict=True)]
+        z = np.concatenate([run[2] for run in runs])
+        moved = regrid_channels(search.structure, parameters.unpack(values), z, beyond)
         model = candidate.model.with_parameters(parameters.at(parameters.pack(moved)))
         if spread:
             model = hold_near_density(model, moved, spread)
         problem = search.problem(model, engine, noise=best.error)
-        solution = solve(problem, np.concatenate([problem.start[:n_free], best.theta[n_free:]]))
-        found.append(_candidate(candidate.seed, model, problem, solution, PRIOR if spread else ""))
+        begin = np.concatenate([problem.start[:n_free], best.theta[n_free:]])
+        solution = search.solve(problem, begin, DEFAULT_SOLVER, held)
+        found.append(_candidate(candidate.seed, model, problem, solution, DENSITY_PRIOR if spread else ""))
         if solution.status is Status.INTERRUPTED:
             return _best_so_far(found)
     smooth = found[-1]
     problem = search.problem(candidate.model, engine, noise=smooth.error)
-    found.append(_candidate(candidate.seed, candidate.model, problem, solve(problem, smooth.theta)))
-    if found[-1].solution.status is Status.INTERRUPTED:
+    solution = search.solve(problem, smooth.theta, DEFAULT_SOLVER, held)
+    found.append(_candidate(candidate.seed, candidate.model, problem, solution))
+    if solution.status is Status.INTERRUPTED:
         return _best_so_far(found)
     best = min(found, key=_merit)
     usable = _merit(smooth)[0] == _merit(best)[0]
     return smooth if usable and smooth.error <= MARGIN * best.error else best
 
 
-def _held(search: StartSearch, candidate: Candidate) -> bool:
-    """Whether a candidate is at an exact bound on a spectral radius, which its multiplier says to hold it."""
+def _is_held(search: StartSearch, candidate: Candidate) -> bool:
+    """Tell whether an exact bound on a spectral radius holds a candidate, by its multiplier."""
     return held_at_bounds(search.problem(candidate.model), candidate.theta, candidate.solution)
 
 
 def _best_so_far(found: list[Candidate]) -> Candidate:
-    """The candidate of the smallest error, as one that was interrupted."""
+    """Return the best candidate, marked as interrupted."""
     best = min(found, key=_merit)
     return replace(best, solution=replace(best.solution, status=Status.INTERRUPTED))
 
 
+def _merit(candidate: Candidate) -> tuple[bool, float]:
+    """Compare candidates by whether the constraints hold, then by the error."""
+    return candidate.solution.status is Status.INFEASIBLE, candidate.error
+
+
 def hold_near_density(model: Model, values: dict[str, Any], spread: float) -> Model:
-    """Hold weights and thresholds near the smoothed density, with a relative standard deviation `spread`."""
+    """Put priors of relative standard deviation `spread` on weights and thresholds that have none."""
     r, w = values["r"], values["w"]
     gap = np.gradient(r, axis=1) if r.shape[1] > 1 else r
     priors = {
@@ -175,9 +208,78 @@ def hold_near_density(model: Model, values: dict[str, Any], spread: float) -> Mo
     return model.with_parameters(model.parameters.change(**own))
 
 
-def _merit(candidate: Candidate) -> tuple[bool, float]:
-    """What candidates are compared by: whether the constraints hold comes first."""
-    return candidate.solution.status is Status.INFEASIBLE, candidate.error
+def regrid(
+    r: np.ndarray,
+    w: np.ndarray,
+    reach: float,
+    *,
+    beyond: float = 1.3,
+    smooth: float = 1 / 12,
+    count: int | None = None,
+    spacing: float = 0.4,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Place the thresholds and weights (N,) of one channel anew along their smoothed density.
+
+    Each new threshold stands for an equal share of `density^spacing`, by default 0.4: knots of a good piecewise-linear
+    approximation of the loading curve. Beyond the visited range, where the data say nothing, its tail goes on.
+
+    Parameters
+    ----------
+    r, w : array, shape (N,)
+        Fitted thresholds and weights; returned as they are if no weight or range is above zero.
+    reach : float
+        Largest |z| visited.
+    beyond : float
+        How far the thresholds may reach, in units of `reach`; the tail is extrapolated log-linearly, never rising.
+    smooth : float
+        Kernel width in units of `reach`.
+    count : int, optional
+        Number of new thresholds, N by default.
+    spacing : float
+        Power of the density that thresholds are spaced by: 0 for an even grid.
+    """
+    if not (np.sum(w) > 0 and reach > 0):
+        return r[:count], w[:count]
+    grid = np.linspace(0.0, beyond * reach, 600)
+    d = weight_density(r, w, grid, smooth * reach)
+    if d.max() <= 1e-200 * np.sum(w):  # all thresholds lie far beyond the visited range: spread them evenly
+        d = np.full_like(grid, np.sum(w) / grid[-1])
+    tail = (grid >= 0.4 * reach) & (grid <= 0.85 * reach)
+    log_d = np.log(d + 1e-6 * d.max())
+    slope = min(float(np.polyfit(grid[tail], log_d[tail], 1)[0]), 0.0)
+    out = grid > 0.85 * reach
+    d[out] = np.exp(np.mean(log_d[tail]) + slope * (grid[out] - np.mean(grid[tail])))
+    share = _integral(d**spacing, grid)
+    edges = np.interp(np.linspace(0, 1, (count or len(r)) + 1), share / share[-1], grid)
+    mass = np.diff(np.interp(edges, grid, _integral(d, grid)))
+    moment = np.diff(np.interp(edges, grid, _integral(d * grid, grid)))
+    return moment / np.maximum(mass, 1e-300), mass
+
+
+def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0.0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(x))])
+
+
+def regrid_channels(
+    structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3
+) -> dict[str, Any]:
+    """Place every channel's thresholds and weights anew; z (M, n_w) is the fitted model's signal."""
+    reaches = [threshold_range(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
+    rows = [regrid(r, w, most, beyond=beyond) for r, w, most in zip(values["r"], values["w"], reaches, strict=True)]
+    return {**values, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
+
+
+def threshold_range(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, channel: int) -> float:
+    """Find the threshold at which a channel's operators would rest over z (M,): its size, or half of its envelopes'.
+
+    A generalized play rests when its lower curve `γ_l - r` is below its upper one `γ_r + r` at every two values of z.
+    """
+    if not has_networks(structure):
+        return float(np.max(np.abs(z)))
+    assert isinstance(structure.element, PrandtlIshlinskii)
+    operator, ends = structure.element.operator, np.array([np.max(z), np.min(z)])
+    low, high = (operator.envelope(side, end, values, channel) for side, end in zip("lr", ends, strict=True))
+    return max(float(low - high) / 2, 0.0)
 
 
 def search_starts(
@@ -188,19 +290,14 @@ def search_starts(
     report: Callable[[str, list[Candidate], int], None],
     keep: int = KEEP,
 ) -> tuple[list[Candidate], Candidate | None, bool]:
-    """All candidates of the exploration, the winner (None if interrupted before there was one), whether interrupted.
+    """Explore and polish; return all explored candidates, the winner, and whether the search was interrupted.
 
-    `report` is told the stage, what it has found and how many it will, first when there is nothing yet.
-
-    Raises
-    ------
-    InputError
-        If no start gives a finite simulation.
+    The winner is None if the search was interrupted before there was one. `report` gets the stage, its candidates so
+    far and their number in the end, first when there are none.
     """
     sequences = np.random.SeedSequence(seed).spawn(starts)
-    found, stopped = run_tasks(
-        explore, [(search, i, s) for i, s in enumerate(sequences)], executor, partial(report, "starts")
-    )
+    tasks = [(search, i, s) for i, s in enumerate(sequences)]
+    found, stopped = run_tasks(explore, tasks, executor, partial(report, "starts"))
     usable = sorted((c for c in found if np.isfinite(c.error)), key=_merit)
     if not usable and stopped:
         return found, None, True
@@ -211,62 +308,12 @@ def search_starts(
     if search.start != "grid" or stopped:
         return found, usable[0], stopped
     chosen = usable[:keep]
-    if any(_held(search, c) for c in usable):
-        # what exploring reaches says less: every one that was among the best when it came, so that more starts are
-        # never worse than fewer
+    if any(_is_held(search, c) for c in usable):
+        # At a bound the explored errors say less. Polish every candidate that was among the best when it came, so that
+        # more starts are never worse than fewer.
         chosen = [c for i, c in enumerate(found) if c in sorted(found[: i + 1], key=_merit)[:keep] and c in usable]
     polished, stopped = run_tasks(polish, [(search, c) for c in chosen], executor, partial(report, "polish"))
     return found, min(polished or usable[:1], key=_merit), stopped
-
-
-@dataclass(frozen=True, eq=False)
-class StartSearch:
-    """All that the tasks of one identification share."""
-
-    structure: PILFR
-    recordings: tuple[Recording, ...]
-    linear: Blocks
-    solver: Any = field(default_factory=GaussNewton)
-    constraints: tuple[Constraint, ...] = ()
-    engine: str = "auto"
-    start: str = "grid"
-    l1: dict[str, float] = field(default_factory=dict)
-    noise: float | None = None
-    weights: np.ndarray | None = None
-    level: float = 1.0
-    coordinates: bool = True  # whether the states' coordinates are free to choose
-    progress: Progress | None = None  # gets the steps of every solve; of starts in other processes they are not heard
-
-    @classmethod
-    def of(cls, context: FitContext, structure: PILFR, linear: Blocks, **options: Any) -> StartSearch:
-        """The search for a structure with the recordings, solver and options of a context."""
-        given = {"engine": context.engine, "noise": context.options.noise, "weights": context.weights, **options}
-        return cls(structure, context.recordings, linear, context.solver, context.constraints, **given)
-
-    def problem(self, model: Model, engine: Engine | None = None, noise: float | None = None) -> Problem:
-        """The simulation-error problem of a model of this structure.
-
-        Priors are weighed against the noise that was asked for, else what has been reached, `noise`; else what a linear
-        model reaches, `level`.
-        """
-        return Problem(
-            model,
-            self.recordings,
-            engine=engine or self.engine,
-            constraints=loosened(self.constraints, least=1.0),
-            l1=self.l1,
-            noise=self.noise or noise or self.level,
-            weights=self.weights,
-        )
-
-    def solve(self, problem: Problem, start: np.ndarray | None, solver: Any, held: bool = False) -> Solution:
-        """A solver's solution inside exact bounds on spectral radii; `held` says that they hold it."""
-        return solve_within_bounds(problem, start, solver, "steps", self.progress, held=held)
-
-    def model(self, values: dict[str, Any]) -> Model:
-        """The closed model starting at `values`."""
-        first = self.recordings[0]
-        return self.structure.model(first.n_u, first.n_y, values, inputs=first.inputs, outputs=first.outputs)
 
 
 def run_tasks(
@@ -275,9 +322,10 @@ def run_tasks(
     executor: Executor | None,
     report: Callable[[list[Candidate], int], None],
 ) -> tuple[list[Candidate], bool]:
-    """Results in the order of the tasks, from an executor or one after the other; whether the run was interrupted.
+    """Return the results in the order of the tasks, and whether the run was interrupted.
 
-    `report` gets the results so far and their number in the end, first when there are none.
+    Tasks run in the executor, or one after the other. `report` gets the results so far and their number in the end,
+    first when there are none.
     """
     tasks, results = list(tasks), list[Candidate]()
     if executor is not None:

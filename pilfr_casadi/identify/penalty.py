@@ -1,23 +1,22 @@
-r"""An L1 penalty on an element's weights that means something: the scales it could hide in are held.
+r"""The L1 penalty on an element's weights, with the scales held that it could hide in.
 
     minimise  1/2 mean(e²) + l1 Σ w_ij
 
-The outputs of a PI-LFR do not change under `w_i -> w_i / μ, (B_w, D_yw)_i -> μ (...)`, nor under a scaling of z with
-its thresholds and of the states, in every combination (`orbit`): with all blocks free the penalty would be driven to
-zero by units alone. Nor is it enough to hold a product such as `C_z B_w`, which no change of the states moves: it is
-the first sample of the response from w to z, next to nothing in a mechanical system, and costs next to nothing to mend.
-So
+(Tibshirani 1996; the simulation error is that of Krikelis et al. 2024, Eq. 20). The outputs of a PI-LFR do not change
+under `w_i -> w_i / μ, (B_w, D_yw)_i -> μ (...)`, nor under a scaling of z with its thresholds and of the states, in
+every combination (`generators`). With all blocks free, units alone would drive the penalty to zero. Nor is it enough to
+hold a product such as `C_z B_w`, which no change of the states moves: it is the first sample of the response from w to
+z, next to nothing in a mechanical system, and costs next to nothing to restore. So
 
 1. the problem is solved without the penalty;
-2. the weights of each channel are scaled to a sum of one, which `B_w` and `D_yw` take up, unless something fixed,
-   bounded or given a prior stands against it: `l1` then is in units of the cost, for all of a channel's weights;
+2. the weights of each channel are scaled to a sum of one, which `B_w` and `D_yw` take up, unless an entry is fixed,
+   bounded or has a prior: `l1` then is in units of the cost, for all of a channel's weights;
 3. plays or stops of a channel with nearly the same threshold are merged into one, as long as the objective grows by
    no more than `SLACK` in all: to the penalty one large weight and two halves of it are the same;
-4. the problem is solved with the penalty from there, with every linear block, every parameter of the operators and all
-   that is zero already held at its value; weights, thresholds, `y_0` and the initial states are free.
+4. the problem is solved with the penalty from there. Every linear block, every parameter of the operators and every
+   entry that is zero is held at its value; weights, thresholds, `y_0` and the initial states are free.
 
-What is fixed in the result is what the user fixed. Tibshirani (1996) is the penalty's source; the simulation error is
-that of Krikelis et al. (2024), Eq. 20.
+Only the user's fixed entries are fixed in the result.
 """
 
 from __future__ import annotations
@@ -39,13 +38,7 @@ SLACK = 0.02  # share of the objective that merging operators may cost before th
 
 
 def check_penalty(l1: dict[str, float], parameters: ParameterSet, linear: bool) -> None:
-    """Refuse a penalty that cannot be used, before any long work.
-
-    Raises
-    ------
-    InputError
-        If the model is linear, a name is unknown, a weight is no number of 0 or more, or a parameter may be negative.
-    """
+    """Refuse a penalty on a linear model, an unknown name or a parameter that may be negative, before any long work."""
     if linear:
         raise InputError("An L1 penalty was asked for on a linear model; it acts on an element's weights, give one.")
     for name, weight in l1.items():
@@ -57,7 +50,7 @@ def check_penalty(l1: dict[str, float], parameters: ParameterSet, linear: bool) 
 
 
 def normalise_weights(model: Model) -> Model:
-    """The same outputs with the weights of each channel at a sum of one, where nothing stands against it."""
+    """Scale the weights of each channel to a sum of one with the same outputs, unless an entry is fixed or bounded."""
     parameters = model.parameters
     if not isinstance(model.element, PrandtlIshlinskii):
         return model
@@ -72,7 +65,7 @@ def normalise_weights(model: Model) -> Model:
 
 
 def _scales(p: Parameter, part: Any, low: float) -> bool:
-    """Whether entries may be scaled: free and not bounded but by `low`, or fixed at zero; no prior."""
+    """Tell whether entries may be scaled: free without a bound other than `low`, or fixed at zero; no prior."""
     fixed = p.fixed[part]
     free = ~fixed & (p.bounds[0][part] == low) & np.isinf(p.bounds[1][part])
     return p.prior is None and bool(np.all(free | (fixed & (p.value[part] == 0))))
@@ -86,7 +79,7 @@ def hold_all_but_element(model: Model, names: Iterable[str]) -> Model:
 
 
 def fix_idle_operators(model: Model) -> Model:
-    """The model with operators of no weight held, so that they do not split from another one again."""
+    """Hold operators of no weight, so that they do not split from another one again."""
     p = model.parameters
     if not isinstance(model.element, PrandtlIshlinskii):
         return model
@@ -95,7 +88,7 @@ def fix_idle_operators(model: Model) -> Model:
 
 
 def merge_operators(held: Problem, theta: np.ndarray) -> np.ndarray:
-    """Variables with operators of like thresholds merged, the nearest first; see above."""
+    """Merge operators of nearly the same threshold, the nearest first; return the variables."""
     element, parameters = held.model.element, held.model.parameters
     if not (isinstance(element, PrandtlIshlinskii) and isinstance(element.operator, Play | Stop)):
         return theta
@@ -107,7 +100,7 @@ def merge_operators(held: Problem, theta: np.ndarray) -> np.ndarray:
     limit = (1 + SLACK) * held.cost(theta)
 
     def trial(i: int, a: int, b: int) -> np.ndarray:
-        """One operator of channel i in the place of two."""
+        """Replace two operators of channel i by one."""
         out, w, r = theta.copy(), theta[w_at[i]], theta[r_at[i]]
         share = w[b] / (w[a] + w[b])
         out[w_at[i, a]], out[w_at[i, b]] = w[a] + w[b], 0.0
@@ -134,7 +127,7 @@ def merge_operators(held: Problem, theta: np.ndarray) -> np.ndarray:
 
 
 def restore_variables(solution: Solution, held: Problem, problem: Problem) -> Solution:
-    """The solution of a problem with parameters held, in the variables of the problem without."""
+    """Express the solution of a problem with held parameters in the variables of the problem without."""
     n_held, n = int(held.free.sum()), int(problem.free.sum())
     theta = np.concatenate([held.parameters(solution.theta)[problem.free], solution.theta[n_held:]])
     multipliers = np.zeros(problem.size + len(problem.g_lower))
@@ -145,24 +138,26 @@ def restore_variables(solution: Solution, held: Problem, problem: Problem) -> So
 
 
 def penalty_sentence(model: Model, l1: dict[str, float]) -> str:
-    """How many entries the penalty has brought to zero."""
+    """Say how many entries the penalty has brought to zero."""
     counts = [f"{np.sum(model.parameters[k].value == 0)} of {model.parameters[k].size} entries of {k}" for k in l1]
     return f"L1 penalty: {', '.join(counts)} are exactly zero; the linear blocks were held while it acted"
 
 
-def solve_with_penalty(model: Model, problem: Problem, solution: Solution, context: FitContext, noise: float) -> Stage:
-    """The model, problem and solution with the L1 penalty, from the solution without, and a note; see `penalty`."""
+def solve_with_penalty(model: Model, problem: Problem, solution: Solution, context: FitContext) -> Stage:
+    """Solve with the L1 penalty from the solution without; return model, problem, solution and a note."""
     if solution.status is Status.INTERRUPTED:
         return model, problem, solution, "interrupted before the L1 penalty was applied"
     found = normalise_weights(with_solution(model, problem, solution))
     states = solution.theta[int(problem.free.sum()) :]
     options: dict[str, Any] = {"engine": problem.engine, "l1": context.l1}
-    whole, held = (context.problem(m, noise, **options) for m in (found, hold_all_but_element(found, context.l1)))
+    whole, held = (
+        context.problem(m, problem.noise, **options) for m in (found, hold_all_but_element(found, context.l1))
+    )
     begin = merge_operators(held, np.concatenate([held.start[: int(held.free.sum())], states]))
     states = begin[int(held.free.sum()) :]
     last = fix_idle_operators(held.model.with_parameters(held.model.parameters.at(held.parameters(begin))))
     if np.any(last.parameters.free):
-        held = context.problem(last, noise, **options)
+        held = context.problem(last, problem.noise, **options)
     begin = np.concatenate([held.start[: int(held.free.sum())], states])
     result = restore_variables(context.solve(held, "L1 penalty", begin), held, whole)
     return found, whole, result, penalty_sentence(with_solution(found, whole, result), context.l1)

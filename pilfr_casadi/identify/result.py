@@ -1,18 +1,9 @@
 """`Fit`, the result of `fit`: a fitted model that simulates, judges, draws and saves itself.
 
-`FitContext.result` builds it from the solution of a problem. Its note says two things that the recordings leave open.
-
-Memory in a periodic steady state: an operator that never slips in a whole period keeps whatever memory it has. Its row
-of the state's slope over a period is that of the identity, every value in an interval is a steady state, and the
-outputs differ by a constant. The memory that periods from rest lead to is taken.
-
-A known DC gain beyond the recordings: the gain of `known` belongs to motions so large that every play slips (`slope`
-1), or so small that every one sticks (0), after an infinite time. A fit may meet it where no data contradict it, by
-operators whose thresholds lie beyond all motions, or by a slow pole. So the gain is computed a second time, over the
-samples of the longest recording and without the operators that never slip (for small motions: with the operators that
-have no threshold),
-
-    gain_M = C' (Σ_{k<M} A'^k) B' + D',   with the blocks of `known` at S = diag(Σ_j w_ij), j slipping.
+`FitOptions` are the options of `fit` that also hold for fits made from its result: the bound on spectral radii, the
+constraints, the noise that priors are weighed against, and the weights of recordings. A model file holds no code, hence
+no constraints: it holds their names, and the bound on spectral radii. A constraint known only by name must be supplied
+again or dropped explicitly.
 """
 
 from __future__ import annotations
@@ -20,37 +11,120 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, is_number, listed
 from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse, rmse_per_output
 from ..engine import Engine, make_engine
 from ..export import FitContent, SavedStart, exported, read_model_file, write_model_file
-from ..models import PILFR, Model, PrandtlIshlinskii, Stop
+from ..models import PILFR, Model
 from ..optimise import (
-    Gain,
+    Constraint,
     Limit,
     Problem,
     Solution,
     Status,
+    checked_weights,
     first_state,
     samples_for_state,
+    stability_limits,
     unknown_multipliers,
 )
 from ..simulators import Simulator
-from .options import FitOptions, options_from_limits
 from .uncertainty import describe_unknown_errors
 
-PRIOR = "weights held near a smooth density by a weak prior"
+DENSITY_PRIOR = "weights held near a smooth density by a weak prior"  # note of a candidate and of its fit
+RADIUS = "spectral radius"  # how the names of bounds on spectral radii begin
+
+
+@dataclass(frozen=True, eq=False)
+class FitOptions:
+    """Options that a fit passes on to fits made from it, as for `fit`.
+
+    `lost` names constraints that the fit had before it was written to a file; `noise` is None where it is to be
+    estimated; `weights` go by the `fingerprint` of each recording, None for equal weights.
+    """
+
+    stable: bool | float = True
+    constraints: tuple[Constraint, ...] = ()
+    lost: tuple[str, ...] = ()
+    noise: float | None = None
+    weights: Mapping[str, float] | None = None
+
+    def updated(
+        self,
+        stable: bool | float | None = None,
+        constraints: Any = None,
+        noise: float | str | None = None,
+        weights: Any = None,
+        train: Any = (),
+    ) -> FitOptions:
+        """Return the options with some replaced; None keeps the present one. `weights` belong to recordings `train`."""
+        if noise is not None and noise != "estimate" and not (is_number(noise) and 0 < noise < np.inf):
+            raise InputError(f"noise = {noise!r} was given; give a number above zero, or 'estimate'.")
+        if constraints is None and self.lost:
+            raise InputError(
+                f"The fit was held by constraints that its file cannot hold ({listed(self.lost)}); give them again as "
+                "constraints=, or constraints=() to do without."
+            )
+        return FitOptions(
+            self.stable if stable is None else stable,
+            self.constraints if constraints is None else _constraint_list(constraints),
+            noise=self.noise if noise is None else None if noise == "estimate" else float(noise),
+            weights=self.weights if weights is None else _weights_by_recording(weights, train),
+        )
+
+    def weights_of(self, recordings: Sequence[Recording]) -> np.ndarray | None:
+        """Return the weight of each recording, or None without weights."""
+        if self.weights is None:
+            return None
+        prints = [fingerprint(r) for r in recordings]
+        for r, name in zip(recordings, prints, strict=True):
+            if name not in self.weights:
+                raise InputError(
+                    f"The fit was made with weights of its recordings, and {r.label} is none of them; give weights=, "
+                    "one for each recording."
+                )
+        return np.array([self.weights[name] for name in prints])
+
+    def all_constraints(self, structure: PILFR | None) -> tuple[Constraint, ...]:
+        """List the bounds on spectral radii, then the other constraints."""
+        return (*(stability_limits(structure, self.stable) if structure else ()), *self.constraints)
+
+
+def _weights_by_recording(weights: Any, train: Any) -> dict[str, float]:
+    """Map fingerprints to weights; a recording given twice gets the root mean square of both."""
+    recordings, sums = as_recordings(train), dict[str, list[float]]()
+    for r, weight in zip(recordings, checked_weights(weights, len(recordings)), strict=True):
+        sums.setdefault(fingerprint(r), []).append(float(weight))
+    return {name: float(np.sqrt(np.mean(np.square(some)))) for name, some in sums.items()}
+
+
+def options_from_limits(limits: Sequence[Limit], structure: PILFR | None, **more: Any) -> FitOptions:
+    """Recover the options from the limits in a model file; `more` are options that the file states."""
+    names = dict.fromkeys(limit.name.partition("[")[0] for limit in limits if limit.kind == "constraint")
+    radii = [limit.upper for limit in limits if limit.name.startswith(f"{RADIUS} <= ")]
+    lost = tuple(name for name in names if not name.startswith(RADIUS))
+    return FitOptions(min(radii) if radii else structure is None or not structure.nx, lost=lost, **more)
+
+
+def _constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
+    """Return one constraint, or several, as a tuple."""
+    if isinstance(given, Constraint):
+        return (given,)
+    if not isinstance(given, Sequence) or not all(isinstance(c, Constraint) for c in given):
+        raise InputError(f"constraints = {given!r} was given; give a Constraint, or a list of them.")
+    return tuple(given)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """What one start led to; `drawn` tells whether its start depends on the seed."""
+    """The result of one start; `drawn` tells whether the start depends on the seed, `nrmse` averages the recordings."""
 
     seed: int
     model: Model
@@ -59,6 +133,7 @@ class Candidate:
     solution: Solution
     note: str = ""
     drawn: bool = True
+    nrmse: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +145,7 @@ class Fit:
     model : Model
         Closed model with the fitted values as its parameters' values.
     structure : PILFR or None
-        What was asked for, where it was a PI-LFR.
+        The structure that was fitted, if it was a PI-LFR.
     solution : Solution
         Status, cost, iterations, history, multipliers.
     train_nrmse : tuple of float
@@ -80,12 +155,12 @@ class Fit:
     labels : tuple of str
         Names of the variables in `solution.theta`.
     errors : dict
-        Standard errors by parameter name, in the gauge of `gauge.standard_errors`; nan where fixed or at a bound, inf
-        where the data (and the user's priors, but none of the search's own) say nothing.
+        Standard errors by parameter name, in the gauge of `standard_errors`; nan where fixed or at a bound, inf where
+        the data (and the user's priors, but none of the search's own) say nothing.
     active : tuple of str
         Variables that are at a bound, with their values, and constraints that are at a limit.
     limits : tuple of Limit
-        Every constraint, and every bound that is active, with its value and its multiplier; see `limits`.
+        Every constraint, and every bound that is active, with its value and its multiplier.
     linear : Model or None
         The linear model that the search began with, `linear_nrmse` its NRMSE on each training recording.
     candidates : tuple of Candidate
@@ -113,7 +188,7 @@ class Fit:
     note: str = ""
     linear_nrmse: tuple[float, ...] = ()
     limits: tuple[Limit, ...] = ()
-    options: FitOptions = FitOptions()  # noqa: RUF009  (frozen)
+    options: FitOptions = FitOptions()
     simulator: Simulator | None = None
 
     @property
@@ -126,11 +201,6 @@ class Fit:
         """Fitted values by name."""
         return {name: p.value for name, p in self.model.parameters.items()}
 
-    @property
-    def asked(self) -> FitOptions:
-        """Old name of `options`."""
-        return self.options
-
     def with_simulator(self, simulator: Simulator) -> Fit:
         """Return the fit of a simulator's model with the simulator at the fitted values."""
         own = {name: self.model.parameters[name] for name in simulator.parameters}
@@ -141,41 +211,35 @@ class Fit:
         return make_engine(self.model, self.engine)
 
     def initial_state(self, recording: Recording, samples: int | None = None) -> np.ndarray:
-        """State with memory at a recording's first sample, as its `initial` says.
+        """Find the state with memory at a recording's first sample, as its `initial` says.
 
-        Where it is to be estimated, a recording of the training gets the state of the fit. For any other the model is
-        held and the state fitted to the first `samples` samples (default: ten a state, at least 50); nothing later is
-        looked at, and `nrmse` does not score them.
+        Where it is to be estimated, a training recording gets the state of the fit. For any other recording the model
+        stays as it is and the state is fitted to the first `samples` samples (default: ten a state, at least 50).
+        Nothing later is looked at, and `nrmse` does not score these samples.
         """
         recording = self._matched(recording)
         known = self.initial.get(fingerprint(recording))
         return first_state(self.model, self._engine, recording, samples, state_prior=True) if known is None else known
 
     def simulate(self, recording: Recording) -> np.ndarray:
-        """Simulated outputs for a recording's inputs, shape (M, n_y).
+        """Simulate the outputs for a recording's inputs, shape (M, n_y).
 
         Raises
         ------
         InputError
-            If what is given is no recording, or does not fit the model.
+            If it is not a recording, or does not fit the model.
         """
         return self.signals(recording)["y"]
 
     def signals(self, recording: Recording) -> dict[str, np.ndarray]:
-        """Simulated `y` (M, n_y) with the element's `z` and `w` (M, n_w)."""
+        """Simulate `y` (M, n_y) with the element's `z` and `w` (M, n_w)."""
         recording = self._matched(recording)
         state = self.initial_state(recording)
         y, _, z, w = self._engine.simulate(self.model.drive(recording), self.model.parameters.start, state, True)
         return {"y": y, "z": z, "w": w}
 
     def scored_from(self, recording: Recording) -> int:
-        """First sample that is scored: behind `skip`, and behind those that an initial state has been fitted to.
-
-        Raises
-        ------
-        InputError
-            If no sample is left.
-        """
+        """Find the first sample that is scored: after `skip`, and after those that an initial state is fitted to."""
         recording = self._matched(recording)
         estimated = recording.begins == "estimate"
         if not estimated or fingerprint(recording) in self.initial or not self.model.n_x + self.model.n_s:
@@ -189,17 +253,16 @@ class Fit:
         return first
 
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
-        """NRMSE (Eq. 27) over outputs, averaged over recordings, in free-run simulation.
+        """Compute the NRMSE (Eq. 27) over outputs, averaged over recordings, in free-run simulation.
 
-        Nothing is fitted to what is scored, but for the training itself: where the initial state of another recording
-        is estimated, the samples it is fitted to are left out (`scored_from`). An output that rests in one of several
-        recordings counts next to its deviation in all of them.
+        Where the initial state of a recording other than the training's is estimated, the samples that it is fitted to
+        are not scored (`scored_from`). An output that rests in one of several recordings is scaled by its deviation in
+        all of them.
 
         Raises
         ------
         InputError
-            If a recording does not fit the model, is not longer than what its initial state is fitted to, or an output
-            never changes.
+            If a recording does not fit the model or has no samples left to score, or an output never changes.
         """
         given = [self._matched(r) for r in as_recordings(recordings)]
         first = [self.scored_from(r) for r in given]
@@ -235,10 +298,21 @@ class Fit:
         return recording
 
     def plot(self, recordings: Recording | Sequence[Recording], **options: Any) -> Any:
-        """Figures of the fit over recordings; see `plots.plot_fit`."""
+        """Draw the figures of the fit over recordings; see `plots.plot_fit`."""
         from ..plots import plot_fit
 
         return plot_fit(self, recordings, **options)
+
+    def report(
+        self,
+        folder: str | os.PathLike[str],
+        train: Recording | Sequence[Recording],
+        test: Recording | Sequence[Recording] = (),
+    ) -> Path:
+        """Write report.html and model.json into a folder; return the page's path. See `report.fit_report`."""
+        from ..report import fit_report
+
+        return fit_report(self, train, test, folder)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the fit as JSON, atomically: an existing file stays as it is until the new one is complete on disk.
@@ -263,26 +337,10 @@ class Fit:
             )
 
     def content(self) -> FitContent:
-        """Return the values that a model file holds of this fit."""
-        return FitContent(
-            model=self.model,
-            structure=self.structure,
-            dt=self.dt,
-            solution=self.solution,
-            labels=self.labels,
-            errors=self.errors,
-            linear=self.linear,
-            initial=self.initial,
-            units=self.units,
-            train_nrmse=self.train_nrmse,
-            linear_nrmse=self.linear_nrmse,
-            seconds=self.seconds,
-            active=self.active,
-            limits=self.limits,
-            noise=self.options.noise,
-            weights=self.options.weights,
-            starts=tuple(SavedStart(c.seed, c.error, c.solution, c.note, c.drawn) for c in self.candidates),
-        )
+        """Collect the values that a model file holds of this fit."""
+        shared = {f.name: getattr(self, f.name) for f in fields(FitContent) if hasattr(self, f.name)}
+        starts = tuple(SavedStart(c.seed, c.error, c.solution, c.note, c.drawn) for c in self.candidates)
+        return FitContent(**shared, noise=self.options.noise, weights=self.options.weights, starts=starts)
 
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
         """`casadi.Function (x, u) -> (x_next, y)`, operator memory inside x; see `export.to_casadi`."""
@@ -369,32 +427,11 @@ def save(fit: Fit, path: str | os.PathLike[str]) -> None:
 def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fit:
     """Read a fit that `save` wrote; simulations are the same to the last digit.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    model : Model or PILFR, optional
-        The equations, where the file cannot hold them: a closed model of your own, or a PI-LFR whose element has
-        envelope expressions of your own. Its values are replaced by those of the file.
-
-    Returns
-    -------
-    Fit
-        Of the starts that were tried only what they reached is kept: each candidate has its seed, error and status, an
-        empty `theta` and the fitted model.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, unreadable, damaged, of another kind or version, was changed after it was written, does
-        not fit `model`, or holds values that are missing, not finite, or outside their bounds.
-
-    Warns
-    -----
-    UserWarning
-        If the file is of the first version of the format, which has no digest to tell changes by.
+    Parameters, errors and warnings are those of `export.read_model_file`. Each candidate has its seed, error and
+    status, an empty `theta` and the fitted model.
     """
     content = read_model_file(path, model)
+    shared = {f.name: getattr(content, f.name) for f in fields(content) if f.name in Fit.__dataclass_fields__}
     candidates = tuple(
         Candidate(c.seed, content.model, np.zeros(0), c.error, c.solution, note=c.note, drawn=c.drawn)
         for c in content.starts
@@ -402,24 +439,7 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     options = FitOptions()  # the first files did not hold them
     if content.limits is not None:
         options = options_from_limits(content.limits, content.structure, noise=content.noise, weights=content.weights)
-    return Fit(
-        model=content.model,
-        structure=content.structure,
-        dt=content.dt,
-        solution=content.solution,
-        train_nrmse=content.train_nrmse,
-        initial=dict(content.initial),
-        labels=content.labels,
-        errors=dict(content.errors),
-        active=content.active,
-        candidates=candidates,
-        linear=content.linear,
-        seconds=content.seconds,
-        units=dict(content.units),
-        linear_nrmse=content.linear_nrmse,
-        limits=content.limits or (),
-        options=options,
-    )
+    return Fit(**{**shared, "limits": content.limits or ()}, candidates=candidates, options=options)
 
 
 def _shown(error: float) -> str:
@@ -429,127 +449,3 @@ def _shown(error: float) -> str:
 def with_solution(model: Model, problem: Problem, solution: Solution) -> Model:
     """Return the model at the values of a solution."""
     return model.with_parameters(model.parameters.at(problem.parameters(solution.theta)))
-
-
-Array = np.ndarray
-CHUNK = 512  # samples of a period whose slopes are held at a time
-STILL = 1e-12  # difference from the identity that is none
-
-
-def find_open_memory(problem: Problem, theta: Array, recording: Recording, state: Array) -> Array:
-    """Which memories a period from a steady state leaves alone though outputs see them, indices (k,)."""
-    engine, p, n_x = problem.engine, problem.parameters(theta), problem.model.n_x
-    rows = CHUNK * problem.model.substeps
-    period = problem.model.drive(recording)[: (recording.period or 1) * problem.model.substeps]
-    slope, after, seen = np.eye(len(state)), state, np.zeros(len(state))
-    for a in range(0, len(period), rows):
-        _, jac, after, slope = engine.sensitivity(period[a : a + rows], p, after, slope, np.full(len(p), -1))
-        seen = np.maximum(seen, np.max(np.abs(jac / problem.scale[:, None]), axis=(0, 1), initial=0.0))
-    still = np.max(np.abs(slope - np.eye(len(state))), axis=1, initial=0.0) <= STILL
-    return np.flatnonzero(still[n_x:] & (seen[n_x:] > STILL * np.max(seen, initial=0.0)))
-
-
-def describe_open_memory(problem: Problem, theta: Array) -> str:
-    """What it means for a result, naming the recordings; empty where every memory is decided."""
-    counts = {}
-    for k, (r, state) in enumerate(zip(problem.recordings, problem.first_states(theta), strict=True)):
-        periodic = r.begins == "periodic"
-        if periodic and problem.model.n_s and np.all(np.isfinite(state)):
-            counts[r.label if len(problem.recordings) == 1 or r.name else f"recording {k + 1}"] = len(
-                find_open_memory(problem, theta, r, state)
-            )
-    found = [f"{count} in {label}" for label, count in counts.items() if count]
-    if not found:
-        return ""
-    return (
-        f"operators that never slip in a steady period: {', '.join(found)}; the period does not tell their memory, "
-        "which shifts the outputs and is taken as periods from rest with zero memory leave it"
-    )
-
-
-APART = 0.05  # difference of gains, next to the largest one asked for, that is told
-
-
-def describe_reached_gain(problem: Problem, theta: Array) -> str:
-    """What it means that a gain is met beyond the recordings alone, one for all; empty where none is."""
-    found, at = [], 0
-    values, moved = problem.model.parameters.unpack(problem.parameters(theta)), None
-    samples = max(len(r) for r in problem.recordings)
-    for c, size in zip(problem.constraints, problem.g_sizes, strict=True):
-        rows, at = slice(at, at + size), at + size
-        if not isinstance(c.expression, Gain):
-            continue
-        if moved is None:
-            moved = find_slipping(problem, theta, values)
-        low, high = problem.g_lower[rows], problem.g_upper[rows]
-        room = APART * float(np.max(np.abs(np.concatenate([low, high])), initial=0.0))
-
-        def far(gain: Array, low: Array = low, high: Array = high, room: float = room) -> bool:
-            return bool(np.any(~((low - room <= gain) & (gain <= high + room))))
-
-        whole, within, odd = channel_weights(problem.model.element, values, c.expression.slope, moved)
-        if far(gain_over(values, whole, None)):
-            continue  # not met at all, which is told elsewhere
-        reached = gain_over(values, within, samples)
-        if not far(reached):
-            continue
-        range_alone, time_alone = far(gain_over(values, within, None)), far(gain_over(values, whole, samples))
-        both = not range_alone and not time_alone
-        why = [odd] if (range_alone or both) and odd else []
-        why += [f"it settles over more than their {samples} samples"] if time_alone or both else []
-        shown = ", ".join(f"{g:.3g}" for g in reached)
-        found.append(f"{c.name} holds only beyond the recordings: {' and '.join(why)}; within them it comes to {shown}")
-    return "; ".join(found)
-
-
-def find_slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -> Array:
-    """Which operators slip in some recording, (channels, N); none without an element."""
-    element = problem.model.element
-    if not isinstance(element, PrandtlIshlinskii):
-        return np.zeros((0, 0), dtype=bool)
-    r, n_x, p = values["r"], problem.model.n_x, problem.parameters(theta)
-    moved = np.zeros(r.shape, dtype=bool)
-    for recording, state in zip(problem.recordings, problem.first_states(theta), strict=True):
-        z = problem.engine.simulate(problem.model.drive(recording), p, state, True)[2]
-        q = state[n_x:].reshape(r.shape)
-        for row in z:
-            after = np.clip(q, row[:, None] - r, row[:, None] + r)
-            moved |= after != q
-            q = after
-    return moved
-
-
-def channel_weights(
-    element: object, values: Mapping[str, Array], slope: float, moved: Array
-) -> tuple[Array, Array, str]:
-    """Σw of each channel (n_w,) as asked for and within the recordings, and how the operators differ in them."""
-    if not isinstance(element, PrandtlIshlinskii):
-        return np.zeros(0), np.zeros(0), ""
-    w, stops = values["w"], isinstance(element.operator, Stop)
-    whole = slope * w.sum(axis=1)
-    if slope not in (0.0, 1.0):
-        return whole, whole, ""
-    if (slope == 1.0) != stops:  # large motions
-        odd, what = ~moved, "never slip in them"
-    else:
-        odd, what = values["r"] <= 0, "have no threshold below which they stick"
-    odd = odd & (w > 0)
-    active = odd if slope == 0.0 else ~odd
-    return whole, (w * active).sum(axis=1), f"{int(odd.sum())} of {w.size} operators {what}" if np.any(odd) else ""
-
-
-def gain_over(values: Mapping[str, Array], weight: Array, samples: int | None) -> Array:
-    """Gain (n_y n_u,), row by row, with Σw of each channel, after a number of samples or (None) in the end."""
-    a, b, c, d = (values[k] for k in ("A", "B_u", "C_y", "D_yu"))
-    if len(weight):
-        s = np.diag(weight)
-        a, b = a + values["B_w"] @ s @ values["C_z"], b + values["B_w"] @ s @ values["D_zu"]
-        c, d = c + values["D_yw"] @ s @ values["C_z"], d + values["D_yw"] @ s @ values["D_zu"]
-    n = len(a)
-    with np.errstate(over="ignore", invalid="ignore"):
-        if samples is None:
-            state = np.linalg.lstsq(np.eye(n) - a, b, rcond=None)[0] if n else b
-        else:
-            step = np.block([[a, b], [np.zeros((b.shape[1], n)), np.eye(b.shape[1])]])
-            state = np.linalg.matrix_power(step, samples)[:n, n:]
-        return np.asarray(c @ state + d).ravel()

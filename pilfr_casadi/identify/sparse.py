@@ -1,15 +1,15 @@
 r"""Fewer operators, stronger priors: a path of fits over the strength of a regularization, chosen by validation.
 
-Along the path the objective is that of Krikelis et al. (2024), Eq. 20, with
+Along the path the objective of Krikelis et al. (2024), Eq. 20, has
 
-    l1 Σ_j w_ij        (what is not needed gets exactly no weight, is taken out, and the rest is fitted again), or
-    s ((θ - m) / σ)²   (a prior of mean m and standard deviation σ, s times as strong).
+    l1 Σ_j w_ij        (operators that are not needed get exactly no weight and are taken out; the rest is fitted again)
+    s ((θ - m) / σ)²   (or a prior of mean m and standard deviation σ, s times as strong).
 
-Every fit is judged by its free-run simulation of a validation recording, which none of them has seen; recommended is
-the strongest regularization whose validation error is within a margin of the smallest. No test recording comes in.
-Penalised estimates are biased towards zero, hence the second fit (relaxed lasso, Meinshausen 2007). It is done with the
-operators that are left, and with as many spread in several ways over the density that the first fit has found, which
-holds their weights; validation chooses here too.
+Every fit is judged by its free-run simulation of a validation recording, which none of them has seen. Recommended is
+the strongest regularization whose validation error is within a margin of the smallest; no test recording is used.
+Penalised estimates are biased towards zero, hence the second fit (relaxed lasso, Meinshausen 2007). It is made with the
+operators that are left, and with as many spread in several ways over the density of the first fit, which holds their
+weights; validation chooses between them too.
 """
 
 from __future__ import annotations
@@ -26,12 +26,14 @@ from ..models import LAYER, PILFR, PrandtlIshlinskii
 from ..optimise import Status
 from .context import context_of_fit
 from .fitting import fit as identify
-from .multistart import POLISH, StartSearch, hold_near_density, polish
-from .result import PRIOR, Candidate, Fit
-from .start import is_density, regrid
+from .multistart import DEFAULT_SOLVER, StartSearch, hold_near_density, polish, regrid
+from .result import DENSITY_PRIOR, Candidate, Fit
 
 FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # of priors
 STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of L1, in units of the objective that is reached without
+# (beyond, spacing) of `regrid`, by which operators are spread
+SPREADINGS = tuple((beyond, spacing) for beyond in (1.0, 1.15, 1.3) for spacing in (0.25, 0.4))
+SPREAD = 0.02  # relative deviation of the prior on weights that are spread over a density
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,15 +45,15 @@ class RegularizationPath:
     strengths : tuple of float
         Weakest first; 0 is the fit without.
     fits : tuple of Fit
-        One a strength.
+        One for each strength.
     operators : tuple of int
-        Operators that each of them has.
+        Number of operators of each fit.
     train, validation : tuple of float
-        Their NRMSE (Eq. 27) on both.
+        NRMSE (Eq. 27) of each fit.
     recommended : int
         Index of the strongest regularization whose validation error is within `margin` of the smallest.
     margin : float
-        That margin, as a share.
+        Share of the smallest validation error.
     """
 
     strengths: tuple[float, ...]
@@ -64,7 +66,7 @@ class RegularizationPath:
 
     @property
     def fit(self) -> Fit:
-        """The fit that is recommended."""
+        """The recommended fit."""
         return self.fits[self.recommended]
 
     def __repr__(self) -> str:
@@ -77,7 +79,7 @@ class RegularizationPath:
 
 
 def operators_used(fit: Fit) -> int:
-    """Operators of some weight, over all channels; 0 without an element of operators."""
+    """Count the operators of some weight, over all channels; 0 without an element of operators."""
     return int(np.sum(fit.parameters["w"] > 0)) if "w" in fit.parameters else 0
 
 
@@ -87,17 +89,17 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     Parameters
     ----------
     fit : Fit
-        Of a PI-LFR with a Prandtl-Ishlinskii element, usually with an L1 penalty on `w`.
+        A fit of a PI-LFR with a Prandtl-Ishlinskii element, usually with an L1 penalty on `w`.
     train : Recording or sequence of Recording
-        What it was fitted to.
+        Training data of the fit.
     options
-        As for `fit`: `solver`, `engine`, and `stable`, `constraints`, `noise`, `weights`, which are as the fit has them
-        where they are left out.
+        As for `fit`: `solver`, `engine`, `stable`, `constraints`, `noise`, `weights`; the last four are those of the
+        fit by default.
 
     Returns
     -------
     Fit
-        With as many operators a channel as the fullest channel needs, at least one.
+        Each channel has as many operators as the fullest channel needs, at least one.
 
     Raises
     ------
@@ -111,7 +113,7 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
         )
     element, weights = structure.element, fit.parameters["w"]
     n = max(1, int(np.max(np.sum(weights > 0, axis=1))))
-    # the operators that stay, a row of indices a channel in their order; those without weight come last
+    # indices of the operators that stay, one row for each channel
     kept = np.sort(np.argsort(weights <= 0, axis=1, kind="stable")[:, :n], axis=1)
     full = weights.shape
 
@@ -141,13 +143,10 @@ def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
 
 
 def polish_fit(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = None, **options: Any) -> Fit:
-    """A fit with its thresholds placed anew, as the search does with its best starts, where that is no worse.
-
-    The weights are then held near a smooth density by a weak prior (`multistart.polish`).
-    """
-    structure, context = fit.structure, context_of_fit(fit, train, solver=solver or POLISH, **options)
+    """Place a fit's thresholds anew as the search does with its best starts (`polish`), unless that is worse."""
+    structure, context = fit.structure, context_of_fit(fit, train, solver=solver or DEFAULT_SOLVER, **options)
     assert structure is not None
-    search = StartSearch.of(context, structure, {}, level=float(np.mean(fit.train_nrmse)))
+    search = StartSearch(context, structure, {}, level=float(np.mean(fit.train_nrmse)))
     problem = search.problem(fit.model)
     states = [fit.initial_state(r) for r in context.recordings if r.begins == "estimate"]
     theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
@@ -179,9 +178,9 @@ def regularization_path(
     fit : Fit
         The fit without regularization, of a PI-LFR; every fit of the path begins there.
     train : Recording or sequence of Recording
-        What it was fitted to.
+        Training data of the fit.
     validation : Recording or sequence of Recording
-        What is judged on: no training recording, and none that is to be a test afterwards.
+        Data that choose the strength: no training recording, and none that is to be a test afterwards.
     strengths : sequence of float
         L1 weights on `w` (default: 1 to 1000 times the objective of the fit), or with `priors` factors on their
         weight (default: 0.01 to 100).
@@ -192,8 +191,7 @@ def regularization_path(
     progress : callable
         Gets ("path", done, total, smallest validation error so far).
     options
-        As for `fit`: `solver`, `engine`, and `stable`, `constraints`, `noise`, `weights`, which are as the fit has them
-        where they are left out.
+        As for `prune`.
 
     Returns
     -------
@@ -210,14 +208,14 @@ def regularization_path(
     thin: dict[int, tuple[Fit, ...]] = {}
     for i, strength in enumerate(given):
         if priors is None:
-            found = _sparser(fit, seen, judged, strength, thin, options)
+            found = _sparser_fit(fit, seen, judged, strength, thin, options)
         else:
             scaled = {k: (m, np.asarray(s, dtype=float) / np.sqrt(strength)) for k, (m, s) in priors.items()}
             held = replace(structure, priors={**structure.priors, **scaled})
             model = fit.model.with_parameters(
                 fit.model.parameters.change(**{k: {"prior": held.priors[k]} for k in scaled})
             )
-            found = _whole(identify(replace(fit, structure=held, model=model), seen, **options))
+            found = _uninterrupted(identify(replace(fit, structure=held, model=model), seen, **options))
         fits.append(found)
         errors.append(found.nrmse(judged))
         if progress:
@@ -238,7 +236,7 @@ def regularization_path(
 def _checked(
     fit: Any, train: Any, validation: Any, sparse: bool
 ) -> tuple[PILFR, tuple[Recording, ...], tuple[Recording, ...]]:
-    """Structure, training and validation recordings of a path, which for a sparse one needs operators."""
+    """Return the structure and the recordings of a path; a sparse path needs operators."""
     if not isinstance(fit, Fit):
         raise InputError(f"A regularization path was asked for of a {type(fit).__name__}; give a Fit.")
     structure, seen, judged = fit.structure, as_recordings(train), as_recordings(validation)
@@ -250,7 +248,7 @@ def _checked(
 
 
 def _strengths(unit: float | None, strengths: Any, margin: Any) -> list[float]:
-    """Strengths in ascending order: those given, else those of a penalty in units of an objective, else of priors."""
+    """Sort the given or the usual strengths; penalties are in units of the objective `unit`, priors have none."""
     usual = FACTORS if unit is None else [unit * s for s in STRENGTHS]
     asked: Any = usual if strengths is None else strengths
     listed = isinstance(asked, Sequence | np.ndarray) and all(is_number(s) and 0 < s < np.inf for s in asked)
@@ -262,7 +260,7 @@ def _strengths(unit: float | None, strengths: Any, margin: Any) -> list[float]:
     return sorted({float(s) for s in asked})
 
 
-def _sparser(
+def _sparser_fit(
     fit: Fit,
     seen: tuple[Recording, ...],
     judged: tuple[Recording, ...],
@@ -270,34 +268,28 @@ def _sparser(
     thin: dict[int, tuple[Fit, ...]],
     options: Mapping[str, Any],
 ) -> Fit:
-    """The better on validation of what a penalty leaves and of as many operators spread anew (kept in `thin`)."""
-    pruned = _whole(prune(_whole(identify(fit, seen, l1={"w": strength}, **options)), seen, **options))
+    """Return the best on validation: the operators that a penalty leaves, or as many spread anew (kept in `thin`)."""
+    pruned = _uninterrupted(prune(_uninterrupted(identify(fit, seen, l1={"w": strength}, **options)), seen, **options))
     n = max(1, pruned.structure.element.n)  # type: ignore[union-attr]
     if n not in thin:
-        thin[n] = tuple(_whole(f) for f in thin_operators(fit, seen, n, **options))
+        thin[n] = tuple(_uninterrupted(f) for f in thin_operators(fit, seen, n, **options))
     return min((pruned, *thin[n]), key=lambda f: _error(f, judged))
 
 
-def _whole(fit: Fit) -> Fit:
-    """The fit, which was not interrupted; else the interrupt goes on."""
+def _uninterrupted(fit: Fit) -> Fit:
+    """Return the fit; if it was interrupted, raise the interrupt again."""
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return fit
 
 
-WAYS = tuple(
-    (beyond, spacing) for beyond in (1.0, 1.15, 1.3) for spacing in (0.25, 0.4)
-)  # to spread operators, `regrid`
-SPREAD = 0.02  # relative deviation of the prior on weights that are spread over a density
-
-
 def thin_operators(
     fit: Fit, train: Recording | Sequence[Recording], n: int, *, solver: Any = None, **options: Any
 ) -> tuple[Fit, ...]:
-    """Fits with n operators a channel, spread in several ways over the density of weights that a fit had.
+    """Fit with n operators a channel, spread in several ways over the density of a fit's weights.
 
-    What the fit was asked with holds, where nothing else is given (`context.following`).
-    None where weights or thresholds are fixed, bounded or have a prior.
+    The options of the fit hold unless others are given. There are no fits where weights or thresholds are fixed,
+    bounded or have a prior.
     """
     structure, recordings = fit.structure, as_recordings(train)
     bound = structure is None or set(LAYER) & {*structure.fixed, *structure.bounds, *structure.priors}
@@ -309,12 +301,12 @@ def thin_operators(
     states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
     states = [np.concatenate([s[: old.n_x], np.zeros(n * structure.element.channels)]) for s in states]
     found: list[Fit] = []
-    for beyond, spacing in WAYS:
-        context = context_of_fit(replace(fit, structure=smaller), recordings, solver=solver or POLISH, **options)
+    for beyond, spacing in SPREADINGS:
+        context = context_of_fit(
+            replace(fit, structure=smaller), recordings, solver=solver or DEFAULT_SOLVER, **options
+        )
         rows = [
             regrid(r, w, float(top), beyond=beyond, spacing=spacing, count=n)
-            if is_density(w) and top > 0
-            else (r[:n], w[:n])
             for r, w, top in zip(fit.parameters["r"], fit.parameters["w"], reach, strict=True)
         ]
         values = {**fit.parameters, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
@@ -324,7 +316,7 @@ def thin_operators(
         begin = np.concatenate([problem.start[: int(problem.free.sum())], *states])
         if not np.isfinite(problem.cost(begin)):
             continue
-        again = context.result(model, smaller, problem, context.solve(problem, "solve", begin), note=PRIOR)
+        again = context.result(model, smaller, problem, context.solve(problem, "solve", begin), note=DENSITY_PRIOR)
         found.append(replace(again, linear=fit.linear, linear_nrmse=fit.linear_nrmse))
         if again.status is Status.INTERRUPTED:
             break

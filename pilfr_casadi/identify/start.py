@@ -1,16 +1,24 @@
-r"""Start values of a PI-LFR's element, given a linear approximation.
+r"""Start values of a PI-LFR: a linear model first, then the element in it.
 
-`paper_start` is Krikelis et al. (2024), Eq. 22-24. `grid_start` spreads the thresholds over the range that z visits
+**Linear model** (`linear_model`; Krikelis et al. 2024, Sec. 5.3): subspace identification refined by output error,
+least squares as in Eq. 20 without an element. The bound on the spectral radius is added after a solve without it: an
+integrator ends on the bound, which would otherwise obstruct its way there.
+
+Identification finds the linear blocks up to a change of the states' basis, `x = T x'`. Where a structure fixes entries
+of `A`, `B_u` or `C_y` (physical sub-matrices), `find_nearest_basis` chooses the basis in which these entries come
+nearest to the known values,
+
+    minimise over T   Σ_known (T⁻¹ A T - A_k)² + (T⁻¹ B_u - B_k)² + (C_y T - C_k)²     (each over its block's size),
+
+from several start bases, and the linear model is fitted again with the entries at their values.
+
+**Element.** `paper_start` is Krikelis et al. (2024), Eq. 22-24. `grid_start` spreads the thresholds over the range of z
 instead of drawing them from `U(0, R)`, because idle or identical thresholds hardly separate again; z is a random
-direction, or the linear model's output or input. `regrid` smooths the density of fitted weights and places the
-thresholds anew, each for an equal share of `density^0.4` (knots of a good piecewise-linear approximation of the loading
-curve); it continues the density's tail beyond the visited range, where the data say nothing. `network_start` is for
-elements without memory.
-
-`envelope_start` starts generalized plays. Between its envelopes such a play keeps its value (Krikelis et al. 2024, Eq.
-7), so the values `v` seen at one `z` fill the interval from the lower to the upper envelope: the outline of the cloud
-`(z, v)` estimates both. The answer `v` is the output where the output is read through the element. Where the input
-passes the element, `v` is the input with which the linear model would have given the measured output,
+direction, or the linear model's output or input. `network_start` is for elements without memory. `envelope_start` is
+for generalized plays. Between its envelopes such a play keeps its value (Eq. 7), so the values `v` seen at one `z` fill
+the interval from the lower to the upper envelope: the outline of the cloud `(z, v)` estimates both. The answer `v` is
+the output where the output is read through the element. Where the input passes the element, `v` is the input with which
+the linear model would have given the measured output,
 
     V = U + G^H (G G^H + λ I)⁻¹ (Y - G U),
 
@@ -22,16 +30,27 @@ that begin as straight lines (or, as in Sec. 5.3, at random) rarely bend to thos
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from .._base import InputError, Progress
 from ..data import Recording
-from ..linear import resolvent
+from ..linear import (
+    FrequencyProblem,
+    in_modal_coordinates,
+    is_modal,
+    propagate,
+    resolvent,
+    robust_bla,
+    subspace_matrices,
+)
 from ..models import (
     PILFR,
     Element,
     GeneralizedPlay,
+    Model,
     PrandtlIshlinskii,
     StaticNetwork,
     direction_fixed,
@@ -41,18 +60,190 @@ from ..models import (
     neurons_over,
     or_one,
     read_through,
-    weight_density,
 )
+from ..optimise import Constraint, GaussNewton, Problem, Solution, Status, stability_limits
+from .context import FitContext, report_iterations
+from .result import with_solution
 
+Array = np.ndarray
 Blocks = dict[str, np.ndarray]
+Values = Mapping[str, np.ndarray]
+Signals = list[np.ndarray]  # one array (M, channels) for each recording
+BLA_OPTION = "bla"  # value of `linear` that asks for the best linear approximation
 LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
-# deviation of the signals of neurons of slope one at the start: of 1, 0.3, 0.1 and 0.03 the one of the least training
-# error over two records of the two-mass rig and two sizes; no test had a part in it
+COORDINATES = ("A", "B_u", "C_y")  # blocks that depend on the basis of the states
+BASES = 30  # start bases of the search for the nearest one
+# Deviation of the signals of neurons of slope one at the start. Of 1, 0.3, 0.1 and 0.03 it gave the smallest training
+# error over two records of the two-mass rig and two sizes; no test recording was used.
 FLAT = 0.1
+BINS = 40  # of z, for the outline of a loop
+INSIDE = 0.03  # share of the samples at one z that an envelope leaves outside
+DAMPING = 0.05  # of the inverse of the linear model, in units of its largest gain
+LEAST = 0.01  # least share of the curve's height for each neuron, so that none begins without a slope
 
 
-def simulate_states(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarray:
-    """States (M, nx) of the linear part driven by u (M, n_u), from zero."""
+def linear_model(
+    recordings: Sequence[Recording],
+    structure: PILFR,
+    *,
+    engine: str = "auto",
+    constraints: tuple[Constraint, ...] = (),
+    progress: Progress | None = None,
+    given: Any = None,
+) -> tuple[Model, Problem, Solution]:
+    """Fit a linear state-space model: subspace identification refined by output error, or the model `given`.
+
+    The structure gives the order, whether there is an offset, and whether `A` is in modal coordinates; its element and
+    its other fixed blocks are ignored. In the search for an element a model `given` stays as it is: at the minimum of
+    the linear error the slope of half of the parameters has vanished, and starts get stuck.
+    """
+    model = _linear_start(recordings, structure, given, progress)
+    problem = Problem(model, recordings, engine=engine, constraints=constraints)
+    if given is not None and structure.element is not None:
+        cost = problem.cost(problem.start)
+        status = Status.CONVERGED if np.isfinite(cost) else Status.DIVERGED_START
+        return model, problem, Solution(problem.start, cost, status, 0, 0.0)
+    solution = _refine(problem, progress)
+    if progress and solution.status is not Status.INTERRUPTED:
+        progress("linear model", 1, 1, float(np.mean(problem.nrmse(solution.theta))))
+    return model, problem, solution
+
+
+def _refine(problem: Problem, progress: Progress | None) -> Solution:
+    """Minimise the output error, first without the constraints."""
+    solver = GaussNewton(tolerance=1e-4)
+    report = report_iterations(progress, "linear model", solver.max_iterations)
+    if not problem.constraints:
+        return solver.solve(problem, progress=report)
+    free = Problem(problem.model, problem.recordings, engine=problem.engine)
+    found = [solver.solve(free, progress=report)]
+    if found[0].status is not Status.INTERRUPTED:
+        found[0] = solver.solve(problem, found[0].theta, report)
+    limits = problem.active_constraints(found[0].theta)
+    if found[0].status is not Status.INTERRUPTED and np.any(limits):
+        found.append(solver.solve(problem, progress=report))
+    return min(found, key=lambda s: (s.status is Status.INFEASIBLE, s.cost))
+
+
+def _linear_start(recordings: Sequence[Recording], structure: PILFR, given: Any, progress: Progress | None) -> Model:
+    """Make the linear model before it is refined."""
+    first = recordings[0]
+    if given is None:
+        # the subspace's relative error is no NRMSE
+        report = progress and (lambda stage, done, total, _: progress(stage, done, total, np.nan))
+        a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset, progress=report)
+    elif isinstance(given, str) and given == BLA_OPTION:
+        a, b, c, d = best_linear_matrices(recordings, structure.nx)
+    else:
+        a, b, c, d = state_space_matrices(given, structure.nx, first)
+    offset = _offset(recordings, a, b, c, d) if structure.offset else np.zeros(first.n_y)
+    blocks, form = {"A": a, "B_u": b, "C_y": c, "D_yu": d, "y_0": offset}, structure.linear()
+    if is_modal(structure.fixed, structure.nx):
+        blocks, form = in_modal_coordinates(blocks, tuple(recordings)), replace(form, fixed={"A": structure.fixed["A"]})
+    return form.model(first.n_u, first.n_y, blocks, inputs=first.inputs, outputs=first.outputs)
+
+
+def best_linear_matrices(recordings: Sequence[Recording], nx: int) -> tuple[Array, Array, Array, Array]:
+    """Estimate the best linear approximation from periodic recordings; of order 0, the static gain about the means."""
+    for r in recordings:
+        if r.period is None:
+            raise InputError(
+                f"linear = 'bla' was given, and the period of {r.label} is not known; give periodic recordings with "
+                "their period in samples, or leave it out."
+            )
+    if nx == 0:
+        return subspace_matrices(recordings, nx, offset=True)
+    model = FrequencyProblem(robust_bla(recordings), True).solve([nx], None)[0]
+    return model.A, model.B, model.C, model.D
+
+
+def state_space_matrices(given: Any, nx: int, recording: Recording) -> tuple[Array, Array, Array, Array]:
+    """Return the matrices of a `control.StateSpace`, which must have the recording's sizes and step."""
+    if not all(hasattr(given, name) for name in ("A", "B", "C", "D", "dt")):
+        raise InputError(f"A {type(given).__name__} was given as linear model; give a control.StateSpace or 'bla'.")
+    a, b, c, d = (np.asarray(getattr(given, name), dtype=float) for name in "ABCD")
+    found, wanted = (len(a), b.shape[1], len(c)), (nx, recording.n_u, recording.n_y)
+    if found != wanted:
+        raise InputError(
+            f"The linear model given has {found[0]} states, {found[1]} inputs and {found[2]} outputs; "
+            f"expected {wanted[0]}, {wanted[1]} and {wanted[2]}."
+        )
+    if given.dt not in (None, True) and not np.isclose(float(given.dt), recording.dt, rtol=1e-4):
+        raise InputError(
+            f"The linear model's step is {given.dt} s, the recording's {recording.dt:g} s; sample it anew."
+        )
+    return a, b, c, d
+
+
+def _offset(recordings: Sequence[Recording], a: Array, b: Array, c: Array, d: Array) -> Array:
+    """Average the outputs' error (n_y,) of a linear model from rest."""
+    left = []
+    for r in recordings:
+        states = propagate(a.T, (r.u @ b.T)[None], np.zeros((1, len(a))))[0][0] if len(a) else np.zeros((len(r), 0))
+        left.append((r.y - states @ c.T - r.u @ d.T)[r.skip :])
+    return np.asarray(np.mean(np.concatenate(left), axis=0))
+
+
+def known_entries(structure: PILFR) -> Blocks:
+    """Return the fixed blocks that depend on the basis of the states (nan: free), without those fixed at zero."""
+    return {k: np.asarray(v) for k, v in structure.fixed.items() if k in COORDINATES and np.any(np.asarray(v) != 0)}
+
+
+def transform_to_known_basis(structure: PILFR, linear: Model, context: FitContext) -> Model:
+    """Fit the linear model again in the basis of the structure's known entries; without any, return it as it is."""
+    known = known_entries(structure)
+    if not known or not structure.nx or (set(known) == {"A"} and is_modal(known, structure.nx)):
+        return linear  # which is in modal coordinates already
+    blocks = {k: p.value for k, p in linear.parameters.items()}
+    spread = np.sqrt(np.mean(simulate_states(blocks, np.concatenate([r.u for r in context.recordings])) ** 2, axis=0))
+    blocks = find_nearest_basis(change_basis(blocks, np.diag(or_one(spread))), known)
+    alone = replace(structure.linear(), fixed=known)
+    model = alone.model(linear.n_u, linear.n_y, blocks, inputs=linear.inputs, outputs=linear.outputs)
+    problem = replace(context, constraints=stability_limits(structure, context.options.stable)[:1]).problem(model)
+    if not np.isfinite(problem.cost(problem.start)):
+        return model
+    return with_solution(model, problem, context.solve(problem, "linear model"))
+
+
+def change_basis(blocks: Values, t: Array) -> Blocks:
+    """Return the blocks with `x = T x'`."""
+    back = np.linalg.inv(t)
+    return {**blocks, "A": back @ blocks["A"] @ t, "B_u": back @ blocks["B_u"], "C_y": blocks["C_y"] @ t}
+
+
+def find_nearest_basis(blocks: Blocks, known: Values, seed: int = 0) -> Blocks:
+    """Return the blocks in the basis in which they come nearest to the `known` entries (nan: unknown)."""
+    from scipy.optimize import least_squares
+
+    n = len(blocks["A"])
+    want = {k: np.broadcast_to(np.asarray(v, dtype=float), blocks[k].shape) for k, v in known.items()}
+    size = {k: max(float(np.sqrt(np.nanmean(v**2))), 1e-12) for k, v in want.items()}
+
+    def left(flat: Array) -> Array:
+        t = flat.reshape(n, n)
+        if not np.linalg.cond(t) < 1e10:
+            return np.full(sum(int(np.sum(~np.isnan(v))) for v in want.values()), 1e6)
+        found = change_basis(blocks, t)
+        return np.concatenate([((found[k] - v) / size[k])[~np.isnan(v)] for k, v in want.items()])
+
+    rng, best, least = np.random.default_rng(seed), np.eye(n), np.inf
+    for k in range(BASES):
+        t = np.eye(n) if k == 0 else rng.standard_normal((n, n))
+        for name, side in (("B_u", 1), ("C_y", -1)):  # the known size of inputs and outputs tells the states' scale
+            if name in want:
+                norm = float(np.linalg.norm(change_basis(blocks, t)[name]))
+                t = t * (norm / (size[name] * np.sqrt(want[name].size))) ** side if norm > 0 else t
+                break
+        result: Any = least_squares(left, t.ravel(), x_scale="jac", max_nfev=200)
+        if result.cost < least and np.linalg.cond(result.x.reshape(n, n)) < 1e8:
+            best, least = result.x.reshape(n, n), float(result.cost)
+        if least < 1e-10:
+            break
+    return change_basis(blocks, best)
+
+
+def simulate_states(blocks: Values, u: Array) -> Array:
+    """Simulate the states (M, nx) of the linear part driven by u (M, n_u), from zero."""
     a, b = blocks["A"], u @ blocks["B_u"].T
     out, x = np.empty((len(u), len(a))), np.zeros(len(a))
     for k in range(len(u)):
@@ -61,79 +252,54 @@ def simulate_states(blocks: Mapping[str, np.ndarray], u: np.ndarray) -> np.ndarr
     return out
 
 
-def unit_states(
-    blocks: Mapping[str, np.ndarray], inputs: list[np.ndarray], free: bool = True
-) -> tuple[Blocks, list[np.ndarray]]:
-    """Scale each state to unit variance (Sec. 5.3), if free; returns the blocks, and the states of each recording."""
+def unit_states(blocks: Values, inputs: Signals, free: bool = True) -> tuple[Blocks, Signals]:
+    """Scale each state to unit variance (Sec. 5.3), if free; return the blocks, and the states of each recording."""
     states = [simulate_states(blocks, u) for u in inputs]
     if not free:
         return dict(blocks), states
-    spread = np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0))
-    spread = np.where(spread > 0, spread, 1.0)
-    scaled = dict(blocks)
-    scaled["A"] = blocks["A"] * spread / spread[:, None]
-    scaled["B_u"] = blocks["B_u"] / spread[:, None]
-    scaled["C_y"] = blocks["C_y"] * spread
-    return scaled, [x / spread for x in states]
+    spread = or_one(np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0)))
+    scaled = {"A": blocks["A"] * spread / spread[:, None], "B_u": blocks["B_u"] / spread[:, None]}
+    return {**blocks, **scaled, "C_y": blocks["C_y"] * spread}, [x / spread for x in states]
 
 
 def paper_start(
-    structure: PILFR,
-    linear: Mapping[str, np.ndarray],
-    inputs: list[np.ndarray],
-    states: list[np.ndarray],
-    rng: np.random.Generator,
-    spread: float = 0.1,
+    structure: PILFR, linear: Values, inputs: Signals, states: Signals, rng: np.random.Generator, spread: float = 0.1
 ) -> Blocks:
-    """Start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)`, R = `spread`, `B_w = D_yw = 0`.
+    """Draw the start of Eq. 22-24: `C_z, D_zu ~ U(-1, 1)`, `w ~ U(0, 1/N)`, `r ~ U(0, R)`, `B_w = D_yw = 0`.
 
-    Where the structure leaves no direction of z to draw, thresholds are in units of z's deviation: z then has the units
-    of an input or output, in which all of them could lie beyond it. Where the output is read through the element alone
-    (Wiener), z is the linear model's output: against any other the weights, which are not negative, fall to zero, where
-    nothing else has a slope.
+    R is `spread`. Where the structure leaves no direction of z to draw, thresholds are in units of z's deviation: z
+    then has the units of an input or output, in which all of them could lie beyond it. For a Wiener model z is the
+    linear model's output: with any other z the weights, which are not negative, fall to zero, where nothing else has a
+    slope.
     """
     element = _layer(structure)
     shape = (element.channels, element.n)
     blocks = _directions(element, linear, rng)
     blocks["w"], blocks["r"] = rng.uniform(0, 1 / element.n, shape), rng.uniform(0, spread, shape)
     if direction_fixed(structure):
-        blocks |= _between(structure, linear, blocks)
+        blocks |= _fixed_blocks(structure, linear, blocks)
         blocks["r"] *= or_one(np.std(_signal(inputs, states, blocks), axis=0))[:, None]
     return blocks
 
 
-def _directions(element: Element, linear: Mapping[str, np.ndarray], rng: np.random.Generator) -> Blocks:
-    """The linear blocks with a random direction of z, Eq. 22 and 23."""
-    blocks = {name: linear[name] for name in LINEAR}
-    for name, of in (("C_z", 0), ("D_zu", 1)):
-        blocks[name] = rng.uniform(-1, 1, (element.channels, linear["B_u"].shape[of]))
-    return blocks
-
-
 def grid_start(
-    structure: PILFR,
-    linear: Mapping[str, np.ndarray],
-    inputs: list[np.ndarray],
-    states: list[np.ndarray],
-    rng: np.random.Generator,
-    place: str = "random",
+    structure: PILFR, linear: Values, inputs: Signals, states: Signals, rng: np.random.Generator, place: str = "random"
 ) -> Blocks:
-    """A direction of z of unit deviation, thresholds on a grid over its range, equal weights.
+    """Choose a direction of z of unit deviation, thresholds on a grid over its range, and equal weights.
 
-    Places of the element, of which the last two stand for the commonest structures (backlash or friction in what drives
-    a linear system, or in what it drives):
+    Places of the element; the last two stand for the commonest structures, backlash or friction in the actuator or in
+    the sensor of a linear system:
 
     - "random": a random direction in states and inputs, each in units of its deviation; `B_w = D_yw = 0`; where the
       structure leaves no direction to draw, random thresholds in place of the grid;
     - "output": z is the linear model's output, half of which is read through the element;
     - "input": z is the input, half of which reaches the linear model through the element.
 
-    Where `structure` fixes blocks such that the input reaches the dynamics only through the element (Hammerstein), or
-    the output is read only through it (Wiener), the linear blocks move to the other side of the element. Where it fixes
-    others, "output" and "input" give the direction of z alone.
+    For Hammerstein and Wiener structures the linear blocks move to the other side of the element. With other fixed
+    blocks, "output" and "input" give the direction of z alone.
     """
     element = _layer(structure)
-    blocks, z = _placed(structure, element, linear, inputs, states, rng, place)
+    blocks, z = _place_element(structure, element, linear, inputs, states, rng, place)
     widest = np.max(np.abs(z), axis=0)
     grid = np.tile(np.arange(element.n) / element.n, (element.channels, 1))
     if place == "random" and direction_fixed(structure):
@@ -144,36 +310,44 @@ def grid_start(
 
 
 def network_start(
-    structure: PILFR,
-    linear: Mapping[str, np.ndarray],
-    inputs: list[np.ndarray],
-    states: list[np.ndarray],
-    rng: np.random.Generator,
+    structure: PILFR, linear: Values, inputs: Signals, states: Signals, rng: np.random.Generator
 ) -> Blocks:
-    """Random directions of z of unit deviation, neurons that bend somewhere in its range, `B_w = D_yw = 0`.
+    """Draw directions of z of unit deviation and neurons that bend in its range; `B_w = D_yw = 0`.
 
-    As in Schoukens (2021), the network does nothing at first: the model begins as the linear one. Where slopes are held
-    at one, z has the deviation `FLAT`: neurons that are nearly linear at first end in better minima.
+    As in Schoukens (2021), the network does nothing at first: the model begins as the linear one. Where slopes are
+    fixed at one, z has the deviation `FLAT`: neurons that are nearly linear at first end in better minima.
     """
     element = structure.element
-    if not isinstance(element, StaticNetwork):
-        raise TypeError("these start values are made for a static network")
-    blocks, z = _placed(structure, element, linear, inputs, states, rng, "random")
+    assert isinstance(element, StaticNetwork)
+    blocks, z = _place_element(structure, element, linear, inputs, states, rng, "random")
     if "slope" in structure.fixed and not {"C_z", "D_zu"} & set(structure.fixed):
         blocks, z = blocks | {k: FLAT * blocks[k] for k in ("C_z", "D_zu")}, FLAT * z
     return blocks | neurons_over(structure, element, z, rng)
 
 
-def _placed(
+def _layer(structure: PILFR) -> PrandtlIshlinskii:
+    assert isinstance(structure.element, PrandtlIshlinskii)
+    return structure.element
+
+
+def _directions(element: Element, linear: Values, rng: np.random.Generator) -> Blocks:
+    """Add a random direction of z to the linear blocks, Eq. 22 and 23."""
+    blocks = {name: linear[name] for name in LINEAR}
+    for name, of in (("C_z", 0), ("D_zu", 1)):
+        blocks[name] = rng.uniform(-1, 1, (element.channels, linear["B_u"].shape[of]))
+    return blocks
+
+
+def _place_element(
     structure: PILFR,
     element: Element,
-    linear: Mapping[str, np.ndarray],
-    inputs: list[np.ndarray],
-    states: list[np.ndarray],
+    linear: Values,
+    inputs: Signals,
+    states: Signals,
     rng: np.random.Generator,
     place: str,
-) -> tuple[Blocks, np.ndarray]:
-    """The linear blocks with the element at its place (see `grid_start`), and the signal z (M, channels)."""
+) -> tuple[Blocks, Array]:
+    """Return the linear blocks with the element at its place (see `grid_start`), and the signal z (M, channels)."""
     blocks = _directions(element, linear, rng)
     fixed, n_u = fixed_whole(structure), linear["B_u"].shape[1]
     blocks["D_zu"] = blocks["D_zu"] / or_one(np.std(np.concatenate(inputs), axis=0))
@@ -184,200 +358,76 @@ def _placed(
         blocks["C_z"], blocks["D_zu"] = np.zeros_like(blocks["C_z"]), np.eye(n_u)[at_input]
     if driven_through(structure):
         blocks["B_w"], blocks["D_yw"] = linear["B_u"], linear["D_yu"]
-    blocks |= _between(structure, linear, blocks)
+    blocks |= _fixed_blocks(structure, linear, blocks)
     z = _signal(inputs, states, blocks)
     size = or_one(np.std(z, axis=0))
     if all(is_zero(structure, k) for k in ("C_z", "D_zu", "D_yw") if k in fixed):
         blocks["C_z"], blocks["D_zu"], z = blocks["C_z"] / size[:, None], blocks["D_zu"] / size[:, None], z / size
     if place != "random" and not {*blocks, "w", "r"} & set(fixed) and not {"B_w", "D_yw"} & set(structure.fixed):
-        blocks |= _halved(linear, size, at_output if place == "output" else at_input, place == "output")
+        blocks |= _split_path(linear, size, at_output if place == "output" else at_input, place == "output")
     return blocks, z
 
 
-def _signal(inputs: list[np.ndarray], states: list[np.ndarray], blocks: Blocks) -> np.ndarray:
-    """The signal z (M, channels) of all recordings."""
+def _signal(inputs: Signals, states: Signals, blocks: Values) -> Array:
+    """Compute the signal z (M, channels) of all recordings."""
     return np.concatenate(states) @ blocks["C_z"].T + np.concatenate(inputs) @ blocks["D_zu"].T
 
 
-def _between(structure: PILFR, linear: Mapping[str, np.ndarray], blocks: Blocks) -> Blocks:
-    """Blocks that the structure dictates: those fixed, and for a Wiener model z = the linear model's output."""
+def _fixed_blocks(structure: PILFR, linear: Values, blocks: Blocks) -> Blocks:
+    """Return the blocks that the structure fixes, and for a Wiener model z = the linear model's output."""
     out = {"C_z": linear["C_y"], "D_zu": linear["D_yu"]} if read_through(structure) else {}
     held = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_whole(structure) if k in blocks}
     return out | {k: np.broadcast_to(v, blocks[k].shape) for k, v in held.items()}
 
 
-def _halved(linear: Mapping[str, np.ndarray], size: np.ndarray, at: np.ndarray, output: bool) -> Blocks:
+def _split_path(linear: Values, size: Array, at: Array, output: bool) -> Blocks:
     """Split the path of output or input `at[i]` in two: half direct, half through channel i of the element."""
-    b, c, d = linear["B_u"], linear["C_y"], linear["D_yu"]
-    through = np.zeros((len(at), len(c) if output else b.shape[1]))
+    through = np.zeros((len(at), len(linear["C_y"]) if output else linear["B_u"].shape[1]))
     through[np.arange(len(at)), at] = size
     carried = np.count_nonzero(through, axis=0)
     through *= 0.5 / np.maximum(carried, 1)
-    left = np.where(carried > 0, 0.5, 1.0)
-    if output:
-        return {"D_yw": through.T, "C_y": c * left[:, None], "D_yu": d * left[:, None]}
-    return {"B_w": b @ through.T, "D_yw": d @ through.T, "B_u": b * left, "D_yu": d * left}
+    return _route(linear, through.T, np.where(carried > 0, 0.5, 1.0), not output)
 
 
-def _layer(structure: PILFR) -> PrandtlIshlinskii:
-    element = structure.element
-    if not isinstance(element, PrandtlIshlinskii):
-        raise TypeError("start values are made for a Prandtl-Ishlinskii element")
-    return element
-
-
-def is_density(w: np.ndarray) -> bool:
-    """Whether weights (N,) are a density: whether any of them is above zero."""
-    return bool(np.sum(w) > 0)
-
-
-def regrid(
-    r: np.ndarray,
-    w: np.ndarray,
-    reach: float,
-    *,
-    beyond: float = 1.3,
-    smooth: float = 1 / 12,
-    count: int | None = None,
-    spacing: float = 0.4,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Thresholds and weights of one channel placed anew along the smoothed density.
-
-    Parameters
-    ----------
-    r, w : array, shape (N,)
-        Fitted thresholds and weights.
-    reach : float
-        Largest |z| visited.
-    beyond : float
-        How far the thresholds may reach, in units of `reach`; the tail is extrapolated log-linearly, never rising.
-    smooth : float
-        Kernel width in units of `reach`.
-    count : int, optional
-        How many there are to be, N by default.
-    spacing : float
-        There are as many thresholds to a length as this power of the density: 0 for an even grid.
-
-    Returns
-    -------
-    r, w : array, shape (N,) or (count,)
-        New thresholds (ascending) and the weights that the density gives them.
-    """
-    grid = np.linspace(0.0, beyond * reach, 600)
-    d = weight_density(r, w, grid, smooth * reach)
-    if d.max() <= 1e-200 * np.sum(w):  # all of them rest far beyond what is visited: evenly
-        d = np.full_like(grid, np.sum(w) / grid[-1])
-    tail = (grid >= 0.4 * reach) & (grid <= 0.85 * reach)
-    log_d = np.log(d + 1e-6 * d.max())
-    slope = min(float(np.polyfit(grid[tail], log_d[tail], 1)[0]), 0.0)
-    out = grid > 0.85 * reach
-    d[out] = np.exp(np.mean(log_d[tail]) + slope * (grid[out] - np.mean(grid[tail])))
-    share = _integral(d**spacing, grid)
-    edges = np.interp(np.linspace(0, 1, (count or len(r)) + 1), share / share[-1], grid)
-    mass = np.diff(np.interp(edges, grid, _integral(d, grid)))
-    moment = np.diff(np.interp(edges, grid, _integral(d * grid, grid)))
-    return moment / np.maximum(mass, 1e-300), mass
-
-
-def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return np.concatenate([[0.0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(x))])
-
-
-def regrid_channels(
-    structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3
-) -> dict[str, Any]:
-    """The values with every channel's thresholds and weights placed anew; z (M, n_w) is the fitted model's signal."""
-    reaches = [threshold_range(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
-    rows = [
-        regrid(r, w, most, beyond=beyond) if is_density(w) and most > 0 else (r, w)
-        for r, w, most in zip(values["r"], values["w"], reaches, strict=True)
-    ]
-    return {**values, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
-
-
-Array = np.ndarray
-BINS = 40
-INSIDE = 0.03  # share of the samples at one z that an envelope leaves outside
-DAMPING = 0.05  # of the inverse of the linear model, in units of its largest gain
-LEAST = 0.01  # share of the curve's height that each neuron has at least, so that none begins without a slope
-
-
-def has_networks(structure: PILFR) -> bool:
-    """Whether the element is a layer of generalized plays between networks."""
-    element = structure.element
-    operator = element.operator if isinstance(element, PrandtlIshlinskii) else None
-    return isinstance(operator, GeneralizedPlay) and operator.networks
-
-
-def threshold_range(structure: PILFR, values: Mapping[str, Array], z: Array, channel: int) -> float:
-    """The threshold at which a channel's operators would rest over z (M,): its size, or half of its envelopes'.
-
-    A generalized play rests when its lower curve `γ_l - r` is below its upper one `γ_r + r` at every two values of z.
-    """
-    if not has_networks(structure):
-        return float(np.max(np.abs(z)))
-    assert isinstance(structure.element, PrandtlIshlinskii)
-    operator, ends = structure.element.operator, np.array([np.max(z), np.min(z)])
-    low, high = (operator.envelope(side, end, values, channel) for side, end in zip("lr", ends, strict=True))
-    return max(float(low - high) / 2, 0.0)
+def _route(linear: Values, through: Array, left: Array, before: bool) -> Blocks:
+    """Route inputs (`before`) or outputs through the element by `through` (n, channels); `left` stays direct."""
+    b, c, d = linear["B_u"], linear["C_y"], linear["D_yu"]
+    if before:
+        return {"B_w": b @ through, "D_yw": d @ through, "B_u": b * left, "D_yu": d * left}
+    return {"D_yw": through, "C_y": c * left[:, None], "D_yu": d * left[:, None]}
 
 
 def envelope_start(
     structure: PILFR,
-    linear: Mapping[str, Array],
-    values: Mapping[str, Array],
+    linear: Values,
+    values: Values,
     recordings: Sequence[Recording],
     states: Sequence[Array],
     place: str,
 ) -> Blocks:
-    """Start values with envelopes, thresholds and weights from the loops of z and what the element should answer.
+    """Choose envelopes, thresholds and weights of a generalized play from the loops of z and its answer.
 
-    Parameters
-    ----------
-    structure : PILFR
-        With networks as envelopes.
-    linear : mapping
-        Blocks of the linear model.
-    values : mapping
-        Start values that say what z is, from `grid_start`.
-    recordings : sequence of Recording
-        What is to be fitted.
-    states : sequence of array, (M, nx)
-        The linear model's states over each recording.
-    place : {"input", "output", "random"}
-        Where the element acts; at "random" the output is read through it too.
-
-    Returns
-    -------
-    dict
-        `values` as they are where the structure fixes other blocks than those of a Hammerstein or Wiener model.
+    `values` (from `grid_start`) say what z is. They are returned as they are where the structure fixes other blocks
+    than those of a Hammerstein or Wiener model. At `place` "random" the output is read through the element too.
     """
-    element = structure.element
-    assert isinstance(element, PrandtlIshlinskii)
+    element = _layer(structure)
     fixed = set(structure.fixed) - {"y_0", "A"}
     before = {"B_u", "D_zu"} <= fixed or (not fixed and place == "input")
     if fixed and not before and not {"C_y", "D_yw"} <= fixed:
         return dict(values)
-    z = np.concatenate(
-        [(x @ values["C_z"].T + r.u @ values["D_zu"].T)[r.skip :] for r, x in zip(recordings, states, strict=True)]
-    )
-    found = dict(values)
-    channels = np.arange(element.channels)
-    n_u, n_y = linear["B_u"].shape[1], len(linear["C_y"])
-    at = channels % (n_u if before else n_y)
-    if before:
-        v = np.concatenate([deconvolve_inputs(linear, r, x)[r.skip :] for r, x in zip(recordings, states, strict=True)])
-    else:
-        v = np.concatenate([r.y[r.skip :] for r in recordings])
-    centre, size = np.mean(v, axis=0), np.std(v, axis=0)
-    size = np.where(size > 0, size, 1.0)
+    pairs = list(zip(recordings, states, strict=True))
+    z = np.concatenate([(x @ values["C_z"].T + r.u @ values["D_zu"].T)[r.skip :] for r, x in pairs])
+    v = np.concatenate([(deconvolve_inputs(linear, r, x) if before else r.y)[r.skip :] for r, x in pairs])
+    found, channels = dict(values), np.arange(element.channels)
+    at = channels % (linear["B_u"].shape[1] if before else len(linear["C_y"]))
+    centre, size = np.mean(v, axis=0), or_one(np.std(v, axis=0))
     if fixed:
         centre, size = np.zeros_like(centre), np.ones_like(size)
     else:
         through = np.zeros((len(size), element.channels))
         through[at, channels] = (size / np.maximum(np.bincount(at, minlength=len(size)), 1))[at]
         left = np.bincount(at, minlength=len(size)) == 0
-        found |= _through(linear, through, left, before)
+        found |= _route(linear, through, left, before)
         if not before:
             found["y_0"] = np.where(left, linear["y_0"], centre)
         else:
@@ -387,31 +437,22 @@ def envelope_start(
         if not fixed and z[:, i] @ target < 0:  # envelopes rise, so z has to rise with the answer
             z[:, i] *= -1
             found |= {name: np.where((channels == i)[:, None], -found[name], found[name]) for name in ("C_z", "D_zu")}
-        own = channel_start(element, z[:, i], target)
-        for name, row in own.items():
+        for name, row in channel_start(element, z[:, i], target).items():
             found[name] = np.array(found.get(name, np.zeros((element.channels, row.size))), dtype=float)
             found[name][i] = row
     return found
 
 
-def _through(linear: Mapping[str, Array], through: Array, left: Array, before: bool) -> Blocks:
-    """Linear blocks of which channel i carries whole inputs or outputs, `through` (n, channels); others `left`."""
-    b, c, d = linear["B_u"], linear["C_y"], linear["D_yu"]
-    if before:
-        return {"B_w": b @ through, "D_yw": d @ through, "B_u": b * left, "D_yu": d * left}
-    return {"D_yw": through, "C_y": c * left[:, None], "D_yu": d * left[:, None]}
-
-
-def _gain(linear: Mapping[str, Array]) -> Array:
-    """Static gain (n_y, n_u), 0 for an integrator."""
+def _gain(linear: Values) -> Array:
+    """Compute the static gain (n_y, n_u), 0 for an integrator."""
     a = linear["A"]
     if len(a) and np.max(np.abs(np.linalg.eigvals(a))) > 0.9999:
         return np.zeros_like(linear["D_yu"])
     return linear["C_y"] @ np.linalg.solve(np.eye(len(a)) - a, linear["B_u"]) + linear["D_yu"]
 
 
-def deconvolve_inputs(linear: Mapping[str, Array], recording: Recording, states: Array) -> Array:
-    """Inputs (M, n_u) with which the linear model would have given the measured outputs, damped where it hardly can."""
+def deconvolve_inputs(linear: Values, recording: Recording, states: Array) -> Array:
+    """Compute the inputs (M, n_u) with which the linear model gives the measured outputs, damped (see above)."""
     u, y = recording.u, recording.y
     error = np.fft.rfft(y - states @ linear["C_y"].T - u @ linear["D_yu"].T - linear["y_0"], axis=0)
     z = np.exp(2j * np.pi * np.arange(len(error)) / len(u))
@@ -424,7 +465,7 @@ def deconvolve_inputs(linear: Mapping[str, Array], recording: Recording, states:
 
 
 def channel_start(element: PrandtlIshlinskii, z: Array, v: Array) -> Blocks:
-    """Envelopes, thresholds and weights (a row each) of one channel from its signal z (M,) and its answer v (M,)."""
+    """Choose envelopes, thresholds and weights (a row each) of one channel from its signal z (M,) and answer v (M,)."""
     at, low, high = loop_outline(z, v)
     n, operator = element.n, element.operator
     widest = float(np.max(high - low)) / 2
@@ -437,9 +478,9 @@ def channel_start(element: PrandtlIshlinskii, z: Array, v: Array) -> Blocks:
 
 
 def loop_outline(z: Array, v: Array) -> tuple[Array, Array, Array]:
-    """Where v (M,) lies over z (M,): bins' centres, and a lower and an upper curve (bins,), neither falling.
+    """Outline where v (M,) lies over z (M,): centres of bins, and a lower and an upper curve (bins,), neither falling.
 
-    Loops that run the wrong way round have no width.
+    Loops that run the wrong way round get no width.
     """
     edges = np.linspace(np.quantile(z, 0.002), np.quantile(z, 0.998), BINS + 1)
     centres, bins = (edges[1:] + edges[:-1]) / 2, np.clip(np.searchsorted(edges, z) - 1, 0, BINS - 1)
@@ -457,16 +498,16 @@ def loop_outline(z: Array, v: Array) -> tuple[Array, Array, Array]:
     low, high = (np.interp(centres, centres[seen], c[seen]) for c in (low, high))
     if turn < 0:
         low = high = (low + high) / 2
-    return centres, _rising(low), _rising(high)
+    return centres, _make_rising(low), _make_rising(high)
 
 
-def _rising(curve: Array) -> Array:
-    """A curve that does not fall, between the smallest above and the largest below."""
+def _make_rising(curve: Array) -> Array:
+    """Make a curve that does not fall, between the smallest one above and the largest one below."""
     return (np.maximum.accumulate(curve) + np.minimum.accumulate(curve[::-1])[::-1]) / 2
 
 
 def fit_envelope(z: Array, curve: Array, neurons: int) -> Blocks:
-    """Parameters `c, a0, a, b, d` (a row each) of the envelope network nearest to a curve (G,) over z (G,)."""
+    """Fit the parameters `c, a0, a, b, d` (a row each) of an envelope network to a curve (G,) over z (G,)."""
     from scipy.optimize import nnls
 
     span = float(z[-1] - z[0]) or 1.0
@@ -477,3 +518,10 @@ def fit_envelope(z: Array, curve: Array, neurons: int) -> Blocks:
     (up, down, a0, *a), _ = nnls(columns, curve)
     least = LEAST * float(np.ptp(curve)) / max(neurons, 1)
     return {"c": np.array([up - down]), "a0": np.array([a0]), "a": np.maximum(a, least), "b": b, "d": d}
+
+
+def has_networks(structure: PILFR) -> bool:
+    """Tell whether the element is a layer of generalized plays between networks."""
+    element = structure.element
+    operator = element.operator if isinstance(element, PrandtlIshlinskii) else None
+    return isinstance(operator, GeneralizedPlay) and operator.networks

@@ -1,39 +1,135 @@
 """Standard errors that respect the gauge freedoms of a PI-LFR.
 
-`orbit.generators` gives the directions that change no output. `covariance` works on their orthogonal complement,
-spanned by Q, in the metric `D = diag(H)`, each variable in units of its own sensitivity: the gauge that stays nearest
-to the fit.
+The outputs of a PI-LFR do not change under
+
+- any change of the basis of the states, `x = T x'` (n_x² directions);
+- a scaling of a port's signal, `(C_z, D_zu, r)_i -> α (...)` with `(B_w, D_yw)_i -> (...)/α`, memory included. The
+  generalized play has two here: the scale of z, which the envelopes take up, and that of the operators' output;
+- a scaling of the weights, `w_i -> μ w_i` with `(B_w, D_yw)_i -> (...)/μ`;
+- for a play with `r_ij = 0` (it passes z on), a shift of `w_ij` that the linear blocks take up;
+- for a static network, the scalings of its signals, `slope_i -> slope_i/α` and `gain_i -> μ gain_i`;
+- for generalized plays, a shift of all `r_i` against the two envelopes, and a shift of the output that `y_0`, the
+  envelopes and the initial state compensate.
+
+Each comes with an affine change of the initial states; `generators` gives their tangents. `covariance` works on the
+orthogonal complement of these directions, spanned by Q, in the metric `D = diag(H)`, each variable in units of its own
+sensitivity: the gauge that stays nearest to the fit.
 
     cov = D^-1/2 Q (Q'H~Q)^-1 Q'M~Q (Q'H~Q)^-1 Q' D^-1/2,    H~ = D^-1/2 H D^-1/2,    M~ = D^-1/2 M D^-1/2
 
 `H = J'J/R` (plus priors) is the Gauss-Newton Hessian, and M the covariance of the gradient, `J'ΩJ/R²` (plus the priors'
-share) with the covariance Ω of the noise as `residual_noise` finds it. For white noise this is the classical
-`σ²/R H^-1`; for coloured noise it is the covariance of the least-squares estimate (Ljung 1999, Chapter 9).
+share) with the covariance Ω of the noise (`gradient_covariance`). For white noise this is the classical `σ²/R H^-1`;
+for coloured noise it is the covariance of the least-squares estimate (Ljung 1999, Chapter 9).
 
-The errors say what another record with another noise would change. They do not know about bias: a model that is too
-simple, or another minimum. A gauge-invariant function f (an eigenvalue, a static gain) has the variance `∇f' cov ∇f`.
+The errors say what another record with another noise would change. They do not cover bias: a model that is too simple,
+or another minimum. A gauge-invariant function f (an eigenvalue, a static gain) has the variance `∇f' cov ∇f`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 
 import numpy as np
 
-from ..models import PILFR, Neighbours, generators
+from ..models import PILFR, GeneralizedPlay, Neighbours, Play, PrandtlIshlinskii, StaticNetwork
 from ..optimise import Problem
 
 Array = np.ndarray
-STATES = ("A", "B_u", "B_w", "C_y", "C_z")  # blocks that a change of coordinates of the states changes
+Generator = tuple[dict[str, Array], Callable[[Array], Array]]
+# powers of the scales of z and of the output in the parameters of an envelope (Eq. 14)
+ENVELOPE = {"c": (0, 1), "a0": (-1, 1), "a": (0, 1), "b": (-1, 0), "d": (0, 0)}
+STATES = ("A", "B_u", "B_w", "C_y", "C_z")  # blocks that depend on the coordinates of the states
 FADED = 1e-30  # share of its matrix's largest sensitivity below which an entry counts as not seen
+LAGS = 40  # largest lag of the noise model
+
+
+def generators(structure: PILFR, values: Mapping[str, Array]) -> Iterator[Generator]:
+    """Generate the tangents of the gauge orbit at `values`: the change of each block, and of the state with memory."""
+    nx = structure.nx
+    element = structure.element
+    for k in range(nx * nx):
+        e = np.zeros((nx, nx))
+        e.flat[k] = 1.0
+        change = {name: -e @ values[name] for name in ("B_u", "B_w")}
+        change |= {name: values[name] @ e for name in ("C_y", "C_z")} | {"A": values["A"] @ e - e @ values["A"]}
+        yield change, partial(_change_of_basis, e)
+    if isinstance(element, PrandtlIshlinskii):
+        for channel in range(element.channels):
+            yield from _scale_channel(element, values, channel, nx)
+            if isinstance(element.operator, Play):
+                yield from _shift_weight(element, values, channel)
+            if isinstance(element.operator, GeneralizedPlay) and element.operator.networks:
+                yield from _shift_offset(element, values, channel, nx)
+    if isinstance(element, StaticNetwork):
+        for channel in range(element.channels):
+            here = (np.arange(element.channels) == channel) * 1.0
+            into = {name: values[name] * here[:, None] for name in ("C_z", "D_zu")}
+            yield {**into, "slope": -values["slope"] * here[:, None]}, np.zeros_like
+            out = {name: -values[name] * here for name in ("B_w", "D_yw")}
+            yield {**out, "gain": values["gain"] * here[:, None]}, np.zeros_like
+
+
+def _change_of_basis(e: Array, state: Array) -> Array:
+    return np.concatenate([-e @ state[: len(e)], np.zeros(len(state) - len(e))])
+
+
+def _scale_channel(
+    element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int, nx: int
+) -> Iterator[Generator]:
+    """Scale one channel, in powers of the scales of z, of the operators' output and of the weights."""
+    here = np.arange(element.channels) == channel
+    memory = np.concatenate([np.zeros(nx), np.repeat(here, element.n)])
+    general = isinstance(element.operator, GeneralizedPlay)
+    rounded = element.rounded and bool(np.any(values["eps"] > 0))
+    scalings = [(1, 1, 0), (0, 0, 1)] if not general else [(0, 0, 1)]
+    if general and element.operator.networks:
+        scalings = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    for of_z, of_v, of_w in scalings:
+        if of_v and rounded:
+            continue
+        powers = {"C_z": of_z, "D_zu": of_z, "r": of_v, "w": of_w}
+        if general and not of_w:
+            powers |= {f"gamma_{side}_{k}": p * of_z + q * of_v for side in "lr" for k, (p, q) in ENVELOPE.items()}
+        change = {name: power * values[name] * here[:, None] for name, power in powers.items()}
+        change |= {name: -(of_v + of_w) * values[name] * here for name in ("B_w", "D_yw")}
+        yield change, partial(np.multiply, of_v * memory)
+
+
+def _shift_weight(element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int) -> Iterator[Generator]:
+    """Shift the weight of a play with r = 0, which passes z on, to the linear blocks."""
+    b, d = values["B_w"][:, [channel]], values["D_yw"][:, [channel]]
+    c, e = values["C_z"][[channel]], values["D_zu"][[channel]]
+    if element.rounded and np.any(values["eps"] > 0):
+        return
+    for j in np.flatnonzero(values["r"][channel] == 0):
+        weight = np.zeros(values["w"].shape)
+        weight[channel, j] = 1.0
+        yield {"w": weight, "A": -b @ c, "B_u": -b @ e, "C_y": -d @ c, "D_yu": -d @ e}, np.zeros_like
+
+
+def _shift_offset(
+    element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int, nx: int
+) -> Iterator[Generator]:
+    """Shift thresholds against the envelopes, and the output's offset against the blocks that follow it."""
+    here = (np.arange(element.channels) == channel)[:, None] * 1.0
+    yield {"r": here * np.ones(values["r"].shape), "gamma_l_c": here, "gamma_r_c": -here}, np.zeros_like
+    to_state = np.eye(nx) - values["A"]
+    if nx and not np.linalg.cond(to_state) < 1e10:
+        return
+    total = values["w"][channel].sum()
+    state = np.linalg.solve(to_state, values["B_w"][:, channel] * total)
+    z = (values["C_z"] @ state)[:, None]
+    change = {"y_0": -values["C_y"] @ state - values["D_yw"][:, channel] * total}
+    for side in "lr":
+        change[f"gamma_{side}_c"] = here - values[f"gamma_{side}_a0"] * z
+        change[f"gamma_{side}_d"] = -values[f"gamma_{side}_b"] * z
+    shift = np.concatenate([state, np.repeat(here.ravel(), element.n)])
+    yield change, lambda _: shift
 
 
 def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, held: Array) -> Array:
-    """Directions of θ that change no output and move no entry that is fixed, given or in `held`: shape (size, k).
-
-    held : bool array, shape (size,)
-        Variables that must not move, such as those at an active bound.
-    """
+    """Find the directions of θ (size, k) that change no output, no fixed entry and no variable in `held` (size,)."""
     inside, outside = orbit_tangents(problem, theta, structure)
     size = np.maximum(np.sqrt(np.sum(inside**2, axis=0) + np.sum(outside**2, axis=0)), 1e-300)
     inside, outside = inside / size, outside / size
@@ -41,7 +137,7 @@ def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, held: Array
 
 
 def orbit_tangents(problem: Problem, theta: Array, structure: PILFR) -> tuple[Array, Array]:
-    """The orbit's generators (one a column) as changes of the variables (size, k), and of what is none (m, k)."""
+    """Write the generators as columns: changes of the variables (size, k), and of all other entries (m, k)."""
     parameters = problem.model.parameters
     values = parameters.unpack(problem.parameters(theta))
     states = problem.initial_states(theta)
@@ -57,7 +153,7 @@ def orbit_tangents(problem: Problem, theta: Array, structure: PILFR) -> tuple[Ar
 
 
 def null_space(rows: Array, tolerance: float = 1e-10) -> Array:
-    """Orthonormal basis of the vectors that every row maps to zero, rows scaled to unit length."""
+    """Find an orthonormal basis of the vectors that every row maps to zero, rows scaled to unit length."""
     length = np.linalg.norm(rows, axis=1)
     rows = rows[length > 0] / length[length > 0, None]
     if not len(rows):
@@ -66,45 +162,45 @@ def null_space(rows: Array, tolerance: float = 1e-10) -> Array:
 
 
 def _complement(columns: Array, tolerance: float = 1e-10) -> Array:
-    """Orthonormal basis of the orthogonal complement of some columns, which may depend on each other."""
+    """Find an orthonormal basis of the orthogonal complement of columns, which may depend on each other."""
     from scipy.linalg import qr
 
     q, r = np.linalg.qr(columns, mode="complete")
     diagonal = np.abs(np.diag(r))
-    if np.any(diagonal <= tolerance * diagonal.max(initial=0.0)):  # dependent: the slower way tells how many are not
+    if np.any(diagonal <= tolerance * diagonal.max(initial=0.0)):  # dependent: pivoting tells how many are not
         q, r, _ = qr(columns, pivoting=True)
         diagonal = np.abs(np.diag(r))
     return np.asarray(q[:, int(np.sum(diagonal > tolerance * diagonal.max(initial=0.0))) :])
 
 
 def covariance(problem: Problem, theta: Array, structure: PILFR | None = None) -> Array:
-    """Covariance of the variables θ at a solution, gauge directions and active constraints removed.
+    """Compute the covariance of θ at a solution, gauge directions and active constraints removed.
 
     Parameters
     ----------
     problem : Problem
         The problem that was solved.
     theta : array, shape (size,)
-        Its solution.
+        Solution of the problem.
     structure : PILFR, optional
-        Says which gauge freedoms the model has; without it there are none.
+        Structure that tells the gauge freedoms of the model; without it there are none.
 
     Returns
     -------
     array, shape (size, size)
-        Rows and columns of variables at an active bound are zero; the variance of what the data leaves open is
-        infinite.
+        Rows and columns of variables at an active bound are zero; variables that the data leave open have an infinite
+        variance.
     """
     return _covariance(problem, theta, structure)[0]
 
 
 def variance(matrix: Array, slope: Array) -> Array:
-    """Covariance of functions of θ by the delta method.
+    """Compute the covariance of functions of θ by the delta method.
 
     Parameters
     ----------
     matrix : array, shape (n, n)
-        From `covariance`.
+        Covariance of θ, from `covariance`.
     slope : array, shape (..., n)
         Derivatives of the functions with respect to θ. Where they are zero, an infinite variance does not count.
 
@@ -122,13 +218,13 @@ def variance(matrix: Array, slope: Array) -> Array:
 
 
 def standard_errors(problem: Problem, theta: Array, structure: PILFR | None = None) -> dict[str, Array]:
-    """Standard errors of the model's parameters by name, in the gauge described above; see `covariance`.
+    """Compute the standard errors of the model's parameters by name, in the gauge described above; see `covariance`.
 
     Returns
     -------
     dict
         One array of the parameter's shape by name: nan where an entry is fixed or at an active bound, inf where the
-        data says nothing about it.
+        data say nothing about it.
     """
     parameters = problem.model.parameters
     matrix, held = _covariance(problem, theta, structure)
@@ -144,11 +240,11 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     if not np.all(np.isfinite(hessian)):
         return np.diag(np.full(problem.size, np.inf)), np.zeros(problem.size, dtype=bool)
     given = theta.copy()
-    held = _snap_to_bounds(problem, theta, np.sqrt(np.diag(hessian)))
+    held = snap_to_bounds(problem, theta, np.sqrt(np.diag(hessian)))
     if np.any(theta != given):  # a threshold on its bound may slip where it stuck
         _, _, hessian = problem.normal(theta)
     sensitivity = np.sqrt(np.diag(hessian))
-    # what only a transient showed that has long faded: its derivative is a number, and says nothing
+    # drop entries that only a transient showed which has long faded: their derivative is a number without meaning
     sensitivity = np.where(sensitivity > FADED * Neighbours(problem.labels).largest(sensitivity), sensitivity, 0.0)
     tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, held)
     slopes = problem.constraint_jacobian(theta)[problem.active_constraints(theta)]
@@ -168,7 +264,7 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     weights = np.zeros((problem.size, int(seen.sum())))
     weights[used] = directions[:, seen] / np.sqrt(values[seen]) / unit[:, None]
     out = weights @ gradient_covariance(problem, theta, weights) @ weights.T
-    # a direction that is not seen counts as one of which the data says just too little
+    # a direction that is not seen counts as one about which the data say just too little
     inverse = np.sum(directions[:, seen] ** 2 / values[seen], axis=1)
     hidden = used[np.sum(directions[:, ~seen] ** 2, axis=1) > least * inverse]
     if problem.residuals <= seen.sum():
@@ -178,11 +274,11 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     return out, held
 
 
-def _snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, tolerance: float = 1e-9) -> Array:
-    """Move variables that are within rounding of a bound onto it, in place; returns which (size,), bool.
+def snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, tolerance: float = 1e-9) -> Array:
+    """Move variables that are within rounding of a bound onto it, in place; return which (size,), bool.
 
     Within rounding means that the move changes the normalised outputs by less than `tolerance`, by the sensitivity at
-    either end: what hardly counts where it is, such as the slope of a saturated neuron, may count at a bound far away.
+    both ends: a variable without effect here, such as the slope of a saturated neuron, may have one at the bound.
     """
     given, held = theta.copy(), np.zeros(problem.size, dtype=bool)
     for bound in (problem.lower, problem.upper):
@@ -200,7 +296,7 @@ def _snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, toleranc
 
 
 def describe_unknown_errors(errors: Mapping[str, np.ndarray]) -> list[str]:
-    """What it means that standard errors are infinite, none where none is."""
+    """Explain infinite standard errors; empty where there are none."""
     count = {name: int(np.sum(np.isinf(e))) for name, e in errors.items()}
     turned = [name for name in STATES if count.get(name)]
     others = [f"{count[k]} of {np.size(e)} entries of {k}" for k, e in errors.items() if count[k] and k not in turned]
@@ -213,25 +309,11 @@ def describe_unknown_errors(errors: Mapping[str, np.ndarray]) -> list[str]:
     return out
 
 
-LAGS = 40
-
-
 def gradient_covariance(problem: Problem, theta: Array, weights: Array) -> Array:
-    """Covariance of the gradient of the cost at a solution, priors included.
+    """Compute the covariance (k, k) of the gradient of the cost at a solution, priors included.
 
-    Parameters
-    ----------
-    problem : Problem
-        Problem that was solved.
-    theta : array, shape (size,)
-        Its solution.
-    weights : array, shape (size, k)
-        Coordinates in which the Gauss-Newton Hessian is the identity.
-
-    Returns
-    -------
-    array, shape (k, k)
-        `weights' J'ΩJ weights / R²`, and `(I - weights' J'J weights / R) σ²/R` for the priors.
+    It is `W' J'ΩJ W / R²`, and `(I - W' J'J W / R) σ²/R` for the priors, with the columns W of `weights` (size, k):
+    coordinates in which the Gauss-Newton Hessian is the identity.
     """
     from scipy.linalg import eigh, solve_banded
 
@@ -261,7 +343,7 @@ def gradient_covariance(problem: Problem, theta: Array, weights: Array) -> Array
 
 
 def _autocovariances(problem: Problem, theta: Array, weights: Array) -> Array:
-    """Autocovariances of each output's noise, shape (n_y, lags), corrected for what the fit took out."""
+    """Estimate the autocovariances of each output's noise, shape (n_y, lags), corrected for the fitted part."""
     total, n_y = problem.residuals, problem.model.n_y
     most = min(LAGS, total // n_y // 20)
     residual, taken = np.zeros((2, n_y, most + 1))
@@ -278,7 +360,7 @@ def _autocovariances(problem: Problem, theta: Array, weights: Array) -> Array:
 
 
 def _autoregression(lags: Array, samples: int) -> tuple[Array, float]:
-    """Autoregression `polynomial(q^-1) e = white` of a signal: its polynomial and the variance of the white part.
+    """Fit an autoregression `polynomial(q^-1) e = white`; return its polynomial and the variance of the white part.
 
     Yule-Walker by the recursion of Levinson and Durbin; the order has the smallest BIC.
     """

@@ -9,17 +9,6 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .arrays import Buffered as Buffered, accumulate_steps as accumulate_steps, map_points as map_points
-    from .baselines import (
-        NARX as NARX,
-        NOE as NOE,
-        Lagged as Lagged,
-        lagged_start as lagged_start,
-        network_lfr as network_lfr,
-        neurons_over as neurons_over,
-        reading_output as reading_output,
-        ssnn as ssnn,
-    )
     from .conversion import to_plays as to_plays, to_stops as to_stops
     from .elements import (
         CREST as CREST,
@@ -36,7 +25,7 @@ if TYPE_CHECKING:
         unknown_slope as unknown_slope,
         weight_density as weight_density,
     )
-    from .gauge_orbit import generators as generators
+    from .evaluation import Buffered as Buffered, accumulate_steps as accumulate_steps, map_points as map_points
     from .model import (
         Model as Model,
         StepExpressions as StepExpressions,
@@ -77,10 +66,18 @@ if TYPE_CHECKING:
         ANY as ANY,
         HYSTERETIC as HYSTERETIC,
         LAGGED as LAGGED,
+        NARX as NARX,
+        NOE as NOE,
         OPERATORS as OPERATORS,
         STRUCTURES as STRUCTURES,
         TAKES as TAKES,
+        Lagged as Lagged,
+        lagged_start as lagged_start,
         named_structure as named_structure,
+        network_lfr as network_lfr,
+        neurons_over as neurons_over,
+        reading_output as reading_output,
+        ssnn as ssnn,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -516,9 +516,6 @@ def unknown_slope(element: Element, p: Mapping[str, Any]) -> bool:
 
 
 def _check_counts(owner: str, **counts: Any) -> None:
-    for count in counts.values():
-        number = isinstance(count, int | float | np.number) and not isinstance(count, bool)
-        if not number or not 1 <= count < np.inf or int(count) != count:
-            names, given = " and ".join(f"{k} >= 1" for k in counts), " and ".join(map(repr, counts.values()))
-            raise InputError(f"{owner} needs whole numbers {names}; {given} were given.")
-    check_size(owner, prod(int(count) for count in counts.values()))
+    check_size(
+        owner, prod(whole(count, f"{name} of {owner[0].lower()}{owner[1:]}", 1) for name, count in counts.items())
+    )

@@ -21,12 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, is_number
+from .._base import InputError, is_whole
 from .parameters import Parameter, ParameterSet, check_size
 
 _TINY = 1e-300
@@ -133,7 +134,7 @@ class GeneralizedPlay:
     name = "generalized_play"
 
     def __post_init__(self) -> None:
-        if not is_number(self.neurons) or not 0 <= self.neurons < np.inf or self.neurons != int(self.neurons):
+        if not is_whole(self.neurons, 0):
             raise InputError(f"An envelope has {self.neurons!r} neurons; give a whole number, 0 or more.")
         check_size("A generalized play", 6 * int(self.neurons))
 
@@ -148,13 +149,12 @@ class GeneralizedPlay:
         for side, own in (("l", self.gamma_l), ("r", self.gamma_r)):
             if own is not None:
                 continue
-            spread = np.tile(np.linspace(-1.0, 1.0, self.neurons), (channels, 1))
-            positive = (0.0, np.inf)
+            shape, positive = (channels, self.neurons), (0.0, np.inf)
             entries[f"gamma_{side}_c"] = Parameter(np.zeros((channels, 1)))
             entries[f"gamma_{side}_a0"] = Parameter(np.ones((channels, 1)), bounds=positive)
-            entries[f"gamma_{side}_a"] = Parameter(np.full((channels, self.neurons), 0.01), bounds=positive)
-            entries[f"gamma_{side}_b"] = Parameter(np.ones((channels, self.neurons)), bounds=positive)
-            entries[f"gamma_{side}_d"] = Parameter(-spread)
+            entries[f"gamma_{side}_a"] = Parameter(np.full(shape, 0.01), bounds=positive)
+            entries[f"gamma_{side}_b"] = Parameter(np.ones(shape), bounds=positive)
+            entries[f"gamma_{side}_d"] = Parameter(-np.tile(np.linspace(-1.0, 1.0, self.neurons), (channels, 1)))
         return ParameterSet(entries)
 
     def envelope(self, side: str, z: Any, p: Any, channel: int = 0) -> Any:
@@ -187,7 +187,6 @@ class GeneralizedPlay:
 
     def step(self, z: Any, q: Any, r: Any, p: Any, eps: Any = 0.0, channel: int = 0) -> tuple[Any, Any]:
         """One step: (output, next memory)."""
-        v = generalized_play(
-            z, q, r, lambda s: self.envelope("l", s, p, channel), lambda s: self.envelope("r", s, p, channel), eps
-        )
+        low, high = (partial(self.envelope, side, p=p, channel=channel) for side in "lr")
+        v = generalized_play(z, q, r, low, high, eps)
         return v, v

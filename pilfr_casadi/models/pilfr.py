@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, filled
+from .._base import InputError, filled, whole
 from .elements import Element, is_element
 from .model import Model, close_loop, open_model
 from .parameters import Parameter, ParameterSet, check_size
@@ -84,12 +84,8 @@ class PILFR:
     offset: bool = True
 
     def __post_init__(self) -> None:
-        if isinstance(self.nx, bool) or not isinstance(self.nx, int | float | np.number) or not 0 <= self.nx < np.inf:
-            raise InputError(f"The number of states is {self.nx!r}; give a whole number, 0 or more.")
-        if int(self.nx) != self.nx:
-            raise InputError(f"The number of states is {self.nx}; give a whole number, 0 or more.")
-        check_size(f"A model with nx = {self.nx}", int(self.nx) ** 2)
-        object.__setattr__(self, "nx", int(self.nx))
+        object.__setattr__(self, "nx", whole(self.nx, "The number of states", 0))
+        check_size(f"A model with nx = {self.nx}", self.nx**2)
         _check_element(self.element)
         for option in ("fixed", "bounds", "priors"):
             given = getattr(self, option)
@@ -188,20 +184,8 @@ class PILFR:
                 )
 
     def count(self, n_u: int, n_y: int) -> int:
-        """Count the free parameters without building the model, which takes long where there are millions."""
-        self._check_channels(n_u, n_y)
-        own = {name: ~p.fixed for name, p in (self.element.parameters() if self.element else {}).items()}
-        total = 0
-        for name, shape in block_shapes(self.nx, n_u, n_y, self.n_w).items():
-            whole = "fixed" not in self._given(name, shape) and (name != "y_0" or self.offset)
-            total += int(np.prod(shape)) if whole else self._free(name, shape)
-        return total + sum(
-            self._free(name, free.shape) if name in self.fixed else int(free.sum()) for name, free in own.items()
-        )
-
-    def _free(self, name: str, shape: tuple[int, ...]) -> int:
-        fixed = self._given(name, shape).get("fixed")
-        return 0 if fixed is None else int(np.isnan(fixed).sum())
+        """Count the free parameters of the model for n_u inputs and n_y outputs."""
+        return int(self.model(n_u, n_y).parameters.free.sum())
 
     def linear(self) -> PILFR:
         """Make the linear structure of the same order, everything free."""

@@ -35,7 +35,7 @@ from pydantic import (
 )
 
 from .._base import InputError, existing_file
-from ..identify import BLA, POLISH, STARTS
+from ..identify import BLA_OPTION, DEFAULT_SOLVER, START_KINDS
 from ..models import ANY, HYSTERETIC, LAGGED, OPERATORS, PILFR, STRUCTURES, TAKES, Lagged, Model, named_structure
 from ..optimise import Constraint, GaussNewton, Ipopt, check_gain, dc_gain, ordered
 from ..simulators import user_variable
@@ -260,8 +260,8 @@ class SolverTable(Table):
 
     name: Any = "gauss-newton"
     starts: int = _whole("starts", 1, 8)
-    start: str = _choice(STARTS, "grid")
-    linear: str = _choice(("output-error", BLA), "output-error")
+    start: str = _choice(START_KINDS, "grid")
+    linear: str = _choice(("output-error", BLA_OPTION), "output-error")
     max_iterations: int | None = _whole("max_iterations", 1)
     tolerance: float | None = _number(0.0)
 
@@ -269,7 +269,7 @@ class SolverTable(Table):
     def search(self) -> dict[str, Any]:
         """The options of the search, as for `fit`."""
         search = {"starts": self.starts, "start": self.start}
-        return {**search, "linear": BLA} if self.linear == BLA else search
+        return {**search, "linear": BLA_OPTION} if self.linear == BLA_OPTION else search
 
     def build(self) -> Any:
         """Build the solver; an object stays as it is."""
@@ -284,7 +284,7 @@ class SolverTable(Table):
             raise InputError(f"'name' in [solver] is {shown(self.name)}; give 'gauss-newton' or 'ipopt'.")
         if self.name == "ipopt":
             return Ipopt(**given)
-        return GaussNewton(**{"tolerance": POLISH.tolerance, **given}) if given else POLISH
+        return GaussNewton(**{"tolerance": DEFAULT_SOLVER.tolerance, **given}) if given else DEFAULT_SOLVER
 
 
 class ConstraintsTable(Table):

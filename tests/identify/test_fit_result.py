@@ -10,7 +10,7 @@ from random_models import random_input, random_lfr, reference
 
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording, nrmse
-from pilfr_casadi.identify import PRIOR, FitContext, fit, standard_errors
+from pilfr_casadi.identify import DENSITY_PRIOR, FitContext, fit, standard_errors
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import Constraint, GaussNewton, Problem, Status
 
@@ -73,7 +73,7 @@ def test_the_searchs_own_prior_is_not_taken_for_knowledge(truth, record):
     held = model.with_parameters(model.parameters.change(**tight))
     problems = [Problem(m, record, noise=0.01) for m in (held, model)]
     solution = GaussNewton().solve(problems[0])
-    found = FitContext((record,), None).result(held, structure, problems[0], solution, PRIOR)
+    found = FitContext((record,), None).result(held, structure, problems[0], solution, DENSITY_PRIOR)
     with_prior, without = (standard_errors(p, solution.theta, structure) for p in problems)
     assert np.all(with_prior["r"] < 0.1 * without["r"])
     for name in ("w", "r"):

@@ -9,8 +9,10 @@ from random_models import random_lfr
 
 from pilfr_casadi.cli.demo import demo_recordings, structure
 from pilfr_casadi.identify import (
-    POLISH,
+    DEFAULT_SOLVER,
     Candidate,
+    FitContext,
+    FitOptions,
     StartSearch,
     explore,
     grid_start,
@@ -46,17 +48,17 @@ def search():
     linear, problem, solution = linear_model(train, model)
     parameters = linear.parameters.at(problem.parameters(solution.theta))
     blocks = {k: p.value for k, p in parameters.items()}
-    return StartSearch(model, train, blocks, POLISH, stability(model), start="paper")
+    return StartSearch(FitContext(train, DEFAULT_SOLVER, stability(model)), model, blocks, start="paper")
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_papers_start_is_polished(search, seed):
     sequence = np.random.SeedSequence(seed)
-    inputs = [r.u for r in search.recordings]
+    inputs = [r.u for r in search.context.recordings]
     scaled, states = unit_states(search.linear, inputs)
     model = search.model(paper_start(search.structure, scaled, inputs, states, np.random.default_rng(sequence)))
     problem = search.problem(model)
-    alone = POLISH.solve(problem).theta
+    alone = DEFAULT_SOLVER.solve(problem).theta
     e = problem.residual(alone)
     candidate = explore(search, seed, sequence)
     plain = explore(replace(search, start="plain"), seed, sequence)  # the paper's own protocol ends here
@@ -69,7 +71,7 @@ def test_the_papers_start_is_polished(search, seed):
 
 def test_the_users_solver_has_the_last_word(search):
     counting = Counting()
-    candidate = explore(replace(search, solver=counting), 1, np.random.SeedSequence(1))
+    candidate = explore(replace(search, context=replace(search.context, solver=counting)), 1, np.random.SeedSequence(1))
     assert len(counting.given) == 2
     np.testing.assert_array_equal(candidate.theta, counting.given[-1].theta)
     assert candidate.solution is counting.given[-1]
@@ -129,11 +131,11 @@ def test_an_interrupted_polish_ends_with_the_best(search, monkeypatch, last):
 
     class Struck:
         def solve(self, problem, start=None):
-            solution = POLISH.solve(problem, start)
+            solution = DEFAULT_SOLVER.solve(problem, start)
             errors.append(np.sqrt(np.mean(problem.residual(solution.theta) ** 2)))
             return replace(solution, status=Status.INTERRUPTED) if len(errors) == last else solution
 
-    monkeypatch.setattr(multistart, "POLISH", Struck())
+    monkeypatch.setattr(multistart, "DEFAULT_SOLVER", Struck())
     found = polish(search, candidate)
     assert found.solution.status is Status.INTERRUPTED and len(errors) == last
     assert found.error == pytest.approx(min([candidate.error, *errors]), rel=1e-12)
@@ -143,4 +145,5 @@ def test_priors_are_weighed_against_the_noise_that_is_known(search):
     model = search.model({})
     assert search.problem(model).noise == 1.0 and replace(search, level=0.2).problem(model).noise == 0.2
     assert replace(search, level=0.2).problem(model, noise=0.1).noise == 0.1
-    assert replace(search, level=0.2, noise=0.3).problem(model, noise=0.1).noise == 0.3
+    known = replace(search.context, options=FitOptions(noise=0.3))
+    assert replace(search, level=0.2, context=known).problem(model, noise=0.1).noise == 0.3

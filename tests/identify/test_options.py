@@ -48,7 +48,7 @@ def test_a_second_fit_stays_where_the_weights_have_led(records, weighted):
     even = pilfr.fit(weighted, records, weights=(1, 1))
     assert gain(again, records) == pytest.approx(gain(weighted, records), abs=2e-3)
     assert gain(even, records) < gain(weighted, records) - 0.02
-    assert again.asked.weights == weighted.asked.weights and set(even.asked.weights.values()) == {1.0}
+    assert again.options.weights == weighted.options.weights and set(even.options.weights.values()) == {1.0}
 
 
 def test_whatever_is_made_from_a_fit_has_its_weights_and_noise(records, weighted):
@@ -71,7 +71,7 @@ def test_weights_can_be_given_to_whatever_is_made_from_a_fit(records, weighted):
     pruned = pilfr.prune(weighted, records, **options)
     pilfr.regularization_path(weighted, records, three_plays(2, 300), strengths=(1e-3,), **options)
     assert {(*p.weights, p.noise) for p in watching.problems} == {(3.0, 1.0, 0.1)}
-    assert list(pruned.asked.weights.values()) == [3.0, 1.0] and pruned.asked.noise == 0.1
+    assert list(pruned.options.weights.values()) == [3.0, 1.0] and pruned.options.noise == 0.1
 
 
 def test_weights_belong_to_recordings_whatever_their_order(records, weighted):
@@ -101,8 +101,8 @@ def test_noise_can_be_estimated_again(records, weighted):
 def test_a_file_keeps_them(records, weighted, tmp_path):
     weighted.save(tmp_path / "m.json")
     loaded = pilfr.load(tmp_path / "m.json")
-    assert loaded.asked.noise == 0.2
-    assert loaded.asked.weights == {fingerprint(r): w for r, w in zip(records, WEIGHTS, strict=True)}
+    assert loaded.options.noise == 0.2
+    assert loaded.options.weights == {fingerprint(r): w for r, w in zip(records, WEIGHTS, strict=True)}
     content = json.loads((tmp_path / "m.json").read_text())
     content["training"]["weights"] = {k: -1.0 for k in content["training"]["weights"]}
     content["version"] = 1

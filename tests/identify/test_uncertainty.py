@@ -9,10 +9,11 @@ from random_models import OPERATORS, envelope, random_input, random_lfr, referen
 
 from pilfr_casadi.data import Recording
 from pilfr_casadi.identify import (
-    _snap_to_bounds,
     covariance,
     gauge_tangents,
+    generators,
     gradient_covariance,
+    snap_to_bounds,
     standard_errors,
     variance,
 )
@@ -23,7 +24,6 @@ from pilfr_casadi.models import (
     Play,
     PrandtlIshlinskii,
     Stop,
-    generators,
     hammerstein,
     open_model,
     wiener,
@@ -347,7 +347,7 @@ def test_what_hardly_counts_is_not_moved_to_a_bound_where_it_counts():
 
     problem = SimpleNamespace(size=3, lower=np.zeros(3), upper=np.full(3, np.inf), normal=normal)
     theta = np.array([1e-12, 70.0, 3.0])
-    held = _snap_to_bounds(problem, theta, np.array([1.0, 1e-20, 1.0]))
+    held = snap_to_bounds(problem, theta, np.array([1.0, 1e-20, 1.0]))
     np.testing.assert_array_equal(held, [True, False, False])
     np.testing.assert_array_equal(theta, [0.0, 70.0, 3.0])
 

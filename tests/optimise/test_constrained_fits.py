@@ -9,7 +9,7 @@ from random_models import coupled_plays
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.identify import WAYS, change_basis, find_nearest_basis, thin_operators
+from pilfr_casadi.identify import SPREADINGS, change_basis, find_nearest_basis, thin_operators
 from pilfr_casadi.optimise import (
     Constraint,
     Gain,
@@ -269,7 +269,7 @@ def test_pruning_takes_an_estimated_initial_state_along(record):
 @pytest.mark.slow
 def test_operators_are_spread_over_the_density(record, full):
     fits = thin_operators(full, record, 3)
-    assert len(fits) == len(WAYS) and all(f.structure.element.n == 3 for f in fits)
+    assert len(fits) == len(SPREADINGS) and all(f.structure.element.n == 3 for f in fits)
     assert len({tuple(f.parameters["r"][0]) for f in fits}) > 1
     assert min(f.nrmse(record) for f in fits) < 2 * full.nrmse(record)
     assert all(p.prior is None for f in fits for p in f.model.parameters.values())
@@ -430,7 +430,7 @@ def holds(fit):
 def test_what_is_made_from_a_fit_holds_what_the_fit_was_asked_to_hold(record, bounded):
     assert holds(bounded)
     for fit in (pilfr.fit(bounded, record), pilfr.prune(bounded, record), *thin_operators(bounded, record, 3)):
-        assert holds(fit) and fit.asked.stable == 0.78
+        assert holds(fit) and fit.options.stable == 0.78
     path = pilfr.regularization_path(bounded, record, three_plays(1, 600), strengths=(1e-5, 1e-3))
     assert all(holds(fit) for fit in path.fits)
     assert all(any(limit.name == "spectral radius <= 0.78" for limit in fit.limits) for fit in path.fits)
@@ -445,21 +445,21 @@ def test_what_is_given_wins_over_what_the_fit_was_asked_to_hold(record, bounded)
     again = pilfr.prune(bounded, record, stable=0.7)
     assert radius(again) <= 0.7 and np.all(np.diff(again.parameters["r"]) >= 0.05)
     free = pilfr.fit(bounded, record, stable=True, constraints=())
-    assert radius(free) > 0.78 and not free.asked.constraints
+    assert radius(free) > 0.78 and not free.options.constraints
     assert next(limit.name for limit in free.limits if limit.kind == "constraint") == "spectral radius <= 1"
 
 
 def test_a_loaded_fit_keeps_its_bound_and_asks_for_its_constraints(record, bounded, tmp_path):
     bounded.save(tmp_path / "m.json")
     loaded = pilfr.load(tmp_path / "m.json")
-    assert loaded.asked.stable == 0.78
+    assert loaded.options.stable == 0.78
     for again in (pilfr.fit, pilfr.prune):
         with pytest.raises(InputError, match=r"cannot hold \(r ascending\); give them again"):
             again(loaded, record)
     assert holds(pilfr.prune(loaded, record, constraints=[ordered(gap=0.05)]))
     assert radius(pilfr.fit(loaded, record, constraints=())) <= 0.78
     pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, stable=False).save(tmp_path / "free.json")
-    assert pilfr.load(tmp_path / "free.json").asked.stable is False
+    assert pilfr.load(tmp_path / "free.json").options.stable is False
 
 
 def test_constraints_hold_a_linear_model_without_a_bound_on_its_radius(record):

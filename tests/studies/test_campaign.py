@@ -23,7 +23,7 @@ from pilfr_casadi.studies import Manifest, RunInterrupted
 
 SLOW = """
 import os, pathlib, time, tomllib
-from pilfr_casadi.identify import POLISH
+from pilfr_casadi.identify import DEFAULT_SOLVER
 
 class Slow:
     def __init__(self, folder):
@@ -37,7 +37,7 @@ class Slow:
                 pass
             else:
                 TROUBLE
-        return POLISH.solve(problem, start)
+        return DEFAULT_SOLVER.solve(problem, start)
 
 run = tomllib.loads(pathlib.Path("FOLDER/rig.toml").read_text())
 run["solver"]["name"] = Slow("FOLDER")
