@@ -26,7 +26,7 @@ ORDER = [
     "studies",
     "cli",
 ]
-FORWARD = {("diagnose/result", "report"), ("identify/result", "report")}  # Diagnosis.report, and a fit's
+FORWARD = {("diagnose/result", "report"), ("identify/result", "report")}  # Diagnosis.report and Fit.report
 CIRCLES_STAY = "diagnose"  # the inside of this folder
 
 

@@ -109,7 +109,7 @@ def test_only_recordings_are_simulated(method, linear, record):
 
 def test_progress_tells_every_stage(record):
     seen = []
-    fit(PILFR(2, layer(4)), record, starts=2, progress=lambda *report: seen.append(report), l1={"w": 1e-5})
+    found = fit(PILFR(2, layer(4)), record, starts=2, progress=lambda *report: seen.append(report), l1={"w": 1e-5})
     stages = list(dict.fromkeys(stage for stage, *_ in seen))
     assert stages == ["subspace", "linear model", "starts", "steps", "polish", "solve", "L1 penalty", "standard errors"]
     assert all(0 <= done <= total for _, done, total, _ in seen)
@@ -117,7 +117,19 @@ def test_progress_tells_every_stage(record):
     assert [(done, total) for stage, done, total, _ in seen if stage == "starts"] == [(0, 2), (1, 2), (2, 2)]
     last = [error for stage, *_, error in seen if stage == "linear model"][-1]
     problem, solution = linear_model([record], PILFR(2))[1:]
-    assert last == pytest.approx(np.sqrt(np.mean(problem.residual(solution.theta) ** 2)), rel=1e-3)
+    assert last == pytest.approx(problem.nrmse(solution.theta)[0], rel=1e-3)
+    assert seen[-1][3] == found.train_nrmse[0]  # the figure that the result prints
+    assert all(np.isnan(error) for stage, *_, error in seen if stage in ("subspace", "steps", "solve", "L1 penalty"))
+
+
+def test_progress_shows_the_error_that_the_result_prints(record):
+    """With two unlike recordings, weights and a prior the cost is another figure than the NRMSE."""
+    pair = (record, record.with_(y=3 * record.y, name="threefold"))
+    model = PILFR(2, offset=False, priors={"D_yu": (0.5, 0.1)})
+    values = {name: p.value for name, p in fit(PILFR(2, offset=False), record).model.parameters.items()}
+    seen = []
+    found = fit(model, pair, start=values, weights=(1.0, 8.0), progress=lambda *report: seen.append(report))
+    assert [error for *_, error in seen if np.isfinite(error)] == [np.mean(found.train_nrmse)]
 
 
 def test_the_choice_of_an_order_reports_orders(record):

@@ -199,7 +199,7 @@ def test_a_damaged_network_is_refused(tmp_path):
     fit.save(tmp_path / "model.json")
     content = json.loads((tmp_path / "model.json").read_text())
     del content["sha256"]
-    for hidden, words in ((3_000_000, "expected"), (0, "whole numbers|expected"), ("three", "hidden")):
+    for hidden, words in ((3_000_000, "expected"), (0, "whole number|expected"), ("three", "hidden")):
         content["structure"]["element"]["hidden"] = hidden
         text = json.dumps({**content, "sha256": ordered_digest(content)})
         (tmp_path / "model.json").write_text(text)
@@ -221,12 +221,12 @@ def test_bad_input():
     narx = pilfr.fit(pilfr.NARX(1, 1), train, starts=1)
     linear = pilfr.fit(pilfr.PILFR(2), train)
     for wrong, words in (
-        (lambda: pilfr.NARX(0), "lags = 0"),
-        (lambda: pilfr.NARX(2, 2.5), "hidden = 2.5"),
-        (lambda: pilfr.NOE(2, input_lags=-1), "input_lags = -1"),
+        (lambda: pilfr.NARX(0), "lags is 0; give a whole number"),
+        (lambda: pilfr.NARX(2, 2.5), "hidden is 2.5"),
+        (lambda: pilfr.NOE(2, input_lags=-1), "input_lags is -1"),
         (lambda: pilfr.NOE(2, validation=1.0), "validation = 1.0"),
-        (lambda: pilfr.ssnn(2, 0), "whole numbers"),
-        (lambda: pilfr.StaticNetwork(3, True), "whole numbers"),
+        (lambda: pilfr.ssnn(2, 0), "hidden of a static network is 0; give a whole number"),
+        (lambda: pilfr.StaticNetwork(3, True), "channels of a static network is True"),
         (lambda: pilfr.one_step(linear, train), "Only a NARX or NOE"),
         (lambda: pilfr.one_step(narx, train.y), "give a Recording"),
         (lambda: pilfr.fit(pilfr.NOE(2), train, solver=pilfr.Ipopt()), "Early stopping needs"),

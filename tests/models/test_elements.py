@@ -99,8 +99,8 @@ def test_rounding_is_a_parameter_that_is_fixed_at_zero(z, q, eps):
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: PrandtlIshlinskii(Play, 0), "n >= 1 and channels >= 1; 0 and 1"),
-        (lambda: PrandtlIshlinskii(Play, 3, channels=0), "channels >= 1"),
+        (lambda: PrandtlIshlinskii(Play, 0), "n of a Prandtl-Ishlinskii element is 0; give a whole number"),
+        (lambda: PrandtlIshlinskii(Play, 3, channels=0), "channels of a Prandtl-Ishlinskii element is 0"),
         (lambda: PrandtlIshlinskii(int, 3), "use Play, Stop or GeneralizedPlay"),
         (lambda: PrandtlIshlinskii("play", 3), "use Play, Stop or GeneralizedPlay"),
         (lambda: PrandtlIshlinskii(Play, 2.5), "whole number"),

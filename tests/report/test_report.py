@@ -149,7 +149,7 @@ def test_writing_is_atomic(tmp_path):
 def test_the_page_of_a_fit(tmp_path):
     fitted = example()
     train, test = record(fitted), record(fitted, "slow", seed=2)
-    path = fit_report(fitted, train, [test, record(fitted, seed=3)], tmp_path / "new" / "folder")
+    path = fitted.report(tmp_path / "new" / "folder", train, [test, record(fitted, seed=3)])
     assert path == tmp_path / "new" / "folder" / "report.html"
     again = replace(load(path.with_name("model.json")), engine="vm")
     assert again.nrmse(test) == fitted.nrmse(test)
