@@ -3,9 +3,9 @@
 import casadi as ca
 import numpy as np
 import pytest
-from pilfr_casadi.models.evaluation import BLOCK
 
 from pilfr_casadi.models import accumulate_steps, map_points
+from pilfr_casadi.models.evaluation import BLOCK
 
 
 @pytest.fixture(scope="module")
