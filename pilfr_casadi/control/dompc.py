@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers
-from .mpc_options import NO_LIMIT, check_task, limit_price, step_function
+from .mpc import NO_LIMIT, check_task, limit_price, step_function
 
 Array = np.ndarray
 MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."

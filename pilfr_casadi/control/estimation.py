@@ -1,4 +1,4 @@
-"""State estimation of a fitted model: its run along a recording, and an extended Kalman filter.
+"""State estimation of a fitted model: its run along a recording, an extended Kalman filter, and what outputs show.
 
 With `F(x, u) = (f, h)`, `C = ∂h/∂x` at the prediction and `A = ∂f/∂x` at the corrected state, the filter is
 
@@ -9,22 +9,35 @@ active branch, so the filter switches with the operators: a play that sticks kee
 slips takes over the variance of the signal that drives it. Memory has process noise, because a filter that has become
 sure of it would stop correcting it. Anderson & Moore (1979), Optimal Filtering, Sec. 8.2. An unscented filter predicts
 as well, within three percent, at four times the work (`python -m problems.observer`).
+
+Observability of memory: the outputs of a window depend on the state at its beginning as `δY = O δx`. With noise of
+variance R and a state known to within its usual spread S, the covariance after the window is
+
+    P = (S⁻² + O' R⁻¹ O)⁻¹,
+
+and a memory is hidden if its standard deviation `sqrt(P_jj)` stays near `S_j`. The columns of O tell why: a zero column
+belongs to a memory that is wiped out before it leaves a trace, or that no output depends on; several operators that
+stick throughout act as one, by their weighted sum.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import casadi as ca
 import numpy as np
 
-from .._base import LARGEST, InputError, numbers
+from .._base import LARGEST, InputError, is_number, numbers
 from ..data import Recording
 from ..export import Exported, exported
 from ..identify import Fit
 from ..linear import measurement_update
+from ..models import PrandtlIshlinskii
 from ..simulators import Simulator
+
+if TYPE_CHECKING:
+    from ..diagnose import Diagnosis
 
 Array = np.ndarray
 SAME_STEP = 1e-4  # relative difference up to which two sampling intervals are the same
@@ -33,62 +46,42 @@ DISTURBANCE = 0.1  # of an output's standard deviation: least size of a disturba
 SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # process noise per step over the states' spread, from which one is chosen
 JUDGED = 2048  # samples on which the shares of process noise are compared
 PROBES = 5  # states and inputs at which an observer's model is compared with a fit
+HIDDEN = 0.5  # of the spread: a memory counts as hidden if the outputs cannot halve its uncertainty
+TRACE = 1e-9  # of the largest column of O: a smaller column is rounding
 
 
-class Diagnosed(Protocol):
-    """The part of a diagnosis that is used here."""
-
-    @property
-    def corrected(self) -> Simulator:
-        """The corrected simulator."""
-
-    def export(self, **options: Any) -> Any:
-        """Its step."""
-
-
-ModelSource = Fit | Diagnosed | Simulator | Exported
+ModelSource: TypeAlias = "Fit | Diagnosis | Simulator | Exported"
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """A model and its free run along a recording.
+    """The step of a model and its free run along a recording.
 
     Attributes
     ----------
-    function : casadi.Function
-        `(x, u) -> (x_next, y)`.
-    names : tuple of str
-        Names of the entries of u; where inputs are interpolated, those of the next sample follow.
+    model : Exported
+        The step; where inputs are interpolated, it also takes those of the next sample.
     u, y : array, shape (M, n_u), (M, n_y)
         Inputs of the steps, and the outputs.
     states : array, shape (n, M + 1)
         States before each sample and after the last.
-    linear : array of int
-        Entries of x that are neither memory of operators nor the time.
-    clock : array of int
-        The entry that is the time, if there is one.
+    linear, clock : list of int
+        Entries of x that are neither memory of operators nor the time; the entry that is the time, if there is one.
     first_scored : int
         First sample of the recording that counts.
     """
 
-    function: ca.Function
-    names: tuple[str, ...]
+    model: Exported
     u: Array
     y: Array
     states: Array
-    linear: Array
-    clock: Array
+    linear: list[int]
+    clock: list[int]
     first_scored: int
 
 
 def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
-    """Run the step of a fit, a diagnosis, a simulator or an export along a recording.
-
-    Raises
-    ------
-    InputError
-        If it is none of these, does not fit the recording, or diverges; `verb` names the caller.
-    """
+    """Run the step of a fit, a diagnosis, a simulator or an export along a recording; `verb` names the caller."""
     model = _export_for(source, recording, verb)
     u = recording.u
     if len(model.inputs) > recording.n_u:
@@ -100,19 +93,10 @@ def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
         raise InputError(
             f"The model diverges along the recording, so {verb} can make nothing of it; give one that is stable."
         )
-    memory = {model.states[name] for name in model.sampled.held}
-    clock = len(model.states) - 1 if model.sampled.timed else -1
-    linear = [i for i in range(len(model.states)) if i not in memory and i != clock]
-    return Rollout(
-        function=model.step,
-        names=model.inputs,
-        u=u,
-        y=y.T,
-        states=np.column_stack([start, following]),
-        linear=np.array(linear, dtype=int),
-        clock=np.array([clock] if clock >= 0 else [], dtype=int),
-        first_scored=first,
-    )
+    memory = {model.states[name] for name in model.held}
+    clock = [len(model.states) - 1] if model.timed else []
+    linear = [i for i in range(len(model.states)) if i not in memory and i not in clock]
+    return Rollout(model, u, y.T, np.column_stack([start, following]), linear, clock, first)
 
 
 def _export_for(source: Any, recording: Recording, verb: str) -> Exported:
@@ -254,10 +238,10 @@ def kalman_filter(
     InputError
         If the recording does not fit the model, or the share is not positive.
     """
-    if share is not None and not (isinstance(share, int | float | np.number) and 0 < share < np.inf):
+    if share is not None and not (is_number(share) and 0 < share < np.inf):
         raise InputError(f"The share of process noise is {share!r}; give a number above 0, such as 1e-3.")
     run = roll_out(fit, recording, "kalman_filter")
-    function, start = run.function, run.states[:, 0]
+    function, start = run.model.step, run.states[:, 0]
     if not len(start) and not disturbance:
         raise InputError("The model has neither states nor memory to observe; ask for disturbance=True.")
     residual = (recording.y - run.y)[run.first_scored :]
@@ -271,9 +255,9 @@ def kalman_filter(
         size = np.maximum(np.sqrt(level), DISTURBANCE * np.std(recording.y, axis=0))
         start, spread = np.concatenate([start, np.zeros(len(level))]), np.concatenate([spread, size])
     noise = np.diag(np.maximum(level, 1e-16 * np.mean(recording.y**2, axis=0) + 1e-300))
-    filters = [_filter(function, spread, noise, s) for s in (SHARES if share is None else [share])]
-    if len(filters) == 1:
-        return filters[0]
+    if share is not None:
+        return _filter(function, spread, noise, share)
+    filters = [_filter(function, spread, noise, s) for s in SHARES]
     return min(filters, key=lambda f: _prediction_cost(f, run.u, recording.y, start))
 
 
@@ -311,14 +295,15 @@ def add_disturbances(function: ca.Function) -> ca.Function:
     return ca.Function("disturbed", [ca.vertcat(x, d), u], [ca.vertcat(following, d), y + d], *names)
 
 
-def function_of_observer(observer: Any, function: ca.Function, recording: Recording) -> ca.Function:
-    """Return the function of an observer after checking that it observes this model, with or without disturbances.
+def linearised(function: ca.Function) -> ca.Function:
+    """Jacobians `(x, u) -> (A, B, C, D)` of any `F(x, u)`."""
+    x, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("u", function.size1_in(1))
+    blocks = [ca.densify(ca.jacobian(f, v)) for f in function(x, u) for v in (x, u)]
+    return ca.Function("slopes", [x, u], blocks)
 
-    Raises
-    ------
-    InputError
-        If it is no observer, or one of another model.
-    """
+
+def function_of_observer(observer: Any, function: ca.Function, recording: Recording) -> ca.Function:
+    """Return the function of an observer, which must observe this model, with or without disturbances."""
     if not isinstance(observer, KalmanFilter):
         raise InputError(f"A {type(observer).__name__} was given as the observer; give a kalman_filter of this fit.")
     theirs, n = observer.function, function.size1_in(0)
@@ -357,3 +342,145 @@ def _is_semidefinite(P: Array) -> bool:
         return False
     size = np.where(size > 0, size, 1.0)
     return bool(np.min(np.linalg.eigvalsh(P / np.outer(size, size)), initial=0.0) >= -1e-9)
+
+
+# --- observability of memory
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """How well the outputs of a window show the state at its beginning.
+
+    Attributes
+    ----------
+    left : array, shape (n,)
+        Standard deviation of each state and memory once the outputs are known, over its usual spread; 0 is seen
+        exactly, 1 not at all.
+    unseen : tuple of int
+        Entries of the state, counted from 0, that are memory and keep half their spread or more.
+    sentences : tuple of str
+        One sentence for each kind of reason.
+    rank : int
+        Number of directions of the state that the outputs show better than it was known.
+    """
+
+    left: Array
+    unseen: tuple[int, ...]
+    sentences: tuple[str, ...]
+    rank: int
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences)
+
+
+def visibility(fit: Fit | Diagnosis | Exported, observer: KalmanFilter, x: Array, u: Array) -> Visibility:
+    """Find the memory that the outputs show when the inputs u are applied from the state x on.
+
+    Parameters
+    ----------
+    fit : Fit, Diagnosis or Exported
+        The model.
+    observer : KalmanFilter
+        Its filter, for the noise and the usual spread.
+    x : array, shape (n,)
+        State of the observer at the window's beginning.
+    u : array, shape (samples, n_u)
+        Inputs of the window, as the observer takes them.
+
+    Returns
+    -------
+    Visibility
+        `print` it for the sentences.
+
+    Raises
+    ------
+    InputError
+        If x or u do not fit the model.
+    """
+    usable = isinstance(fit, Exported) or (callable(getattr(fit, "export", None)) and not isinstance(fit, type))
+    if not usable or not isinstance(observer, KalmanFilter):
+        raise InputError(
+            f"A {type(fit).__name__} and a {type(observer).__name__} were given; give a Fit and its kalman_filter."
+        )
+    model, n = fit if isinstance(fit, Exported) else exported(fit), len(observer.x0)
+    if n < len(model.states):
+        raise InputError(
+            f"The observer has {n} states and the model {len(model.states)}; give the model's own observer."
+        )
+    x, u = numbers(x, "The state").ravel(), numbers(u, "u")
+    u = u[:, None] if u.ndim == 1 else u
+    if len(x) != n or u.ndim != 2 or u.shape[1] != len(model.inputs) or not len(u):
+        raise InputError(
+            f"A state of {len(x)} numbers and inputs {u.shape} were given; give {n} numbers and "
+            f"(samples, {len(model.inputs)})."
+        )
+    traces, slip = _sensitivities(observer, x, u)
+    information = np.linalg.eigvalsh(traces.T @ traces)
+    left = np.sqrt(np.clip(np.diag(np.linalg.inv(np.eye(n) + traces.T @ traces)), 0, 1))
+    kind, names = _memory_names(fit, model)
+    unseen = [j for j in names if left[j] > HIDDEN]
+    sentences = _reasons(kind, names, unseen, np.linalg.norm(traces, axis=0), slip, len(u))
+    return Visibility(left, tuple(unseen), tuple(sentences), int(np.sum(information > 1)))
+
+
+def _sensitivities(observer: KalmanFilter, x: Array, u: Array) -> tuple[Array, Array]:
+    """Outputs of a window by the state at its beginning, in units of noise and spread; sample of each first slip."""
+    n, slopes = len(x), linearised(observer.function)
+    root = 1 / np.sqrt(np.diag(observer.R))
+    carried, rows, slip = np.eye(n), [], np.full(n, -1)
+    for k, value in enumerate(u):
+        a, _, c, _ = (np.asarray(block) for block in slopes(x, value))
+        x = np.asarray(observer.function(x, value)[0]).ravel()
+        rows.append(root[:, None] * (c @ carried))
+        carried = a @ carried
+        slip[np.flatnonzero((slip < 0) & (np.diag(a) == 0))] = k
+    return np.vstack(rows) * observer.spread, slip
+
+
+def _reasons(kind: str, names: dict[int, str], unseen: list[int], size: Array, slip: Array, samples: int) -> list[str]:
+    """A sentence for each reason why memory is hidden."""
+    if not names:
+        return ["The model has no memory to see."]
+    tiny = TRACE * np.max(size, initial=0.0)
+    wiped = [j for j in unseen if size[j] <= tiny and slip[j] >= 0]
+    idle = [j for j in unseen if size[j] <= tiny and slip[j] < 0]
+    rest = [j for j in unseen if size[j] > tiny]
+    joint, faint = ([j for j in rest if slip[j] < 0], [j for j in rest if slip[j] >= 0])
+    several = (
+        f"stick over all {samples} samples, so the outputs show only their weighted sum; an excursion that makes them "
+        "slip one after the other tells them apart"
+    )
+    one = (
+        f"sticks over all {samples} samples, and its effect on the outputs drowns in noise or looks like that of "
+        "others; an excursion that makes it slip settles it"
+    )
+    slipping = (
+        f"{'slip' if len(faint) > 1 else 'slips'} within the window, and the trace left before drowns in noise or "
+        "looks like that of others; from then on the signal that drives the operator determines its memory"
+    )
+    reasons = {
+        "wiped out before a trace reaches an output; its value does not matter": wiped,
+        "no output depends on it, because its weight is zero": idle,
+        several if len(joint) > 1 else one: joint,
+        slipping: faint,
+    }
+    if not unseen:
+        return [f"The outputs of {samples} samples see all {len(names)} memories."]
+    return [f"{kind} {', '.join(names[j] for j in entries)}: {why}." for why, entries in reasons.items() if entries]
+
+
+def _memory_names(fit: Any, model: Exported) -> tuple[str, dict[int, str]]:
+    """Kind of the memory, and the name and threshold of each entry of the state that is memory."""
+    places = {model.states[name]: name for name in model.held}
+    element = fit.model.element if isinstance(fit, Fit) else None
+    if isinstance(fit, Fit) and not isinstance(element, PrandtlIshlinskii):
+        return "Memory", {place: str(k + 1) for k, place in enumerate(places)}
+    out = {}
+    for k, (place, name) in enumerate(places.items()):
+        r, shown = model.thresholds.get(name), name
+        if isinstance(element, PrandtlIshlinskii):
+            channel, i = divmod(k, element.n)
+            shown = f"{i + 1}{f' of channel {channel + 1}' if element.channels > 1 else ''}"
+        out[place] = shown if r is None else f"{shown} (r = {r:.3g})"
+    kind = element.operator.name.replace("_", " ") if isinstance(element, PrandtlIshlinskii) else "memory"
+    return f"{kind[0].upper()}{kind[1:]}", out

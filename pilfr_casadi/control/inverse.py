@@ -1,6 +1,6 @@
-"""The input for a wanted output: a fitted model inverted one look-ahead at a time.
+"""The input for a wanted output: a fitted model inverted one look-ahead at a time, and an element inverted exactly.
 
-**Method.** With `F(x, u) = (f, h)`, a delay of n samples and a look-ahead of d >= n samples, the input u of a sample
+**Model.** With `F(x, u) = (f, h)`, a delay of n samples and a look-ahead of d >= n samples, the input u of a sample
 solves
 
     y_{k+d}(x_k, u_{k+i} = u + min(i, d - n) (u - u_{k-1})) = wanted_{k+d}:
@@ -20,6 +20,19 @@ by the Markov parameter `m_0 = D, m_j = C A^{j-1} B`. A pure delay of n samples 
 these are small instead of zero, so values within four standard errors, or a thousandth of the largest, count as zero.
 Standard errors follow from the covariance of the fit's parameters by the delta method. The zeros are the eigenvalues of
 `A - B C A^n / m_n` (`A - B C / D` for n = 0), the poles of the exact inverse; n of them are zero, those of the delay.
+
+**Element.** For plays with `0 = r_0 < r_1 < ... < r_n` and weights `w_0 > 0` (the linear part), all partial sums
+positive, Krejčí & Kuhnen (2001), IEE Proc. Control Theory Appl. 148, give the inverse in closed form:
+
+    r'_i = Σ_{j≤i} w_j (r_i - r_j),   w'_0 = 1 / w_0,
+    w'_i = -w_i / ((w_0 + ... + w_i) (w_0 + ... + w_{i-1})),
+    q'_i = Σ_{j≤i} w_j q_i + Σ_{j>i} w_j q_j.
+
+r' are the values of the virgin loading curve at the kinks, w' the changes of slope of its inverse function. The
+memories q' follow from those of the plays at the moment when play i slipped last. Stops become plays by
+`S_r[z] = z - P_r[z]`: `Σ w_j S_rj = (Σ w_j) z - Σ w_j P_rj`. A sum of stops alone saturates and has no inverse; a
+spring of stiffness `gain` beside it makes one possible. If all partial sums are negative, the output falls as the input
+rises. Then the formulas hold with -r' for r', because plays are odd: `P_r[-z] = -P_r[z]` from the negative memory.
 """
 
 from __future__ import annotations
@@ -30,11 +43,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, numbers
+from .._base import InputError, is_whole, listed, numbers
 from ..data import Recording
 from ..identify import Fit, covariance, variance
+from ..models import Play, Stop, play
 from ..optimise import Problem
-from .estimation import KalmanFilter, ModelSource, Rollout, function_of_observer, roll_out
+from .estimation import KalmanFilter, ModelSource, Rollout, function_of_observer, linearised, roll_out
 
 Array = np.ndarray
 FARTHEST = 12  # samples of look-ahead beyond the delay that are tried; longer ones gain nothing on the benchmarks
@@ -139,7 +153,7 @@ def feedforward(
     run = roll_out(fit, recording, "feedforward")
     _check_ports(run, recording)
     ends = _input_limits(limits, recording)
-    planned = run.function if observer is None else function_of_observer(observer, run.function, recording)
+    planned = run.model.step if observer is None else function_of_observer(observer, run.model.step, recording)
     response = analyse_response(fit, run, recording)
     found, why = _choose_look_ahead(run, recording, response, ahead)
     delay = response.delay or 0
@@ -165,7 +179,7 @@ def _check_ports(run: Rollout, recording: Recording) -> None:
             f"The model has {n_u} inputs and {n_y} output(s); the compensator inverts models of one input "
             "and one output, so fit such a one, or use predictive control."
         )
-    if len(run.names) > 1:
+    if len(run.model.inputs) > 1:
         raise InputError(
             "The model's input is interpolated between samples, so that a step takes two, and the compensator holds "
             "its own; give exported(simulator, dt=..., hold='zero', start=...), of a diagnosis with its `corrected`."
@@ -221,8 +235,7 @@ def _output_ahead(function: ca.Function, ahead: int, delay: int) -> ca.Function:
 
 def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, ahead: int | None) -> tuple[int, str]:
     """Check the look-ahead, or find the shortest stable one; also why its inverse is not the exact one."""
-    whole = isinstance(ahead, int | np.integer) and not isinstance(ahead, bool)
-    if ahead is not None and not (whole and 0 <= ahead <= LONGEST):
+    if ahead is not None and not is_whole(ahead, 0, LONGEST):
         raise InputError(f"A look-ahead of {ahead!r} samples was given; give a whole number from 0 to {LONGEST}.")
     n = response.delay
     if n is None:
@@ -241,16 +254,14 @@ def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, a
     largest, limit = max(h for _, h, _ in found.values()), _stability_limit(response)
     usable = [d for d, (gain, _, radius) in found.items() if gain > FAINT * largest and radius < limit]
     if usable and ahead in (None, usable[-1]):
-        taken, why = usable[0] if ahead is None else ahead, ""
+        taken = usable[0] if ahead is None else int(ahead)
         if taken == n:
-            return int(n), why
+            return taken, ""
         if found[n][2] >= limit:
-            why = f"the exact inverse would be unstable ({_reason(response, found[n][2])})"
-        elif n in usable:
-            why = "a longer look-ahead was asked for"
-        else:
-            why = f"only by less than {100 * FAINT:g} % of what follows"
-        return int(taken), why
+            return taken, f"the exact inverse would be unstable ({_reason(response, found[n][2])})"
+        if n in usable:
+            return taken, "a longer look-ahead was asked for"
+        return taken, f"only by less than {100 * FAINT:g} % of what follows"
     which = f"{ahead}" if ahead is not None else f"{n} to {tried[-1]}"
     smallest = min(radius for d, (_, _, radius) in found.items() if ahead in (None, d))
     raise InputError(
@@ -262,9 +273,9 @@ def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, a
 def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: int) -> tuple[float, float, float]:
     """Usual gain of a look-ahead, gain of a constant input, and largest spectral radius along the recording."""
     n = len(response.linear[0][0])
-    reached, poles, constant = _output_ahead(run.function, d, response.delay or 0), [], []
+    reached, poles, constant = _output_ahead(run.model.step, d, response.delay or 0), [], []
     for k, (a, b, _, _) in zip(response.at, response.linear, strict=True):
-        slopes = reached(response.states[:, k], recording.u[max(k - 1, 0)], recording.u[k])
+        slopes = reached(run.states[:, k], recording.u[max(k - 1, 0)], recording.u[k])
         _, g_x, g_before, g_u = (np.asarray(v) for v in slopes)
         gain = float(g_u.item())
         constant.append(abs(gain + float(g_before.item())))
@@ -281,7 +292,7 @@ def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: 
 def _gain_changes_sign(run: Rollout, recording: Recording, response: Response, ends: tuple[float, float]) -> bool:
     """Tell whether the output rises with the input in places and falls in others."""
     n = response.delay or 0
-    reached, grid = _output_ahead(run.function, n, n), np.linspace(*ends, INPUTS)
+    reached, grid = _output_ahead(run.model.step, n, n), np.linspace(*ends, INPUTS)
     of = [reached(run.states[:, k], recording.u[max(k - 1, 0)], grid[None, :])[3] for k in response.at]
     gains = np.ravel([np.asarray(gain) for gain in of])
     counted = FAINT * float(np.median(np.abs(gains[gains != 0]))) if np.any(gains) else 0.0
@@ -301,26 +312,19 @@ def _stability_limit(response: Response) -> float:
 
 def _reason(response: Response, radius: float) -> str:
     zeros = _unstable_zeros(response)
+    zeros = zeros[zeros.imag >= 0]  # one of each conjugate pair
     if len(zeros):
-        return f"zeros on or outside the unit circle at {_list_zeros(zeros)}"
+        shown = [f"{z.real:.4g}" + (f" ± {z.imag:.4g}i" if z.imag else "") for z in zeros]
+        return f"zeros on or outside the unit circle at {listed(shown, 5)}"
     return (
         f"along the recording its inverse has a pole of magnitude {radius:.4g}, beyond {_stability_limit(response):.4g}"
     )
 
 
-def _list_zeros(zeros: Array) -> str:
-    """Zeros in words, one of each conjugate pair, at most five."""
-    upper = zeros[zeros.imag >= 0]
-    named = [f"{z.real:.4g}" + (f" ± {z.imag:.4g}i" if z.imag else "") for z in upper[:5]]
-    return ", ".join(named) + (f" and {len(upper) - 5} more" if len(upper) > 5 else "")
-
-
 def _note(ahead: int, delay: int, why: str) -> str:
     delayed, known = (f"{n} sample" + "s" * (n != 1) for n in (delay, ahead))
-    begin = f"An input reaches the output after {delayed}"
-    if not why:
-        return f"{begin}: the exact inverse, for a path that is known {known} ahead."
-    return f"{begin}, but {why}: an approximate inverse, for a path that is known {known} ahead."
+    kind = f", but {why}: an approximate" if why else ": the exact"
+    return f"An input reaches the output after {delayed}{kind} inverse, for a path that is known {known} ahead."
 
 
 def _percent(share: float) -> str:
@@ -332,31 +336,14 @@ def _percent(share: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """A model linearised at states along a recording.
-
-    Attributes
-    ----------
-    at : array, shape (points,)
-        Samples of the recording.
-    states : array, shape (n_x + n_s, samples + 1)
-        States of the model before each sample and after the last.
-    linear : tuple
-        `(A, B, C, D)` of the linear states at each point, with the memory constant.
-    markov, errors : array, shape (SAMPLES,)
-        Median magnitudes of the Markov parameters over the points, and their standard errors (nan where unknown).
-    delay : int or None
-        Samples after which the input reaches the output; None where it never does.
-    early : float
-        Largest Markov parameter before the delay at any of the points, over the largest median.
-    """
+    """A model linearised at states along a recording, samples `at`; Markov parameters are medians of magnitudes."""
 
     at: Array
-    states: Array
-    linear: tuple[tuple[Array, ...], ...]
-    markov: Array
-    errors: Array
-    delay: int | None
-    early: float = 0.0
+    linear: tuple[tuple[Array, ...], ...]  # (A, B, C, D) of the linear states at each point, with the memory constant
+    markov: Array  # (SAMPLES,)
+    errors: Array  # standard errors of these, nan where unknown
+    delay: int | None  # samples after which the input reaches the output; None where it never does
+    early: float  # largest Markov parameter before the delay at any of the points, over the largest median
 
     def zeros(self) -> Array:
         """Return the zeros at the point of the median gain, including those of the delay."""
@@ -373,10 +360,9 @@ class Response:
 
 def analyse_response(given: Any, run: Rollout, recording: Recording) -> Response:
     """Linearise a model of one input and one output along its run of a recording."""
-    function, states = run.function, run.states
+    function, states = run.model.step, run.states
     at = np.unique(np.linspace(min(1, len(recording) - 1), len(recording) - 1, POINTS).astype(int))
-    x, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("u")
-    slopes = _linearisation("slopes", [x, u], x, u, *function(x, u))
+    slopes = linearised(function)
     linear = tuple(_linear_blocks(slopes(states[:, k], recording.u[k]), run.linear) for k in at)
     each = np.array([_markov(point, SAMPLES) for point in linear])
     markov = np.median(np.abs(each), axis=0)
@@ -388,15 +374,10 @@ def analyse_response(given: Any, run: Rollout, recording: Recording) -> Response
     reached = largest > 1e-12 * np.ptp(recording.y) / max(float(np.ptp(recording.u)), 1e-300) and np.any(counts)
     delay = int(np.argmax(counts)) if reached else None
     early = float(np.max(np.abs(each[:, :delay]), initial=0.0) / largest) if reached else 0.0
-    return Response(at, states, linear, markov, errors, delay, early)
+    return Response(at, linear, markov, errors, delay, early)
 
 
-def _linearisation(name: str, arguments: list[ca.SX], x: ca.SX, u: ca.SX, following: ca.SX, y: ca.SX) -> ca.Function:
-    blocks = [ca.densify(ca.jacobian(f, v)) for f in (following, y) for v in (x, u)]
-    return ca.Function(name, arguments, blocks)
-
-
-def _linear_blocks(blocks: Any, linear: Array) -> tuple[Array, ...]:
+def _linear_blocks(blocks: Any, linear: list[int]) -> tuple[Array, ...]:
     a, b, c, d = (np.asarray(v) for v in blocks)
     return a[np.ix_(linear, linear)], b[linear], c[:, linear], d
 
@@ -421,14 +402,117 @@ def _markov_errors(fit: Fit, recording: Recording, state: Array, drive: Array) -
     except InputError:  # everything is fixed
         return np.full(SAMPLES, np.nan)
     x, u, p = ca.SX.sym("x", model.n_state), ca.SX.sym("u"), ca.SX.sym("p", parameters.size)
-    slopes = _linearisation("slopes", [x, u, p], x, u, *model.closed(x, u, p))
+    blocks = [ca.densify(ca.jacobian(f, v)) for f in model.closed(x, u, p) for v in (x, u)]
+    slopes = ca.Function("slopes", [x, u, p], blocks)
     derivatives = []
     for i in np.flatnonzero(parameters.free):
         step = 1e-6 * max(abs(parameters.start[i]), 1e-3 * np.max(np.abs(parameters.start)))
         moved = [parameters.start + sign * step * (np.arange(parameters.size) == i) for sign in (1, -1)]
         up, down = (
-            _markov(_linear_blocks(slopes(state, drive, value), np.arange(model.n_x)), SAMPLES) for value in moved
+            _markov(_linear_blocks(slopes(state, drive, value), list(range(model.n_x))), SAMPLES) for value in moved
         )
         derivatives.append((up - down) / (2 * step))
     spread = np.diag(variance(covariance(problem, problem.start, fit.structure), np.array(derivatives).T))
     return np.sqrt(np.where(np.isfinite(spread), np.maximum(spread, 0.0), np.nan))
+
+
+# --- inverse of an element
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """The inverse of `gain z + Σ w_j H_rj[z]`: plays again, the first with threshold 0.
+
+    Attributes
+    ----------
+    step : casadi.Function
+        `(memory, wanted) -> (memory_next, u)`: the u for which the element gives the wanted value.
+    r, w : array, shape (n + 1,)
+        Thresholds (in units of the element's output) and weights, for a `PrandtlIshlinskii(Play, n + 1)`.
+    """
+
+    step: ca.Function
+    r: Array
+    w: Array
+    _sorted: tuple[Array, Array, Array]
+
+    def __str__(self) -> str:
+        r = ", ".join(f"{v:.4g}" for v in self.r)
+        w = ", ".join(f"{v:.4g}" for v in self.w)
+        return f"inverse element of {len(self.r)} plays, from a wanted value to u\nthresholds: {r}\nweights: {w}"
+
+    __repr__ = __str__
+
+    def memory(self, s: Array | None = None) -> Array:
+        """Memory of the inverse for the element's memory s, shape (n,); at rest by default.
+
+        s are the states of the plays, also for stops, in the order of the given thresholds. Some input must be able to
+        bring them about.
+        """
+        order, _, w = self._sorted
+        q = np.zeros(len(order)) if s is None else numbers(s, "The memory").ravel()
+        if len(q) != len(order):
+            raise InputError(f"{len(q)} memories were given for {len(order)} operators; give one each.")
+        q = np.concatenate([[0.0], q[order]])
+        own = np.cumsum(w) * q + np.sum(w * q) - np.cumsum(w * q)
+        own[0] = 0.0  # the play of threshold 0 forgets at once
+        return np.asarray(own)
+
+
+def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, name: str = "inverse") -> Inverse:
+    """Invert one channel of a Prandtl-Ishlinskii element, `v = gain z + Σ w_j H_rj[z]`.
+
+    Parameters
+    ----------
+    r, w : array, shape (n,)
+        Thresholds (not negative, any order) and weights of the operators.
+    gain : float
+        Linear part beside them; it joins the weights of operators with threshold 0.
+    operator : Play or Stop
+        Kind of the operators.
+    name : str
+        Name of the CasADi Function.
+
+    Returns
+    -------
+    Inverse
+
+    Raises
+    ------
+    InputError
+        If the element has no inverse: its slope right after a reversal or along its loading curve is zero or
+        changes its sign.
+    """
+    kind = operator() if isinstance(operator, type) else operator
+    r, w = numbers(r, "The thresholds").ravel(), numbers(w, "The weights").ravel()
+    gain = float(numbers(gain, "gain", ()))
+    if not isinstance(name, str) or not ca.Function.check_name(name):
+        raise InputError(f"The function name {name!r} cannot be used; give letters, digits and single underscores.")
+    if not isinstance(kind, Play | Stop):
+        raise InputError(f"The inverse of {operator!r} is not known in closed form; give Play or Stop.")
+    if len(r) != len(w):
+        raise InputError(f"{len(r)} thresholds and {len(w)} weights were given; give one weight for each threshold.")
+    if np.any(r < 0):
+        raise InputError(f"A threshold is {np.min(r):.4g}; thresholds are half-widths, give zero or more.")
+    if isinstance(kind, Stop):
+        gain, w = gain + float(np.sum(w)), -w
+    order = np.argsort(r, kind="stable")
+    r, w = np.concatenate([[0.0], r[order]]), np.concatenate([[float(gain)], w[order]])
+    slope = np.cumsum(w)
+    first = int(np.sum(r == 0))  # operators without width belong to the linear part
+    sign = 1.0 if slope[first - 1] > 0 else -1.0
+    if np.any(sign * slope[first - 1 :] <= 1e-12 * np.max(np.abs(slope))):
+        raise InputError(
+            f"This element has no inverse: its slope is {slope[first - 1]:.4g} right after a reversal and "
+            f"{slope[-1]:.4g} once everything slips, and all slopes must be above zero, or all below; add a linear "
+            "part with gain=."
+        )
+    own = np.zeros(len(r))
+    own[0] = 1 / slope[first - 1]
+    own[first:] = -w[first:] / (slope[first:] * slope[first - 1 : -1])
+    low = sign * np.array([np.sum(w[: i + 1] * (r[i] - r[: i + 1])) for i in range(len(r))])
+    q, v = ca.SX.sym("memory", len(r)), ca.SX.sym("wanted")
+    following = ca.vertcat(*[play(v, q[i], low[i]) for i in range(len(r))])
+    names = ["memory", "wanted"], ["memory_next", "u"]
+    step = ca.Function(name, [q, v], [following, ca.dot(ca.DM(own), following)], *names)
+    return Inverse(step, low, own, (order, r, w))

@@ -12,6 +12,20 @@ Operators with memory make the model piecewise linear. Within a piece the Gauss-
 pieces the line search decides, and a plan may stop at a kink that is no optimum. It is then marked as not converged:
 rare with one input, common with several inputs behind plays. A plan is never worse than the last one shifted, and it
 keeps the limits of inputs and rates in any case. Nocedal & Wright (2006), Numerical Optimization, ch. 18.
+
+Scales say how large a deviation counts as one in the cost. They follow from the options alone, so the cost is the same
+in every call and does not depend on the units:
+
+    u_scale   half of the width between the limits of an input; 1 where it has no limits;
+    y_scale   the smaller of half the width between the limits of an output, and half of the range that it covers when
+              the model is driven from rest by either end of the inputs over the horizon. Without output limits, a tenth
+              of that range; 1 where nothing is known.
+
+A violated limit costs in proportion to y_scale and a deviation with its square, so a small y_scale makes limits that
+cannot be kept count less against the reference. Therefore y_scale is larger with limits than without.
+
+The price of a violation is an exact penalty. A reference that lies `e` scales beyond a limit pulls with at most `2 e`
+per sample, so a price of 30, or `30 e` for `e > 1`, keeps a limit wherever that is possible.
 """
 
 from __future__ import annotations
@@ -23,11 +37,17 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, numbers
+from .._base import InputError, is_whole, numbers, whole
+from ..export import Exported
+from ..identify import Fit
 from ..models import Buffered
-from .mpc_options import ControlTask, check_task, is_count
 
 Array = np.ndarray
+NO_LIMIT = 1e20  # stands for infinity in limits of outputs; IPOPT's convention
+PRICE = 30.0  # cost of a violated limit per y_scale; 15 times the steepest pull of a reference one scale beyond it
+UNLIMITED_SHARE = 0.1  # of an output's range: the scale without limits, so that errors of a few per cent count
+PROBE = 2.0  # u_scale from zero: the range of inputs over which an output's range is looked at
+LARGEST, SMALLEST = 1e15, 1e-300  # limits and ranges beyond these count as unknown
 FIRST = 10  # times as many iterations for the first plan, which starts from a held input
 KEPT = 1e-5  # of y_scale: a violation of an output limit below the solver's tolerance is none
 SLACK_CURVATURE = 0.1  # Hessian of the slacks: makes the QP strictly convex, small against the price of 30
@@ -38,7 +58,7 @@ SQP = {
     "tol_pr": 1e-5,  # of the scaled constraints: DAQP's own tolerance with the curvature of the slacks
     "tol_du": 1e-4,
     "beta": 0.5,  # the line search halves a step until the cost falls: kinks stand in the way of full steps
-    "max_iter_ls": 8,
+    "max_iter_ls": 12,  # shorter steps than 2^-12 no longer gain; with 8, plans of several inputs cost 3 % more
     "merit_memory": 1,
     "min_step_size": 1e-6,  # of u_scale: a smaller step has nothing to gain
     **dict.fromkeys(("print_header", "print_iteration", "print_status"), False),
@@ -143,7 +163,7 @@ class PredictiveController:
         iterations: int = 5,
     ) -> None:
         task = check_task(function, horizon, inputs, outputs, rate, move, y_scale, u_scale)
-        if solver not in ("sqp", "ipopt") or not is_count(iterations):
+        if solver not in ("sqp", "ipopt") or not is_whole(iterations, 1):
             raise InputError(
                 f"The solver {solver!r} and {iterations!r} iterations were given; give 'sqp' or 'ipopt', and 1 or more."
             )
@@ -277,3 +297,143 @@ def _reference(reference: Any, samples: int, n_y: int) -> Array:
     if found.shape == (samples, n_y) or (n_y == 1 and found.size == samples == max(found.shape, default=0)):
         return found.reshape(-1)
     raise InputError(f"The reference has the shape {found.shape}; give {(samples, n_y)}, a row a sample.")
+
+
+# --- options
+
+
+@dataclass(frozen=True, eq=False)
+class ControlTask:
+    """A checked problem of predictive control; vectors over the horizon, sample by sample: (N n_u,) or (N n_y,)."""
+
+    function: ca.Function
+    horizon: int
+    low: Array
+    high: Array
+    low_y: Array
+    high_y: Array
+    limited: bool
+    rate: Array
+    move: float
+    y_scale: Array
+    u_scale: Array
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers of states, inputs and outputs."""
+        return self.function.size1_in(0), self.function.size1_in(1), self.function.size1_out(1)
+
+    def beyond(self, y: Array) -> Array:
+        """How far each output (N n_y,) is outside its limits."""
+        return np.maximum(0, np.maximum(self.low_y - y, y - self.high_y))
+
+    def price(self, reference: Array) -> float:
+        """Cost of a violated output limit per y_scale, for a reference (N n_y,)."""
+        return limit_price(self.beyond(reference) / self.y_scale)
+
+    def first_rate(self, before: Array) -> Array:
+        """Largest changes (N n_u,); the first is as large as it takes to come back inside the limits."""
+        rate, n_u = self.rate.copy(), len(before)
+        rate[:n_u] = np.maximum(rate[:n_u], np.maximum(self.low[:n_u] - before, before - self.high[:n_u]))
+        return rate
+
+    def clip(self, u: Array, before: Array, rate: Array) -> Array:
+        """Move inputs into the limits and the rates, sample by sample, after the input `before`."""
+        n, u = len(before), np.clip(u, self.low, self.high)
+        if np.any(np.abs(u - np.concatenate([before, u[:-n]])) > rate):
+            for k in range(0, len(u), n):
+                now = slice(k, k + n)
+                slow = np.clip(u[now], before - rate[now], before + rate[now])
+                u[now] = before = np.clip(slow, self.low[now], self.high[now])
+        return u
+
+
+def check_task(
+    function: Any,
+    horizon: Any,
+    inputs: Any,
+    outputs: Any = None,
+    rate: Any = None,
+    move: Any = 1e-3,
+    y_scale: Any = None,
+    u_scale: Any = None,
+) -> ControlTask:
+    """Check the options of a predictive controller and spread them over the horizon."""
+    function = step_function(function)
+    n_u, n_y = function.size1_in(1), function.size1_out(1)
+    horizon = whole(horizon, "The horizon", 1)
+    low, high = _limits(inputs, "inputs", (horizon, n_u))
+    low_y, high_y = _limits((-NO_LIMIT, NO_LIMIT) if outputs is None else outputs, "outputs", (horizon, n_y))
+    width = (np.clip(high, -LARGEST, LARGEST) - np.clip(low, -LARGEST, LARGEST)) / 2
+    u_size = np.where(width < LARGEST / 4, width, 1.0)
+    if u_scale is not None:
+        u_size = numbers(u_scale, "u_scale", (horizon, n_u)).ravel()
+    if y_scale is None:
+        rest = np.clip(0.0, low, high)
+        ends = np.maximum(low, rest - PROBE * u_size), np.minimum(high, rest + PROBE * u_size)
+        y_size = _output_scale(function, low_y, high_y, ends)
+    else:
+        y_size = numbers(y_scale, "y_scale", (horizon, n_y)).ravel()
+    rates = numbers(np.inf if rate is None else rate, "rate", (horizon, n_u), infinite=True).ravel()
+    weight = float(numbers(move, "move", ()))
+    if any(np.any(size <= 0) for size in (y_size, u_size, rates)) or weight < 0:
+        raise InputError("y_scale, u_scale, rate and move are sizes; give numbers above zero (move may be zero).")
+    limited = outputs is not None
+    return ControlTask(function, horizon, low, high, low_y, high_y, limited, rates, weight, y_size, u_size)
+
+
+def step_function(given: Any) -> ca.Function:
+    """Return the step `(x, u) -> (x_next, y)` of a fit, an observer or an export, or a function as it is."""
+    model = given.export() if isinstance(given, Fit) else given
+    if isinstance(model, Exported) and "next" in model.reads:
+        raise InputError(
+            f"The inputs of {model.name} are interpolated, so a step takes those of the next sample too, and these "
+            'are not free; export it with hold="zero" to plan with it.'
+        )
+    function = model
+    if not isinstance(model, ca.Function):  # an observer has a function, an export a step
+        function = getattr(model, "function", getattr(model, "step", model))
+    if not isinstance(function, ca.Function):
+        raise InputError(
+            f"A {type(given).__name__} cannot be planned with; give a Fit, an observer, an export, or a "
+            "casadi.Function (x, u) -> (x_next, y)."
+        )
+    if function.n_in() != 2 or function.n_out() != 2 or function.size1_in(0) != function.size1_out(0):
+        raise InputError(
+            f"The function {function.name()} has {function.n_in()} inputs and {function.n_out()} outputs, or its "
+            "state changes size in a step; give (x, u) -> (x_next, y)."
+        )
+    return function
+
+
+def limit_price(beyond: Array) -> float:
+    """Price of a violated limit for a reference that lies `beyond` the limits, in units of y_scale."""
+    return PRICE * max(1.0, float(np.max(beyond, initial=0.0)))
+
+
+def _limits(limits: Any, of: str, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Lower and upper limit over the horizon; infinite means none."""
+    if not isinstance(limits, tuple | list) or len(limits) != 2:
+        raise InputError(f"The limits of the {of} cannot be {str(limits)[:60]}; give (low, high).")
+    if any(v is None for v in limits):
+        raise InputError(f"A limit of the {of} is None; give (low, high), infinite where there is no limit.")
+    ends = zip(limits, ("lower", "upper"), strict=True)
+    low, high = (numbers(v, f"The {end} limit of the {of}", shape, infinite=True).ravel() for v, end in ends)
+    if np.any(low >= high):
+        raise InputError(f"A lower limit of the {of} is not below its upper one; give (low, high) with low below high.")
+    return low, high
+
+
+def _output_scale(function: ca.Function, low: Array, high: Array, ends: tuple[Array, Array]) -> Array:
+    """Scale of the outputs from their limits (N n_y,) and from runs with the inputs at both ends (N n_u,)."""
+    n_u, n_y = function.size1_in(1), function.size1_out(1)
+    samples = len(low) // n_y
+    width = np.min(((high - low) / 2).reshape(samples, n_y), axis=0)
+    limited = np.any((np.minimum(-low, high) < LARGEST).reshape(samples, n_y), axis=0)
+    run, rest = function.mapaccum("output_range", samples), np.zeros(function.size1_in(0))
+    with np.errstate(all="ignore"):
+        paths = [np.asarray(run(rest, end.reshape(samples, n_u).T)[1]) for end in ends]
+        covered = np.ptp(np.hstack(paths), axis=1) / 2
+    known = [np.where((v > SMALLEST) & (v < LARGEST), v, np.inf) for v in (width, covered)]
+    size = np.minimum(*known) * np.where(limited, 1.0, UNLIMITED_SHARE)
+    return np.tile(np.where(np.isfinite(size), size, 1.0), samples)

@@ -5,13 +5,6 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .exported_model import (
-        NAMES as NAMES,
-        Exported as Exported,
-        FittedModel as FittedModel,
-        exported as exported,
-        to_casadi as to_casadi,
-    )
     from .model_file import (
         FitContent as FitContent,
         SavedStart as SavedStart,
@@ -20,5 +13,12 @@ if TYPE_CHECKING:
         write_model_file as write_model_file,
     )
     from .smoothing import enclosed as enclosed, smoothed as smoothed
+    from .step import (
+        NAMES as NAMES,
+        Exported as Exported,
+        FittedModel as FittedModel,
+        exported as exported,
+        to_casadi as to_casadi,
+    )
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

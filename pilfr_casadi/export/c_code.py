@@ -17,29 +17,44 @@ from typing import Any
 
 import casadi as ca
 
-from .._base import make_folder, write_atomically
+from .._base import InputError, make_folder, write_atomically
+
+LONGEST_NAME = 50  # letters: C tells names apart by their first 63, and the longest ending is "_casadi_release"
+C_KEYWORDS = frozenset(  # of C and C++
+    (  # noqa: SIM905
+        "alignas alignof and asm auto bool break case catch char class compl const constexpr continue decltype default "
+        "delete do double else enum explicit export extern false float for friend goto if inline int long mutable "
+        "namespace new noexcept not nullptr operator or private protected public register reinterpret restrict return "
+        "short signed sizeof static struct switch template this throw true try typedef typeid typename union unsigned "
+        "using virtual void volatile while xor"
+    ).split()
+)
+C_HEADERS = frozenset(  # of C's library, which a file `<name>.h` would hide
+    (  # noqa: SIM905
+        "assert complex ctype errno fenv float inttypes iso646 limits locale malloc math memory mex setjmp signal "
+        "stdarg stdbool stddef stdint stdio stdlib string strings tgmath threads time uchar unistd wchar wctype"
+    ).split()
+)
+WORK = {"arg": "const casadi_real *arg", "res": "casadi_real *res", "iw": "casadi_int iw", "w": "casadi_real w"}
+
+
+def check_name(name: Any) -> None:
+    """Refuse a function name that CasADi, a file or C does not take."""
+    if not isinstance(name, str) or not ca.Function.check_name(name):
+        raise InputError(
+            f"The function name {str(name)[:60]!r} cannot be used; give letters, digits and single underscores."
+        )
+    if len(name) > LONGEST_NAME:
+        raise InputError(f"The function name {name[:20]}... has {len(name)} characters; give at most {LONGEST_NAME}.")
+    if name.lower() in C_KEYWORDS | C_HEADERS:
+        kind = "a word of C" if name.lower() in C_KEYWORDS else "the name of one of C's headers"
+        raise InputError(f"The function name {name!r} is {kind}; give another one.")
 
 
 def write_c(
     folder: str | os.PathLike[str], step: ca.Function, names: Mapping[str, Any], interpolated: bool
 ) -> tuple[Path, Path]:
-    """Write source and header of a step `(x, u) -> (x_next, y)`; see `Exported.to_c`.
-
-    Parameters
-    ----------
-    folder : path
-        Made where it does not exist.
-    step : casadi.Function
-    names : mapping
-        `Exported.names()`.
-    interpolated : bool
-        Whether the second half of u holds the inputs of the next sample.
-
-    Returns
-    -------
-    tuple of Path
-        Source and header.
-    """
+    """Write source and header of a step `(x, u) -> (x_next, y)` with `Exported.names()`; see `Exported.to_c`."""
     target, name = make_folder(folder), names["name"]
     header = write_atomically(target / f"{name}.h", _header(names, interpolated))
     return write_atomically(target / f"{name}.c", _source(step, names)), header
@@ -116,7 +131,7 @@ def _source(step: ca.Function, names: Mapping[str, Any]) -> str:
         "}",
         "",
         f"void {name}_step(const double *x, const double *u, double *x_next, double *y) {{",
-        *(f"  {kind}[{max(1, sizes[key])}];" for key, kind in _WORK.items()),
+        *(f"  {kind}[{max(1, sizes[key])}];" for key, kind in WORK.items()),
         f"  double now[{max(1, len(names['states']))}]; /* x_next may be x */",
         "  int i;",
         f"  for (i = 0; i < {big}_NX; i++) now[i] = x[i];" if names["states"] else "  (void)x; i = 0; now[i] = 0;",
@@ -128,9 +143,6 @@ def _source(step: ca.Function, names: Mapping[str, Any]) -> str:
         "}",
     ]
     return "\n".join(lines) + "\n"
-
-
-_WORK = {"arg": "const casadi_real *arg", "res": "casadi_real *res", "iw": "casadi_int iw", "w": "casadi_real w"}
 
 
 def _use_all_parameters(code: str) -> str:

@@ -16,17 +16,26 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from math import comb
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, __version__, ordered_digest, path_text, short, write_atomically
+from .._base import (
+    InputError,
+    __version__,
+    existing_file,
+    is_number,
+    ordered_digest,
+    path_text,
+    short,
+    write_atomically,
+)
 from ..models import (
     PILFR,
     Combined,
@@ -54,7 +63,9 @@ LARGEST_FILE = 200_000_000  # bytes; a model with 500 states takes 20 million
 MOST_PARTS = 100  # combined elements and degrees of products; more would only exhaust the memory
 HISTORY = ("number", "cost", "seconds", "step", "damping")  # columns of a solver's history
 OPERATORS: dict[str, Any] = {"play": Play, "stop": Stop, "generalized_play": GeneralizedPlay}
-Built = TypeVar("Built")
+WRITTEN = {Envelope: ("channels",), Products: ("channels", "degrees"), StaticNetwork: ("hidden", "channels")}
+LIMIT_NUMBERS = ("value", "lower", "upper", "multiplier")
+DEEPEST = 3  # nested lists of an array: no parameter has more dimensions than two
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,21 +107,12 @@ class FitContent:
     starts: tuple[SavedStart, ...] = ()
 
 
+class _Unusable(Exception):
+    """The end of a sentence about a file that is not damaged, but cannot be used."""
+
+
 def write_model_file(path: str | os.PathLike[str], content: FitContent) -> None:
-    """Write a fit as JSON, atomically: an existing file stays as it is until the new one is complete on disk.
-
-    Parameters
-    ----------
-    path : path
-        The file, usually `*.json`.
-    content : FitContent
-        The values to save. Of a model of the user's own equations only the values are kept; see `read_model_file`.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Write a fit as JSON, atomically; of a model of the user's own equations only the values are kept."""
     write_atomically(path, model_text(content))
 
 
@@ -129,9 +131,9 @@ def _tables_of_fit(fit: FitContent) -> dict[str, Any]:
         "written_by": {"pilfr_casadi": __version__, "casadi": ca.__version__},
         "model": {
             "dt": fit.dt,
-            "inputs": _channel_tables(model.inputs, fit.units),
-            "outputs": _channel_tables(model.outputs, fit.units),
-            "states": list(model.states),
+            "inputs": [{"name": name, "unit": fit.units.get(name, "")} for name in model.inputs],
+            "outputs": [{"name": name, "unit": fit.units.get(name, "")} for name in model.outputs],
+            "states": model.states,
             "memory": model.n_s,
         },
         "structure": None if fit.structure is None else _structure_table(fit.structure),
@@ -150,8 +152,11 @@ def _tables_of_fit(fit: FitContent) -> dict[str, Any]:
             "weights": None if fit.weights is None else dict(fit.weights),
             "linear_nrmse": _to_json(fit.linear_nrmse),
             "seconds": fit.seconds,
-            "active": list(fit.active),
-            "limits": [_limit_table(limit) for limit in fit.limits or ()],
+            "active": fit.active,
+            "limits": [
+                {key: _to_json(v, "inf") if key in LIMIT_NUMBERS else v for key, v in asdict(limit).items()}
+                for limit in fit.limits or ()
+            ],
             "solve": _solve_table(solution),
             "variables": dict(zip(fit.labels, _to_json(solution.theta), strict=True)),
             "multipliers": _to_json(solution.multipliers if len(solution.multipliers) == limited else ()),
@@ -163,27 +168,17 @@ def _tables_of_fit(fit: FitContent) -> dict[str, Any]:
                     "status": c.solution.status.name,
                     "note": c.note,
                     "drawn": c.drawn,
+                    **_solve_table(c.solution),
                 }
-                | _solve_table(c.solution)
                 for c in fit.starts
             ],
         },
     }
 
 
-def _limit_table(limit: Any) -> dict[str, Any]:
-    """Constraint or active bound."""
-    numbers = {key: _to_json(getattr(limit, key), "inf") for key in ("value", "lower", "upper", "multiplier")}
-    return {"name": limit.name, "kind": limit.kind, **numbers, "active": limit.active, "met": limit.met}
-
-
-def _solve_table(solution: Any) -> dict[str, Any]:
-    numbers = {"cost": solution.cost, "violation": solution.violation, "seconds": solution.seconds}
-    return {"iterations": int(solution.iterations), **{k: _to_json(v) for k, v in numbers.items()}}
-
-
-def _channel_tables(names: tuple[str, ...], units: Mapping[str, str]) -> list[dict[str, str]]:
-    return [{"name": name, "unit": units.get(name, "")} for name in names]
+def _solve_table(solution: Solution) -> dict[str, Any]:
+    numbers = {key: _to_json(getattr(solution, key)) for key in ("cost", "violation", "seconds")}
+    return {"iterations": int(solution.iterations), **numbers}
 
 
 def _structure_table(structure: PILFR) -> dict[str, Any]:
@@ -200,18 +195,14 @@ def _structure_table(structure: PILFR) -> dict[str, Any]:
 def _element_table(element: Any) -> dict[str, Any]:
     if isinstance(element, Combined):
         parts = [
-            {"name": p.name, "element": _element_table(p.element), "reads": list(p.reads), "writes": list(p.writes)}
+            {"name": p.name, "element": _element_table(p.element), "reads": p.reads, "writes": p.writes}
             for p in element.parts
         ]
         return {"kind": element.kind, "channels": element.channels, "parts": parts}
-    if isinstance(element, Envelope):
-        return {"kind": element.kind, "channels": element.channels}
-    if isinstance(element, Products):
-        return {"kind": element.kind, "channels": element.channels, "degrees": list(element.degrees)}
-    if isinstance(element, StaticNetwork):
-        return {"kind": element.kind, "hidden": element.hidden, "channels": element.channels}
     if not isinstance(element, PrandtlIshlinskii):
-        return {"kind": type(element).__name__}
+        if type(element) not in WRITTEN:
+            return {"kind": type(element).__name__}
+        return {"kind": element.kind, **{name: getattr(element, name) for name in WRITTEN[type(element)]}}
     operator = element.operator
     out = {"kind": element.kind, "operator": operator.name, "n": element.n, "channels": element.channels}
     out["rounded"] = element.rounded
@@ -242,338 +233,294 @@ def _layout(value: Any, depth: int = 0) -> str:
 
 
 def read_model_file(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> FitContent:
-    """Read a file that `write_model_file` wrote; simulations are the same to the last digit.
+    """Read a file that `write_model_file` wrote, as `identify.load` describes.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    model : Model or PILFR, optional
-        The equations, where the file cannot hold them: a closed model of your own, or a PI-LFR whose element has
-        envelope expressions of your own. Its values are replaced by those of the file.
-
-    Returns
-    -------
-    FitContent
-        Solutions of the starts have an empty `theta`: a file keeps only what they reached.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, unreadable, damaged, of another kind or version, was changed after it was written, does
-        not fit `model`, or holds values that are missing, not finite, or outside their bounds.
-
-    Warns
-    -----
-    UserWarning
-        If the file is of the first version of the format, which has no digest to tell changes by.
+    Solutions of the starts have an empty `theta`: a file keeps only what they reached.
     """
-    return _Reader(path, model).fit_content()
+    from .model_schema import read_tables
 
-
-class _Reader:
-    """A model file being read; every surprise in it becomes one sentence about the file."""
-
-    def __init__(self, path: str | os.PathLike[str], given: Model | PILFR | None) -> None:
-        from . import model_schema as schema
-
-        self.path, self.given = path_text(path, "model file"), given
-        self.tables = schema.read_tables(self._content(), self.damaged)
-        self.inputs = tuple(channel.name for channel in self.tables.model.inputs)
-        self.outputs = tuple(channel.name for channel in self.tables.model.outputs)
-
-    def fail(self, fault: str) -> NoReturn:
-        """Raise the sentence for a file that cannot be used."""
-        raise InputError(f"The file {short(self.path)} {' '.join(fault.split())}.")
-
-    def damaged(self, fault: str) -> NoReturn:
-        """Raise the sentence for content that is never written, or was written for another model than the one given."""
-        if self.given is not None:
-            self.fail(f"does not fit the model given: {fault}; give the model it was saved from")
-        self.fail(f"is damaged: {fault}; save the model again")
-
-    def build(self, make: Callable[..., Built], *parts: Any) -> Built:
-        """Make an object of parts of the file; where they do not go together, the file is damaged."""
-        try:
-            return make(*parts)
-        except InputError as error:
-            self.damaged(str(error).rstrip("."))
-
-    def array(self, value: Any, shape: tuple[int, ...] | None, name: str, missing: float | None = None) -> np.ndarray:
-        """Read nested lists as an array of a shape."""
-        from . import model_schema as schema
-
-        return schema.array(value, shape, name, self.damaged, missing)
-
-    def parameter(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Read the value of a parameter, which must have this shape."""
-        if name not in self.tables.parameters:
-            self.damaged(f"{name!r} is missing")
-        return self.array(self.tables.parameters[name].value, shape, f"parameter {name!r}")
-
-    def _content(self) -> dict[str, Any]:
-        """Tables of the file, less the digest, which must be theirs."""
-        content = self._parse(self._text())
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            self.fail(f"is not a model file (its format is not {FORMAT!r}); give a file that `save` wrote")
-        version = content.get("version")
-        if type(version) is not int or version not in (VERSION_WITHOUT_DIGEST, VERSION):
-            self.fail(
-                f"has version {json.dumps(version)[:20]} of the model format and this release reads versions "
-                f"{VERSION_WITHOUT_DIGEST} and {VERSION}; save the model again with this release, or use the release "
-                "that wrote it"
-            )
-        written = content.pop("sha256", None)
-        if written != ordered_digest(content) and (version == VERSION or written is not None):
-            self.fail(
-                "was changed after it was written (its content does not have the SHA-256 that it was written with); "
-                "restore it, or save the model again"
-            )
-        if written is None:
+    name = path_text(path, "model file")
+    text = _text(name)
+    try:
+        content = _checked(_parse(text))
+        if content.pop("sha256", None) is None:
             warnings.warn(
-                f"The file {short(self.path)} carries no digest (it has version {version} of the model format), so "
-                "changes made to it after it was written cannot be noticed; save the model again to give it one.",
-                stacklevel=5,
+                f"The file {short(name)} carries no digest (it has version {content['version']} of the model format), "
+                "so changes made to it after it was written cannot be noticed; save the model again to give it one.",
+                stacklevel=3,
             )
-        return content
+        return _fit_content(read_tables(content), model)
+    except _Unusable as error:
+        fault = str(error)
+    except ValueError as error:  # also of objects that cannot be made of the file's entries
+        fault = f"is damaged: {str(error).rstrip('.')}; save the model again"
+        if model is not None:
+            fault = f"does not fit the model given: {str(error).rstrip('.')}; give the model it was saved from"
+    raise InputError(f"The file {short(name)} {' '.join(fault.split())}.")
 
-    def _text(self) -> str:
-        try:
-            size = os.stat(self.path).st_size
-            if size > LARGEST_FILE:
-                self.fail(f"has {size / 1e6:.0f} MB, which no model file has; give a file that `save` wrote")
-            return Path(self.path).read_text(encoding="utf-8-sig")
-        except FileNotFoundError:
-            self.fail("does not exist; check the path")
-        except IsADirectoryError:
-            self.fail("is a folder; give the model file in it")
-        except UnicodeDecodeError:
-            self.fail("is not a model file (it is not text); give a file that `save` wrote")
-        except InputError:
-            raise
-        except (OSError, ValueError) as error:
-            self.fail(
-                f"cannot be read ({getattr(error, 'strerror', None) or error}); check the path and the permissions"
-            )
 
-    def _parse(self, text: str) -> Any:
-        def refuse_constant(name: str) -> NoReturn:
-            self.damaged(f"it holds {name}, which is not a number")
+def _text(path: str) -> str:
+    try:
+        file = existing_file(path)
+        size = file.stat().st_size
+        if size > LARGEST_FILE:
+            fault = f"has {size / 1e6:.0f} MB, which no model file has; give a file that `save` wrote"
+        else:
+            return file.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        fault = "is not a model file (it is not text); give a file that `save` wrote"
+    except OSError as error:
+        fault = f"cannot be read ({error.strerror or error}); check the path and the permissions"
+    raise InputError(f"The file {short(path)} {fault}.")
 
-        def parse_float(digits: str) -> float:
-            number = float(digits)
-            if not math.isfinite(number):
-                self.damaged(f"it holds {digits[:20]}, which is not a finite number")
-            return number
 
-        def refuse_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-            keys = [key for key, _ in pairs]
-            if len(set(keys)) < len(keys):
-                twin = next(key for key in keys if keys.count(key) > 1)
-                self.damaged(f"it has the key {twin[:40]!r} twice in one table")
-            return dict(pairs)
+def _parse(text: str) -> Any:
+    """Parse JSON that has each key once and no numbers beyond floating point."""
 
-        try:
-            return json.loads(
-                text, parse_constant=refuse_constant, parse_float=parse_float, object_pairs_hook=refuse_twins
-            )
-        except json.JSONDecodeError as error:
-            if not text.strip():
-                self.fail("is empty; it may have been cut off while being copied: copy or save it again")
-            if error.pos >= len(text.rstrip()) - 1 or "Unterminated" in error.msg:
-                self.fail("is incomplete, its end is missing; copy or save it again")
-            self.fail(f"is not valid JSON (line {error.lineno}, column {error.colno}); give a file that `save` wrote")
-        except InputError:
-            raise
-        except (ValueError, RecursionError, MemoryError):
-            self.fail("is not a model file (its JSON cannot be used); give a file that `save` wrote")
+    def finite(digits: str) -> float:
+        if not math.isfinite(number := float(digits)):
+            raise InputError(f"it holds {digits[:20]}, which is not a finite number")
+        return number
 
-    def fit_content(self) -> FitContent:
-        """Build the model and read everything about its training."""
-        tables, training = self.tables, self.tables.training
-        names = (*self.inputs, *self.outputs)
-        if not (self.inputs and self.outputs and all(names)) or len(set(names)) < len(names):
-            self.damaged("the names of inputs and outputs are missing or not distinct")
-        if tables.model.dt <= 0:
-            self.damaged(f"the step dt is {tables.model.dt:g} s")
-        structure, start = self._equations()
-        model = self._with_values(start, structure)
-        limits = None if training.limits is None else tuple(Limit(**dict(row)) for row in training.limits)
-        theta = np.array(list(training.variables.values()), dtype=float)
-        solution = replace(
-            self._solution(training.solve, training.status, theta),
-            multipliers=self._multipliers(limits, len(theta)),
-            history=self._history(),
-            message=training.message,
+    def table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        keys = [key for key, _ in pairs]
+        if len(set(keys)) < len(keys):
+            twin = next(key for key in keys if keys.count(key) > 1)
+            raise InputError(f"it has the key {twin[:40]!r} twice in one table")
+        return dict(pairs)
+
+    try:
+        return json.loads(text, parse_constant=finite, parse_float=finite, object_pairs_hook=table)
+    except json.JSONDecodeError as error:
+        if not text.strip():
+            fault = "is empty; it may have been cut off while being copied: copy or save it again"
+        elif error.pos >= len(text.rstrip()) - 1 or "Unterminated" in error.msg:
+            fault = "is incomplete, its end is missing; copy or save it again"
+        else:
+            fault = f"is not valid JSON (line {error.lineno}, column {error.colno}); give a file that `save` wrote"
+    except InputError:
+        raise
+    except (ValueError, RecursionError, MemoryError):
+        fault = "is not a model file (its JSON cannot be used); give a file that `save` wrote"
+    raise _Unusable(fault)
+
+
+def _checked(content: Any) -> dict[str, Any]:
+    """Return the content of a model file of a known version, whose digest is that of the rest."""
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise _Unusable(f"is not a model file (its format is not {FORMAT!r}); give a file that `save` wrote")
+    version = content.get("version")
+    if type(version) is not int or version not in (VERSION_WITHOUT_DIGEST, VERSION):
+        raise _Unusable(
+            f"has version {json.dumps(version)[:20]} of the model format and this release reads versions "
+            f"{VERSION_WITHOUT_DIGEST} and {VERSION}; save the model again with this release, or use the release "
+            "that wrote it"
         )
-        if any(v <= 0 for v in (training.noise, *(training.weights or {}).values()) if v is not None):
-            self.damaged("the noise or a weight of a recording is not above zero")
-        return FitContent(
-            model=model,
-            structure=structure,
-            dt=tables.model.dt,
-            solution=solution,
-            labels=tuple(training.variables),
-            errors={
-                name: self.array(tables.parameters[name].std, p.value.shape, f"the standard error of {name!r}", np.nan)
-                for name, p in model.parameters.items()
-                if tables.parameters[name].std is not None
-            },
-            linear=self._linear(structure),
-            initial={
-                recording: self.array(state, (model.n_x + model.n_s,), "an initial state")
-                for recording, state in tables.initial_states.items()
-            },
-            units={c.name: c.unit for c in (*tables.model.inputs, *tables.model.outputs) if c.unit},
-            train_nrmse=tuple(training.nrmse),
-            linear_nrmse=tuple(training.linear_nrmse),
-            seconds=training.seconds,
-            active=tuple(training.active),
-            limits=limits,
-            noise=training.noise,
-            weights=training.weights,
-            starts=tuple(
-                SavedStart(s.seed, s.error, self._solution(s, s.status, np.zeros(0)), s.note, s.drawn)
-                for s in training.starts
-            ),
+    written = content.get("sha256")
+    found = ordered_digest({key: value for key, value in content.items() if key != "sha256"})
+    if written != found and (version == VERSION or written is not None):
+        raise _Unusable(
+            "was changed after it was written (its content does not have the SHA-256 that it was written with); "
+            "restore it, or save the model again"
         )
+    return content
 
-    def _equations(self) -> tuple[PILFR | None, Model]:
-        """Structure (None for a model of the user's own) and closed model, not yet with the file's values."""
-        n_u, n_y = len(self.inputs), len(self.outputs)
-        if isinstance(self.given, Model):
-            if (self.given.n_u, self.given.n_y) != (n_u, n_y):
-                self.damaged(f"it has {self.given.n_u} inputs and {self.given.n_y} outputs, the file {n_u} and {n_y}")
-            return None, self.given
-        structure = self.given or self._structure(n_u, n_y)
-        try:
-            return structure, structure.model(n_u, n_y, inputs=self.inputs, outputs=self.outputs)
-        except ValueError as error:
-            self.damaged(f"its structure cannot be built ({str(error).rstrip('.')})")
 
-    def _structure(self, n_u: int, n_y: int) -> PILFR:
-        table = self.tables.structure
-        if table is None:
-            self.fail(
-                "holds the values of a model of your own equations, not the equations; give the model as `model=`"
-            )
-        element = None if table.element is None else self._outer_element(table.element)
-        for name, shape in block_shapes(table.nx, n_u, n_y, 0 if element is None else element.channels).items():
-            self.parameter(name, shape)
-
-        def pairs(kind: str, low: float | None, high: float | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-            title = f"the {kind} of"
-            return {
-                name: (self.array(pair[0], None, f"{title} {name!r}", low), self.array(pair[1], None, title, high))
-                for name, pair in getattr(table, kind).items()
-            }
-
-        fixed = {n: self.array(value, None, f"the fixed block {n!r}", np.nan) for n, value in table.fixed.items()}
-        bounds, priors = pairs("bounds", -np.inf, np.inf), pairs("priors", None, None)
-        return self.build(PILFR, table.nx, element, fixed, bounds, priors, table.offset)
-
-    def _outer_element(self, table: schema.OuterElementTable) -> Element:
-        """Build the element of the structure, which may combine others."""
-        if table.kind != "combined":
-            return self._element(table, "")
-        if len(table.parts) > MOST_PARTS:
-            self.damaged(f"it combines {len(table.parts)} elements")
-        parts = []
-        for row in table.parts:
-            element = self._element(row.element, f"{row.name}_")
-            parts.append(self.build(Part, row.name, element, tuple(row.reads), tuple(row.writes)))
-        return self.build(Combined, tuple(parts), table.channels)
-
-    def _element(self, table: schema.ElementTable, prefix: str) -> Element:
-        """Build the element that a table describes; its parameters in the file are called `prefix + name`."""
-        channels, hidden, degrees = table.channels, table.hidden, tuple(table.degrees)
-        terms = sum(comb(channels + d - 1, d) for d in set(degrees) if d <= MOST_PARTS)
-        known: dict[str, tuple[dict[str, tuple[int, ...]], Callable[..., Element], tuple[Any, ...]]] = {
-            "static_network": (
-                dict.fromkeys(("gain", "slope", "bias"), (channels, hidden)),
-                StaticNetwork,
-                (hidden, channels),
-            ),
-            "envelope": ({"knee": (channels,)}, Envelope, (channels,)),
-            "products": ({"reach": (channels,), "gain": (channels, terms)}, Products, (channels, degrees)),
-        }
-        if table.kind == "prandtl_ishlinskii":
-            return self._layer(table, prefix)
-        if table.kind not in known:
-            self.fail(f"has the element {table.kind[:40]!r}, which a file cannot hold; give the model as `model=`")
-        shapes, make, arguments = known[table.kind]
-        for name, shape in shapes.items():
-            self.parameter(prefix + name, shape)
-        return self.build(make, *arguments)
-
-    def _layer(self, table: schema.ElementTable, prefix: str) -> Element:
-        if table.operator not in OPERATORS:
-            self.fail(f"has the unknown operator {table.operator[:40]!r}; known are {', '.join(OPERATORS)}")
-        for name in ("w", "r"):
-            self.parameter(prefix + name, (table.channels, table.n))
-        operator = OPERATORS[table.operator]()
-        if table.operator == "generalized_play":
-            if table.expressions:
-                self.fail(
-                    "has envelopes that are expressions of your own, which a file cannot hold; give the model as "
-                    "`model=`"
-                )
-            for name in ("a", "b", "d"):
-                self.parameter(f"{prefix}gamma_l_{name}", (table.channels, table.neurons))
-            operator = self.build(GeneralizedPlay, table.neurons)
-        return self.build(PrandtlIshlinskii, operator, table.n, table.channels, table.rounded)
-
-    def _with_values(self, model: Model, structure: PILFR | None) -> Model:
-        """Put the file's values into the model: all of them, inside their bounds, and equal to what is fixed."""
-        values = {name: self.parameter(name, p.value.shape) for name, p in model.parameters.items()}
-        unknown = sorted(set(self.tables.parameters) - set(values))
-        if unknown:
-            self.fail(f"has the parameter {unknown[0]!r}, which its model lacks; give the model it was saved from")
-        states, memory = len(self.tables.model.states), self.tables.model.memory
-        if (states, memory) != (model.n_x, model.n_s):
-            self.fail(
-                f"is of a model with {states} states and {memory} of memory and this one has {model.n_x} and "
-                f"{model.n_s}; give the model it was saved from"
-            )
-        for name, p in model.parameters.items():
-            if np.any((values[name] < p.bounds[0]) | (values[name] > p.bounds[1])):
-                self.damaged(f"a value of parameter {name!r} lies outside its bounds")
-            if structure is not None and name in structure.fixed and np.any((values[name] != p.value)[p.fixed]):
-                self.damaged(f"parameter {name!r} differs from the value that the structure fixes")
-        return _at_values(model, values)
-
-    def _linear(self, structure: PILFR | None) -> Model | None:
-        """Linear model that the fit began with, where the file has it."""
-        table = self.tables.linear
-        if table is None or structure is None:
-            return None
-        n_u, n_y = len(self.inputs), len(self.outputs)
-        model = structure.linear().model(n_u, n_y, inputs=self.inputs, outputs=self.outputs)
-        values = {
-            name: self.array(table.get(name), p.value.shape, f"the linear model's {name!r}")
+def _fit_content(tables: schema.ModelTables, given: Model | PILFR | None) -> FitContent:
+    """Build the model and read everything about its training."""
+    training = tables.training
+    structure, start = _equations(tables, given)
+    model = _with_values(tables, start, structure)
+    limits = None if training.limits is None else tuple(Limit(**dict(row)) for row in training.limits)
+    return FitContent(
+        model=model,
+        structure=structure,
+        dt=tables.model.dt,
+        solution=_solution_of_training(training, limits),
+        labels=tuple(training.variables),
+        errors={
+            name: _array(tables.parameters[name].std, p.value.shape, f"the standard error of {name!r}", np.nan)
             for name, p in model.parameters.items()
+            if tables.parameters[name].std is not None
+        },
+        linear=_linear(tables, structure),
+        initial={
+            recording: _array(state, (model.n_state,), "an initial state")
+            for recording, state in tables.initial_states.items()
+        },
+        units={c.name: c.unit for c in (*tables.model.inputs, *tables.model.outputs) if c.unit},
+        train_nrmse=tuple(training.nrmse),
+        linear_nrmse=tuple(training.linear_nrmse),
+        seconds=training.seconds,
+        active=tuple(training.active),
+        limits=limits,
+        noise=training.noise,
+        weights=training.weights,
+        starts=tuple(SavedStart(s.seed, s.error, _solution(s, s.status), s.note, s.drawn) for s in training.starts),
+    )
+
+
+def _equations(tables: schema.ModelTables, given: Model | PILFR | None) -> tuple[PILFR | None, Model]:
+    """Structure (None for a model of the user's own) and closed model, not yet with the file's values."""
+    n_u, n_y = len(tables.model.inputs), len(tables.model.outputs)
+    if isinstance(given, Model):
+        if (given.n_u, given.n_y) != (n_u, n_y):
+            raise InputError(f"it has {given.n_u} inputs and {given.n_y} outputs, the file {n_u} and {n_y}")
+        return None, given
+    structure = given or _structure(tables, n_u, n_y)
+    return structure, _model_of(structure, tables.model)
+
+
+def _structure(tables: schema.ModelTables, n_u: int, n_y: int) -> PILFR:
+    table = tables.structure
+    if table is None:
+        raise _Unusable(
+            "holds the values of a model of your own equations, not the equations; give the model as `model=`"
+        )
+    element = None if table.element is None else _element(table.element, tables)
+    for name, shape in block_shapes(table.nx, n_u, n_y, 0 if element is None else element.channels).items():
+        _parameter(tables, name, shape)
+
+    def pairs(kind: str, low: float | None, high: float | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        return {
+            name: (_array(pair[0], None, f"{kind} {name!r}", low), _array(pair[1], None, f"{kind} {name!r}", high))
+            for name, pair in getattr(table, kind).items()
         }
-        return _at_values(model, values)
 
-    def _solution(self, solve: schema.Solve, status: str, theta: np.ndarray) -> Solution:
-        if status not in Status.__members__:
-            self.damaged(f"the status {status[:40]!r} is unknown")
-        return Solution(theta, solve.cost, Status[status], solve.iterations, solve.seconds, violation=solve.violation)
+    fixed = {name: _array(value, None, f"the fixed block {name!r}", np.nan) for name, value in table.fixed.items()}
+    return PILFR(table.nx, element, fixed, pairs("bounds", -np.inf, np.inf), pairs("priors", None, None), table.offset)
 
-    def _multipliers(self, limits: tuple[Limit, ...] | None, n_theta: int) -> np.ndarray:
-        """One for each variable and each constraint, or none; the first files did not name the constraints."""
-        found = np.array(self.tables.training.multipliers, dtype=float)
-        n = n_theta + sum(limit.kind == "constraint" for limit in limits or ())
-        if found.size not in (0, n) and not (limits is None and found.size > n):
-            self.damaged(f"it has {found.size} multipliers of {n} variables and constraints")
-        return found
 
-    def _history(self) -> tuple[Iteration, ...]:
-        columns = [getattr(self.tables.training.history, key) for key in HISTORY]
-        if len({len(column) for column in columns}) > 1:
-            self.damaged("the columns of the history differ in length")
-        return tuple(Iteration(int(number), *row) for number, *row in zip(*columns, strict=True))
+def _element(table: schema.ElementTable, tables: schema.ModelTables, prefix: str = "") -> Element:
+    """Build an element, after a look at its parameters in the file, which are called `prefix + name`."""
+
+    def check(names: tuple[str, ...], *shape: int) -> None:
+        for name in names:
+            _parameter(tables, prefix + name, shape)
+
+    channels = table.channels
+    if not prefix and table.kind == "combined":
+        rows = getattr(table, "parts", ())
+        if len(rows) > MOST_PARTS:
+            raise InputError(f"it combines {len(rows)} elements")
+        parts = (Part(row.name, _element(row.element, tables, f"{row.name}_"), row.reads, row.writes) for row in rows)
+        return Combined(tuple(parts), channels)
+    if table.kind == "prandtl_ishlinskii":
+        if table.operator not in OPERATORS:
+            raise _Unusable(f"has the unknown operator {table.operator[:40]!r}; known are {', '.join(OPERATORS)}")
+        check(("w", "r"), channels, table.n)
+        operator = OPERATORS[table.operator]()
+        if table.expressions:
+            raise _Unusable(
+                "has envelopes that are expressions of your own, which a file cannot hold; give the model as `model=`"
+            )
+        if table.operator == "generalized_play":
+            check(("gamma_l_a", "gamma_l_b", "gamma_l_d"), channels, table.neurons)
+            operator = GeneralizedPlay(table.neurons)
+        return PrandtlIshlinskii(operator, table.n, channels, table.rounded)
+    if table.kind == "static_network":
+        check(("gain", "slope", "bias"), channels, table.hidden)
+        return StaticNetwork(table.hidden, channels)
+    if table.kind == "envelope":
+        check(("knee",), channels)
+        return Envelope(channels)
+    if table.kind == "products":
+        check(("reach",), channels)
+        check(("gain",), channels, sum(comb(channels + d - 1, d) for d in set(table.degrees) if d <= MOST_PARTS))
+        return Products(channels, table.degrees)
+    raise _Unusable(f"has the element {table.kind[:40]!r}, which a file cannot hold; give the model as `model=`")
+
+
+def _with_values(tables: schema.ModelTables, model: Model, structure: PILFR | None) -> Model:
+    """Put the file's values into the model: all of them, inside their bounds, and equal to what is fixed."""
+    values = {name: _parameter(tables, name, p.value.shape) for name, p in model.parameters.items()}
+    unknown = sorted(set(tables.parameters) - set(values))
+    if unknown:
+        raise _Unusable(f"has the parameter {unknown[0]!r}, which its model lacks; give the model it was saved from")
+    states, memory = len(tables.model.states), tables.model.memory
+    if (states, memory) != (model.n_x, model.n_s):
+        raise _Unusable(
+            f"is of a model with {states} states and {memory} of memory and this one has {model.n_x} and "
+            f"{model.n_s}; give the model it was saved from"
+        )
+    for name, p in model.parameters.items():
+        if np.any((values[name] < p.bounds[0]) | (values[name] > p.bounds[1])):
+            raise InputError(f"a value of parameter {name!r} lies outside its bounds")
+        if structure is not None and name in structure.fixed and np.any((values[name] != p.value)[p.fixed]):
+            raise InputError(f"parameter {name!r} differs from the value that the structure fixes")
+    return _at_values(model, values)
+
+
+def _linear(tables: schema.ModelTables, structure: PILFR | None) -> Model | None:
+    """Linear model that the fit began with, where the file has it."""
+    if tables.linear is None or structure is None:
+        return None
+    model = _model_of(structure.linear(), tables.model)
+    values = {
+        name: _array(tables.linear.get(name), p.value.shape, f"the linear model's {name!r}")
+        for name, p in model.parameters.items()
+    }
+    return _at_values(model, values)
+
+
+def _model_of(structure: PILFR, signals: schema.Signals) -> Model:
+    inputs, outputs = signals.names
+    return structure.model(len(inputs), len(outputs), inputs=inputs, outputs=outputs)
 
 
 def _at_values(model: Model, values: Mapping[str, np.ndarray]) -> Model:
     return model.with_parameters(model.parameters.change(**{name: {"value": v} for name, v in values.items()}))
+
+
+def _solution_of_training(training: schema.Training, limits: tuple[Limit, ...] | None) -> Solution:
+    """Read the solution with its multipliers, one for each variable and constraint or none, and its history."""
+    theta, multipliers = (np.array(list(v), float) for v in (training.variables.values(), training.multipliers))
+    n = len(theta) + sum(limit.kind == "constraint" for limit in limits or ())
+    # the first files did not name the constraints
+    if multipliers.size not in (0, n) and not (limits is None and multipliers.size > n):
+        raise InputError(f"it has {multipliers.size} multipliers of {n} variables and constraints")
+    columns = [getattr(training.history, key) for key in HISTORY]
+    history = tuple(Iteration(int(number), *row) for number, *row in zip(*columns, strict=True))
+    solution = _solution(training.solve, training.status)
+    return replace(solution, theta=theta, multipliers=multipliers, history=history, message=training.message)
+
+
+def _solution(solve: schema.Solve, status: str) -> Solution:
+    numbers = solve.cost, Status[status], solve.iterations, solve.seconds
+    return Solution(np.zeros(0), *numbers, violation=solve.violation)
+
+
+def _parameter(tables: schema.ModelTables, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Read the value of a parameter, which must have this shape."""
+    if name not in tables.parameters:
+        raise InputError(f"{name!r} is missing")
+    return _array(tables.parameters[name].value, shape, f"parameter {name!r}")
+
+
+def _array(value: Any, shape: tuple[int, ...] | None, name: str, missing: float | None = None) -> np.ndarray:
+    """Return nested lists of finite numbers as an array of a shape (any where None).
+
+    Where `missing` is given, null becomes it and "inf" becomes infinite.
+    """
+    from .model_schema import number_or, shown
+
+    flat: list[float] = []
+
+    def nested_shape(part: Any, depth: int = 0) -> tuple[int, ...]:
+        """Collect the numbers; the shape of nested lists, -1 where their lengths differ."""
+        if isinstance(part, list) and depth < DEEPEST:
+            inner = {nested_shape(item, depth + 1) for item in part}
+            return (len(part), *(inner.pop() if len(inner) == 1 else (-1,) if inner else ()))
+        number = part if missing is None else number_or(missing, part)
+        if number is part and not (is_number(part) and abs(part) <= sys.float_info.max):
+            raise InputError(f"{name} holds {shown(part)}, which is not a finite number")
+        flat.append(float(number))
+        return ()
+
+    found = nested_shape(value)
+    if shape is not None and len(flat) == math.prod(shape) == 0:
+        return np.zeros(shape)
+    if found != (found if shape is None else shape) or math.prod(found) != len(flat):
+        expected = "" if shape is None else f", expected {shape}"
+        raise InputError(f"{name} has {len(flat)} numbers in the shape {found}{expected}")
+    return np.array(flat, dtype=float).reshape(found)

@@ -1,4 +1,4 @@
-"""The schema of a model file: which tables, keys and kinds of entries it has, each violation told in one sentence.
+"""The schema of a model file: its tables, keys and kinds of entries, and the sentence about the first that is wrong.
 
 Only this file imports pydantic, and `read_model_file` imports this file only when a model is read.
 """
@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import json
 import math
-import sys
-from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, Self
 
-import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-Refuse = Callable[[str], NoReturn]  # raises an InputError that says what is wrong
+from .._base import InputError
+from ..optimise import Status
+
 SHOWN = 40  # letters of a key or a value in a message
-DEEPEST = 3  # nested lists of an array: no parameter has more dimensions than two
 KINDS = {
     "string_type": "a text",
     "int_type": "a whole number",
@@ -25,6 +23,7 @@ KINDS = {
     "float_type": "a finite number",
     "finite_number": "a finite number",
     "list_type": "a list",
+    "tuple_type": "a list",
     "dict_type": "a table",
     "model_type": "a table",
     "too_short": "a pair",
@@ -32,23 +31,33 @@ KINDS = {
 }
 
 
-class Table(BaseModel):
-    """A table with these keys and no others; numbers stay numbers and texts stay texts."""
+def _known(status: str) -> str:
+    if status not in Status.__members__:
+        raise ValueError(f"the status {status[:SHOWN]!r} is unknown")
+    return status
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-
-def _or_missing(missing: float, value: Any) -> Any:
+def number_or(missing: float, value: Any) -> Any:
     """Read null as a number and "inf" as infinity: JSON has neither nan nor infinity."""
     return missing if value is None else math.inf if value == "inf" else value
 
 
+Ending = Annotated[str, AfterValidator(_known)]
 Count = Annotated[int, Field(ge=0)]
+Counts = Annotated[tuple[Count, ...], Field(strict=False)]  # a list in the file
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-OrInfinite = Annotated[float, BeforeValidator(partial(_or_missing, math.inf))]
-OrMinusInfinite = Annotated[float, BeforeValidator(partial(_or_missing, -math.inf))]
-OrNan = Annotated[float, BeforeValidator(partial(_or_missing, math.nan))]
-Pair = Annotated[list[Any], Field(min_length=2, max_length=2)]
+Positive = Annotated[Finite, Field(gt=0)]
+OrInfinite = Annotated[float, BeforeValidator(partial(number_or, math.inf))]
+OrMinusInfinite = Annotated[float, BeforeValidator(partial(number_or, -math.inf))]
+OrNan = Annotated[float, BeforeValidator(partial(number_or, math.nan))]
+Arrays = dict[str, Any]  # nested lists, read as arrays once their shapes are known
+Pairs = dict[str, Annotated[list[Any], Field(min_length=2, max_length=2)]]
+
+
+class Table(BaseModel):
+    """A table with these keys and no others; numbers stay numbers and texts stay texts."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 class Channel(Table):
@@ -67,6 +76,20 @@ class Signals(Table):
     states: list[str]
     memory: Count
 
+    @property
+    def names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names of inputs and of outputs."""
+        return tuple(c.name for c in self.inputs), tuple(c.name for c in self.outputs)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        inputs, outputs = self.names
+        if not (inputs and outputs and all(inputs + outputs)) or len({*inputs, *outputs}) < len(inputs + outputs):
+            raise ValueError("the names of inputs and outputs are missing or not distinct")
+        if self.dt <= 0:
+            raise ValueError(f"the step dt is {self.dt:g} s")
+        return self
+
 
 class ElementTable(Table):
     """An element; which entries it has beside its kind depends on the kind."""
@@ -79,7 +102,7 @@ class ElementTable(Table):
     neurons: Count = 0
     expressions: list[str] = []
     hidden: Count = 0
-    degrees: list[Count] = []
+    degrees: Counts = ()
 
 
 class PartTable(Table):
@@ -87,8 +110,8 @@ class PartTable(Table):
 
     name: str
     element: ElementTable
-    reads: list[Count]
-    writes: list[Count]
+    reads: Counts
+    writes: Counts
 
 
 class OuterElementTable(ElementTable):
@@ -98,14 +121,14 @@ class OuterElementTable(ElementTable):
 
 
 class Structure(Table):
-    """A PI-LFR; its numbers are read as arrays."""
+    """A PI-LFR."""
 
     nx: Count
     offset: bool
     element: OuterElementTable | None = None
-    fixed: dict[str, Any]
-    bounds: dict[str, Pair]
-    priors: dict[str, Pair]
+    fixed: Arrays
+    bounds: Pairs
+    priors: Pairs
 
 
 class ParameterRow(Table):
@@ -130,7 +153,7 @@ class Start(Solve):
 
     seed: Count
     error: OrInfinite
-    status: str
+    status: Ending
     note: str
     drawn: bool = True
 
@@ -157,16 +180,22 @@ class History(Table):
     step: list[OrInfinite]
     damping: list[OrInfinite]
 
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len({len(column) for _, column in self}) > 1:
+            raise ValueError("the columns of the history differ in length")
+        return self
+
 
 class Training(Table):
     """How the fit came about; the first files had no limits, noise, weights and errors of the linear model."""
 
-    status: str
+    status: Ending
     sentence: str = ""
     message: str
     nrmse: list[OrInfinite] = []
-    noise: Finite | None = None
-    weights: dict[str, Finite] | None = None
+    noise: Positive | None = None
+    weights: dict[str, Positive] | None = None
     linear_nrmse: list[OrInfinite] = []
     seconds: Finite
     active: list[str]
@@ -178,87 +207,43 @@ class Training(Table):
     starts: list[Start]
 
 
-class WrittenBy(Table):
-    """Versions of the programs that wrote the file."""
-
-    pilfr_casadi: str = ""
-    casadi: str = ""
-
-
 class ModelTables(Table):
     """All tables of a model file, less its digest."""
 
     format: str
     version: int
-    written_by: WrittenBy = WrittenBy()
+    written_by: dict[str, str] = {}
     model: Signals
     structure: Structure | None = None
     parameters: dict[str, ParameterRow]
-    linear: dict[str, Any] | None = None
-    initial_states: dict[str, Any]
+    linear: Arrays | None = None
+    initial_states: Arrays
     training: Training
 
 
-def read_tables(content: Any, refuse: Refuse) -> ModelTables:
-    """Return the content of a file as its tables, or refuse it by its first violation."""
+def read_tables(content: Any) -> ModelTables:
+    """Return the content of a file as its tables, or refuse it with a sentence about its first violation."""
     try:
         return ModelTables.model_validate(content)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-        refuse(_sentence([str(part)[:SHOWN] for part in first["loc"]], first["type"], first.get("input")))
+        first = error.errors(include_url=False)[0]
+    *outer, key = [str(part)[:SHOWN] for part in first["loc"]]
+    inside = f" in {'.'.join(outer)}" if outer else ""
+    expected = KINDS.get(first["type"], "usable")
+    sentences = {
+        "extra_forbidden": f"it has the unknown key {key!r}{inside}",
+        "missing": f"{key!r} is missing{inside}",
+        "greater_than_equal": f"{key!r} is negative{inside}",
+        "greater_than": f"{key!r} is not above zero{inside}",
+        "value_error": str(first.get("ctx", {}).get("error")),
+    }
+    other = f"{'.'.join([*outer, key])} is not {expected} but {shown(first['input'])}"
+    raise InputError(sentences.get(first["type"], other))
 
 
-def _sentence(path: list[str], kind: str, found: Any) -> str:
-    """Tell a violation: the field, what was found, what was expected."""
-    inside = f" in {'.'.join(path[:-1])}" if path[:-1] else ""
-    if kind == "extra_forbidden":
-        return f"it has the unknown key {path[-1]!r}{inside}"
-    if kind == "missing":
-        return f"{path[-1]!r} is missing{inside}"
-    if kind == "greater_than_equal":
-        return f"{path[-1]!r} is negative{inside}"
-    return f"{'.'.join(path)} is not {KINDS.get(kind, 'usable')} but {_shown(found)}"
-
-
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """Show an entry of a file in a message."""
     if isinstance(value, list | dict):
         return "a list" if isinstance(value, list) else "a table"
     text = json.dumps(value)
     return text if len(text) <= SHOWN else f"{text[: SHOWN // 2]}..."
-
-
-def array(
-    value: Any, shape: tuple[int, ...] | None, name: str, refuse: Refuse, missing: float | None = None
-) -> np.ndarray:
-    """Return nested lists of finite numbers as an array of a shape (any where None).
-
-    Where `missing` is given, null becomes it and "inf" becomes infinite.
-    """
-    flat = list(_numbers(value, name, refuse, missing))
-    if shape is not None and len(flat) == math.prod(shape) == 0:
-        return np.zeros(shape)
-    found = _nested_shape(value)
-    if (shape is not None and found != shape) or math.prod(found) != len(flat):
-        expected = "" if shape is None else f", expected {shape}"
-        refuse(f"{name} has {len(flat)} numbers in the shape {found}{expected}")
-    return np.array(flat, dtype=float).reshape(found)
-
-
-def _numbers(value: Any, name: str, refuse: Refuse, missing: float | None, depth: int = 0) -> Any:
-    if isinstance(value, list) and depth < DEEPEST:
-        for item in value:
-            yield from _numbers(item, name, refuse, missing, depth + 1)
-    elif missing is not None and (value is None or value == "inf"):
-        yield _or_missing(missing, value)
-    elif isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
-        refuse(f"{name} holds {_shown(value)}, which is not a finite number")
-    else:
-        yield float(value)
-
-
-def _nested_shape(value: Any) -> tuple[int, ...]:
-    """Shape of nested lists; -1 where their lengths differ."""
-    if not isinstance(value, list):
-        return ()
-    inner = {_nested_shape(item) for item in value}
-    return (len(value), *(inner.pop() if len(inner) == 1 else (-1,) if inner else ()))

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -53,7 +54,8 @@ _RISING: dict[str, Callable[[float], float]] = {
 
 def smoothed(function: ca.Function, eps: float) -> ca.Function:
     """Round every max, min, |·| and sign of a function of scalar expressions by eps."""
-    arguments = _symbols(function)
+    arguments = [ca.SX.sym(name, int(function.numel_in(i))) for i, name in enumerate(function.name_in())]
+    entries = [ca.vertsplit(a) if a.numel() else [] for a in arguments]
 
     def apply(op: str, code: int, a: Any, b: Any = None) -> Any:
         if op in ("FMAX", "FMIN"):
@@ -63,20 +65,14 @@ def smoothed(function: ca.Function, eps: float) -> ca.Function:
             return ca.sqrt(a**2 + eps**2 / 4)
         if op == "SIGN":
             return a / ca.sqrt(a**2 + eps**2 / 4)
-        return _same(code, a, b)
+        return ca.SX.unary(code, a) if b is None else ca.SX.binary(code, a, b)
 
-    results = [ca.vertcat(ca.SX(0, 1), *row) for row in _walk(function, _entries(arguments), apply, ca.SX)]
+    results = [ca.vertcat(ca.SX(0, 1), *row) for row in _walk(function, entries, apply, ca.SX)]
     return ca.Function(function.name(), arguments, results, function.name_in(), function.name_out())
 
 
 def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) -> list[list[Interval]]:
-    """Enclose every result of a function of scalar expressions, rounded by eps or not, in an interval.
-
-    Raises
-    ------
-    InputError
-        If the function holds an operation without a known enclosure.
-    """
+    """Enclose every result of a function of scalar expressions, rounded by eps or not, in an interval."""
 
     def apply(op: str, code: int, a: Interval, b: Interval | None = None) -> Interval:
         with np.errstate(all="ignore"):
@@ -87,19 +83,6 @@ def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) 
         return EVERYTHING if math.isnan(low) or math.isnan(high) else (float(low), float(high))
 
     return _walk(function, list(arguments), apply, lambda value: (float(value), float(value)))
-
-
-def _symbols(function: ca.Function) -> list[Any]:
-    return [ca.SX.sym(name, int(function.numel_in(i))) for i, name in enumerate(function.name_in())]
-
-
-def _entries(arguments: list[Any]) -> list[Any]:
-    return [ca.vertsplit(a) if a.numel() else [] for a in arguments]
-
-
-def _same(code: int, a: Any, b: Any) -> Any:
-    """Apply an operation as it is."""
-    return ca.SX.unary(code, a) if b is None else ca.SX.binary(code, a, b)
 
 
 def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any], constant: Callable[..., Any]) -> Any:
@@ -127,10 +110,10 @@ def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any]
             results[written[0]][written[1]] = values[registers[read[0]]]
             continue
         if op == "INPUT":
-            found = numbered((op, *read), lambda read=read: arguments[read[0]][read[1]])  # type: ignore[misc]
+            found = numbered((op, *read), partial(arguments[read[0]].__getitem__, read[1]))
         elif op == "CONST":
             number = function.instruction_constant(k)
-            found = numbered((op, number), lambda number=number: constant(number))  # type: ignore[misc]
+            found = numbered((op, number), partial(constant, number))
         elif len(read) not in (1, 2) or len(written) != 1:
             raise InputError(
                 f"The equations hold the operation {op.lower()!r}, which has no smooth form here; leave it out."
@@ -138,8 +121,8 @@ def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any]
         else:
             node: Any = (op, *(registers[r] for r in read))
             node = _choice(nodes, node) or node
-            code = getattr(ca, f"OP_{node[0]}")
-            found = numbered(node, lambda node=node, code=code: apply(node[0], code, *(values[i] for i in node[1:])))  # type: ignore[misc]
+            parts = (values[i] for i in node[1:])
+            found = numbered(node, partial(apply, node[0], getattr(ca, f"OP_{node[0]}"), *parts))
         registers[written[0]] = found
     return results
 

@@ -1,4 +1,4 @@
-"""One step over a whole sample, `(x, u) -> (x_next, y)`, of any closed model, with a name for every entry of x and u.
+"""An exported model: one step over a whole sample, `(x, u) -> (x_next, y)`, with what a controller has to know of it.
 
 A model steps from sub-step to sub-step and may read the input at the sub-step's end and the time (`Model.reads`). Here
 the sub-steps of a sample run one after the other, and y is the output at the first. The arguments stay plain: `u` is
@@ -8,88 +8,48 @@ read the time, it is the last entry of x and advances by itself.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+import json
+import os
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol, TypeGuard
 
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import LARGEST, InputError, is_number, numbers, path_text, positive, whole, write_atomically
+from ..data import Recording
+from ..engine import make_engine
 from ..models import Model, PrandtlIshlinskii
-from ..simulators import ClosedEquations, Instant, Simulator, on_grid
+from ..optimise import first_state
+from ..simulators import ClosedEquations, Instant, Simulator, choose_substeps, discretise, on_grid
+from .c_code import check_name, write_c
+from .smoothing import enclosed, smoothed
 
+FORMAT, VERSION = "pilfr_casadi function", 1
+NAMES = ".names.json"  # appended to the function's file name for the file with the names
+DT_TOLERANCE = 1e-4  # relative difference of two steps that are taken as equal, from rounding in files
+REST_SAMPLES = 400  # samples of a resting recording from which a simulator's sub-steps are chosen
 INLINE = 4  # sub-steps written out one after the other; more become a loop, which keeps generated C short
 TIME, NEXT = "time", "_next"
 
 
-@dataclass(frozen=True, eq=False)
-class Sampled:
-    """A closed model at its parameters' values, with names for every entry of its state.
-
-    Attributes
-    ----------
-    one : casadi.Function
-        A sub-step, `(x, row) -> (x_next, y)`, of scalar expressions; `row` holds the signals that `reads` lists.
-    states : tuple of str
-        Names of the entries of x; the time comes last where it is a state.
-    thresholds : dict
-        Name of a memory -> half-width of the play that it belongs to.
-    held : tuple of str
-        Names of the operators' memory. A delay's shift register is not among them: it moves at every step.
-    """
-
-    one: ca.Function
-    reads: tuple[str, ...]
-    substeps: int
-    dt: float
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    thresholds: dict[str, float]
-    held: tuple[str, ...] = ()
+class FittedModel(Protocol):
+    """A model with a time step of its own, such as a `Fit`."""
 
     @property
-    def timed(self) -> bool:
-        """Whether the last entry of x is the time, s."""
-        return "t" in self.reads
+    def model(self) -> Model:
+        """Closed model at its fitted values."""
 
     @property
-    def interpolated(self) -> bool:
-        """Whether the second half of u holds the inputs of the next sample."""
-        return "next" in self.reads
+    def dt(self) -> float:
+        """Duration of a step, s."""
 
-    def rows(self, u: Any, t: Any, stack: Any) -> list[Any]:
-        """List the signals that each sub-step reads, for inputs u and the time t; `stack` joins columns."""
-        n, count = self.substeps, len(self.inputs) // 2 if self.interpolated else len(self.inputs)
-        now, after = u[:count], u[count:]
-        out = []
-        for i in range(n):
-            columns = {"t": t + i * self.dt / n, "u": now}
-            if self.interpolated:
-                columns["u"] = now + (after - now) * (i / n)
-                columns["next"] = now + (after - now) * ((i + 1) / n)
-            out.append(stack(*(columns[name] for name in self.reads)))
-        return out
-
-    def function(self, name: str, one: ca.Function | None = None) -> CheckedStep:
-        """Compose the step over a sample of the sub-steps `one` (default: the model's own)."""
-        one, own = one or self.one, len(self.states) - self.timed
-        kind = ca.SX if self.substeps <= INLINE else ca.MX
-        x, u = kind.sym("x", len(self.states)), kind.sym("u", len(self.inputs))
-        t = x[own] if self.timed else kind(0)
-        rows = self.rows(u, t, ca.vertcat)
-        if kind is ca.SX:
-            state, y = one(x[:own], rows[0])
-            for row in rows[1:]:
-                state = one(state, row)[0]
-        else:
-            first = one(x[:own], rows[0])
-            run = one.mapaccum(self.substeps - 1)
-            state, y = run(first[0], ca.horzcat(*rows[1:]))[0][:, -1], first[1]
-        state = ca.vertcat(state, t + self.dt) if self.timed else state
-        x_next, y = ca.densify(state), ca.densify(y)
-        return CheckedStep(ca.Function(name, [x, u], [x_next, y], ["x", "u"], ["x_next", "y"]))
+    def initial_state(self, recording: Recording) -> np.ndarray:
+        """State with memory at a recording's first sample."""
 
 
 class CheckedStep(ca.Function):
@@ -136,14 +96,389 @@ def _fits(shape: tuple[int, ...] | None, size: int) -> bool:
     return shape[0] == size or shape == (1, size)
 
 
-def sampled(model: Model, dt: float, simulator: Simulator | None = None) -> Sampled:
-    """Put a closed model's values into its sub-steps and name its states; `simulator` names those of its laws.
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """One step of a model, `(x, u) -> (x_next, y)`, in engineering units; operator memory is inside x.
+
+    Attributes
+    ----------
+    step : casadi.Function
+        x (n_x,) and u (n_u,) to x_next (n_x,) and y (n_y,); y belongs to the sample at which x and u are given. Called
+        from Python it refuses other sizes (`CheckedStep`).
+    name : str
+        The function's name.
+    states : dict
+        Name of each entry of x -> its index: linear states, then the operators' memory `memory[i,j]` of channel i and
+        threshold r[i,j]; of a simulator its states, then the laws' own, `<port>.q1`, and their memory,
+        `<port>.memory1`; `time`, in s, comes last where the equations read it.
+    thresholds : dict
+        Name of a memory -> half-width of its play or stop, in units of the signal that drives it.
+    inputs, outputs : tuple of str
+        Names of the entries of u and y. Where inputs are interpolated, those of the next sample follow, `<input>_next`.
+    units : dict
+        Unit by name, where it is known.
+    dt : float
+        Duration of a step, s.
+    smooth : float
+        eps of the rounding (`smoothing`), 0 where min and max are exact.
+    rhs : casadi.Function or None
+        `(x, u) -> (xdot, y)`, or `(x, u, t)`, where the model has equations in continuous time.
+    one : casadi.Function
+        An exact sub-step, `(x, row) -> (x_next, y)`, of scalar expressions; `row` holds the signals that `reads` lists.
+    substeps : int
+        Number of these in a step.
+    held : tuple of str
+        Names of the operators' memory. A delay's shift register is not among them: it moves at every step.
+    """
+
+    one: ca.Function
+    reads: tuple[str, ...]
+    substeps: int
+    dt: float
+    states: dict[str, int]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    thresholds: dict[str, float]
+    held: tuple[str, ...]
+    name: str = "model"
+    smooth: float = 0.0
+    start: np.ndarray | None = None
+    units: dict[str, str] = field(default_factory=dict)
+    rhs: ca.Function | None = None
+
+    @cached_property
+    def step(self) -> CheckedStep:
+        """The function `(x, u) -> (x_next, y)`."""
+        one = smoothed(self.one, self.smooth) if self.smooth else self.one
+        own = len(self.states) - self.timed
+        kind = ca.SX if self.substeps <= INLINE else ca.MX
+        x, u = kind.sym("x", len(self.states)), kind.sym("u", len(self.inputs))
+        t = x[own] if self.timed else kind(0)
+        rows = self._rows(u, t, ca.vertcat)
+        if kind is ca.SX:
+            state, y = one(x[:own], rows[0])
+            for row in rows[1:]:
+                state = one(state, row)[0]
+        else:
+            first = one(x[:own], rows[0])
+            run = one.mapaccum(self.substeps - 1)
+            state, y = run(first[0], ca.horzcat(*rows[1:]))[0][:, -1], first[1]
+        state = ca.vertcat(state, t + self.dt) if self.timed else state
+        x_next, y = ca.densify(state), ca.densify(y)
+        return CheckedStep(ca.Function(self.name, [x, u], [x_next, y], ["x", "u"], ["x_next", "y"]))
+
+    @property
+    def timed(self) -> bool:
+        """Whether the last entry of x is the time, s."""
+        return "t" in self.reads
+
+    @property
+    def interpolated(self) -> bool:
+        """Whether the second half of u holds the inputs of the next sample."""
+        return "next" in self.reads
+
+    def x0(self) -> np.ndarray:
+        """Return the state to start from, (n_x,): that of the recording given as `start`, else zero."""
+        return np.zeros(len(self.states)) if self.start is None else self.start.copy()
+
+    def bound(self, x: Any, u: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Bound the difference of one smoothed step from x and u to the exact one: arrays (n_x,) and (n_y,).
+
+        In a PI-LFR model with plays or stops it is never more than `|D_yw| Σ_j w_j eps/2` for y, and for the linear
+        states the same with `|B_w|`; a play's memory is off by at most eps/2. See `smoothing`.
+
+        Raises
+        ------
+        InputError
+            If x or u has another size or is not finite, or the equations hold an operation without a known enclosure.
+        """
+        x, u = numbers(x, "The state").ravel(), numbers(u, "The input").ravel()
+        for role, given, wanted in (("state", x, len(self.states)), ("input", u, len(self.inputs))):
+            if given.size != wanted:
+                raise InputError(f"{given.size} numbers were given for the {role}; expected {wanted}.")
+        one, own = self.one, len(x) - self.timed
+        rows = self._rows(u, x[own] if self.timed else 0.0, lambda *columns: np.hstack([np.zeros(0), *columns]))
+        exact, enclosure = x[:own], [(v, v) for v in x[:own]]
+        output_error = np.zeros(0)
+        for i, row in enumerate(rows):
+            found = enclosed(one, self.smooth, enclosure, [(v, v) for v in row])
+            true = [np.asarray(part).ravel() for part in one(exact, row)]
+            if i == 0:
+                output_error = _largest_error(found[1], true[1])
+            enclosure, exact = found[0], true[0]
+        return np.append(_largest_error(enclosure, exact), np.zeros(int(self.timed))), output_error
+
+    def _rows(self, u: Any, t: Any, stack: Any) -> list[Any]:
+        """List the signals that each sub-step reads, for inputs u and the time t; `stack` joins columns."""
+        n, count = self.substeps, len(self.inputs) // 2 if self.interpolated else len(self.inputs)
+        now, after = u[:count], u[count:]
+        out = []
+        for i in range(n):
+            columns = {"t": t + i * self.dt / n, "u": now}
+            if self.interpolated:
+                columns["u"] = now + (after - now) * (i / n)
+                columns["next"] = now + (after - now) * ((i + 1) / n)
+            out.append(stack(*(columns[name] for name in self.reads)))
+        return out
+
+    def names(self) -> dict[str, Any]:
+        """Return everything but the function as plain JSON."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "casadi": ca.__version__,
+            "name": self.name,
+            "dt": self.dt,
+            "smooth": self.smooth,
+            "inputs": list(self.inputs),
+            "outputs": list(self.outputs),
+            "states": self.states,
+            "thresholds": self.thresholds,
+            "units": self.units,
+            "x0": self.x0().tolist(),
+        }
+
+    def serialize(self, path: str | os.PathLike[str]) -> Path:
+        """Write the function for `casadi.Function.load`, and names, units, dt and start state as JSON beside it.
+
+        Neither needs this package to be read. The second file is called `<path>.names.json`.
+
+        Raises
+        ------
+        InputError
+            If a file cannot be written.
+        """
+        text = json.dumps(self.names(), indent=1, allow_nan=False) + "\n"
+        write_atomically(f"{path_text(path, 'file')}{NAMES}", text)
+        with tempfile.TemporaryDirectory() as folder:
+            function = Path(folder) / "function"
+            self.step.save(str(function))
+            return write_atomically(path, function.read_bytes())
+
+    def to_c(self, folder: str | os.PathLike[str]) -> tuple[Path, Path]:
+        """Write `<name>.c` and `<name>.h` into a folder: C99 that needs nothing but the C library's mathematics.
+
+        The header declares `<name>_step(x, u, x_next, y)` and `<name>_x0(x)` with sizes and indices as constants.
+
+        Returns
+        -------
+        tuple of Path
+            Source and header.
+
+        Raises
+        ------
+        InputError
+            If the folder cannot be made or written.
+        """
+        return write_c(folder, self.step, self.names(), self.interpolated)
+
+    def to_control(self) -> Any:
+        """Return the model as a `control.NonlinearIOSystem` in discrete time; dots in names become underscores.
+
+        `control.input_output_response(system, t, u, X0=exported.x0())` runs it, with t in steps of `dt`.
+        """
+        import control
+
+        def step(x: Any, u: Any) -> Any:
+            return self.step(np.atleast_1d(x), np.atleast_1d(u))
+
+        def without_dots(names: Iterable[str]) -> tuple[str, ...]:
+            return _make_unique(name.replace(".", "_") for name in names)
+
+        return control.NonlinearIOSystem(
+            (lambda t, x, u, params: np.asarray(step(x, u)[0]).ravel()) if self.states else None,
+            lambda t, x, u, params: np.asarray(step(x, u)[1]).ravel(),
+            inputs=without_dots(self.inputs),
+            outputs=without_dots(self.outputs),
+            states=without_dots(self.states) if self.states else None,
+            dt=self.dt,
+            name=self.name,
+        )
+
+    def __str__(self) -> str:
+        def listed(names: Iterable[str]) -> str:
+            return ", ".join(f"{n} [{self.units[n]}]" if self.units.get(n) else n for n in names) or "none"
+
+        exact = f"smoothed, eps = {self.smooth:g}" if self.smooth else "min and max exact"
+        lines = [f"{self.name}: (x, u) -> (x_next, y), a step of {self.dt:g} s, {exact}"]
+        lines += [f"x: {listed(self.states)}", f"u: {listed(self.inputs)}", f"y: {listed(self.outputs)}"]
+        lines.append(f"rhs in continuous time: {'none, it is sampled' if self.rhs is None else 'yes'}")
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def exported(
+    model: Any,
+    *,
+    dt: float | None = None,
+    hold: str | None = None,
+    substeps: int | None = None,
+    start: Any = None,
+    smooth: float = 0.0,
+    name: str = "model",
+) -> Exported:
+    """Export a model as one step `(x, u) -> (x_next, y)`, with start state, names and units.
+
+    Parameters
+    ----------
+    model : Fit, Simulator, Model or Diagnosis
+        A simulator is taken with the laws in its ports, at its parameters' values; of a diagnosis, the corrected one.
+    dt : float
+        Duration of a step, s: needed for a simulator and a model; a fit and a diagnosis have theirs.
+    hold : {"zero", "linear"}, optional
+        Inter-sample behaviour of the inputs, for a simulator; default: its own, else "zero".
+    substeps : int, optional
+        Runge-Kutta steps a sample, for a simulator; by default chosen from its fastest eigenvalue.
+    start : Recording or array, optional
+        The state `x0()`: at a recording's first sample, as its `initial` says, or given, with or without memory.
+    smooth : float
+        eps > 0 rounds min, max, |.| and sign (`smoothing`), for solvers that need derivatives everywhere; the error is
+        `Exported.bound`.
+    name : str
+        Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; no word of C.
+
+    Returns
+    -------
+    Exported
 
     Raises
     ------
     InputError
-        If the model's port is open, or it reads measured outputs.
+        If something is missing or does not fit; one sentence says what.
     """
+    check_name(name)
+    if not is_number(smooth) or not 0 <= smooth <= LARGEST:
+        raise InputError(
+            f"smooth = {smooth!r} was given; give a number, from zero to {LARGEST:g}, in the signals' units."
+        )
+    if not isinstance(model, Simulator | Model) and not _is_fitted(model):
+        if isinstance(model, type) or not callable(getattr(model, "export", None)):
+            given = "a class" if isinstance(model, type) else f"a {type(model).__name__}"
+            raise InputError(f"{given} was given; give a Fit, a Simulator, a Model or a Diagnosis.")
+        if any(option is not None for option in (dt, hold, substeps)):
+            raise InputError("A diagnosis has its own step and hold; leave dt, hold and substeps out.")
+        corrected: Exported = model.export(name=name, smooth=smooth, start=start)
+        return corrected
+    rhs = None
+    if isinstance(model, Simulator):
+        dt = _duration(dt)
+        closed = _discretised(model, dt, hold, substeps)
+        step = _named_step(closed, dt, model)
+        rhs = _right_hand_side(model, f"{name}_rhs")
+    else:
+        if hold is not None or substeps is not None:
+            raise InputError("The model has its own steps; `hold` and `substeps` are for simulators, leave them out.")
+        if not isinstance(model, Model) and dt not in (None, model.dt):
+            raise InputError(f"dt = {dt!r} was given, but the fit's step is {model.dt:g} s; leave dt out.")
+        closed, dt = (model, _duration(dt)) if isinstance(model, Model) else (model.model, model.dt)
+        step = _named_step(closed, dt)
+    return replace(
+        step,
+        name=name,
+        smooth=float(smooth),
+        start=_start_state(model, closed, step, start),
+        units={k: v for k, v in getattr(model, "units", {}).items() if v},
+        rhs=smoothed(rhs, smooth) if rhs is not None and smooth else rhs,
+    )
+
+
+def to_casadi(model: Any, name: str = "model", **options: Any) -> ca.Function:
+    """Export one step of a model as `casadi.Function (x, u) -> (x_next, y)`, in engineering units.
+
+    Parameters
+    ----------
+    model : Fit, Simulator, Model or Diagnosis
+        The model; its values become constants of the function.
+    name : str
+        Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; no word of C.
+    **options
+        Those of `exported`: for a simulator `dt`, `hold`, `substeps`; `smooth`.
+
+    Returns
+    -------
+    casadi.Function
+        `x` (n_x + n_s,) holds the linear states in the order of `fit.model.states`, then the operators' memory: channel
+        by channel, and inside a channel in the order of the thresholds `r[i, :]` (the play state, for stops too). `u`
+        is (n_u,), `x_next` like `x`, `y` (n_y,). A step takes `fit.dt` s; `fit.initial_state(recording)` is an `x`.
+        `exported` gives the same with a map of the states' names, start state and units.
+
+    Raises
+    ------
+    InputError
+        If CasADi does not take the name, or an option does not fit the model.
+    """
+    return exported(model, name=name, **options).step
+
+
+def _is_fitted(model: Any) -> TypeGuard[FittedModel]:
+    return isinstance(getattr(model, "model", None), Model) and callable(getattr(model, "initial_state", None))
+
+
+def _duration(dt: float | None) -> float:
+    return positive(dt, "dt", "the duration of a step in s")
+
+
+def _discretised(model: Simulator, dt: float, hold: str | None, substeps: int | None) -> Model:
+    """Integrate a simulator over one sample."""
+    hold = hold or model.hold or "zero"
+    if hold not in ("zero", "linear"):
+        raise InputError(f"hold = {hold!r} was given; use 'zero' or 'linear'.")
+    chosen = _choose_substeps_at_rest(model, dt) if substeps is None else whole(substeps, "substeps", 1)
+    return discretise(model, dt, hold, chosen)
+
+
+def _choose_substeps_at_rest(simulator: Simulator, dt: float) -> int:
+    """Choose sub-steps a sample from the fastest eigenvalue at rest, at least as many as the laws need."""
+    if simulator.discrete:
+        return 1
+    # a recording needs an input, so a simulator without inputs gets one that its equations do not read
+    driven = simulator if simulator.inputs else replace(simulator, inputs=("none",))
+    u, y = (np.zeros((REST_SAMPLES, len(names))) for names in (driven.inputs, driven.output_names))
+    least = max((getattr(e.law, "substeps", 1) for e in simulator.elements), default=1)
+    return max(choose_substeps(driven, [Recording(u, y, dt)]), least)
+
+
+def _start_state(model: Any, closed: Model, step: Exported, start: Any) -> np.ndarray | None:
+    """State to start from, (n_x,), of a recording, an array or nothing."""
+    n, size = closed.n_state, len(step.states)
+    if start is None:
+        return None
+    if isinstance(start, Recording):
+        if _is_fitted(model):
+            state = model.initial_state(start)
+        else:
+            _check_recording(closed, step, start)
+            state = first_state(closed, make_engine(closed), start)
+        if not np.all(np.isfinite(state)):
+            raise InputError("The state at the recording's first sample is not finite; give another start.")
+        return np.append(state, np.zeros(size - n))
+    given = numbers(start, "The start state").ravel()
+    if given.size not in (len(closed.states), n, size):
+        raise InputError(
+            f"The start state has {given.size} numbers; give {len(closed.states)} (memory zero) or {size}."
+        )
+    return np.append(given, np.zeros(size - given.size))
+
+
+def _check_recording(model: Model, step: Exported, recording: Recording) -> None:
+    if (recording.inputs, recording.outputs) != (model.inputs, model.outputs):
+        raise InputError(
+            f"The recording has {', '.join((*recording.inputs, *recording.outputs))}, the model "
+            f"{', '.join((*model.inputs, *model.outputs))}; they must be the same, in this order."
+        )
+    if abs(recording.dt / step.dt - 1) > DT_TOLERANCE:
+        raise InputError(f"The recording's step is {recording.dt:g} s, that of the export {step.dt:g} s; use one.")
+
+
+def _largest_error(enclosure: list[tuple[float, float]], exact: np.ndarray) -> np.ndarray:
+    """Largest distance of an enclosure's ends from the exact values."""
+    ends = np.array(enclosure, dtype=float).reshape(-1, 2)
+    return np.maximum(np.maximum(ends[:, 1] - exact, exact - ends[:, 0]), 0.0)
+
+
+def _named_step(model: Model, dt: float, simulator: Simulator | None = None) -> Exported:
+    """Put a closed model's values into its sub-steps and name its states; `simulator` names those of its laws."""
     if model.n_w and model.element is None and not model.n_s:
         raise InputError("The model has an open port; close it with close_loop first.")
     if "y" in model.reads:
@@ -158,12 +493,12 @@ def sampled(model: Model, dt: float, simulator: Simulator | None = None) -> Samp
     inputs = model.inputs + (tuple(f"{name}{NEXT}" for name in model.inputs) if "next" in model.reads else ())
     names = _make_unique([*states, *([TIME] if "t" in model.reads else [])])
     renamed = dict(zip(states, names, strict=False))
-    return Sampled(
+    return Exported(
         one=one,
         reads=model.reads,
         substeps=model.substeps,
         dt=dt,
-        states=names,
+        states={name: i for i, name in enumerate(names)},
         inputs=_make_unique(inputs),
         outputs=model.outputs,
         thresholds={renamed[name]: value for name, value in thresholds.items()},
@@ -171,7 +506,7 @@ def sampled(model: Model, dt: float, simulator: Simulator | None = None) -> Samp
     )
 
 
-def right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
+def _right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
     """Return `(x, u) -> (xdot, y)`, or `(x, u, t)` where the equations read the time.
 
     x are the simulator's states and those of its laws; inputs are held. A simulator in discrete time, or with a law
@@ -221,7 +556,7 @@ def _name_law_states(model: Model, dt: float, simulator: Simulator) -> tuple[lis
     return [*simulator.states, *flows, *memory], thresholds, held
 
 
-def _make_unique(names: Sequence[str]) -> tuple[str, ...]:
+def _make_unique(names: Iterable[str]) -> tuple[str, ...]:
     """Append underscores to names that are taken already."""
     out: list[str] = []
     for name in names:

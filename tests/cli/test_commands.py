@@ -201,6 +201,8 @@ def test_unusable_model_files_are_refused_and_left_alone(capsys, tmp_path, train
         refused(capsys, "simulate", path, train, "--out", tmp_path / "sim.csv", says=f"{name}.json")
         assert path.read_text() == text and not (tmp_path / "sim.csv").exists()
     refused(capsys, "simulate", tmp_path / "nowhere.json", train, "--out", tmp_path / "sim.csv", says="nowhere.json")
+    os.mkfifo(tmp_path / "pipe.json")  # reading it would wait forever
+    refused(capsys, "simulate", tmp_path / "pipe.json", train, "--out", tmp_path / "sim.csv", says="a pipe or a device")
 
 
 def test_an_unstable_start_is_refused(capsys, tmp_path, train, model):

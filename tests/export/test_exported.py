@@ -118,7 +118,7 @@ def test_a_real_diagnosis_exports_what_it_judged():
     train, test = (read_csv(f"pilfr_casadi/cli/demo_data/rig_{name}.csv", **known) for name in ("train", "test"))
     diagnosis = diagnose(simulator, train, test=test, laws=(PreslidingFriction,))
     found = diagnosis.export(name="rig")
-    assert found.sampled.substeps == diagnosis.substeps > 1 and "ground-m2.memory1" in found.states
+    assert found.substeps == diagnosis.substeps > 1 and "ground-m2.memory1" in found.states
     assert found.units["x2"] == "m"
     for kind, recording in (("train", train), ("test", test)):
         x, rows = found.x0(), []
@@ -236,7 +236,7 @@ def test_continuous_time_where_there_is_one():
 def test_a_simulator_without_inputs_and_one_without_states(tmp_path):
     ringing = Simulator(lambda x: dict(a=x.b, b=-800 * x.a), lambda x: dict(y=x.a), ("a", "b"))
     found = exported(ringing, dt=0.1)
-    assert (found.inputs, found.sampled.substeps) == ((), 12)
+    assert (found.inputs, found.substeps) == ((), 12)
     assert float(found.step([1.0, 0.0], [])[0][0]) == pytest.approx(np.cos(np.sqrt(8.0)), abs=1e-4)
     device = exported(Simulator({}.get, lambda u: dict(y=2 * u.v), (), ("v",)), dt=0.1, name="device")
     assert (device.states, device.x0().size, float(device.step([], 3.0)[1])) == ({}, 0, 6.0)
@@ -250,12 +250,15 @@ REFUSED = {
     "quotes": (lambda: exported(some_fit(), name='a";'), "cannot be used"),
     "smooth": (lambda: exported(some_fit(), smooth=-1.0), "smooth = -1.0 was given"),
     "smooth nan": (lambda: exported(some_fit(), smooth=float("nan")), "smooth = nan was given"),
-    "dt": (lambda: exported(mass_on_spring()), "dt = None was given"),
-    "dt zero": (lambda: exported(mass_on_spring(), dt=0.0), "dt = 0.0 was given"),
+    "dt": (lambda: exported(mass_on_spring()), "dt=None was given"),
+    "dt zero": (lambda: exported(mass_on_spring(), dt=0.0), "dt=0.0 was given"),
     "other dt": (lambda: exported(some_fit(), dt=0.1), "the fit's step is"),
     "hold": (lambda: exported(mass_on_spring(), dt=0.1, hold="cubic"), "hold = 'cubic'"),
     "hold of a fit": (lambda: exported(some_fit(), hold="zero"), "are for simulators"),
-    "substeps": (lambda: exported(mass_on_spring(), dt=0.1, substeps=0), "substeps = 0"),
+    "substeps": (
+        lambda: exported(mass_on_spring(), dt=0.1, substeps=0),
+        "substeps is 0; give a whole number, 1 or more",
+    ),
     "start": (lambda: exported(some_fit(), start=np.zeros(4)), "has 4 numbers; give 3 .* or 7"),
     "start nan": (lambda: exported(some_fit(), start=[np.nan] * 3), "finite numbers"),
     "start text": (lambda: exported(some_fit(), start="zero"), "give numbers"),

@@ -156,7 +156,7 @@ def exports(every):
     for name, (simulator, dt, hold, substeps) in simulators(every).items():
         data = wave(simulator, dt, 3.0 if name.startswith("law") else 1.0)
         given = {"dt": dt, "hold": hold, "substeps": substeps}
-        used = exported(simulator, **given).sampled.substeps
+        used = exported(simulator, **given).substeps
         model = discretise(simulator, dt, hold, used)
         run = VirtualMachine(model).simulate(model.drive(data), model.parameters.start, np.zeros(model.n_state))
         out[name] = simulator, given, data, run[0]
