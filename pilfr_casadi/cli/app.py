@@ -20,10 +20,10 @@ from .._base import InputError, __version__, deferred_interrupt, terminable
 from ._common import BAD_INPUT, DONE, INTERRUPTED, NO_RESULT, UsageError, say
 
 COMMANDS = {  # name: (file, help)
-    "fit": ("fit", "Identify a PI-LFR model from recordings."),
+    "fit": ("models", "Identify a PI-LFR model from recordings."),
     "diagnose": ("diagnose", "Find the physics that a simulator leaves out."),
-    "simulate": ("model", "Simulate a saved model on a recording's inputs."),
-    "export": ("model", "Write a model's step as a serialized CasADi function or as C."),
+    "simulate": ("models", "Simulate a saved model on a recording's inputs."),
+    "export": ("models", "Write a model's step as a serialized CasADi function or as C."),
     "run": ("studies", "Execute a run file: identifications and all they depend on; jobs that are done are skipped."),
     "campaign": (
         "studies",

@@ -301,7 +301,7 @@ def test_fit_says_what_it_works_with(capsys, tmp_path, train, monkeypatch):
     arguments = list(fit_arguments(train, tmp_path, "--operators", 0))
     del arguments[arguments.index("--nx") : arguments.index("--nx") + 2]
     monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: None)
-    monkeypatch.setattr("pilfr_casadi.cli.fit.compiler", lambda: None)
+    monkeypatch.setattr("pilfr_casadi.cli.models.compiler", lambda: None)
     status, out, err = run(capsys, *arguments)
     assert status == 0 and "warning" not in err
     assert ", chosen on the training data\n" in out

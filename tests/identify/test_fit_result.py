@@ -279,7 +279,7 @@ def test_constraints_are_found_by_name(record, truth):
 
 
 def test_the_command_line_says_what_is_not_scored(of_record):
-    from pilfr_casadi.cli.fit import _test_line
+    from pilfr_casadi.cli.models import _test_line
 
     u, y = simulated(6, 400, X0)
     line = _test_line(of_record, Recording(u, y, 0.01, name="test"))
