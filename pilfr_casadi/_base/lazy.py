@@ -23,21 +23,15 @@ from typing import Any
 
 
 def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Make `__getattr__`, `__dir__` and `__all__` of a package from its imports under ``TYPE_CHECKING``.
-
-    Parameters
-    ----------
-    package : str
-        The package's `__name__`.
-    file : str
-        The package's `__file__`.
-
-    Returns
-    -------
-    tuple
-        `__getattr__`, `__dir__` and `__all__` to be bound in the package.
-    """
-    origins = listed_imports(Path(file).read_text(encoding="utf-8"))
+    """Make `__getattr__`, `__dir__` and `__all__` of a package from its imports under ``TYPE_CHECKING``."""
+    origins = {
+        alias.asname or alias.name: "." * node.level + (node.module or "")
+        for block in ast.parse(Path(file).read_text(encoding="utf-8")).body
+        if isinstance(block, ast.If) and isinstance(block.test, ast.Name) and block.test.id == "TYPE_CHECKING"
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
 
     def load(name: str) -> Any:
         if name not in origins:
@@ -51,16 +45,3 @@ def lazy_face(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[
 
     names = sorted(origins)
     return load, lambda: sorted({*vars(sys.modules[package]), *names}), names
-
-
-def listed_imports(source: str) -> dict[str, str]:
-    """Map each name that is imported under ``TYPE_CHECKING`` to its relative module."""
-    blocks = [
-        node.body
-        for node in ast.parse(source).body
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-    ]
-    imports = [node for body in blocks for node in body if isinstance(node, ast.ImportFrom)]
-    return {
-        alias.asname or alias.name: "." * node.level + (node.module or "") for node in imports for alias in node.names
-    }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -15,14 +16,11 @@ from ..models import accumulate_steps, map_points
 from .base import Law, Local
 
 
-class _Values:
+class _Values(SimpleNamespace):
     """Parameters by name, `p.k` or `p["k"]`."""
 
-    def __init__(self, values: dict[str, Any]) -> None:
-        self.__dict__.update(values)
-
     def __getitem__(self, name: str) -> Any:
-        return self.__dict__[name]
+        return getattr(self, name)
 
 
 def count_columns(law: Law) -> int:
@@ -94,7 +92,7 @@ def _lane(kind: Any, h: float) -> ca.Function:
     shape = {n: vector[int(a) : int(b)] for n, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
     forces = []
     for strength in _unit_strengths(law):
-        values = _Values({**shape, **strength})
+        values = _Values(**shape, **strength)
         if n_s:
             rate = {"dz": dz} if "dz" in law.reads() else {}
             w, end = law.step(z, own, values, **rate)
@@ -107,15 +105,9 @@ def _lane(kind: Any, h: float) -> ca.Function:
 
 def _unit_strengths(law: Law) -> list[dict[str, Any]]:
     """List the strengths with one entry at one and the others at zero, in turn."""
-    p = law.parameters()
-    zero = {name: ca.DM(np.zeros(p[name].value.shape)) for name in law.strength}
-    out = []
-    for name in law.strength:
-        for j in range(p[name].size):
-            one = np.zeros(p[name].size)
-            one[j] = 1.0
-            out.append({**zero, name: ca.DM(one)})
-    return out or [{}]
+    sizes = {name: law.parameters()[name].size for name in law.strength}
+    zero = {name: ca.DM(np.zeros(size)) for name, size in sizes.items()}
+    return [{**zero, name: ca.DM(one)} for name, size in sizes.items() for one in np.eye(size)] or [{}]
 
 
 @functools.cache

@@ -314,12 +314,6 @@ def test_values_that_a_law_cannot_have(given, says):
         Clearance(**given)
 
 
-@pytest.mark.parametrize("kind", EVERY, ids=lambda kind: kind.__name__)
-def test_a_wrong_name_is_refused_by_every_law(kind):
-    with pytest.raises(InputError, match=f"'banana'; its parameters are {', '.join(kind.units)}"):
-        kind().at({"banana": 1.0})
-
-
 def test_hysteresis_behind_a_gap_keeps_the_gap():
     law = behind_gap(StopHysteresis)()
     assert list(law.at(next(iter(law.shapes(LOCAL)))).parameters()) == ["w", "r", "g"]
