@@ -15,7 +15,7 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from functools import cache
@@ -35,7 +35,11 @@ __all__ = ["KINDS", "Case", "Score", "case", "export", "run_one", "score", "summ
 
 def run_one(seed: int) -> Score:
     """Diagnose one case and judge the answer; a crash is an answer that is wrong."""
-    hidden = case(seed)
+    return judged(case(seed))
+
+
+def judged(hidden: Case) -> Score:
+    """Diagnose a case that was drawn, and judge the answer."""
     began = time.perf_counter()
     try:
         diagnosis = pilfr_casadi.diagnose(hidden.simulator, hidden.train, test=hidden.test, workers=1)
@@ -60,7 +64,8 @@ def scored(path: Path) -> dict[int, Score]:
 @cache
 def code() -> str:
     """A digest of the package's files and of the cases': results of different code do not make one score."""
-    files = [*Path(pilfr_casadi.__file__).parent.rglob("*.py"), *Path(__file__).parent.glob("concealed*.py")]
+    here = Path(__file__).parent
+    files = [*Path(pilfr_casadi.__file__).parent.rglob("*.py"), *here.glob("concealed*.py"), *here.glob("stress*.py")]
     return hashlib.sha256(b"".join(f.read_bytes() for f in sorted(files))).hexdigest()[:16]
 
 
@@ -123,19 +128,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if not seeds:
         sys.exit("No case has that tag; see --list.")
-    done = scored(a.out) if a.out else {}
+    print("\n" + summary(answered(seeds, run_one, a.out, a.workers)))
+
+
+def answered(seeds: Sequence[int], run: Callable[[int], Score], out: Path | None, workers: int) -> list[Score]:
+    """Scores of all seeds, in their order; what the file `out` has is not run again, and what comes is put there."""
+    done = scored(out) if out else {}
     scores = [done[seed] for seed in seeds if seed in done]
-    pool = ProcessPoolExecutor(a.workers, mp_context=get_context("spawn"))
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
     try:
-        for task in as_completed([pool.submit(run_one, seed) for seed in seeds if seed not in done]):
+        for task in as_completed([pool.submit(run, seed) for seed in seeds if seed not in done]):
             scores.append(task.result())
-            if a.out:
-                with a.out.open("a", encoding="utf-8") as file:
+            if out:
+                with out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps({"code": code(), **asdict(scores[-1])}, default=lambda v: v.item()) + "\n")
             print(f"[{len(scores):3d}/{len(seeds)}] {line(scores[-1])}", flush=True)
     finally:  # an end in the middle begins no further case
         pool.shutdown(cancel_futures=True)
-    print("\n" + summary(sorted(scores, key=lambda s: s.seed)))
+    return sorted(scores, key=lambda s: s.seed)
 
 
 if __name__ == "__main__":

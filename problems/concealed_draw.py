@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,12 +27,63 @@ class Unsuited(Exception):
     """This draw cannot be used; the next is tried."""
 
 
+@dataclass(frozen=True)
+class Plan:
+    """Wishes for a draw; the defaults are those of the concealed cases.
+
+    Parameters
+    ----------
+    rigs : tuple of str
+        Names of the rigs to draw from; empty for all.
+    visible : tuple of float
+        Least and largest error of the refit over the noise.
+    target : tuple of float
+        Range of the refit's NRMSE that the strength of an effect is set for.
+    loudest : float
+        Largest noise over the signal.
+    pole : float
+        Pole of AR(1) noise; 0 draws the kind of noise.
+    start : str
+        How the recordings start; empty draws it.
+    pairs : callable, optional
+        Gives (port, law) of every hidden effect from the draw.
+    drafts : mapping
+        law -> maker of an effect from (draw, port, scale), before the makers of the concealed cases.
+    value : {"", "fixed", "bounds"}
+        A parameter held at a wrong value, or bounds that leave out the true value.
+    fault, side : str
+        Kind of fault, and "input" or "output"; empty draws them.
+    undeclared : bool
+        The user declares every port but the one with the effect.
+    """
+
+    rigs: tuple[str, ...] = ()
+    visible: tuple[float, float] = (LEAST, MOST)
+    target: tuple[float, float] = (0.01, 0.2)
+    loudest: float = dull.LOUDEST
+    pole: float = 0.0
+    start: str = ""
+    pairs: Callable[[Draw], list[tuple[str, str]]] | None = None
+    drafts: Mapping[str, Callable[[Draw, str, Scale], Draft]] = field(default_factory=dict)
+    value: str = ""
+    fault: str = ""
+    side: str = ""
+    undeclared: bool = False
+
+
+USUAL = Plan()
+
+
 class Draw:
     """One attempt: rig, true values, sampling, inputs, and hidden effects with their strengths."""
 
-    def __init__(self, rng: np.random.Generator, seed: int, kind: str, rig: Rig | None = None) -> None:
-        self.rng, self.seed, self.kind = rng, seed, kind
+    def __init__(
+        self, rng: np.random.Generator, seed: int, kind: str, rig: Rig | None = None, plan: Plan = USUAL
+    ) -> None:
+        self.rng, self.seed, self.kind, self.plan = rng, seed, kind, plan
+        self.told: dict[str, tuple[float, float | None, float | None]] = {}  # start and bounds; no bounds where held
         rigs = [r for r in RIGS.values() if r.states or kind != "two"]
+        rigs = [r for r in rigs if not plan.rigs or r.name in plan.rigs]
         self.rig = rig = rig or rigs[int(rng.integers(len(rigs)))]
         self.values = {
             n: float(f"{np.exp(rng.uniform(np.log(a), np.log(b))):.4g}") for n, (a, b, _, _) in rig.parameters.items()
@@ -38,7 +91,7 @@ class Draw:
         self.p = np.array(list(self.values.values()))
         self.names = {"states": rig.states, "inputs": rig.inputs, "outputs": rig.outputs}
         self.names["parameters"] = tuple(rig.parameters)
-        self.bare = bool(rig.bare) and rng.random() < 0.3
+        self.bare = bool(rig.bare) and rng.random() < 0.3 and not plan.undeclared
         self.module = rig.module(rig.source({n: f"Parameter({v!r})" for n, v in self.values.items()}))
         self.module["PORTS"] = self.module["simulator"].ports
         self.plant = Plant(self.module, self.names, ())
@@ -46,6 +99,7 @@ class Draw:
         self._times()
         self.levels = 1 + int(rng.integers(3))
         self.start = str(rng.choice(["zero", "estimate", "periodic"], p=[0.4, 0.35, 0.25]))
+        self.start = plan.start or self.start
         if self.start == "periodic" and (rig.integrator or not rig.states):
             self.start = "estimate"
 
@@ -154,6 +208,8 @@ class Draw:
     def draft(self, port: str, law: str, scale: Scale, bare: Motion) -> Draft:
         """An effect without its strength."""
         series = ":" in port
+        if law in self.plan.drafts:
+            return self.plan.drafts[law](self, port, scale)
         if law == "outside":
             others = [] if series else self.apart(port, bare)
             return outside(self.rng, scale, series, str(self.rng.choice(others)) if others else None)
@@ -165,8 +221,10 @@ class Draw:
         return [name for name, r in zip(self.rig.states, own, strict=True) if abs(r) < SAME]
 
     def pairs(self) -> list[tuple[str, str]]:
-        """Where this case hides something: one or two (port, law)."""
+        """Where this case hides something: (port, law) of each effect."""
         rng, found = self.rng, places(self.rig)
+        if self.plan.pairs is not None:
+            return self.plan.pairs(self)
         if self.kind == "outside":
             ports = sorted({p for p, _ in found if ":" not in p}) or sorted({p for p, _ in found})
             return [(str(rng.choice(ports)), "outside")]
@@ -184,15 +242,30 @@ class Draw:
     def bounds(self) -> tuple[Array, Array, Array]:
         """Which parameters are free, and their bounds."""
         free = np.array([not f for *_, f in self.rig.parameters.values()])
-        return free, 0.2 * self.p, 5.0 * self.p
+        lower, upper = 0.2 * self.p, 5.0 * self.p
+        for i, name in enumerate(self.rig.parameters):
+            if name in self.told:
+                _, low, high = self.told[name]
+                free[i] = low is not None
+                lower[i], upper[i] = (low, high) if low is not None and high is not None else (lower[i], upper[i])
+        return free, lower, upper
+
+    def left(self, u: Array, y: Array, plant: Plant | None = None, hold: str = "", steps: int = 4) -> float:
+        """NRMSE that a refit of the free parameters inside the user's bounds leaves; from the plant by default."""
+        free, lower, upper = self.bounds()
+        p = self.p.copy()
+        for i, name in enumerate(self.rig.parameters):
+            if name in self.told:
+                p[i] = np.clip(p[i], lower[i], upper[i]) if free[i] else self.told[name][0]
+        return refit(plant or self.plant, p, free, u, y, self.dt, hold or self.hold, self.coarse, lower, upper, steps)
 
     def effect(self, port: str, law: str, bare: Motion, item: Any) -> tuple[Effect, float]:
         """An effect with a strength that its refit leaves visible, and that refit's NRMSE."""
         scale = self.scale(port, bare, item[1])
         draft, strength = self.draft(port, law, scale, bare), 0.0
         strength, warm = draft.start, item[2]
-        target = float(np.exp(self.rng.uniform(np.log(0.01), np.log(0.2))))
-        free, lower, upper = self.bounds()
+        low, high = self.plan.target
+        target = float(np.exp(self.rng.uniform(np.log(low), np.log(high))))
         for attempt in range(TRIES):
             effect = Effect(port, law, draft.variant, **draft.make(strength))
             try:
@@ -204,15 +277,13 @@ class Draw:
             if size > 0.9 and attempt < TRIES - 1:
                 strength *= 0.4
                 continue
-            left = refit(
-                self.plant, self.p, free, item[1][warm:], y[warm:], self.dt, self.hold, self.coarse, lower, upper
-            )
+            left = self.left(item[1][warm:], y[warm:])
             if not 0.5 * target < left < 2 * target and attempt < 4:
                 factor = float(np.clip(target / max(left, 1e-9), 0.2, 6.0))
                 if min(strength * factor, draft.most) != strength:
                     strength = min(strength * factor, draft.most)
                     continue
-            if LEAST * dull.QUIETEST < left < 0.5:
+            if self.plan.visible[0] * dull.QUIETEST < left < 0.5:
                 return effect, left
             raise Unsuited
         raise Unsuited

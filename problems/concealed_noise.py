@@ -14,6 +14,7 @@ import numpy as np
 
 Array = np.ndarray
 FAULTS = ("sign", "unit", "clipped", "alignment", "clock", "time-unit")
+RARE_FAULTS = ("zero", "offset", "exchange", "gap", "stale", "hold")  # of the stress sets alone
 NOISES = {"white": 0.5, "coloured": 0.25, "quantised": 0.25}
 QUIETEST, LOUDEST = 10 ** (-70 / 20), 10 ** (-40 / 20)  # noise of 70 and 40 dB below the signal
 FEWEST_SHIFT = 5  # whole samples
@@ -27,6 +28,8 @@ class Fault(NamedTuple):
     column: int
     is_input: bool
     size: float
+    other: int = 0  # the column it is exchanged with
+    seed: int = 0  # of what is drawn for each recording
 
 
 def excitation(
@@ -56,8 +59,14 @@ def excitation(
     return u / u.std()
 
 
-def noise(rng: np.random.Generator, kind: str, y: Array, level: Array) -> Array:
-    """Outputs with noise of standard deviation `level` (n_y,)."""
+def noise(rng: np.random.Generator, kind: str, y: Array, level: Array, pole: float = 0.0) -> Array:
+    """Outputs with noise of standard deviation `level` (n_y,); a pole makes it AR(1), stationary from the start."""
+    if pole:
+        from scipy.signal import lfilter
+
+        first = pole * rng.standard_normal((1, y.shape[1])) / np.sqrt(1 - pole**2)
+        e = lfilter([1.0], [1.0, -pole], rng.standard_normal(y.shape), axis=0, zi=first)[0]
+        return y + level * e * np.sqrt(1 - pole**2)
     if kind == "white":
         return y + level * rng.standard_normal(y.shape)
     if kind == "coloured":
@@ -78,11 +87,15 @@ def draw_fault(
     linear: bool,
     dynamic: bool,
     kind: str = "",
+    side: str = "",
 ) -> Fault:
-    """Draw a fault; a wrong unit of time only where something moves in time."""
+    """Draw a fault; a wrong unit of time only where something moves in time. `side` is "input", "output" or drawn."""
+    if kind in RARE_FAULTS:
+        return _draw_rare(rng, inputs, outputs, linear, kind, side == "input")
     kind = kind or str(rng.choice([f for f in FAULTS if dynamic or f != "time-unit"]))
     single = len(inputs) == len(outputs) == 1
     is_input = kind in ("sign", "unit", "clipped") and rng.random() < 0.4
+    is_input = side == "input" if side else is_input
     names = inputs if is_input else outputs
     column = int(rng.integers(len(names)))
     channels = {names[column]}
@@ -95,8 +108,8 @@ def draw_fault(
         size = float(rng.uniform(0.55, 0.8))
     if kind == "alignment":
         size = float(rng.integers(FEWEST_SHIFT, 40) * rng.choice([-1, 1]))
-        if len(outputs) == 1:
-            channels |= {*inputs, "time"}
+        if len(inputs if is_input else outputs) == 1:
+            channels |= {*inputs, "time", *(outputs if is_input else ())}
     if kind == "clock":
         size = float(rng.uniform(1e-3, 5e-3) * rng.choice([-1, 1]))
         channels |= {*inputs, "time"}
@@ -105,14 +118,37 @@ def draw_fault(
     return Fault(kind, frozenset(channels), column, is_input, size)
 
 
+def _draw_rare(
+    rng: np.random.Generator, inputs: tuple[str, ...], outputs: tuple[str, ...], linear: bool, kind: str, is_input: bool
+) -> Fault:
+    """A fault of `RARE_FAULTS`; an exchange needs two channels of the side."""
+    names = inputs if is_input else outputs
+    column = int(rng.integers(len(names)))
+    channels, size, other = {names[column]}, 0.0, 0
+    if kind in ("zero", "offset"):
+        size = float(rng.uniform(0.15, 0.6) * rng.choice([-1, 1]))
+        if len(inputs) == len(outputs) == 1 and linear:  # in steady state the one is the other times the gain
+            channels = {*inputs, *outputs}
+    elif kind == "exchange":
+        column, other = (int(i) for i in rng.choice(len(names), 2, replace=False))
+        channels = {names[column], names[other]}
+    elif kind == "gap":
+        size, channels = float(rng.integers(15, 150)), {*inputs, *outputs, "time"}
+    elif kind == "stale":
+        size = float(rng.uniform(0.04, 0.2))
+    else:  # hold
+        channels = {*inputs, "time", *(outputs if len(outputs) == 1 else ())}
+    return Fault(kind, frozenset(channels), column, is_input, size, other, int(rng.integers(2**31)))
+
+
 def spoil_clean(fault: Fault | None, u: Array, y: Array) -> tuple[Array, Array]:
     """Faults that lie before the noise: alignment, clock."""
     if fault is None:
         return u, y
     if fault.kind == "alignment":
-        n, y = abs(int(fault.size)), np.array(y)
-        shifted = np.roll(y[:, fault.column], int(fault.size))
-        y[:, fault.column] = shifted
+        n, u, y = abs(int(fault.size)), np.array(u), np.array(y)
+        a = u if fault.is_input else y
+        a[:, fault.column] = np.roll(a[:, fault.column], int(fault.size))
         return u[n:-n], y[n:-n]
     if fault.kind == "clock":
         from scipy.interpolate import CubicSpline
@@ -124,17 +160,34 @@ def spoil_clean(fault: Fault | None, u: Array, y: Array) -> tuple[Array, Array]:
     return u, y
 
 
-def spoil(fault: Fault | None, u: Array, y: Array, tops: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Faults that lie after the noise: sign, unit, clipping (at a share of `tops`, largest |u| and |y|)."""
-    if fault is None or fault.kind not in ("sign", "unit", "clipped"):
+def spoil(fault: Fault | None, u: Array, y: Array, tops: tuple[Array, Array], record: int = 0) -> tuple[Array, Array]:
+    """Faults that lie after the noise; sizes are shares of `tops`, the largest |u| and |y|.
+
+    An offset differs from recording to recording, a zero does not; samples are missing in the first recording alone.
+    """
+    if fault is None or fault.kind not in ("sign", "unit", "clipped", *RARE_FAULTS):
         return u, y
     u, y = np.array(u), np.array(y)
+    rng = np.random.default_rng([fault.seed, record])
+    if fault.kind == "gap" and record == 0:
+        begin = int(rng.uniform(0.3, 0.7) * len(y))
+        kept = np.r_[0:begin, begin + int(fault.size) : len(y)]
+        return u[kept], y[kept]
     a, i = (u, fault.column) if fault.is_input else (y, fault.column)
     if fault.kind == "sign":
         a[:, i] *= -1
     elif fault.kind == "unit":
         a[:, i] *= fault.size
-    else:
+    elif fault.kind in ("zero", "offset"):
+        share = fault.size * (rng.choice([-1, 1]) * rng.uniform(0.5, 1.5) if fault.kind == "offset" else 1.0)
+        a[:, i] += share * tops[0 if fault.is_input else 1][i]
+    elif fault.kind == "exchange":
+        a[:, [i, fault.other]] = a[:, [fault.other, i]]
+    elif fault.kind == "stale":
+        fresh = rng.random(len(a)) >= fault.size
+        fresh[0] = True
+        a[:, i] = a[np.maximum.accumulate(np.where(fresh, np.arange(len(a)), 0)), i]
+    elif fault.kind == "clipped":
         limit = fault.size * tops[0 if fault.is_input else 1][i]
         a[:, i] = np.clip(a[:, i], -limit, limit)
     return u, y

@@ -222,8 +222,9 @@ def refit(
     coarse: int,
     lower: Array,
     upper: Array,
+    steps: int = 4,
 ) -> float:
-    """NRMSE left by the plant without effects after three damped Gauss-Newton steps on its free parameters and x0."""
+    """NRMSE left by a plant after a few damped Gauss-Newton steps on its free parameters and x0."""
     sigma = np.maximum(y.std(axis=0), 1e-300)
     m, n_x = len(u), plant.n_x
     u0, u1 = fine_inputs(u, coarse, hold)
@@ -233,18 +234,18 @@ def refit(
     zeros, t = np.zeros((1, BLOCK)), np.arange(total + pad)[None, :] * dt / coarse
 
     def output(p: Array, x0: Array) -> Array:
-        state, columns = x0, []
+        state, columns = np.concatenate([x0, np.zeros(plant.size - n_x)]), []
         for k in range(0, total, BLOCK):
             s = slice(k, k + BLOCK)
             xs, seen = run(state, u0[:, s], u1[:, s], zeros, t[:, s], ca.repmat(ca.DM(p), 1, BLOCK))
-            state = np.asarray(xs)[:, -1] if n_x else state
+            state = np.asarray(xs)[:, -1] if plant.size else state
             columns.append(np.asarray(seen)[: y.shape[1]])
         return np.concatenate(columns, axis=1)[:, :total:coarse].T
 
     x0, index = np.zeros(n_x), np.flatnonzero(free)
     now = output(p, x0)
     step0 = None
-    for _ in range(4):
+    for _ in range(steps):
         e = ((y - now) / sigma).ravel()
         cost = float(e @ e)
         if not np.isfinite(cost):

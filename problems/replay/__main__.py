@@ -3,6 +3,7 @@
 The bank holds the answers of an earlier commit, one JSON line per case, in one file per suite beside this program:
 
     cases      120 concealed cases, balanced over rigs, laws, two effects, outside, faults and nothing missing
+    bank       400 of them (`problems.bank`), only where the suite is named
     machines   the recordings of real machines, and the paper's rig without its spring
     table2     Table 2 in its short form
     accuracy   the default identification on a fresh record of the paper's rig
@@ -29,7 +30,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from .suites import SUITES, differences, drifts, keys, timed
+from .suites import ON_REQUEST, SUITES, differences, drifts, keys, timed
 
 FOLDER = Path(__file__).parent
 
@@ -50,7 +51,9 @@ def record(suite: str, rows: dict[str, dict[str, Any]]) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Replay, print what differs, and return the number of suites that differ as an exit status of 0 or 1."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("suites", nargs="*", choices=[*SUITES, []], help="suites to replay; all by default")
+    parser.add_argument(
+        "suites", nargs="*", choices=[*SUITES, []], help="suites to replay; all but the bank by default"
+    )
     parser.add_argument("--record", action="store_true", help="write the bank instead of comparing with it")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="only every N-th key of each suite")
     parser.add_argument("--only", nargs="+", default=None, metavar="KEY", help="only these keys")
@@ -58,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     different, compared = [], 0
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
-        for suite in options.suites or SUITES:
+        for suite in options.suites or [s for s in SUITES if s not in ON_REQUEST]:
             old = banked(suite)
             wanted = [k for k in keys(suite)[:: options.every] if options.only is None or k in options.only]
             if options.record:  # what is there already stays: delete the file to begin anew

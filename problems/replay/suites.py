@@ -15,7 +15,7 @@ import numpy as np
 
 import pilfr_casadi as pilfr
 
-from .. import accuracy, concealed, emps, masing_diagnosis, piezo_diagnosis, silverbox, speed, table2, tanks, zoo
+from .. import accuracy, bank, concealed, emps, masing_diagnosis, piezo_diagnosis, silverbox, speed, table2, tanks, zoo
 from ..masing_data import benchmark
 from ..measured_data import measured
 
@@ -23,6 +23,10 @@ DIGITS = 10  # of exported steps
 SHORT_TABLE = ["--rows", "LTI", "N=5, paper", "nx=5, n=5", "--starts", "2", "--network-starts", "1", "--workers", "1"]
 ACCURACY = [(operators, seed) for operators in (20, 10) for seed in (0, 1)]
 EXPORTS = ("casadi", "smooth", "control", "diagnosis")
+MARKS = ("verdict_right", "port", "law", "both", "channel", "ratio")
+MARKS += ("answer", "finding", "fault_kind", "wrong_fault", "sure_wrong", "certainties")
+DIAGNOSES = ("cases", "bank", "machines")  # suites whose answers are diagnoses
+ON_REQUEST = ("bank",)  # suites that take hours
 Answer = dict[str, Any]
 # Concealed cases whose answers have been looked at before, balanced over kinds, rigs and laws.
 SEED_LIST = """
@@ -56,8 +60,8 @@ def _case(key: str) -> Answer:
     except Exception as error:  # a crash is an answer too
         return {"verdict": f"crash: {type(error).__name__}", "effects": [], "gates": []}
     score = concealed.score(hidden, diagnosis.to_dict())
-    marks = {k: getattr(score, k) for k in ("verdict_right", "port", "law", "both", "channel", "ratio")}
-    return {"name": hidden.name, **diagnosed(diagnosis), "score": marks}
+    marks = {k: getattr(score, k) for k in MARKS}
+    return {"name": hidden.name, "least": hidden.floor, **diagnosed(diagnosis), "score": marks}
 
 
 def from_files(folder: Path) -> Any:
@@ -163,6 +167,7 @@ SUITES: dict[str, tuple[tuple[str, ...], Callable[[str], Answer | None]]] = {
     "exports": (EXPORTS, _export),
     "machines": (("masing", *MACHINES), _machine),
     "cases": (tuple(map(str, SEEDS)), _case),
+    "bank": (tuple(map(str, bank.SEEDS)), _case),
     "speed": (("quick",), _speed),
 }
 
@@ -188,7 +193,7 @@ def differences(suite: str, old: Answer, new: Answer) -> list[str]:
     """Differences that fail a replay."""
     if suite == "speed":
         return []
-    if suite in ("cases", "machines"):
+    if suite in DIAGNOSES:
         before, now = ({"verdict": a["verdict"], "effects": [e[:2] for e in a["effects"]]} for a in (old, new))
     else:
         before, now = ({k: v for k, v in a.items() if k not in ("key", "seconds")} for a in (old, new))
@@ -197,7 +202,7 @@ def differences(suite: str, old: Answer, new: Answer) -> list[str]:
 
 def drifts(suite: str, old: Answer, new: Answer) -> list[str]:
     """Differences of a diagnosis that are reported only."""
-    if suite not in ("cases", "machines") or "train" not in old or "train" not in new:
+    if suite not in DIAGNOSES or "train" not in old or "train" not in new:
         return []
     out = []
     for kind in ("train", "test"):
