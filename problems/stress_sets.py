@@ -131,7 +131,7 @@ def load_allowed(case: Case) -> Case:
 def load_expected(case: Case) -> Case:
     """A load is a finding, and no effect to be named."""
     laws = [i for i, t in enumerate(case.truth) if t["law"] != LOAD]
-    truth, accepted = (tuple(a[i] for i in laws) for a in (case.truth, case.accepted))
+    truth, accepted = tuple(case.truth[i] for i in laws), tuple(case.accepted[i] for i in laws)
     case = replace(case, truth=truth, accepted=accepted, findings=(_load(case, True),))
     if truth:
         return replace(case, tags=case.tags - {"two"} | {"one", "load"}, also=frozenset({"recording-fault"}))

@@ -189,7 +189,7 @@ def test_report_has_every_set(monkeypatch, tmp_path, capsys):
     stress.main(["slow-noise", "weak"])
     text = capsys.readouterr().out
     assert len(drawn) == 49 and "slow-noise (25 cases)" in text and "weak (24 cases)" in text
-    assert "25 of   25 answers right" in text and "whole answer right" in text
+    assert "25 of 25 answers right" in text and "whole answer right" in text
 
 
 def test_the_bank_is_burnt_and_balanced():

@@ -23,8 +23,8 @@ DIGITS = 10  # of exported steps
 SHORT_TABLE = ["--rows", "LTI", "N=5, paper", "nx=5, n=5", "--starts", "2", "--network-starts", "1", "--workers", "1"]
 ACCURACY = [(operators, seed) for operators in (20, 10) for seed in (0, 1)]
 EXPORTS = ("casadi", "smooth", "control", "diagnosis")
-MARKS = ("verdict_right", "port", "law", "both", "channel", "ratio")
-MARKS += ("answer", "finding", "fault_kind", "wrong_fault", "sure_wrong", "certainties")
+FIRST_NAME = ("verdict_right", "port", "law", "both", "channel", "ratio")
+MARKS = (*FIRST_NAME, "answer", "finding", "fault_kind", "wrong_fault", "sure_wrong", "certainties")
 DIAGNOSES = ("cases", "bank", "machines")  # suites whose answers are diagnoses
 ON_REQUEST = ("bank",)  # suites that take hours
 Answer = dict[str, Any]
