@@ -138,10 +138,11 @@ def unknown_multipliers(limits: Sequence[Limit], status: Status) -> str:
     ]
     if not names:
         return ""
-    why = "no step of a solver has led to this point"
-    if status is Status.SMALL_STEP:
-        why = "the solver ended in steps too small to matter, as at a kink of the error, where no rate holds on both "
-        why += "sides"
+    why = (
+        "the solver ended in steps too small to matter, as at a kink of the error, where no rate holds on both sides"
+        if status is Status.SMALL_STEP
+        else "no step of a solver has led to this point"
+    )
     return f"multipliers are not known ({', '.join(names)}): {why}"
 
 

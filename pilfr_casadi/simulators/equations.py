@@ -13,7 +13,7 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import casadi as ca
 
@@ -211,7 +211,7 @@ class Equations:
     @property
     def parameter_set(self) -> ParameterSet:
         """The parameters with the layout of their vector."""
-        return self.parameters if isinstance(self.parameters, ParameterSet) else ParameterSet(self.parameters)
+        return cast(ParameterSet, self.parameters)
 
     def _symbols(self) -> tuple[Named, Named, Named, Any]:
         x = Named("state", {n: ca.SX.sym(n) for n in self.states})
@@ -281,23 +281,22 @@ class Equations:
 
         Where the state is the derivative of another state (a velocity), the local coordinate is that other state.
         """
-        x, u, p, t = self._symbols()
-        derivatives = ca.vertsplit(self.derivatives(x, u, p, t))
-        integral = next(
-            (n for n, d in zip(self.states, derivatives, strict=True) if d.is_symbolic() and d.name() == state), None
-        )
+        integral = next((n for n, rate in self._integrals.items() if rate == state), None)
         if integral is None or integral == state:
             return Port(f"equation:{state}", {state: -1.0}, lambda x: x[state])
         return Port(f"equation:{state}", {state: -1.0}, lambda x: x[integral], lambda x: x[state])
 
     @cached_property
+    def _integrals(self) -> dict[str, str]:
+        """States whose derivative is a single symbol, with its name."""
+        derivatives = ca.vertsplit(self.derivatives(*self._symbols())) if self.states else []
+        return {n: d.name() for n, d in zip(self.states, derivatives, strict=True) if d.is_symbolic()}
+
+    @cached_property
     def kinematic(self) -> frozenset[str]:
         """States that are the integral of another state: their equations are definitions and lack nothing."""
-        if self.discrete:
-            return frozenset()
-        x, u, p, t = self._symbols()
-        derivatives = zip(self.states, ca.vertsplit(self.derivatives(x, u, p, t)), strict=True)
-        return frozenset(n for n, d in derivatives if d.is_symbolic() and d.name() in self.states and d.name() != n)
+        own = {} if self.discrete else self._integrals
+        return frozenset(n for n, rate in own.items() if rate in self.states and rate != n)
 
     @cached_property
     def idle_inputs(self) -> tuple[str, ...]:
