@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pilfr_casadi import load, response_bound
-from pilfr_casadi.cli.app import main
+from pilfr_casadi.cli import main
 from problems.fsm import COMBINED, HELD, ITERATIONS, LEVELS, PERIOD, PUBLISHED, Mirror, noise_table, run
 from problems.fsm_linear import Levels, Spectra, fitted_levels, in_modes, normal, simulated
 from problems.fsm_model import combined, envelope_alone, pure

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pilfr_casadi.cli.app import main
+from pilfr_casadi.cli import main
 from problems.measured_data import measured
 from problems.piezo_stack import run
 

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from pilfr_casadi import InputError, Limit, Recording, fit, load, save
 from pilfr_casadi._base import write_atomically
-from pilfr_casadi.cli.app import main
+from pilfr_casadi.cli import main
 from pilfr_casadi.models import PILFR, GeneralizedPlay, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import Status
 

@@ -8,7 +8,7 @@ from run_files import DATA
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.cli.app import main
+from pilfr_casadi.cli import main
 from pilfr_casadi.models import ANY, STRUCTURES, TAKES, named_structure
 from pilfr_casadi.studies import read_run
 
