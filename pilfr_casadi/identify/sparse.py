@@ -211,11 +211,7 @@ def regularization_path(
             found = _sparser_fit(fit, seen, judged, strength, thin, options)
         else:
             scaled = {k: (m, np.asarray(s, dtype=float) / np.sqrt(strength)) for k, (m, s) in priors.items()}
-            held = replace(structure, priors={**structure.priors, **scaled})
-            model = fit.model.with_parameters(
-                fit.model.parameters.change(**{k: {"prior": held.priors[k]} for k in scaled})
-            )
-            found = _uninterrupted(identify(replace(fit, structure=held, model=model), seen, **options))
+            found = _uninterrupted(identify(_with_priors(fit, structure, scaled), seen, **options))
         fits.append(found)
         errors.append(found.nrmse(judged))
         if progress:
@@ -231,6 +227,13 @@ def regularization_path(
         recommended=recommended,
         margin=float(margin),
     )
+
+
+def _with_priors(fit: Fit, structure: PILFR, priors: Mapping[str, tuple[Any, Any]]) -> Fit:
+    """Replace priors in the structure and the model of a fit."""
+    parameters = fit.model.parameters.change(**{k: {"prior": prior} for k, prior in priors.items()})
+    held = replace(structure, priors={**structure.priors, **priors})
+    return replace(fit, structure=held, model=fit.model.with_parameters(parameters))
 
 
 def _checked(

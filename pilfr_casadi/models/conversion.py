@@ -34,18 +34,7 @@ MIRRORED = ("B_w", "D_yw")
 
 
 def complement(values: Mapping[str, Any]) -> dict[str, Array]:
-    """Convert the blocks of a PI-LFR with plays to the equal one with stops, or the other way round.
-
-    Parameters
-    ----------
-    values : mapping
-        The blocks of `pilfr.BLOCKS` and `w`, `r` (n_w, N) by name; further names are passed on.
-
-    Returns
-    -------
-    dict
-        All values in the other form; applied twice, the given values.
-    """
+    """Convert the blocks and weights of a PI-LFR from plays to stops or back; further names are passed on."""
     out = {name: np.array(value, dtype=float) for name, value in values.items()}
     total = out["w"].sum(axis=1)
     for name, (into, out_of) in SLOPES.items():

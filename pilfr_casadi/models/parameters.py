@@ -21,13 +21,7 @@ LARGEST_MODEL = 20_000  # parameters: the Gauss-Newton Hessian then takes 3.2 GB
 
 
 def check_size(owner: str, count: int) -> None:
-    """Refuse a model whose number of parameters no fit could handle, before anything of that size is allocated.
-
-    Raises
-    ------
-    InputError
-        With the number of parameters and the memory that a fit would take.
-    """
+    """Refuse a model whose number of parameters no fit could handle, before anything of that size is allocated."""
     if count > LARGEST_MODEL:
         raise InputError(
             f"{owner} of this size has at least {float(count):.3g} parameters, and the matrix that a fit solves for "
@@ -251,13 +245,7 @@ class ParameterSet(Mapping[str, Parameter]):
         return {n: ca.reshape(vector[entries], *p.shape) for n, p, entries in self._slices()}
 
     def at(self, vector: Array) -> ParameterSet:
-        """Copy with start values from a vector, clipped to the bounds.
-
-        Raises
-        ------
-        InputError
-            If the vector has another length or an entry is not finite.
-        """
+        """Copy with start values from a vector, which must be finite, clipped to the bounds."""
         values = self.unpack(np.clip(vector, self.lower, self.upper))
         if not all(np.all(np.isfinite(value)) for value in values.values()):
             raise InputError("A parameter's value is not finite; give a number.")

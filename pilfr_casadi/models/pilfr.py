@@ -112,13 +112,7 @@ class PILFR:
         return 0 if self.element is None else self.element.channels
 
     def _given(self, name: str, shape: tuple[Any, ...]) -> dict[str, Any]:
-        """Collect `fixed`, `bounds` and `prior` of a parameter, as far as they are given, filled to its shape.
-
-        Raises
-        ------
-        InputError
-            If one of them is neither a number nor an array of this shape.
-        """
+        """Collect the given ones of `fixed`, `bounds` and `prior` of a parameter, filled to its shape."""
         out: dict[str, Any] = {}
         if name in self.fixed:
             value = self.fixed[name]

@@ -262,32 +262,20 @@ ANY = frozenset(name for takes in TAKES.values() for name in takes)
 
 
 def named_structure(structure: str = "lfr", **given: Any) -> PILFR | Lagged:
-    """Build the named structure with options of `TAKES`; omitted options have the structure's defaults.
+    """Build a structure of `STRUCTURES` with the options of `TAKES`, at least `nx` or `lags`.
 
-    Parameters
-    ----------
-    structure : str
-        One of `STRUCTURES`.
-    given
-        `nx` or `lags` at least. `operators` is 20 by default and 0 for a linear model; `neurons` belong to a
-        generalized play.
-
-    Raises
-    ------
-    InputError
-        As for `PILFR`, `PrandtlIshlinskii`, `StaticNetwork` and `NARX`.
+    Omitted options have the structure's defaults; `operators` is 20 by default and 0 for a linear model; `neurons`
+    belong to a generalized play.
     """
     if structure in LAGGED:
         return LAGGED[structure](**given)
     element: dict[str, Any] = {k: given[k] for k in ("hidden", "channels") if k in given}
     form = {k: given[k] for k in ("bounds", "priors", "offset") if k in given}
-    base = _network(structure, given["nx"], element) if "hidden" in TAKES[structure] else _hysteretic(structure, given)
+    if "hidden" in TAKES[structure]:
+        base = ssnn(given["nx"], **element) if structure == "ssnn" else network_lfr(given["nx"], **element)
+    else:
+        base = _hysteretic(structure, given)
     return PILFR(given["nx"], base.element, {**base.fixed, **given.get("fix", {})}, **form)
-
-
-def _network(structure: str, nx: int, options: Mapping[str, Any]) -> PILFR:
-    """Build an SS-NN, or a network in the port of a linear model."""
-    return ssnn(nx, **options) if structure == "ssnn" else network_lfr(nx, **options)
 
 
 def _hysteretic(structure: str, given: Mapping[str, Any]) -> PILFR:
