@@ -100,7 +100,7 @@ def filled(
     wanted = f"a number or an array of shape ({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
     wanted = wanted if shape else "a number"
     found = real_array(values)
-    if found is None:
+    if found is None or np.asarray(values).dtype.kind == "O":  # None would become nan
         raise InputError(f"{what} is {str(values)[:60]}; give {wanted}.")
     known = tuple(k if isinstance(n, str) else n for n, k in zip(shape, found.shape, strict=False))
     if found.ndim and (len(shape), known) != (found.ndim, found.shape):
