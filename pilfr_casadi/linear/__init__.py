@@ -6,7 +6,6 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .bla import BLA as BLA, output_spectra as output_spectra, plain_bla as plain_bla, robust_bla as robust_bla
-    from .order_selection import select_order as select_order
     from .statespace import (
         INJECTION as INJECTION,
         in_modal_coordinates as in_modal_coordinates,
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from .subspace import (
         FrequencyProblem as FrequencyProblem,
         frequency_subspace as frequency_subspace,
+        select_order as select_order,
         subspace_matrices as subspace_matrices,
         time_subspace as time_subspace,
     )

@@ -25,12 +25,14 @@ if TYPE_CHECKING:
         unknown_slope as unknown_slope,
         weight_density as weight_density,
     )
-    from .evaluation import Buffered as Buffered, accumulate_steps as accumulate_steps, map_points as map_points
     from .model import (
+        Buffered as Buffered,
         Model as Model,
         StepExpressions as StepExpressions,
+        accumulate_steps as accumulate_steps,
         close_loop as close_loop,
         from_expressions as from_expressions,
+        map_points as map_points,
         open_model as open_model,
     )
     from .operators import (

@@ -2,7 +2,7 @@ r"""The errors of a run in tables and box plots, the model that is chosen, and t
 
 The box plots are those of Krikelis et al. (2024), Fig. 11.
 
-A structure is selected by cross-validation, or by a validation recording, with the rule of `order_selection`: with
+A structure is selected by cross-validation, or by a validation recording, with the rule of `select_order`: with
 :math:`e(c)` the error of a cell on recordings it has not been fitted to, take the cell of the fewest free parameters
 among :math:`\{c : e(c) \le (1 + m) \min_k e(k)\}`. In each fold the seed of the smallest training error stands for its
 cell, and :math:`e(c)` is the mean over the folds: the part held out judges, and has no part in what it judges.
@@ -26,7 +26,7 @@ from .schema import Cell, Run, grid_keys
 
 QUARTILES = ("smallest", "lower_quartile", "median", "upper_quartile", "largest")
 FOLDS = "folds"
-SELECTION_MARGIN = 0.05  # share of the smallest error that a smaller structure may cost; convention, as order_selection
+SELECTION_MARGIN = 0.05  # share of the smallest error that a smaller structure may cost; convention, as select_order
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pilfr_casadi.models import accumulate_steps, map_points
-from pilfr_casadi.models.evaluation import BLOCK
+from pilfr_casadi.models.model import BLOCK
 
 
 @pytest.fixture(scope="module")
