@@ -40,6 +40,7 @@ $(STAMP): pyproject.toml requirements.lock
 	        echo "$$found could not make a virtual environment: install its venv module (on Debian: python3-venv), then run make again." >&2; exit 1; \
 	    fi; \
 	fi
+	@echo "installing into .venv (a few minutes the first time)"
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@

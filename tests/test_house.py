@@ -1,6 +1,7 @@
 """The rule of imports: a folder imports only folders before it, and nothing imports in a circle."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -146,3 +147,13 @@ def test_faces_have_what_they_list(folder):
     assert set(module.__all__) <= set(dir(module))
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = module.no_such_name
+
+
+@pytest.mark.parametrize("folder", ORDER)
+def test_files_that_a_face_names_exist(folder):
+    """A word in backticks in a face's docstring is a file of the folder, or a public name."""
+    module = __import__(f"pilfr_casadi.{folder}", fromlist=["__all__"])
+    known = {"pilfr", *ORDER, *(name.rpartition("/")[2] for name in FILES if name.startswith(f"{folder}/"))}
+    words = re.findall(r"`([a-z][a-z_]{2,})(?:\.py)?`", module.__doc__)
+    wrong = [w for w in words if w not in known and w not in module.__all__ and not hasattr(pilfr_casadi, w)]
+    assert not wrong, f"{folder}/__init__.py: {', '.join(wrong)}"

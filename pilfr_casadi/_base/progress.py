@@ -19,7 +19,7 @@ from .interrupts import repeated_interrupt
 Progress = Callable[[str, int, int, float], None]
 
 NEW_STAGE_LINE = 1.0  # least seconds between plain lines when a new stage begins; quicker work stays silent
-LINE = 10.0  # least seconds between other plain lines
+LINE = 10.0  # least seconds between other plain lines, the last step of a stage excepted
 
 
 @contextmanager
@@ -59,18 +59,26 @@ Show = Callable[[str, int, int], None]
 
 
 def _lines(shown: _Shown) -> Show:
-    """Print a line when a new stage begins and about every ten seconds, never two within a second."""
+    """Print a line when a stage has its first step done, about every ten seconds, and when its last step is done.
+
+    A count that stands at zero is left out, and so are all lines of stages that are quick.
+    """
     stages: set[str] = set()
+    ended: set[str] = set()
     last_line = shown.began
 
     def show(stage: str, done: int, total: int) -> None:
         nonlocal last_line
         now = time.monotonic()
-        if now - last_line < (LINE if stage in stages else NEW_STAGE_LINE):
+        complete, pending = 0 < total <= done, done == 0 < total
+        last_step = complete and stage in stages and stage not in ended
+        if not last_step and now - last_line < (LINE if stage in stages or pending else NEW_STAGE_LINE):
             return
         stages.add(stage)
+        if complete:
+            ended.add(stage)
         last_line = now
-        parts = [f"{stage} {_count(done, total)}".rstrip(), shown.best_text(), shown.time_text()]
+        parts = [f"{stage} {_count(done, total) if done else ''}".rstrip(), shown.best_text(), shown.time_text()]
         print(", ".join(part for part in parts if part), file=sys.stderr, flush=True)
 
     return show

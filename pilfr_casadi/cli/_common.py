@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 DONE, NO_RESULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]  # Typer's own name for it has moved between releases
-MOST_SAMPLES = 10**9  # of a period or of samples left out: 8 GB a channel
+MOST_SAMPLES = 10**9  # of a period or of samples left out: 8 GB per channel
 
 
 def say(sentence: str, status: int) -> int:
@@ -97,7 +97,7 @@ class DataOptions:
     initial: Literal["estimate", "zero", "periodic"] | None = option(
         "State at the first sample (default: estimate; zero where no outputs were measured)."
     )
-    period: int | None = whole("Samples a period; goes with --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
+    period: int | None = whole("Samples per period; goes with --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
     hold: Literal["zero", "linear"] | None = option("Course of the inputs between samples.")
     skip: int = whole("Leading samples that are simulated, not scored.", 0, MOST_SAMPLES, 0, "SAMPLES")
     dt: float | None = option("Step, where the file has no time column.", "SECONDS")

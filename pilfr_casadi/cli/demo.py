@@ -38,7 +38,7 @@ PUBLISHED: Mapping[str, tuple[float, float, float]] = {
     "PI-LFR N=15": (0.0078, 0.0143, 0.0144),
     "PI-LFR N=20": (0.0073, 0.0134, 0.0153),
 }
-SHOWN = ("LTI", "PI-LFR N=20")
+SHOWN = {"LTI": "linear model", "PI-LFR N=20": "with 20 hysteresis operators"}  # rows, and their names in the table
 
 
 def demo_recordings() -> dict[str, Recording]:
@@ -69,7 +69,7 @@ class DemoOptions:
     """The options of `pilfr demo`."""
 
     out: str = option("Folder for the reports (default: runs/demo).", "DIR", "runs/demo")
-    workers: int | None = whole("Processes (default: one a processor, at most four).", 1, LARGEST_SIZE["workers"])
+    workers: int | None = whole("Processes (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"])
 
 
 @takes_options
@@ -131,12 +131,13 @@ def _fit_rows(recordings: Mapping[str, Recording], workers: int) -> list[Fit]:
 def _table(found: Sequence[Fit], recordings: Mapping[str, Recording]) -> Table:
     from rich.table import Table
 
-    table = Table("model", *SETS, "time", title="NRMSE in simulation, in brackets Krikelis et al. (2024), Table 2")
-    for row, result in zip(SHOWN, found, strict=False):
-        errors = [result.nrmse(recordings[s]) for s in SETS]
-        cells = [f"{e:.4f} ({p:.4f})" for e, p in zip(errors, PUBLISHED[row], strict=True)]
-        name = f"{row}, interrupted" if result.status is Status.INTERRUPTED else row
-        table.add_row(name, *cells, f"{result.seconds:.1f} s")
+    title = "Error of the simulation (NRMSE); published: Krikelis et al. (2024), Table 2"
+    table = Table("model", *SETS, "time", title=title)
+    for (row, name), result in zip(SHOWN.items(), found, strict=False):
+        note = ", interrupted" if result.status is Status.INTERRUPTED else ""
+        errors = [f"{result.nrmse(recordings[s]):.4f}" for s in SETS]
+        table.add_row(name + note, *errors, f"{result.seconds:.1f} s")
+        table.add_row("  (published)", *(f"{p:.4f}" for p in PUBLISHED[row]), "")
     table.add_row("noise floor", *(f"{FLOOR:.4f}" for _ in SETS), "")
     return table
 

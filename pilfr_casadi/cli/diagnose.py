@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from .._base import InputError, deferred_interrupt, listed, progress_bar, write_atomically
-from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
+from ..data import SAME_STEP, TABLE_SUFFIXES, TIME_NAMES, Recording, column_names
 from ..identify import load
 from ..simulators import Simulator, as_simulator, simulator_variable
 from ..studies import LARGEST_SIZE
@@ -36,8 +36,6 @@ from ._common import (
 if TYPE_CHECKING:
     from ..diagnose import Diagnosis
 
-TABLES = (".csv", ".tsv", ".txt", ".dat", ".mat", ".npz", ".npy")
-
 
 @dataclass(frozen=True, kw_only=True)
 class DiagnoseOptions(DataOptions):
@@ -56,7 +54,7 @@ class DiagnoseOptions(DataOptions):
         [],
     )
     workers: int | None = whole(
-        "Fits side by side (default: one a processor, at most four).", 1, LARGEST_SIZE["workers"]
+        "Fits side by side (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
     )
     out: str = option("Folder for diagnosis.json and report.html (default: diagnosis).", "DIR", "diagnosis")
     overwrite: bool = flag("Replace a diagnosis that is in that folder already.", "--overwrite")
@@ -157,7 +155,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path) -> int:
 
 def _check_files(options: DiagnoseOptions) -> None:
     source = options.source
-    if source is not None and Path(source).suffix.lower() in TABLES:
+    if source is not None and Path(source).suffix.lower() in TABLE_SUFFIXES:
         raise InputError(
             f"{source} is no simulator file; give SIMULATOR.py first, or the simulation's own inputs and outputs with "
             "--simulated SIM.csv."

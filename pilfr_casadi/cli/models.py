@@ -26,6 +26,7 @@ from .._base import (
 )
 from ..data import (
     NOTHING_SENTENCE,
+    STACK_SUFFIXES,
     Recording,
     check_for_identification,
     column_names,
@@ -63,7 +64,6 @@ from ._common import (
     whole,
 )
 
-ARRAYS = (".npz", ".npy")
 # options of a search, which a saved model to start from has already
 SEARCH = ("nx", "operators", "operator", "channels", "structure", "hidden", "lags", "bound", "fix", "starts", "seed")
 STRUCTURE_NAMES = {"bound": "bounds"}  # options that the structures call otherwise
@@ -79,7 +79,7 @@ class FitOptions(DataOptions):
     test: list[str] = option("Recording to report on, never fitted (repeatable).", "FILE", [])
     nx: int | None = whole("States of the linear part (default: chosen on the training data).", 0, LARGEST_SIZE["nx"])
     operators: int | None = whole(
-        "Hysteresis operators a channel (default: 20); 0 for a linear model.", 0, LARGEST_SIZE["operators"]
+        "Hysteresis operators per channel (default: 20); 0 for a linear model.", 0, LARGEST_SIZE["operators"]
     )
     operator: Literal["play", "stop", "generalized_play"] | None = option("Kind of operator (default: play).")
     channels: int | None = whole("Channels of the element (default: 1).", 1, LARGEST_SIZE["channels"])
@@ -90,7 +90,7 @@ class FitOptions(DataOptions):
     lags: int | None = whole("Past outputs and inputs of narx and noe.", 1, LARGEST_SIZE["lags"])
     bound: list[str] = option("Bounds of a parameter (repeatable).", "NAME=LOW:HIGH", [])
     fix: list[str] = option("Hold a block of parameters at a value (repeatable).", "NAME=VALUE", [])
-    starts: int | None = whole("Random starts (default: 8).", 1, LARGEST_SIZE["starts"])
+    starts: int | None = whole("Starts (default: 8).", 1, LARGEST_SIZE["starts"])
     seed: int | None = whole("Seed of all starts (default: 0).", 0, LARGEST_SIZE["seed"])
     start_from: str | None = option("Start from a saved model instead of searching.", "MODEL.json", name="--from")
     solver: Literal["gauss-newton", "ipopt"] = option(
@@ -282,11 +282,11 @@ def simulate_command(options: SimulateOptions) -> int:
     fitted = load(options.model)
     inputs, outputs = options.names(fitted.model.inputs, fitted.model.outputs)
     kind = Path(options.data).suffix.lower()
-    if kind in ARRAYS:
+    if kind in STACK_SUFFIXES:
         stack = read_stack(Path(options.data), inputs, outputs)
         if stack is not None:
             return _simulate_stack(options, fitted, *stack)
-    if Path(options.out).suffix.lower() in ARRAYS:
+    if Path(options.out).suffix.lower() in STACK_SUFFIXES:
         raise InputError(f"--out {options.out} is for several records in one array; give a name that ends in .csv.")
     if kind not in (".mat", ".npz"):  # there, a matrix stands for several names
         check_names(fitted, inputs, outputs)
@@ -316,7 +316,7 @@ def _check_out(options: SimulateOptions) -> None:
     for path, what in ((options.data, "recording"), (options.model, "model")):
         if os.path.realpath(out) == os.path.realpath(path):
             raise InputError(f"--out {options.out} would overwrite the {what}; give another file.")
-    if out.suffix.lower() in (".mat", *ARRAYS) and Path(options.data).suffix.lower() not in ARRAYS:
+    if out.suffix.lower() in (".mat", *STACK_SUFFIXES) and Path(options.data).suffix.lower() not in STACK_SUFFIXES:
         raise InputError(f"--out {options.out} is written as CSV; give a name that ends in .csv.")
 
 
@@ -380,7 +380,7 @@ def _simulate_stack(options: SimulateOptions, fitted: Fit, u: np.ndarray, y: np.
 
 def _stack_content(out: Path, u: np.ndarray, y: np.ndarray, dt: float, fitted: Fit) -> bytes:
     """Write `y` as an array laid out like the inputs (.npz, .npy), or as CSV whose first column numbers the records."""
-    if out.suffix.lower() in ARRAYS:
+    if out.suffix.lower() in STACK_SUFFIXES:
         buffer = BytesIO()
         if out.suffix.lower() == ".npz":
             np.savez(buffer, y=y, dt=dt)

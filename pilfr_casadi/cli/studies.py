@@ -149,7 +149,7 @@ def _print_summary(result: RunResult) -> None:
 
     keys = grid_keys(s.cell for s in result.summary)
     table = Table(box=None, header_style="bold", pad_edge=False)
-    for name in ("recording", *keys, "jobs", "failed", "25 %", "median", "75 %", "s a job"):
+    for name in ("recording", *keys, "jobs", "failed", "25 %", "median", "75 %", "s per job"):
         table.add_column(name, justify="left" if name == "recording" else "right", no_wrap=True)
     for s in result.summary:
         quartiles = [f"{q:.4f}" for q in s.quartiles[1:4]]

@@ -29,7 +29,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import LARGEST, InputError, is_number, numbers
-from ..data import Recording
+from ..data import SAME_STEP, Recording
 from ..export import Exported, exported
 from ..identify import Fit
 from ..linear import measurement_update
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from ..diagnose import Diagnosis
 
 Array = np.ndarray
-SAME_STEP = 1e-4  # relative difference up to which two sampling intervals are the same
 SMALLEST_SPREAD = 1e-6  # of the largest: keeps the covariance of a state that never moves from being singular
 DISTURBANCE = 0.1  # of an output's standard deviation: least size of a disturbance, above any model error worth one
 SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # process noise per step over the states' spread, from which one is chosen

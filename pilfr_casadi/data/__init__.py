@@ -47,6 +47,6 @@ if TYPE_CHECKING:
         check_for_identification as check_for_identification,
         fingerprint as fingerprint,
     )
-    from .tables import read_stack as read_stack
+    from .tables import STACK_SUFFIXES as STACK_SUFFIXES, TABLE_SUFFIXES as TABLE_SUFFIXES, read_stack as read_stack
 
 __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

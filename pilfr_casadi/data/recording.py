@@ -15,7 +15,7 @@ import numpy as np
 
 from .._base import LARGEST, InputError, is_whole, listed, positive, real_array, usable
 
-SAME_STEP = 1e-4  # relative difference in `dt` between recordings fitted together; written times have few digits
+SAME_STEP = 1e-4  # relative difference up to which two steps are the same; written times have few digits
 HOLDS = ("zero", "linear", None)
 INITIALS = ("zero", "estimate", "periodic")
 

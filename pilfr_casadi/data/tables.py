@@ -7,7 +7,7 @@ as an editor does, so the header is line 1. No code in a ``.mat`` or ``.npz`` fi
 
 import contextlib
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,6 @@ from .._base import LARGEST, InputError, existing_file, usable
 
 Array = np.ndarray
 
-CSV_SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
-SUFFIXES = (*CSV_SUFFIXES, ".mat", ".npz")
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
 REPAIR = "only finite numbers up to {:g} can be used: repair or cut out that piece, or give it in another unit."
 KINDS = {
@@ -153,14 +151,10 @@ class ArrayTable:
 def open_table(path: Path, wanted: Sequence[str] = (), suffix: str = "") -> CsvTable | ArrayTable:
     """Open a file by its suffix, or as a file with another one; `wanted` columns tell the delimiter of a CSV file."""
     suffix = suffix or path.suffix.lower()
-    if suffix in CSV_SUFFIXES:
-        return _open_csv(path, wanted)
-    if suffix == ".mat":
-        return _open_mat(path)
-    if suffix == ".npz":
-        return _open_npz(path)
+    if suffix in OPENERS:
+        return OPENERS[suffix](path, wanted)
     existing_file(path)
-    raise InputError(f"{path} has the suffix {suffix!r}; files named {', '.join(SUFFIXES)} can be read.")
+    raise InputError(f"{path} has the suffix {suffix!r}; files named {', '.join(OPENERS)} can be read.")
 
 
 def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
@@ -182,7 +176,7 @@ def _open_csv(path: Path, wanted: Sequence[str]) -> CsvTable:
     return CsvTable(path, names, delimiter, below, top + 2)
 
 
-def _open_mat(path: Path) -> ArrayTable:
+def _open_mat(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
     """Read the variables of a MATLAB file (up to version 7.2)."""
     from scipy.io import loadmat
 
@@ -195,7 +189,7 @@ def _open_mat(path: Path) -> ArrayTable:
     return ArrayTable(path, tuple(arrays), arrays)
 
 
-def _open_npz(path: Path) -> ArrayTable:
+def _open_npz(path: Path, _wanted: Sequence[str] = ()) -> ArrayTable:
     arrays: dict[str, Any] = {}
     with _parsing(path, "a NumPy archive", "write it with numpy.savez"), path.open("rb") as file:
         content = np.load(file, allow_pickle=False)
@@ -207,6 +201,16 @@ def _open_npz(path: Path) -> ArrayTable:
             except Exception as error:  # damaged, encrypted or odd members raise many kinds
                 arrays[name] = error
     return ArrayTable(path, tuple(arrays), arrays)
+
+
+# the function that opens a file, by the file's suffix
+OPENERS: dict[str, Callable[[Path, Sequence[str]], CsvTable | ArrayTable]] = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), _open_csv),
+    ".mat": _open_mat,
+    ".npz": _open_npz,
+}
+STACK_SUFFIXES = (".npz", ".npy")  # files that may hold several records in one array; see `read_stack`
+TABLE_SUFFIXES = (*OPENERS, ".npy")  # files of numbers, which are no simulators
 
 
 @contextlib.contextmanager

@@ -1,4 +1,21 @@
-"""Find the physics that a simulator leaves out: where, what, how sure, and the proof."""
+"""Find the physics that a simulator leaves out: where, what, how sure, and the proof.
+
+The files by stage:
+
+- The whole: `run` (the steps in their order), `workbench` (what all steps share), `stages` (progress).
+- Preparation: `preparation` calls the checks of recordings `glitches`, `settling`, `stale`, `gates` (sign, unit,
+  exchange, hold), `clipping`, `gaps`, `timing` and `offset`; `arranged` and `standing` set how recordings begin,
+  `finer_steps` the integration steps, `floor` the noise.
+- Search: `search_start`, `search`; candidates are found by `linearise`, `screen`, `remainder` and `flexible`, fitted by
+  `candidate` and `explain`, and compared by `choice`, `kinship`, `imitated`, `knees` and `passed_over`; `first_effect`,
+  `second_effect` and `pairs` go from one effect to the next.
+- Review: `review`, `rivals`, `exchange`, `every_sensor`, `own_shape`, `other_hold`, `held`, `varying`, `undeclared`,
+  `tones` and `ringing` look for another reading of what was found.
+- Verdict: `verdict`, `conclusion`, `description` (the corrected simulator where no name is sure).
+- Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
+- Result: `result`.
+- In place of a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
+"""
 
 from __future__ import annotations
 
@@ -42,22 +59,24 @@ def diagnose(
     simulator : Simulator, control.StateSpace, or a fitted PI-LFR
         The simulator, with nominal parameters, bounds and ports.
     train : Recording or sequence of Recording
-        What is fitted and chosen on.
+        Recordings to fit to and to choose on.
     test : Recording or sequence of Recording, optional
-        Reported on; never used to fit or to choose.
+        Recordings to report on, never used to fit or to choose.
     hold : {"zero", "linear"}, optional
-        What inputs do between samples, where neither recordings nor simulator say.
+        Course of the inputs between samples, if neither recordings nor simulator say; by default the data decide.
     laws : sequence of Law classes, optional
         By default the whole catalogue. Inputs that the simulator's equations do not
         read are tried as scales of some of its laws.
     effects : int
-        Most effects looked for.
+        Largest number of effects to look for.
     limits : mapping, optional
         Largest amplitude of each input that a next experiment may have; by default what was recorded.
     workers : int, optional
-        Fits run side by side, by default one a processor, at most four.
+        Fits run side by side, by default one per processor, at most four.
+    engine : {"auto", "c", "vm"}
+        Generated C or CasADi's virtual machine; by default C where there is a compiler.
     stand_in_error : float
-        NRMSE by which the simulator misses what it stands for (a surrogate: another simulation); it counts as noise.
+        NRMSE between a surrogate and the simulation that it stands for; it counts as noise.
     progress : callable
         Called with (stage, done, total, smallest error so far).
 

@@ -283,8 +283,8 @@ def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
     rate = WALL * FINER * bench.substeps / bench.dt
     lift, push = (np.max([getattr(r, name) for r in runs], axis=0) for name in ("lift", "push"))
     with np.errstate(divide="ignore", over="ignore"):  # a force that does not move the port has no limit
-        stiffest, firmest = np.where(lift > 0, rate / lift, rate**2 / push), rate / push
+        max_stiffness, max_damping = np.where(lift > 0, rate / lift, rate**2 / push), rate / push
     inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in runs]).T, strict=True))
     rest = tuple(r.from_zero for r in runs)
-    pairs = enumerate(zip(stiffest.tolist(), firmest.tolist(), strict=True))
+    pairs = enumerate(zip(max_stiffness.tolist(), max_damping.tolist(), strict=True))
     return [Local(z[:, j], dz[:, j], bench.dt, lengths, k, d, inputs, rest) for j, (k, d) in pairs]

@@ -172,7 +172,7 @@ def usable(law: Law, local: Local) -> bool:
     """Whether the data can speak to a law at a port."""
     if "dz" in law.reads() and not np.any(local.dz):
         return False
-    return not law.applies(local)
+    return not law.why_not(local)
 
 
 def folds(length: int, recordings: int) -> np.ndarray:

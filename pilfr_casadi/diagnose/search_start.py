@@ -15,7 +15,7 @@ from ..data import Recording
 from ..laws import Law
 from ..simulators import Simulator
 from .gates import said_hold
-from .preparation import Prepared, prepare
+from .preparation import CHECKS, Prepared, prepare
 from .search import Search
 from .stages import Stages
 from .verdict import UNSURE
@@ -74,7 +74,7 @@ def prepared_search(asked: Asked, ready: Prepared | None = None) -> tuple[Prepar
     ) -> tuple[Prepared, Search]:
         began = time.perf_counter()
         ready = ready or asked.prepared(starts, early)
-        times["gates and refit"] = times.get("gates and refit", 0.0) + time.perf_counter() - began
+        times[CHECKS] = times.get(CHECKS, 0.0) + time.perf_counter() - began
         return ready, asked.search(ready, times, not starts).run(asked.effects)
 
     def settled(ready: Prepared | None = None, early: bool = True) -> tuple[Prepared, Search]:

@@ -1,12 +1,13 @@
 """The base class of all laws: one small class for each physical hypothesis.
 
 A law is a force `w = Σ_i c_i φ_i(z, ż, q, t; shape)`, linear in its *strengths* c and nonlinear in its *shape*
-(threshold, gap, knee, delay). `q̇ = flow(...)` are states of its own; a law with `step(z, s, p)` has a discrete memory
-instead. In series at an actuator or a sensor the force is the deviation of the signal: `w = law(u) - u`.
+parameters (threshold, gap, knee, delay). Here z is the local coordinate at the port, ż its rate, and w the force. A law
+may have states q of its own, with `q̇ = flow(...)`, or a discrete memory s, with `step(z, s, p)` in place of `force`. In
+series at an actuator or a sensor, w is the deviation of the signal: `w = law(u) - u`.
 
-To add a law, state its equation, its sentence and the units of its parameters, and write `force`. The parameters whose
-unit begins with w are its strengths. `starts` and `ranges` give the values of the others that are tried, and their
-bounds, as multiples of an attribute of `Local` or as a function of it:
+To add a law, state its equation, its sentence and the units of its parameters, and write `force`. Parameters whose unit
+begins with w are strengths; all others are shape parameters. For each shape parameter, `starts` gives the start values
+and `ranges` the bounds, as multiples of an attribute of `Local` or as a function of it:
 
 >>> class RubberBlock(Law):
 ...     id, equation = "rubber_block", "w = k L tan(z / L)"
@@ -21,8 +22,8 @@ bounds, as multiples of an attribute of `Local` or as a function of it:
 >>> [round(shape["L"], 2) for shape in RubberBlock().shapes(signals)]
 [1.4, 2.0, 3.99]
 
-`diagnose(simulator, recordings, laws=(*CATALOGUE, RubberBlock))` tries it beside the others. A class in the file of its
-kind is in the catalogue.
+`diagnose(simulator, recordings, laws=(*CATALOGUE, RubberBlock))` tries it beside the others. A class written into one
+of the files of this folder is in the catalogue without further steps.
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ import numpy as np
 from .._base import InputError
 from ..models import Parameter
 
-EDGE = 0.05  # width of the onset of a contact, as a share of its gap
+ONSET_WIDTH = 0.05  # of a contact, as a share of its gap
 
-SIDED = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
+MIN_SIDE = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +59,10 @@ class Local:
         Sampling interval, s.
     lengths : tuple of int
         Samples of each recording.
-    stiffest : float
+    max_stiffness : float
         Largest stiffness (w/z) at the port that the simulation's steps resolve; a harder contact is a wall.
-    firmest : float
-        Largest damping (w*s/z) at the port that the steps resolve.
+    max_damping : float
+        Largest damping (w*s/z) at the port that the simulation's steps resolve.
     inputs : mapping of str to array, shape (M,)
         The simulator's inputs, for laws whose strength is scaled by one of them.
     from_zero : tuple of bool
@@ -72,8 +73,8 @@ class Local:
     dz: np.ndarray
     dt: float
     lengths: tuple[int, ...]
-    stiffest: float = np.inf
-    firmest: float = np.inf
+    max_stiffness: float = np.inf
+    max_damping: float = np.inf
     inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
     from_zero: tuple[bool, ...] = ()
 
@@ -133,26 +134,29 @@ class Law:
         Parameters in which the force is linear; left out, those whose unit begins with w.
     starts, ranges : mapping
         Start values and (lower, upper) bounds of parameters: an attribute of `Local` ("reach", "half", "low", "high",
-        "speed", "dt", "duration", "stiffest", or "" for plain numbers) and its multiples, or a function of `Local`.
-        Every combination of start values is tried.
+        "speed", "dt", "duration", "max_stiffness", or "" for plain numbers) and its multiples, or a function of
+        `Local`. Every combination of start values is tried.
     defaults : mapping
         Values of parameters before any are given; otherwise strengths are zero and shapes one.
     places : tuple of {"parallel", "series", "sensor"}
         Allowed places: inside the dynamics, at an actuator or a sensor, or at a sensor alone.
     dissipative, restoring : bool
-        Strengths must oppose motion, except those in `signed`; strengths must push back.
+        The force always opposes the motion, or always pushes back towards z = 0. This fixes the sign of all strengths
+        except those in `signed`.
+    signed : tuple of str
+        Strengths of a dissipative or restoring law that may have either sign.
     two_sided : bool
-        The data carries information only if z is both above and below zero.
+        The data carries information on the law only if z is both above and below zero.
     order, follows : int
-        Number of its own states, and of these, from the first, how many settle at the signal where it stands still;
-        the others settle at zero.
+        `order` is the number of its own states. If the signal stands still, the first `follows` of them settle at
+        the signal's value, the others at zero.
     memory, shifts : int, bool
-        Length of its discrete memory, and whether that is a shift register, which takes in the signal at the beginning
-        of a step.
+        `memory` is the length of its discrete memory. `shifts` says that the memory is a shift register, which takes
+        in the signal at the beginning of a step.
     substeps : int
         Smallest number of integration steps per sample.
     knee : str
-        Name of the speed over which the force reverses about rest; steps have to be fine there.
+        Name of the speed within which the force changes its sign; integration steps have to be fine there.
     scaled_by : str
         Input that multiplies the force, if any; see `scaled`.
 
@@ -227,18 +231,18 @@ class Law:
         found = {name: _tried(entry, local) for name, entry in self.ranges.items()}
         return {name: (low, high) for name, (low, high) in found.items()}
 
-    def applies(self, local: Local) -> str:
-        """Reason why the data carries no information on this law; empty if it does."""
-        hidden = self.two_sided and min(-local.low, local.high) <= SIDED * local.reach
+    def why_not(self, local: Local) -> str:
+        """Say why the data carries no information on this law; empty if it does."""
+        hidden = self.two_sided and min(-local.low, local.high) <= MIN_SIDE * local.reach
         return "one side of zero is hardly visited" if hidden else ""
 
     @property
     def lacks(self) -> str:
-        """Input that is still needed before the law can stand in a port; empty if none."""
+        """Say what is still needed before the law can stand in a port; empty if nothing."""
         return ""
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
-        """Tell whether the fitted values hardly agree with the law's sentence."""
+        """Tell whether the law at its fitted values hardly does what its sentence says."""
         return False
 
     def starts_as(self, plain: Law, own: Mapping[str, Any]) -> dict[str, Any]:
@@ -322,6 +326,6 @@ def readable_unit(unit: str, w: str, z: str) -> str:
     return "".join(f" {p} " if p == "*" else p for p in parts).strip()
 
 
-def beyond(z: Any, g: Any) -> Any:
+def contact_onset(z: Any, g: Any) -> Any:
     """Rise from 0 to 1 where |z| passes a gap g, over a share of the gap, because a jump would have no slope in g."""
-    return (1 + ca.tanh((ca.fabs(z) - g) / (EDGE * g))) / 2
+    return (1 + ca.tanh((ca.fabs(z) - g) / (ONSET_WIDTH * g))) / 2

@@ -15,7 +15,7 @@ import casadi as ca
 
 from .._base import InputError
 from . import curves, dynamic, friction, hysteresis, stiffness
-from .base import Law, Local, beyond
+from .base import Law, Local, contact_onset
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
 
@@ -92,7 +92,7 @@ def _behind_gap(base: Any) -> Any:
 
     def past(z: Any, dz: Any, p: Any) -> dict[str, Any]:
         """Arguments of the law's force or step beyond the gap."""
-        signals = {"z": z - ca.fmin(ca.fmax(z, -p["g"]), p["g"]), "dz": beyond(z, p["g"]) * dz}
+        signals = {"z": z - ca.fmin(ca.fmax(z, -p["g"]), p["g"]), "dz": contact_onset(z, p["g"]) * dz}
         return {"p": p, **{name: value for name, value in signals.items() if name in read}}
 
     class Behind(base):

@@ -28,9 +28,9 @@ class Polynomial(Law):
     def force(self, z: Any, p: Any) -> Any:
         return p.a_2 * z**2 + p.a_3 * z**3
 
-    def applies(self, local: Local) -> str:
+    def why_not(self, local: Local) -> str:
         narrow = local.half < NARROW * abs(local.low + local.high) / 2
-        return "the signal stays where any curve is straight" if narrow else super().applies(local)
+        return "the signal stays where any curve is straight" if narrow else super().why_not(local)
 
 
 class Quadratic(Polynomial):
@@ -218,7 +218,7 @@ class DeadZone(Law):
     def force(self, z: Any, p: Any) -> Any:
         return -ca.fmax(ca.fmin(z, p.g), -p.g)
 
-    def applies(self, local: Local) -> str:
+    def why_not(self, local: Local) -> str:
         return "" if np.min(np.abs(local.z)) < 0.1 * local.reach else "the signal is never small"
 
 
@@ -234,5 +234,5 @@ class AsymmetricDeadZone(DeadZone):
     def force(self, z: Any, p: Any) -> Any:
         return -ca.fmax(ca.fmin(z, p.g_2), -p.g_1)
 
-    def applies(self, local: Local) -> str:
+    def why_not(self, local: Local) -> str:
         return "" if local.low < 0 < local.high else "one side is never visited"

@@ -13,8 +13,8 @@ import numpy as np
 from ..models import Parameter
 from .base import Law, Local
 
-SCREENED = 24  # memory of a delay in the screen, in steps; longer delays are not tried
-DEAF = 0.707  # damping ratio above which a second-order response has no peak
+LONGEST_SCREENED = 24  # memory of a delay in the screen, in steps; longer delays are not tried
+NO_PEAK = 0.707  # damping ratio above which a second-order response has no peak
 
 
 @dataclass(frozen=True)
@@ -39,24 +39,24 @@ class Delay(Law):
     @property
     def memory(self) -> int:
         """Largest delay, in steps."""
-        most = self.limits.get("T", self._about)[1]
-        return int(np.ceil(most / self.h)) if self.h and np.isfinite(most) else SCREENED
+        most = self.limits.get("T", self._default_limits)[1]
+        return int(np.ceil(most / self.h)) if self.h and np.isfinite(most) else LONGEST_SCREENED
 
     @property
     def lacks(self) -> str:
         """The missing start value or limit, without which the length of the memory is unknown."""
-        known = np.isfinite(self.limits.get("T", self._about)[1])
+        known = np.isfinite(self.limits.get("T", self._default_limits)[1])
         return "" if known else "give the time that it starts at, as in Delay().at({'T': 0.01}); it may come to double"
 
     @property
-    def _about(self) -> tuple[float, float]:
+    def _default_limits(self) -> tuple[float, float]:
         """Default limits: from zero to twice the start value."""
         return 0.0, 2 * float(np.asarray(self.values.get("T", np.inf)))
 
     def parameters(self) -> dict[str, Parameter]:
         """The delay, within the length of its memory."""
         out = super().parameters()
-        return out if "T" in self.limits else {"T": replace(out["T"], bounds=self._about)}
+        return out if "T" in self.limits else {"T": replace(out["T"], bounds=self._default_limits)}
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         """Shift the register, and read it between two of its entries."""
@@ -213,7 +213,7 @@ class Mode(Resonance):
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether it has no peak, like two lags that follow anything linear, or is too fast to be seen."""
-        return bool(values["D"] > DEAF or values["W"] >= self.parameters()["W"].bounds[1])
+        return bool(values["D"] > NO_PEAK or values["W"] >= self.parameters()["W"].bounds[1])
 
 
 class Attached(Resonance):

@@ -38,7 +38,7 @@ class CoulombFriction(Law):
         return p.F_c * ca.tanh(dz / p.v_0)
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"v_0": (_sharpest(self, local), 0.5 * local.speed)}
+        return {"v_0": (_narrowest_reversal(self, local), 0.5 * local.speed)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the reversal is so wide that the force depends on speed nearly everywhere."""
@@ -114,7 +114,10 @@ class StribeckFriction(CoulombFriction):
                 yield {"v_s": v_s * local.speed, "v_0": v_0 * v_s * local.speed}
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"v_s": (4e-3 * local.speed, 0.8 * local.speed), "v_0": (_sharpest(self, local), 0.3 * local.speed)}
+        return {
+            "v_s": (4e-3 * local.speed, 0.8 * local.speed),
+            "v_0": (_narrowest_reversal(self, local), 0.3 * local.speed),
+        }
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the reversal is as wide as the range of the fall, or the fall is negligible."""
@@ -141,12 +144,12 @@ class PreslidingStribeckFriction(PreslidingFriction):
         return super().doubtful(values) or _hardly_falls(self, values)
 
 
-def _sharpest(law: Law, local: Local) -> float:
+def _narrowest_reversal(law: Law, local: Local) -> float:
     """Compute the narrowest reversal, z/s; in a narrower one a simulation chatters at rest."""
     force = sum(
         abs(float(law.values.get(name, 0.0))) for name in law.strength if name.startswith("F") and name != "F_0"
     )
-    followed = 0.0 if law.scaled_by else force / (STABLE * local.firmest)
+    followed = 0.0 if law.scaled_by else force / (STABLE * local.max_damping)
     if not followed:
         return SHARP * local.speed
     return float(np.clip(followed, SHARPEST * local.speed, SHARP * local.speed))

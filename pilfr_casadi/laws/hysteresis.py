@@ -21,9 +21,9 @@ from ..models import Parameter, play
 from .base import Law, Local
 
 PARTS = 4  # parts into which a step of a held signal is divided
-THIN = 0.1  # width of the loops over the bend beside them, below which a fit is a curve without memory
-DIRECT = 0.05  # gain past the plays over their total weight, below which they may be a mere backlash
-ALIKE = 0.15  # spread of their thresholds over the mean threshold, below which they are one
+THIN = 0.1  # ratio of the loops' width to the bend beside them, below which a fit is a curve without memory
+DIRECT = 0.05  # ratio of the direct gain to the plays' total weight, below which they may be a mere backlash
+ALIKE = 0.15  # ratio of the thresholds' spread to their mean, below which the plays are one
 NODES = 24  # stops that stand for the smooth density
 # edges of cells that hold equal shares of the curve of a = 1; each cell is one stop at its centre of gravity
 _LOW = -2 * np.log(1 - np.arange(NODES) / NODES)

@@ -8,14 +8,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .base import Law, Local, beyond
+from .base import Law, Local, contact_onset
 
-SEEN = 2.0  # number of periods within the motion from which a force counts as periodic
+LEAST_PERIODS = 2.0  # within the motion, from which a force counts as periodic
 
 
-def _hardest(local: Local) -> tuple[float, float]:
+def _hertz_limits(local: Local) -> tuple[float, float]:
     """Limit Hertz's strength so that its stiffness, pressed in by a tenth of the travel, is resolved by the steps."""
-    k = local.stiffest / (1.5 * float(np.sqrt(0.2 * local.half)))
+    k = local.max_stiffness / (1.5 * float(np.sqrt(0.2 * local.half)))
     return -k, k
 
 
@@ -27,7 +27,7 @@ class LinearStiffness(Law):
     source = "Meirovitch (2001), Fundamentals of Vibrations, sec. 1.4"
     sentence = "a spring (or a leak): a force in proportion to the deflection"
     units = {"k_1": "w/z"}
-    ranges = {"k_1": ("stiffest", -1.0, 1.0)}
+    ranges = {"k_1": ("max_stiffness", -1.0, 1.0)}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_1 * z
@@ -125,7 +125,7 @@ class PiecewiseStiffness(Law):
     starts = {"g": lambda at: at.low + 2 * at.half * np.array([0.15, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])}
     ranges = {
         "g": lambda at: (at.low + 0.04 * at.half, at.high - 0.04 * at.half),
-        "k_c": ("stiffest", -1.0, 1.0),
+        "k_c": ("max_stiffness", -1.0, 1.0),
     }
 
     def force(self, z: Any, p: Any) -> Any:
@@ -149,7 +149,7 @@ class HertzContact(PiecewiseStiffness):
     equation = "w = k_c max(z - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
     units = {"k_c": "w/z^1.5", "g": "z"}
-    ranges = {**PiecewiseStiffness.ranges, "k_c": _hardest}
+    ranges = {**PiecewiseStiffness.ranges, "k_c": _hertz_limits}
 
     def force(self, z: Any, p: Any) -> Any:
         depth = ca.fmax(z - p.g, 0)
@@ -167,7 +167,7 @@ class Clearance(Law):
     units = {"k_g": "w/z", "g": "z"}
     two_sided = True
     starts = {"g": ("reach", 0.03, 0.08, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8)}
-    ranges = {"g": ("reach", 0.001, 0.97), "k_g": ("stiffest", -1.0, 1.0)}
+    ranges = {"g": ("reach", 0.001, 0.97), "k_g": ("max_stiffness", -1.0, 1.0)}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_g * (ca.fmax(z - p.g, 0) - ca.fmax(-z - p.g, 0))
@@ -196,7 +196,7 @@ class SlackCoupling(SlackSpring):
     units = {"k_g": "w/z", "c_g": "w*s/z", "g": "z"}
 
     def force(self, z: Any, dz: Any, p: Any) -> Any:  # type: ignore[override]
-        return super().force(z, p) - p.c_g * dz * (1 - beyond(z, p.g))
+        return super().force(z, p) - p.c_g * dz * (1 - contact_onset(z, p.g))
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether there is no spring at all, only damping that depends on the position."""
@@ -210,7 +210,7 @@ class SoftClearance(Clearance):
     equation = "w = k_g sign(z) max(|z| - g, 0)^1.5"
     source = "Johnson (1985), Contact Mechanics, ch. 4"
     units = {"k_g": "w/z^1.5", "g": "z"}
-    ranges = {**Clearance.ranges, "k_g": _hardest}
+    ranges = {**Clearance.ranges, "k_g": _hertz_limits}
 
     def force(self, z: Any, p: Any) -> Any:
         above, below = ca.fmax(z - p.g, 0), ca.fmax(-z - p.g, 0)
@@ -224,7 +224,7 @@ class OffCentreClearance(Clearance):
     equation = "w = k_g (z - clip(z, m - g, m + g))"
     units = {"k_g": "w/z", "g": "z", "m": "z"}
     starts = {"g": ("half", 0.1, 0.3, 0.6), "m": lambda at: at.middle + at.half * np.array([-0.3, 0.0, 0.3])}
-    ranges = {"g": ("half", 1e-3, 1.0), "m": lambda at: (at.low, at.high), "k_g": ("stiffest", -1.0, 1.0)}
+    ranges = {"g": ("half", 1e-3, 1.0), "m": lambda at: (at.low, at.high), "k_g": ("max_stiffness", -1.0, 1.0)}
 
     def force(self, z: Any, p: Any) -> Any:
         return p.k_g * (ca.fmax(z - p.m - p.g, 0) - ca.fmax(p.m - z - p.g, 0))
@@ -238,7 +238,7 @@ class PeriodicForce(Law):
     source = "Hanselman (2006), Brushless Permanent Magnet Motor Design, sec. 8.3"
     sentence = "a force that repeats with position, as from cogging or the pitch of a screw or gear"
     units = {"a": "w", "b": "w", "L": "z"}
-    fewest = 1.5  # smallest number of periods within the motion that is tried
+    min_periods = 1.5  # smallest number of periods within the motion that is tried
     starts = {"L": lambda at: 2 * at.half / np.concatenate([np.arange(1.5, 8, 0.5), np.arange(8, 60.1, 1.0)])}
 
     def force(self, z: Any, p: Any) -> Any:
@@ -246,11 +246,11 @@ class PeriodicForce(Law):
         return p.a * ca.sin(angle) + p.b * ca.cos(angle)
 
     def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
-        return {"L": (2 * local.half / 60, 2 * local.half / self.fewest)}
+        return {"L": (2 * local.half / 60, 2 * local.half / self.min_periods)}
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the motion holds fewer than two periods, which could be any other curve."""
-        return bool(values["L"] > self.fewest / SEEN * self.parameters()["L"].bounds[1])
+        return bool(values["L"] > self.min_periods / LEAST_PERIODS * self.parameters()["L"].bounds[1])
 
 
 class HarmonicForce(PeriodicForce):
@@ -272,5 +272,5 @@ class Ripple(PeriodicForce):
     source = "Heydemann (1981), Applied Optics 20(19)"
     sentence = "an error that repeats with the signal itself, as from an encoder off centre or its interpolation"
     places = ("sensor",)
-    fewest = 3.0
+    min_periods = 3.0
     starts = {"L": lambda at: 2 * at.half / np.arange(3.0, 60.1, 1.0)}

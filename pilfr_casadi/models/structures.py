@@ -61,7 +61,7 @@ def ssnn(nx: int, hidden: int = 15, offset: bool = True) -> PILFR:
 
 
 def network_lfr(nx: int, hidden: int = 15, channels: int = 1, offset: bool = True) -> PILFR:
-    """Make a linear model of nx states with a static network of `hidden` neurons a channel in its port.
+    """Make a linear model of nx states with a static network of `hidden` neurons per channel in its port.
 
     Raises
     ------
@@ -92,7 +92,7 @@ class Lagged:
 
     @property
     def element(self) -> StaticNetwork:
-        """The neurons, one a channel."""
+        """The neurons, one per channel."""
         return StaticNetwork(1, self.hidden)
 
     def unknowns(self, n_u: int, n_y: int) -> int:

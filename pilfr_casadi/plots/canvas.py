@@ -15,6 +15,10 @@ from matplotlib.textpath import TextPath
 
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 SKY, ORANGE, INK, GREY = "#56B4E9", "#E69F00", "#222222", "#7A7A7A"
+GRID = "#DDDDDD"
+PALE_GREY, PALE_BLUE = "#EEEEEE", "#E8F1F7"  # areas: not scored or not visited; the range of the recordings
+BOX = "#D6E8F4"  # inside of box plots
+SHADES, LOOPS = "cividis", "viridis"  # colormaps of maps of errors, and of loops; distinct for all, and in grey
 FONT = 10.5  # points
 MOST_POINTS = 3000  # of a line before it is thinned: more than a page has pixels
 LONGEST_TITLE = 46  # letters that fit above a figure of the usual width
@@ -40,7 +44,7 @@ def finish(
     ax.set_ylabel(plain(y), fontsize=FONT)
     title = plain(title if len(title) <= LONGEST_TITLE else title[: LONGEST_TITLE - 1] + "…")
     ax.tick_params(labelsize=FONT - 1)
-    ax.grid(True, color="#DDDDDD", linewidth=0.6)
+    ax.grid(True, color=GRID, linewidth=0.6)
     ax.set_axisbelow(True)
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)

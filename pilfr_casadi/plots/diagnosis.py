@@ -17,6 +17,8 @@ from .canvas import (
     GREEN,
     GREY,
     INK,
+    PALE_GREY,
+    SHADES,
     VERMILLION,
     axes_or_new,
     finish,
@@ -30,7 +32,6 @@ from .canvas import (
 )
 
 CLOUD_POINTS = 2500  # as many as can be told apart in a figure
-SHADES = "cividis"  # distinct for every kind of colour vision, and in grey
 
 
 def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
@@ -49,7 +50,7 @@ def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
     _readable_log(bar.ax.yaxis, top / 100, top)
     bar.ax.tick_params(labelsize=FONT - 1)
     ax.set_yscale("log")
-    ax.set_facecolor("#EEEEEE")
+    ax.set_facecolor(PALE_GREY)
     finish(ax, label, "frequency [Hz]", "where it hurts")
     ax.grid(False)
     return ax
@@ -202,7 +203,7 @@ def port_law_map(
     ax.invert_yaxis()
     ax.xaxis.tick_top()
     ax.tick_params(length=0)
-    ax.set_facecolor("#F0F0F0")
+    ax.set_facecolor(PALE_GREY)
     for side in ax.spines.values():
         side.set_visible(False)
     bar = figure.colorbar(mesh, ax=ax, pad=0.02)

@@ -15,7 +15,7 @@ from .._base import InputError
 from ..data import Recording, as_recordings
 from ..models import weight_density
 from ..optimise import Iteration
-from .canvas import BLUE, GREY, INK, SKY, VERMILLION, axes_or_new, finish, new_figure, with_unit
+from .canvas import BLUE, GREY, INK, PALE_BLUE, SKY, VERMILLION, axes_or_new, finish, new_figure, with_unit
 from .signals import PlottedFit, as_scored, spectrum, time
 
 Records = Recording | Sequence[Recording]
@@ -61,7 +61,7 @@ def loading_curve(
     ax, reach, limit = axes_or_new(ax), _reach(fit, recordings, channel), _range(fit, recordings, channel)
     z = np.linspace(0.0, limit, 300)
     if reach:
-        ax.axvspan(0, reach, color="#E8F1F7", linewidth=0, label="|z| in the recordings")
+        ax.axvspan(0, reach, color=PALE_BLUE, linewidth=0, label="|z| in the recordings")
     ax.plot(z, virgin_curve(fit, z, channel), color=BLUE, linewidth=1.8, label="fitted")
     if reference is not None:
         ax.plot(z, reference(z), color=INK, linewidth=1.4, linestyle="--", label="reference")

@@ -23,6 +23,7 @@ from .canvas import (
     GREEN,
     INK,
     ORANGE,
+    PALE_GREY,
     PURPLE,
     VERMILLION,
     axes_or_new,
@@ -257,7 +258,7 @@ def as_scored(fit: PlottedFit, recording: Recording) -> Recording:
 def _over_time(ax: Axes, recording: Recording, label: str) -> Axes:
     """Finish a picture over time; samples that are not scored are grey."""
     if recording.skip:
-        ax.axvspan(0, recording.skip * recording.dt, color="#EEEEEE", label="not scored")
+        ax.axvspan(0, recording.skip * recording.dt, color=PALE_GREY, label="not scored")
     ax.margins(x=0.01)
     return finish(ax, "time [s]", label, recording.name)
 

@@ -17,9 +17,11 @@ from ..linear import BLA, resolvent
 from ..models import Model
 from .canvas import (
     BLUE,
+    BOX,
     FONT,
     GREEN,
     INK,
+    LOOPS,
     MOST_POINTS,
     ORANGE,
     PURPLE,
@@ -93,7 +95,7 @@ def loops(
 
     ax = axes_or_new(ax)
     for k, (label, (horizontal, vertical)) in enumerate(curves.items()):
-        colour = colormaps["viridis"](0.88 * k / max(len(curves) - 1, 1))
+        colour = colormaps[LOOPS](0.88 * k / max(len(curves) - 1, 1))
         dense = len(horizontal) > MOST_POINTS
         ax.plot(horizontal, vertical, color=colour, linewidth=1.3, label=plain(label), rasterized=dense)
     return finish(ax, x, y, title, 3)
@@ -123,7 +125,7 @@ def spread(
         positions=range(len(groups)),
         widths=0.5,
         patch_artist=True,
-        boxprops={"facecolor": "#D6E8F4", "edgecolor": BLUE},
+        boxprops={"facecolor": BOX, "edgecolor": BLUE},
         whiskerprops={"color": BLUE},
         capprops={"color": BLUE},
         medianprops={"color": VERMILLION, "linewidth": 2},

@@ -24,7 +24,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, listed
+from .._base import InputError, existing_file, listed
 from ..data import Recording
 from ..models import Model, Parameter
 from .equations import Named
@@ -32,7 +32,7 @@ from .simulator import Simulator
 
 FACTOR = 2.0  # by which an entry of a state space may move
 GAIN = (0.7, 1.3)  # bounds of the gain of a fitted model's output
-SAME_STEP = 1e-3  # largest relative difference of two sampling intervals that count as equal
+STATED_STEP = 1e-3  # relative difference up to which a model's stated step is that of a recording: three digits of it
 LONGEST = 240  # characters shown of another program's message
 VARIABLE = "simulator"  # name of the variable that a simulator file sets
 
@@ -71,7 +71,7 @@ def as_simulator(thing: Any, recordings: Sequence[Recording] = ()) -> Simulator:
 
 def _check_step(dt: float, recordings: Sequence[Recording]) -> None:
     for r in recordings:
-        if abs(r.dt / dt - 1) > SAME_STEP:
+        if abs(r.dt / dt - 1) > STATED_STEP:
             raise InputError(f"The model's step is {dt:g} s, that of {r.label} {r.dt:g} s; resample the recording.")
 
 
@@ -252,7 +252,7 @@ def _read(path: Path, what: str) -> bytes:
     if path.is_dir():
         raise InputError(f"{path} is a folder; give {what}'s Python file.")
     try:
-        return path.read_bytes()
+        return (existing_file(path) if path.exists() else path).read_bytes()
     except OSError as error:
         raise InputError(
             f"The {what.removeprefix('the ')} file {path} cannot be read ({error.strerror}); check its name."

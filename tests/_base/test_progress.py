@@ -57,6 +57,27 @@ def test_lines_tell_each_new_stage_and_every_ten_seconds(clock, capsys):
     ]
 
 
+def test_lines_never_show_a_count_of_zero_and_end_with_the_last_step(clock, capsys):
+    reports = [
+        (2.0, "linear model", 0, 200, NAN),  # nothing is done yet
+        (4.0, "linear model", 3, 200, 0.5),
+        (6.0, "linear model", 90, 200, 0.4),
+        (7.0, "linear model", 200, 200, 0.3),  # the last step, soon after the first line
+        (7.1, "linear model", 200, 200, 0.3),
+        (16.0, "screen", 0, 1, NAN),
+        (18.0, "screen", 0, 1, NAN),  # long without a step
+    ]
+    with progress_bar() as progress:
+        for seconds, *news in reports:
+            clock.now = 100.0 + seconds
+            progress(*news)
+    assert capsys.readouterr().err.splitlines() == [
+        "linear model 3/200, best NRMSE 0.5000, 4 s",
+        "linear model 200/200, best NRMSE 0.3000, 7 s",
+        "screen, best NRMSE 0.3000, 18 s",
+    ]
+
+
 def test_quick_work_prints_nothing(clock, capsys):
     with progress_bar() as progress:
         for k in range(5):

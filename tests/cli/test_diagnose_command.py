@@ -171,6 +171,11 @@ BAD_SIMULATORS = {
 }
 
 
+def test_a_pipe_is_no_simulator_file(capsys, files):
+    os.mkfifo(files / "pipe.py")  # reading it would wait forever
+    refused(capsys, *arguments(files, simulator="pipe.py"), says=("pipe.py", "a pipe or a device"))
+
+
 @pytest.mark.parametrize("case", BAD_SIMULATORS)
 def test_bad_simulators_are_refused(capsys, files, case):
     (old, new), says = BAD_SIMULATORS[case]

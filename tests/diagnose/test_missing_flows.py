@@ -140,18 +140,18 @@ def test_a_contact_is_no_harder_than_the_steps_can_follow():
     fitted = bench.fit(simulator)
     probe = Probe.of(bench, fitted)
     upper = locals_of(bench, [run(bench, probe, fitted, 0)])[probe.ports.index("upper")]
-    assert upper.stiffest == pytest.approx(4 * bench.substeps / 4.0)  # one over the finest step: the port moves at once
-    assert PiecewiseStiffness().bounds(upper)["k_c"] == (-upper.stiffest, upper.stiffest)
+    assert upper.max_stiffness == pytest.approx(4 * bench.substeps / 4.0)  # 1 / finest step
+    assert PiecewiseStiffness().bounds(upper)["k_c"] == (-upper.max_stiffness, upper.max_stiffness)
     low, high = HertzContact().bounds(upper)["k_c"]
-    assert high * 1.5 * np.sqrt(0.2 * upper.half) == pytest.approx(upper.stiffest)
+    assert high * 1.5 * np.sqrt(0.2 * upper.half) == pytest.approx(upper.max_stiffness)
     assert low == -high
 
 
 def test_two_odd_powers_need_both_sides():
     z = np.linspace(1.0, 3.0, 50)
-    assert QuinticStiffness().applies(Local(z, z, 0.1, (50,)))
-    assert not QuinticStiffness().applies(Local(z - 2, z, 0.1, (50,)))
-    assert not CubicStiffness().applies(Local(z, z, 0.1, (50,)))
+    assert QuinticStiffness().why_not(Local(z, z, 0.1, (50,)))
+    assert not QuinticStiffness().why_not(Local(z - 2, z, 0.1, (50,)))
+    assert not CubicStiffness().why_not(Local(z, z, 0.1, (50,)))
 
 
 def test_a_fit_goes_on_from_given_states():

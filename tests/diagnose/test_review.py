@@ -165,7 +165,7 @@ def test_a_search_begins_anew_from_where_a_law_has_led(monkeypatch):
     stops = False
     _, search = search_start.prepared_search(asked)
     assert begun == [(), [values]] and not search.may_be_led
-    assert list(search.times) == ["gates and refit"]
+    assert list(search.times) == ["checks and refit"]
     begun.clear()
     stops = True
     _, search = search_start.prepared_search(asked)

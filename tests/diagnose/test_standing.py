@@ -126,4 +126,4 @@ def test_a_curve_that_the_signal_sees_only_a_straight_part_of_is_not_tried():
         (Quadratic(), 3.0, True),
         (Quadratic(), 30.0, False),
     ):
-        assert bool(law.applies(Local(z + level, z, DT, (200,)))) is not tried
+        assert bool(law.why_not(Local(z + level, z, DT, (200,)))) is not tried

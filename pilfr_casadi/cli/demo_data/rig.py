@@ -35,9 +35,29 @@ simulator = Simulator(
         "d2": Parameter(1.3, unit="N s/m", bounds=(0, 50)),
     },
     ports=(
-        Port("ground-m1", lambda p: {"v1": -1 / p.m1}, lambda x: x.x1, lambda x: x.v1, unit="N", across_unit="m"),
-        Port("m1-m2", lambda p: {"v1": -1 / p.m1, "v2": 1 / p.m2}, lambda x: x.x1 - x.x2, unit="N", across_unit="m"),
-        Port("ground-m2", lambda p: {"v2": -1 / p.m2}, lambda x: x.x2, lambda x: x.v2, unit="N", across_unit="m"),
+        Port(
+            "ground-m1",
+            into=lambda p: {"v1": -1 / p.m1},
+            across=lambda x: x.x1,
+            rate=lambda x: x.v1,
+            unit="N",
+            across_unit="m",
+        ),
+        Port(
+            "m1-m2",
+            into=lambda p: {"v1": -1 / p.m1, "v2": 1 / p.m2},
+            across=lambda x: x.x1 - x.x2,
+            unit="N",
+            across_unit="m",
+        ),
+        Port(
+            "ground-m2",
+            into=lambda p: {"v2": -1 / p.m2},
+            across=lambda x: x.x2,
+            rate=lambda x: x.v2,
+            unit="N",
+            across_unit="m",
+        ),
     ),
     units={"force": "N", "x2": "m"},
 )
