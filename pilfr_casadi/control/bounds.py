@@ -1,13 +1,13 @@
-r"""A guarantee that a fitted model's response stays bounded, whatever the input does within its limits.
+r"""Guaranteed bound of a fitted model's response, for every input within its limits.
 
 If the element of a PI-LFR (Krikelis et al. 2024, Eq. 15-17) gives bounded forces `|w| <= w_max` for every signal, the
-rest is a linear model, and with its impulse responses `h`
+rest is a linear model. With its impulse responses `h`
 
 .. math:: |y_i| <= \sum_j \|h_{ij}^u\|_1 \max|u_j| + \sum_j \|h_{ij}^w\|_1 w_{j,\max} + |y_{0,i}|
 
 whenever the spectral radius of A is below one: no feedback through the element can make it grow. Stops, envelopes and
-products are bounded for every signal, plays only if the inputs alone drive them. The memory at the start is zero. The
-bound shows that nothing diverges; it is far above the actual responses if modes are hardly damped.
+products are bounded for every signal, plays only if the inputs alone drive them. The memory is zero at the start. The
+bound shows that nothing diverges; for lightly damped modes it is far above the actual responses.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class ResponseBound:
     radius : float
         Spectral radius of the linear part.
     forces : array, (n_w,)
-        Largest |w| of each channel of the element; infinite where none is known.
+        Largest |w| of each channel of the element; infinite where no bound is known.
     outputs : array, (n_y,)
         Largest |y|, in the outputs' units; infinite where nothing is guaranteed.
     """
@@ -75,10 +75,10 @@ def response_bound(fit: Fit, largest_input: Any) -> ResponseBound:
     Raises
     ------
     InputError
-        If the model is none of these, or the limits are not finite numbers of 0 or more.
+        If the model is not a PI-LFR or linear, or the limits are not finite numbers of 0 or more.
     """
     if fit.structure is None:
-        raise InputError("Only a PI-LFR has a linear part and an element to bound; give the fit of one.")
+        raise InputError("A bound needs a PI-LFR, which has a linear part and an element; give the fit of a PI-LFR.")
     model, p = fit.model, fit.parameters
     u = numbers(largest_input, "The largest input", (len(model.inputs),))
     if np.any(u < 0):
@@ -99,7 +99,7 @@ def response_bound(fit: Fit, largest_input: Any) -> ResponseBound:
 
 
 def _absolute_sum(A: Array, B: Array, C: Array) -> Array:
-    """`Σ_k |C A^k B|`, or a little more: the tail is bounded in modal coordinates."""
+    """Bound `Σ_k |C A^k B|` from above: sum the beginning, bound the tail in modal coordinates."""
     if not len(A):
         return np.zeros((len(C), B.shape[1]))
     values, V = np.linalg.eig(A)

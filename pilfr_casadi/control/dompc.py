@@ -1,8 +1,7 @@
-"""A fitted model in do-mpc (Fiedler et al. 2023, Control Engineering Practice 140), which is an optional extra.
+"""A fitted model in do-mpc (Fiedler et al. 2023, Control Engineering Practice 140), an optional extra.
 
-It solves the problem of `PredictiveController` by multiple shooting and IPOPT, with the states as variables. The two
-problems are the same as long as no output limit has to be violated. IPOPT gets the model with its kinks and may stop at
-one.
+do-mpc solves the problem of `PredictiveController` by multiple shooting and IPOPT, with the states as variables. Both
+problems agree as long as all output limits can be kept. The model keeps its kinks, and IPOPT may stop at one.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, numbers
-from .mpc import NO_LIMIT, check_task, limit_price, step_function
+from .mpc import NO_LIMIT, as_step_function, check_task, limit_price
 
 Array = np.ndarray
 MISSING = "do-mpc is not installed; install it with `pip install pilfr-casadi[do-mpc]`, or use PredictiveController."
 
 
 def _import_do_mpc() -> Any:
-    """Import do-mpc, or say how to install it."""
+    """Import do-mpc; if it is missing, explain how to install it."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it warns about each of its own optional parts
@@ -42,14 +41,14 @@ def do_mpc_model(function: Any) -> Any:
     Returns
     -------
     do_mpc.model.Model
-        Set up; r is a time-varying parameter of as many entries as y.
+        Ready for use; r is a time-varying parameter with as many entries as y.
 
     Raises
     ------
     InputError
-        If do-mpc is not installed, or there is no such function.
+        If do-mpc is not installed, or `function` cannot be used.
     """
-    function = step_function(function)
+    function = as_step_function(function)
     model = _import_do_mpc().model.Model("discrete", "SX")
     x = model.set_variable("_x", "x", (function.size1_in(0), 1))
     u = model.set_variable("_u", "u", (function.size1_in(1), 1))
@@ -79,7 +78,7 @@ def do_mpc_controller(
     Parameters
     ----------
     reference : array, shape (M, n_y)
-        The whole path, one row per sample; after its end the last row holds.
+        The whole path, one row per sample; the last row holds after its end.
 
     Returns
     -------
@@ -90,14 +89,14 @@ def do_mpc_controller(
     Raises
     ------
     InputError
-        If do-mpc is not installed, or an argument is unfit.
+        If do-mpc is not installed, or an argument cannot be used.
     """
     task = check_task(function, horizon, inputs, outputs, None, move, y_scale, u_scale)
     function, n_y = task.function, task.function.size1_out(1)
     path = numbers(reference, "The reference")
     path = path[:, None] if path.ndim == 1 else path
     if path.ndim != 2 or not len(path) or path.shape[1] != n_y:
-        raise InputError(f"The reference has the shape {path.shape}; give (samples, {n_y}), a row a sample.")
+        raise InputError(f"The reference has the shape {path.shape}; give (samples, {n_y}), one row per sample.")
     low, high, u_size = (_constant(v, horizon) for v in (task.low, task.high, task.u_scale))
     low_y, high_y, y_size = (_constant(v, horizon) for v in (task.low_y, task.high_y, task.y_scale))
     do_mpc = _import_do_mpc()
@@ -117,18 +116,18 @@ def do_mpc_controller(
             mpc.set_nl_cons(name, side * (model.aux["y"] - limit)[limited] / y_size[limited], **soft)
     template = mpc.get_tvp_template()
 
-    def wanted(now: float) -> Any:
+    def future_reference(now: float) -> Any:
         for k in range(horizon + 1):
             template["_tvp", k, "r"] = path[min(round(np.asarray(now).item()) + k, len(path) - 1)]
         return template
 
-    mpc.set_tvp_fun(wanted)
+    mpc.set_tvp_fun(future_reference)
     mpc.setup()
     return mpc
 
 
 def _constant(values: Array, samples: int) -> Array:
-    """Return the one value of each signal that holds over the horizon."""
+    """Return the constant value of each signal; refuse values that change over the horizon."""
     each = values.reshape(samples, -1)
     if np.any(each != each[0]):
         raise InputError(

@@ -1,23 +1,23 @@
-"""State estimation of a fitted model: its run along a recording, an extended Kalman filter, and what outputs show.
+"""State estimation of a fitted model: its run along a recording, an extended Kalman filter, observability of memory.
 
 With `F(x, u) = (f, h)`, `C = ∂h/∂x` at the prediction and `A = ∂f/∂x` at the corrected state, the filter is
 
     x̂ = x + K (y - h(x, u)),   x⁺ = f(x̂, u),   P⁺ = A P̂ A' + Q,
 
-with the gain K and the covariance P̂ of `linear.measurement_update`. The Jacobian of min and max is that of the
-active branch, so the filter switches with the operators: a play that sticks keeps the variance of its memory, one that
-slips takes over the variance of the signal that drives it. Memory has process noise, because a filter that has become
-sure of it would stop correcting it. Anderson & Moore (1979), Optimal Filtering, Sec. 8.2. An unscented filter predicts
-as well, within three percent, at four times the work (`python -m problems.observer`).
+with the gain K and the covariance P̂ of `linear.measurement_update`. The Jacobian of min and max is the one of the
+active branch, so the filter switches with the operators: a play that sticks keeps the variance of its memory, and a
+play that slips takes over the variance of the signal that drives it. Memory has process noise; without it the filter
+would become certain and stop correcting the memory. Anderson & Moore (1979), Optimal Filtering, Sec. 8.2. An unscented
+filter predicts as well, within three percent, at four times the work (`python -m problems.observer`).
 
 Observability of memory: the outputs of a window depend on the state at its beginning as `δY = O δx`. With noise of
 variance R and a state known to within its usual spread S, the covariance after the window is
 
     P = (S⁻² + O' R⁻¹ O)⁻¹,
 
-and a memory is hidden if its standard deviation `sqrt(P_jj)` stays near `S_j`. The columns of O tell why: a zero column
-belongs to a memory that is wiped out before it leaves a trace, or that no output depends on; several operators that
-stick throughout act as one, by their weighted sum.
+and a memory is hidden if its standard deviation `sqrt(P_jj)` stays near `S_j`. The columns of O show the reason. A zero
+column means that the memory is wiped out before it leaves a trace, or that no output depends on it. Several operators
+that stick throughout act as one, by their weighted sum.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 SMALLEST_SPREAD = 1e-6  # of the largest: keeps the covariance of a state that never moves from being singular
-DISTURBANCE = 0.1  # of an output's standard deviation: least size of a disturbance, above any model error worth one
-SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # process noise per step over the states' spread, from which one is chosen
+DISTURBANCE = 0.1  # of an output's standard deviation: least size of a disturbance, above the error of a usable model
+SHARES = 10.0 ** np.arange(-4.5, -0.4, 0.5)  # process noise per step over the states' spread: values to choose from
 JUDGED = 2048  # samples on which the shares of process noise are compared
 PROBES = 5  # states and inputs at which an observer's model is compared with a fit
 HIDDEN = 0.5  # of the spread: a memory counts as hidden if the outputs cannot halve its uncertainty
@@ -59,15 +59,15 @@ class Rollout:
     Attributes
     ----------
     model : Exported
-        The step; where inputs are interpolated, it also takes those of the next sample.
+        The step; where inputs are interpolated, it also takes the inputs of the next sample.
     u, y : array, shape (M, n_u), (M, n_y)
-        Inputs of the steps, and the outputs.
+        Inputs of the steps, and simulated outputs.
     states : array, shape (n, M + 1)
         States before each sample and after the last.
     linear, clock : list of int
-        Entries of x that are neither memory of operators nor the time; the entry that is the time, if there is one.
+        Entries of x that are neither memory of operators nor the time; the entry of the time, if there is one.
     first_scored : int
-        First sample of the recording that counts.
+        First sample of the recording that is scored.
     """
 
     model: Exported
@@ -89,17 +89,15 @@ def roll_out(source: Any, recording: Recording, verb: str) -> Rollout:
     following, y = (np.asarray(v) for v in model.step.mapaccum("rollout", len(u))(start, u.T))
     first = source.scored_from(recording) if isinstance(source, Fit) else recording.skip
     if not (np.all(np.abs(following) < LARGEST) and np.all(np.abs(y[:, first:]) < LARGEST)):
-        raise InputError(
-            f"The model diverges along the recording, so {verb} can make nothing of it; give one that is stable."
-        )
-    memory = {model.states[name] for name in model.held}
+        raise InputError(f"The model diverges along the recording, so {verb} cannot use it; give a stable model.")
+    memory = {model.states[name] for name in model.memory_names}
     clock = [len(model.states) - 1] if model.timed else []
     linear = [i for i in range(len(model.states)) if i not in memory and i not in clock]
     return Rollout(model, u, y.T, np.column_stack([start, following]), linear, clock, first)
 
 
 def _export_for(source: Any, recording: Recording, verb: str) -> Exported:
-    """The step of a model that begins where the recording begins."""
+    """Export the step of a model that starts where the recording starts."""
     diagnosed = not isinstance(source, type) and isinstance(getattr(source, "corrected", None), Simulator)
     if not (isinstance(source, Fit | Simulator | Exported) or diagnosed):
         raise InputError(
@@ -153,7 +151,7 @@ class KalmanFilter:
         noise = ", ".join(f"{v:.3g}" for v in np.sqrt(np.diag(self.R)))
         return (
             f"extended Kalman filter of {len(self.x0)} states (memory included), {self.step.size1_in(2)} inputs and "
-            f"{self.step.size1_in(3)} outputs\nnoise of the outputs, std: {noise}; process noise a step: {share:.2g} "
+            f"{self.step.size1_in(3)} outputs\nnoise of the outputs, std: {noise}; process noise per step: {share:.2g} "
             "of each state's size"
         )
 
@@ -167,7 +165,7 @@ class KalmanFilter:
         u, y : array, shape (M, n_u), (M, n_y)
             Inputs and measured outputs.
         x0, P0 : array, optional
-            State at the start and its covariance; unknown by default. For a known start give `P0=filter.Q`.
+            Start state and its covariance; unknown by default. For a known start give `P0=filter.Q`.
 
         Returns
         -------
@@ -216,17 +214,17 @@ def kalman_filter(
     Parameters
     ----------
     fit : Fit, Diagnosis, Simulator or Exported
-        The model: of a diagnosis its corrected simulator; an export with `start=` the recording. Where inputs are
-        interpolated, the filter's u are those of a sample and of the next one, as in the export.
+        The model. A diagnosis gives its corrected simulator; an export needs `start=` the recording. Where inputs are
+        interpolated, the filter's u holds the inputs of this sample and of the next one, as in the export.
     recording : Recording
         Usually the training recording.
     disturbance : bool
-        Observe a slow disturbance of each output as well, `y = h(x, u) + d, d⁺ = d`, which takes up what the model
-        leaves out and makes control free of offset. Its usual size is that of the residual, and at least a tenth of the
-        output's standard deviation.
+        Observe a slow disturbance of each output as well, `y = h(x, u) + d, d⁺ = d`, which absorbs model errors and
+        makes control free of offset. Its usual size is the rms of the residual, and at least a tenth of the output's
+        standard deviation.
     share : float, optional
         Standard deviation of the process noise per step over the root mean square of the state. By default the share
-        that makes the one-step predictions of the recording most likely.
+        with the most likely one-step predictions of the recording.
 
     Returns
     -------
@@ -242,7 +240,7 @@ def kalman_filter(
     run = roll_out(fit, recording, "kalman_filter")
     function, start = run.model.step, run.states[:, 0]
     if not len(start) and not disturbance:
-        raise InputError("The model has neither states nor memory to observe; ask for disturbance=True.")
+        raise InputError("The model has neither states nor memory to observe; give disturbance=True.")
     residual = (recording.y - run.y)[run.first_scored :]
     spread = np.sqrt(np.mean(run.states[:, 1:] ** 2, axis=1))
     spread[run.clock] = 0.0  # the time is known
@@ -261,7 +259,7 @@ def kalman_filter(
 
 
 def ekf_step(function: ca.Function, Q: Array, R: Array) -> ca.Function:
-    """One step `(x, P, u, y) -> (x_next, P_next, y_pred)` of the extended Kalman filter around any `F(x, u)`.
+    """Build one step `(x, P, u, y) -> (x_next, P_next, y_pred)` of the extended Kalman filter of any `F(x, u)`.
 
     Parameters
     ----------
@@ -294,15 +292,15 @@ def add_disturbances(function: ca.Function) -> ca.Function:
     return ca.Function("disturbed", [ca.vertcat(x, d), u], [ca.vertcat(following, d), y + d], *names)
 
 
-def linearised(function: ca.Function) -> ca.Function:
-    """Jacobians `(x, u) -> (A, B, C, D)` of any `F(x, u)`."""
+def jacobians_of(function: ca.Function) -> ca.Function:
+    """Build the Jacobians `(x, u) -> (A, B, C, D)` of any `F(x, u)`."""
     x, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("u", function.size1_in(1))
     blocks = [ca.densify(ca.jacobian(f, v)) for f in function(x, u) for v in (x, u)]
     return ca.Function("slopes", [x, u], blocks)
 
 
 def function_of_observer(observer: Any, function: ca.Function, recording: Recording) -> ca.Function:
-    """Return the function of an observer, which must observe this model, with or without disturbances."""
+    """Return the function of an observer; refuse one of another model (disturbances are allowed)."""
     if not isinstance(observer, KalmanFilter):
         raise InputError(f"A {type(observer).__name__} was given as the observer; give a kalman_filter of this fit.")
     theirs, n = observer.function, function.size1_in(0)
@@ -315,7 +313,7 @@ def function_of_observer(observer: Any, function: ca.Function, recording: Record
         pairs = (own[0], other[0][:n]), (own[1], other[1])
         same = same and all(np.allclose(np.asarray(a), np.asarray(b), rtol=1e-9, atol=0.0) for a, b in pairs)
     if not same:
-        raise InputError("The observer is one of another model; give a kalman_filter of the same fit.")
+        raise InputError("The observer belongs to another model; give a kalman_filter of the same fit.")
     return theirs
 
 
@@ -326,7 +324,7 @@ def _filter(function: ca.Function, spread: Array, noise: Array, share: float) ->
 
 
 def _prediction_cost(observer: KalmanFilter, u: Array, y: Array, start: Array) -> float:
-    """Minus twice the mean log-likelihood of one-step predictions with errors of their own size, up to a constant."""
+    """Compute minus twice the mean log-likelihood of one-step predictions with errors of their own size."""
     u, y = u[:JUDGED], y[:JUDGED]
     _, predicted, _ = observer.run(u, y, start, observer.Q + 1e-6 * observer.P0)
     error = (y - predicted)[len(y) // 10 :]
@@ -335,7 +333,7 @@ def _prediction_cost(observer: KalmanFilter, u: Array, y: Array, start: Array) -
 
 
 def _is_semidefinite(P: Array) -> bool:
-    """Tell whether no direction has a negative variance, in each state's own unit, as states differ by decades."""
+    """Tell whether no direction has a negative variance, after scaling, since sizes of states differ by decades."""
     size = np.sqrt(np.maximum(np.diag(P), 0.0))
     if np.any(np.diag(P) < 0) or np.any(P[size == 0] != 0):
         return False
@@ -353,14 +351,14 @@ class Visibility:
     Attributes
     ----------
     left : array, shape (n,)
-        Standard deviation of each state and memory once the outputs are known, over its usual spread; 0 is seen
-        exactly, 1 not at all.
+        Standard deviation of each state and memory once the outputs are known, over its usual spread: 0 if it is
+        determined exactly, 1 if the outputs do not show it.
     unseen : tuple of int
-        Entries of the state, counted from 0, that are memory and keep half their spread or more.
+        Entries of the state, counted from 0, that are memory and keep at least half their spread.
     sentences : tuple of str
-        One sentence for each kind of reason.
+        One sentence per reason.
     rank : int
-        Number of directions of the state that the outputs show better than it was known.
+        Number of directions of the state about which the outputs add information.
     """
 
     left: Array
@@ -373,16 +371,16 @@ class Visibility:
 
 
 def visibility(fit: Fit | Diagnosis | Exported, observer: KalmanFilter, x: Array, u: Array) -> Visibility:
-    """Find the memory that the outputs show when the inputs u are applied from the state x on.
+    """Find which memory the outputs show when the inputs u are applied from the state x on.
 
     Parameters
     ----------
     fit : Fit, Diagnosis or Exported
         The model.
     observer : KalmanFilter
-        Its filter, for the noise and the usual spread.
+        The filter of the model; it gives the noise and the usual spread.
     x : array, shape (n,)
-        State of the observer at the window's beginning.
+        State of the observer at the start of the window.
     u : array, shape (samples, n_u)
         Inputs of the window, as the observer takes them.
 
@@ -423,8 +421,8 @@ def visibility(fit: Fit | Diagnosis | Exported, observer: KalmanFilter, x: Array
 
 
 def _sensitivities(observer: KalmanFilter, x: Array, u: Array) -> tuple[Array, Array]:
-    """Outputs of a window by the state at its beginning, in units of noise and spread; sample of each first slip."""
-    n, slopes = len(x), linearised(observer.function)
+    """Differentiate the outputs of a window by its start state, in units of noise and spread; find each first slip."""
+    n, slopes = len(x), jacobians_of(observer.function)
     root = 1 / np.sqrt(np.diag(observer.R))
     carried, rows, slip = np.eye(n), [], np.full(n, -1)
     for k, value in enumerate(u):
@@ -437,7 +435,7 @@ def _sensitivities(observer: KalmanFilter, x: Array, u: Array) -> tuple[Array, A
 
 
 def _reasons(kind: str, names: dict[int, str], unseen: list[int], size: Array, slip: Array, samples: int) -> list[str]:
-    """A sentence for each reason why memory is hidden."""
+    """Write a sentence for each reason why memory is hidden."""
     if not names:
         return ["The model has no memory to see."]
     tiny = TRACE * np.max(size, initial=0.0)
@@ -464,13 +462,13 @@ def _reasons(kind: str, names: dict[int, str], unseen: list[int], size: Array, s
         slipping: faint,
     }
     if not unseen:
-        return [f"The outputs of {samples} samples see all {len(names)} memories."]
+        return [f"The outputs of {samples} samples show all {len(names)} memories."]
     return [f"{kind} {', '.join(names[j] for j in entries)}: {why}." for why, entries in reasons.items() if entries]
 
 
 def _memory_names(fit: Any, model: Exported) -> tuple[str, dict[int, str]]:
-    """Kind of the memory, and the name and threshold of each entry of the state that is memory."""
-    places = {model.states[name]: name for name in model.held}
+    """Return the kind of the memory, and name and threshold of each entry of the state that is memory."""
+    places = {model.states[name]: name for name in model.memory_names}
     element = fit.model.element if isinstance(fit, Fit) else None
     if isinstance(fit, Fit) and not isinstance(element, PrandtlIshlinskii):
         return "Memory", {place: str(k + 1) for k, place in enumerate(places)}

@@ -1,25 +1,26 @@
-"""The input for a wanted output: a fitted model inverted one look-ahead at a time, and an element inverted exactly.
+"""Inverses: the input for a wanted output by a look-ahead on a fitted model, and the exact inverse of an element.
 
 **Model.** With `F(x, u) = (f, h)`, a delay of n samples and a look-ahead of d >= n samples, the input u of a sample
 solves
 
     y_{k+d}(x_k, u_{k+i} = u + min(i, d - n) (u - u_{k-1})) = wanted_{k+d}:
 
-the input continues its change since the sample before, as long as it still reaches the output. The equation is scalar,
+the input continues its last change for as long as it still reaches the output. The equation is scalar,
 piecewise linear and increasing for plays (decreasing where the gain is negative). Newton steps inside a shrinking
 bracket solve it in a fixed number of steps. For d = n, a model without response before n samples and one solution, this
 is the exact inverse. Sampled machines often have zeros outside the unit circle (Åström, Hagander & Sternby 1984,
-Automatica 20), which make the exact inverse unstable. Then a longer look-ahead is taken, under which
+Automatica 20), which make the exact inverse unstable. Then the shortest longer look-ahead is taken for which
 
     x⁺ = A x + B u,   u = -(g_x x + g_before u_before) / g_u,   g = ∂y_{k+d},
 
-is stable wherever the model has been driven. That inverse is approximate, and the result says so.
+is stable all along the recording. That inverse is approximate, and the result says so.
 
 **Delay and zeros.** Linearised at a state of the recording, `A, B, C, D`, the output after j samples follows the input
 by the Markov parameter `m_0 = D, m_j = C A^{j-1} B`. A pure delay of n samples is `m_0 = ... = m_{n-1} = 0`. In a fit
 these are small instead of zero, so values within four standard errors, or a thousandth of the largest, count as zero.
 Standard errors follow from the covariance of the fit's parameters by the delta method. The zeros are the eigenvalues of
-`A - B C A^n / m_n` (`A - B C / D` for n = 0), the poles of the exact inverse; n of them are zero, those of the delay.
+`A - B C A^n / m_n` (`A - B C / D` for n = 0), the poles of the exact inverse; n of them are zero and stand for the
+delay.
 
 **Element.** For plays with `0 = r_0 < r_1 < ... < r_n` and weights `w_0 > 0` (the linear part), all partial sums
 positive, Krejčí & Kuhnen (2001), IEE Proc. Control Theory Appl. 148, give the inverse in closed form:
@@ -29,10 +30,11 @@ positive, Krejčí & Kuhnen (2001), IEE Proc. Control Theory Appl. 148, give the
     q'_i = Σ_{j≤i} w_j q_i + Σ_{j>i} w_j q_j.
 
 r' are the values of the virgin loading curve at the kinks, w' the changes of slope of its inverse function. The
-memories q' follow from those of the plays at the moment when play i slipped last. Stops become plays by
-`S_r[z] = z - P_r[z]`: `Σ w_j S_rj = (Σ w_j) z - Σ w_j P_rj`. A sum of stops alone saturates and has no inverse; a
-spring of stiffness `gain` beside it makes one possible. If all partial sums are negative, the output falls as the input
-rises. Then the formulas hold with -r' for r', because plays are odd: `P_r[-z] = -P_r[z]` from the negative memory.
+memories q' follow from the memories of the plays at the moment when play i slipped last. Stops become plays by
+`S_r[z] = z - P_r[z]`: `Σ w_j S_rj = (Σ w_j) z - Σ w_j P_rj`. A sum of stops alone saturates and has no inverse; with a
+spring of stiffness `gain` beside it, the inverse exists. If all partial sums are negative, the output falls as the
+input rises. Then the formulas hold with -r' for r', because plays are odd: `P_r[-z] = -P_r[z]` from the negative
+memory.
 """
 
 from __future__ import annotations
@@ -48,20 +50,20 @@ from ..data import Recording
 from ..identify import Fit, covariance, variance
 from ..models import Play, Stop, play
 from ..optimise import Problem
-from .estimation import KalmanFilter, ModelSource, Rollout, function_of_observer, linearised, roll_out
+from .estimation import KalmanFilter, ModelSource, Rollout, function_of_observer, jacobians_of, roll_out
 
 Array = np.ndarray
 FARTHEST = 12  # samples of look-ahead beyond the delay that are tried; longer ones gain nothing on the benchmarks
-LONGEST = 1000  # samples of look-ahead that may be asked for: each unrolls the model once
+LONGEST = 1000  # largest look-ahead, samples: each sample unrolls the model once
 STABLE = 0.999  # spectral radius of an accepted inverse: disturbances fade within some thousand samples
 FAINT = 0.02  # of the largest gain over the look-aheads and along the recording: smaller gains are model error
 STEPS = 40  # Newton or bisection steps: bisection alone then reaches 1e-12 of the bracket
 NOTHING = 1e-9  # of the largest response: an earlier one below this is rounding
-INPUTS = 31  # inputs between the limits at which the sign of the gain is looked at
+INPUTS = 31  # inputs between the limits at which the sign of the gain is checked
 POINTS = 60  # states along the recording at which the model is linearised
-SAMPLES = 100  # length of the response that is looked at
-ERRORS = 4.0  # standard errors from which on a Markov parameter counts
-SMALL, UNKNOWN = 1e-3, 0.02  # of the largest Markov parameter: none counts below; the second where errors are unknown
+SAMPLES = 100  # length of the impulse response
+ERRORS = 4.0  # standard errors above which a Markov parameter counts
+SMALL, UNKNOWN = 1e-3, 0.02  # of the largest Markov parameter: smaller ones count as zero; second: errors unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,18 +73,18 @@ class Feedforward:
     Attributes
     ----------
     step : casadi.Function
-        `(x, u_before, wanted) -> (x_next, u)`: the input for which the output is the wanted one `ahead` samples later,
-        and the model's state after it. In feedback, x is the observer's state and x_next is not used.
+        `(x, u_before, wanted) -> (x_next, u)`: the input that gives the wanted output `ahead` samples later, and the
+        next state of the model. In feedback, x is the observer's state and x_next is not used.
     ahead : int
         Look-ahead (preview): number of samples that the wanted path must be known in advance.
     limits : tuple of float
-        Smallest and largest input; a wanted output out of reach gets one of them.
+        Smallest and largest input; an unreachable wanted output gets one of them.
     delay : int
-        Samples after which an input reaches the output at the earliest.
+        Number of samples before an input can reach the output.
     zeros : array of complex
         Zeros of the linearised model on or outside the unit circle, which forbid the exact inverse.
     note : str
-        Sentence that says whether the inverse is exact, or approximate and why.
+        Sentence that says whether the inverse is exact, or why it is approximate.
     """
 
     step: ca.Function
@@ -96,7 +98,7 @@ class Feedforward:
         return self.note
 
     def inputs(self, wanted: Array, x0: Array | None = None) -> Array:
-        """Inputs (M, 1) for a whole wanted path (M,), from the state x0 (at rest by default), without feedback."""
+        """Compute inputs (M, 1) for a wanted path (M,), from the state x0 (default: at rest), without feedback."""
         path = numbers(wanted, "The wanted path")
         if path.size < 1 or path.size != max(path.shape, default=0):
             raise InputError(f"A path of the shape {path.shape} was given; give one output over at least one sample.")
@@ -128,17 +130,17 @@ def feedforward(
     Parameters
     ----------
     fit : Fit, Diagnosis, Simulator or Exported
-        A model of one input, held between samples, and one output; of a diagnosis its corrected simulator.
+        A model of one input, held between samples, and one output. A diagnosis gives its corrected simulator.
     recording : Recording
-        Where the model works; the inverse has to be stable along it. Usually the training recording.
+        A recording of typical operation, usually the training recording; the inverse must be stable along it.
     limits : (low, high), optional
-        Smallest and largest input; by default those of the recording.
+        Smallest and largest input; by default the range of the recording.
     ahead : int, optional
-        Look-ahead in samples; by default the shortest under which the inverse is stable. A look-ahead beyond the delay
-        makes the inverse approximate, and so does a small response before the delay, or an output that several inputs
-        give; the printed result says so.
+        Look-ahead in samples; by default the shortest with a stable inverse. The inverse is approximate with a
+        look-ahead beyond the delay, with a small response before the delay, or where several inputs give the same
+        output; the printed result says so.
     observer : KalmanFilter, optional
-        The observer whose state the compensator works on, disturbances included.
+        Observer whose state the compensator reads, disturbances included.
 
     Returns
     -------
@@ -147,7 +149,7 @@ def feedforward(
     Raises
     ------
     InputError
-        If the observer is one of another model, or the model cannot be inverted: it has several inputs or outputs, the
+        If the observer belongs to another model, or the model cannot be inverted: it has several inputs or outputs, the
         input does not reach the output within the look-ahead, or no inverse is stable.
     """
     run = roll_out(fit, recording, "feedforward")
@@ -158,10 +160,10 @@ def feedforward(
     found, why = _choose_look_ahead(run, recording, response, ahead)
     delay = response.delay or 0
     if found == delay and _gain_changes_sign(run, recording, response, ends):
-        why = "within the limits the output rises with the input in places and falls in others, so that it is not the "
-        why += "output of one input alone"
+        why = "within the limits the output rises with the input in places and falls in others, so that several inputs "
+        why += "give the same output"
     elif found == delay and response.early > NOTHING:
-        why = f"it has {_percent(response.early)} of its largest response before, which counts as an error of the model"
+        why = f"it has {_percent(response.early)} of its largest response before, counted as a model error"
     step = inverse_step(planned, found, ends, delay)
     return Feedforward(step, found, ends, delay, _unstable_zeros(response), _note(found, delay, why))
 
@@ -171,32 +173,30 @@ def _check_ports(run: Rollout, recording: Recording) -> None:
     n_u, n_y = recording.n_u, run.y.shape[1]
     if n_y > n_u:
         raise InputError(
-            f"The model has {n_y} outputs and {n_u} input(s), which cannot make all of them follow wanted "
+            f"The model has {n_y} outputs and {n_u} input(s), too few for all of them to follow wanted "
             "paths; fit a model of one output, or use predictive control."
         )
     if n_u != 1 or n_y != 1:
         raise InputError(
             f"The model has {n_u} inputs and {n_y} output(s); the compensator inverts models of one input "
-            "and one output, so fit such a one, or use predictive control."
+            "and one output, so fit such a model, or use predictive control."
         )
     if len(run.model.inputs) > 1:
         raise InputError(
-            "The model's input is interpolated between samples, so that a step takes two, and the compensator holds "
-            "its own; give exported(simulator, dt=..., hold='zero', start=...), of a diagnosis with its `corrected`."
+            "The model's input is interpolated between samples, but the compensator holds its input; give "
+            "exported(simulator, dt=..., hold='zero', start=...), for a diagnosis its `corrected` simulator."
         )
 
 
 def _input_limits(limits: tuple[float, float] | None, recording: Recording) -> tuple[float, float]:
-    """Smallest and largest input, by default those of the recording."""
+    """Check the limits of the input; the default is the range of the recording."""
     try:
         low, high = (np.min(recording.u), np.max(recording.u)) if limits is None else map(float, limits)
     except (TypeError, ValueError):
         low = high = np.nan
     if not (low < high and np.isfinite(high - low)):
         given = "none, and the recording's input is constant" if limits is None else repr(limits)
-        raise InputError(
-            f"Limits of the input of {given[:60]} were given; give (low, high), finite, with low below high."
-        )
+        raise InputError(f"The input limits {given[:60]} were given; give (low, high), finite, with low below high.")
     return float(low), float(high)
 
 
@@ -223,7 +223,7 @@ def inverse_step(function: ca.Function, ahead: int, limits: tuple[float, float],
 
 
 def _output_ahead(function: ca.Function, ahead: int, delay: int) -> ca.Function:
-    """Output after `ahead` samples of a continued input, with slopes: `(x, u_before, u) -> (y, y_x, y_before, y_u)`."""
+    """Build the output `ahead` samples later with slopes, `(x, u_before, u) -> (y, y_x, y_before, y_u)`."""
     x, before, u = ca.SX.sym("x", function.size1_in(0)), ca.SX.sym("before"), ca.SX.sym("u")
     state = x
     for i in range(ahead):
@@ -234,19 +234,19 @@ def _output_ahead(function: ca.Function, ahead: int, delay: int) -> ca.Function:
 
 
 def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, ahead: int | None) -> tuple[int, str]:
-    """Check the look-ahead, or find the shortest stable one; also why its inverse is not the exact one."""
+    """Check the look-ahead, or find the shortest stable one; also say why its inverse is approximate."""
     if ahead is not None and not is_whole(ahead, 0, LONGEST):
         raise InputError(f"A look-ahead of {ahead!r} samples was given; give a whole number from 0 to {LONGEST}.")
     n = response.delay
     if n is None:
         raise InputError(
             "The input reaches the output nowhere along the recording (no direct feedthrough, no path through the "
-            "states), so there is nothing to invert; give a model and a recording in which it does."
+            "states), so there is nothing to invert; give a model and a recording with a response to the input."
         )
     if ahead is not None and ahead < n:
         raise InputError(
-            f"The look-ahead is {ahead} samples, but the input reaches the output only after {n} (a delay; what "
-            f"the model has before is no larger than its errors, {_percent(response.early)} of its largest response); "
+            f"The look-ahead is {ahead} samples, but the input reaches the output only after {n} (a delay; the "
+            f"response before is within the model's errors, {_percent(response.early)} of its largest response); "
             f"know the wanted path {n} samples ahead and give ahead={n} or more, or leave it out."
         )
     tried = range(n, n + FARTHEST + 1) if ahead is None else sorted({n, ahead})
@@ -258,20 +258,20 @@ def _choose_look_ahead(run: Rollout, recording: Recording, response: Response, a
         if taken == n:
             return taken, ""
         if found[n][2] >= limit:
-            return taken, f"the exact inverse would be unstable ({_reason(response, found[n][2])})"
+            return taken, f"the exact inverse would be unstable ({_explain_instability(response, found[n][2])})"
         if n in usable:
-            return taken, "a longer look-ahead was asked for"
+            return taken, "a longer look-ahead was given"
         return taken, f"only by less than {100 * FAINT:g} % of what follows"
     which = f"{ahead}" if ahead is not None else f"{n} to {tried[-1]}"
     smallest = min(radius for d, (_, _, radius) in found.items() if ahead in (None, d))
     raise InputError(
         f"The model has no stable inverse with a look-ahead of {which} samples (non-minimum phase: "
-        f"{_reason(response, smallest)}); use predictive control."
+        f"{_explain_instability(response, smallest)}); use predictive control."
     )
 
 
 def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: int) -> tuple[float, float, float]:
-    """Usual gain of a look-ahead, gain of a constant input, and largest spectral radius along the recording."""
+    """Compute the median gain of a look-ahead, the gain of a constant input, and the largest spectral radius."""
     n = len(response.linear[0][0])
     reached, poles, constant = _output_ahead(run.model.step, d, response.delay or 0), [], []
     for k, (a, b, _, _) in zip(response.at, response.linear, strict=True):
@@ -283,7 +283,7 @@ def _gain_and_radius(run: Rollout, recording: Recording, response: Response, d: 
             feedback = -np.hstack([g_x[:, run.linear], g_before]) / gain
             inverse = np.vstack([np.hstack([a, np.zeros((n, 1))]) + b @ feedback, feedback])
             poles.append((abs(gain), float(np.max(np.abs(np.linalg.eigvals(inverse))))))
-    # where a play sticks the gain may vanish, as in a dead zone; there the input jumps and stays in its bracket
+    # where a play sticks the gain may vanish, as in a dead zone; there the input jumps, within its bracket
     usual = float(np.median([g for g, _ in poles] + [0.0] * (len(response.at) - len(poles))))
     radius = max((radius for g, radius in poles if g > FAINT * usual), default=0.0)
     return usual, float(np.median(constant)), radius
@@ -305,12 +305,12 @@ def _unstable_zeros(response: Response) -> Array:
 
 
 def _stability_limit(response: Response) -> float:
-    """Largest spectral radius of a stable inverse; slow poles that zeros nearly cancel do not count against a fit."""
+    """Return the largest spectral radius of a stable inverse: nearer to 1 for slow poles that zeros nearly cancel."""
     slowest = max(float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a, *_ in response.linear)
     return max(STABLE, 1 - (1 - min(slowest, 1.0)) / 10)
 
 
-def _reason(response: Response, radius: float) -> str:
+def _explain_instability(response: Response, radius: float) -> str:
     zeros = _unstable_zeros(response)
     zeros = zeros[zeros.imag >= 0]  # one of each conjugate pair
     if len(zeros):
@@ -346,7 +346,7 @@ class Response:
     early: float  # largest Markov parameter before the delay at any of the points, over the largest median
 
     def zeros(self) -> Array:
-        """Return the zeros at the point of the median gain, including those of the delay."""
+        """Return the zeros at the point of the median gain, including the n zeros of the delay."""
         if self.delay is None:
             return np.zeros(0)
         gains = [_markov(point, self.delay + 1)[-1] for point in self.linear]
@@ -362,7 +362,7 @@ def analyse_response(given: Any, run: Rollout, recording: Recording) -> Response
     """Linearise a model of one input and one output along its run of a recording."""
     function, states = run.model.step, run.states
     at = np.unique(np.linspace(min(1, len(recording) - 1), len(recording) - 1, POINTS).astype(int))
-    slopes = linearised(function)
+    slopes = jacobians_of(function)
     linear = tuple(_linear_blocks(slopes(states[:, k], recording.u[k]), run.linear) for k in at)
     each = np.array([_markov(point, SAMPLES) for point in linear])
     markov = np.median(np.abs(each), axis=0)
@@ -383,7 +383,7 @@ def _linear_blocks(blocks: Any, linear: list[int]) -> tuple[Array, ...]:
 
 
 def _markov(point: tuple[Array, ...], samples: int) -> Array:
-    """`D, C B, C A B, ...` of one linear model."""
+    """Compute `D, C B, C A B, ...` of one linear model."""
     a, b, c, d = point
     out, carried = [d.item()], b
     for _ in range(samples - 1):
@@ -393,7 +393,7 @@ def _markov(point: tuple[Array, ...], samples: int) -> Array:
 
 
 def _markov_errors(fit: Fit, recording: Recording, state: Array, drive: Array) -> Array:
-    """Standard errors of the Markov parameters at a state; nan where the recording says nothing about them."""
+    """Compute standard errors of the Markov parameters at a state; nan where the recording does not determine them."""
     model = fit.model
     parameters = model.parameters
     known = recording.with_(initial=fit.initial_state(recording) if model.n_state else "zero", period=None)
@@ -426,7 +426,7 @@ class Inverse:
     Attributes
     ----------
     step : casadi.Function
-        `(memory, wanted) -> (memory_next, u)`: the u for which the element gives the wanted value.
+        `(memory, wanted) -> (memory_next, u)`: the u that gives the wanted value.
     r, w : array, shape (n + 1,)
         Thresholds (in units of the element's output) and weights, for a `PrandtlIshlinskii(Play, n + 1)`.
     """
@@ -444,10 +444,10 @@ class Inverse:
     __repr__ = __str__
 
     def memory(self, s: Array | None = None) -> Array:
-        """Memory of the inverse for the element's memory s, shape (n,); at rest by default.
+        """Convert the element's memory s, (n,), at rest by default, to the memory of the inverse.
 
-        s are the states of the plays, also for stops, in the order of the given thresholds. Some input must be able to
-        bring them about.
+        s holds the states of the plays, also for stops, in the order of the given thresholds. It must be reachable by
+        some input.
         """
         order, _, w = self._sorted
         q = np.zeros(len(order)) if s is None else numbers(s, "The memory").ravel()
@@ -467,7 +467,7 @@ def inverse_element(r: Any, w: Any, *, gain: float = 0.0, operator: Any = Play, 
     r, w : array, shape (n,)
         Thresholds (not negative, any order) and weights of the operators.
     gain : float
-        Linear part beside them; it joins the weights of operators with threshold 0.
+        Linear part; it adds to the weights of operators with threshold 0.
     operator : Play or Stop
         Kind of the operators.
     name : str

@@ -1,25 +1,26 @@
-"""Predictive control: the inputs that let the predicted outputs follow a reference within limits.
+"""Predictive control: inputs that make the predicted outputs follow a reference within limits.
 
     minimise   Σ |(y_k - r_k) / y_scale|² + move |(u_k - u_{k-1}) / u_scale|² + price · s_k / y_scale
     subject to low_u <= u_k <= high_u,   |u_k - u_{k-1}| <= rate,   low_y - s_k <= y_k <= high_y + s_k,   s_k >= 0
 
-over N samples from a state x with memory. Each output and sample has a slack s of its own, so one violation that cannot
-be avoided gives no leave to another. States are eliminated (single shooting), and the Hessian is the Gauss-Newton one,
+over N samples from a state x with memory. Each output and sample has its own slack s, so an unavoidable
+violation does not permit another one. States are eliminated (single shooting), and the Hessian is Gauss-Newton's,
 `2 JᵀJ` of the weighted deviations. CasADi solves the problem by `sqpmethod` with the QP solver DAQP (`solver="sqp"`) or
 by IPOPT (`solver="ipopt"`), starting from the last plan shifted by a sample.
 
 Operators with memory make the model piecewise linear. Within a piece the Gauss-Newton step ends in the optimum; between
-pieces the line search decides, and a plan may stop at a kink that is no optimum. It is then marked as not converged:
-rare with one input, common with several inputs behind plays. A plan is never worse than the last one shifted, and it
-keeps the limits of inputs and rates in any case. Nocedal & Wright (2006), Numerical Optimization, ch. 18.
+pieces the line search decides, and a plan may stop at a kink that is not an optimum. It is then marked as not
+converged, which is rare with one input and common with several inputs behind plays. A plan is never worse than the last
+one shifted, and it always keeps the limits of inputs and rates. Nocedal & Wright (2006), Numerical Optimization, ch.
+18.
 
-Scales say how large a deviation counts as one in the cost. They follow from the options alone, so the cost is the same
+A scale is the deviation that counts as one in the cost. Scales follow from the options alone, so the cost is the same
 in every call and does not depend on the units:
 
     u_scale   half of the width between the limits of an input; 1 where it has no limits;
     y_scale   the smaller of half the width between the limits of an output, and half of the range that it covers when
-              the model is driven from rest by either end of the inputs over the horizon. Without output limits, a tenth
-              of that range; 1 where nothing is known.
+              the lowest or highest inputs drive the model from rest over the horizon. Without output limits, a tenth
+              of that range; 1 if neither is known.
 
 A violated limit costs in proportion to y_scale and a deviation with its square, so a small y_scale makes limits that
 cannot be kept count less against the reference. Therefore y_scale is larger with limits than without.
@@ -46,10 +47,10 @@ Array = np.ndarray
 NO_LIMIT = 1e20  # stands for infinity in limits of outputs; IPOPT's convention
 PRICE = 30.0  # cost of a violated limit per y_scale; 15 times the steepest pull of a reference one scale beyond it
 UNLIMITED_SHARE = 0.1  # of an output's range: the scale without limits, so that errors of a few per cent count
-PROBE = 2.0  # u_scale from zero: the range of inputs over which an output's range is looked at
+PROBE = 2.0  # u_scale from zero: the range of inputs over which an output's range is probed
 LARGEST, SMALLEST = 1e15, 1e-300  # limits and ranges beyond these count as unknown
 FIRST = 10  # times as many iterations for the first plan, which starts from a held input
-KEPT = 1e-5  # of y_scale: a violation of an output limit below the solver's tolerance is none
+KEPT = 1e-5  # of y_scale: smaller violations of an output limit lie within the solver's tolerance
 SLACK_CURVATURE = 0.1  # Hessian of the slacks: makes the QP strictly convex, small against the price of 30
 QUIET = {"print_time": False, "error_on_fail": False}
 SQP = {
@@ -69,7 +70,7 @@ SUCCESS = ("Solve_Succeeded", "Search_Direction_Becomes_Too_Small", "Solved_To_A
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The answer of a predictive controller.
+    """The result of a call of a predictive controller.
 
     Attributes
     ----------
@@ -78,9 +79,9 @@ class Plan:
     cost, slack : float
         Cost, and the largest violation of an output limit, in units of the outputs.
     seconds : float
-        Time that the plan took.
+        Computing time, s.
     converged : bool
-        Whether the solver ended in an optimum.
+        Whether the solver reached an optimum.
     limited : bool
         Whether output limits were given; without them the slack is zero.
     """
@@ -122,12 +123,12 @@ class PredictiveController:
     horizon : int
         Samples N.
     inputs : (low, high)
-        Limits of the inputs, numbers or arrays (n_u,); infinite where there is none.
+        Limits of the inputs, numbers or arrays (n_u,); infinite for no limit.
     outputs : (low, high), optional
-        Limits of the outputs. Each is kept where that is possible; otherwise the output comes as close as it can.
+        Limits of the outputs, kept wherever possible; otherwise the output comes as close as it can.
     rate : float or array, optional
-        Largest change of an input from sample to sample. Where the previous input is so far outside the limits that
-        both cannot be kept, the first change is as large as it takes.
+        Largest change of an input from sample to sample. If the previous input is so far outside the limits that both
+        cannot be kept, the first change is as large as needed.
     move : float
         Weight of changes of the inputs.
     y_scale, u_scale : float or array, optional
@@ -144,8 +145,8 @@ class PredictiveController:
     Raises
     ------
     InputError
-        If limits are unfit or the solver is unknown; in a call, if the state, the reference or the previous input has
-        another shape or is not finite.
+        If limits cannot be used or the solver is unknown; in a call, if the state, the reference or the previous input
+        has another shape or is not finite.
     """
 
     def __init__(
@@ -275,7 +276,7 @@ class Transcription:
     def solve(
         self, solver: Buffered, start: Array, rate: Array, x: Array, wanted: Array, before: Array
     ) -> tuple[Array, bool]:
-        """Inputs (N n_u,) found from a start, and whether the solver converged."""
+        """Find inputs (N n_u,) from a start; also tell whether the solver converged."""
         task, most = self._task, (rate / self._task.u_scale)[self._rated]
         p = np.concatenate([x, wanted, before, [task.price(wanted)]])
         low, high = np.append(-most, self._sides[0]), np.append(most, self._sides[1])
@@ -283,7 +284,7 @@ class Transcription:
         return found * task.u_scale, solver.status in SUCCESS and bool(np.all(np.isfinite(found)))
 
     def cost(self, u: Array, x: Array, wanted: Array, before: Array) -> tuple[float, Array]:
-        """Cost of inputs (N n_u,) and their outputs (N n_y,), violated limits included."""
+        """Compute the cost of inputs (N n_u,), violated limits included, and their outputs (N n_y,)."""
         task = self._task
         cost, y = self._predict(u / task.u_scale, x, wanted, before)
         y = y * task.y_scale
@@ -292,11 +293,11 @@ class Transcription:
 
 
 def _reference(reference: Any, samples: int, n_y: int) -> Array:
-    """A reference (samples, n_y) as one vector; one of a single output may come without its second dimension."""
+    """Flatten a reference (samples, n_y); for a single output (samples,) is accepted."""
     found = numbers(reference, "The reference")
     if found.shape == (samples, n_y) or (n_y == 1 and found.size == samples == max(found.shape, default=0)):
         return found.reshape(-1)
-    raise InputError(f"The reference has the shape {found.shape}; give {(samples, n_y)}, a row a sample.")
+    raise InputError(f"The reference has the shape {found.shape}; give {(samples, n_y)}, one row per sample.")
 
 
 # --- options
@@ -324,15 +325,15 @@ class ControlTask:
         return self.function.size1_in(0), self.function.size1_in(1), self.function.size1_out(1)
 
     def beyond(self, y: Array) -> Array:
-        """How far each output (N n_y,) is outside its limits."""
+        """Compute how far each output (N n_y,) is outside its limits."""
         return np.maximum(0, np.maximum(self.low_y - y, y - self.high_y))
 
     def price(self, reference: Array) -> float:
-        """Cost of a violated output limit per y_scale, for a reference (N n_y,)."""
+        """Compute the cost of a violated output limit per y_scale, for a reference (N n_y,)."""
         return limit_price(self.beyond(reference) / self.y_scale)
 
     def first_rate(self, before: Array) -> Array:
-        """Largest changes (N n_u,); the first is as large as it takes to come back inside the limits."""
+        """Compute the largest changes (N n_u,); the first may be as large as needed to return inside the limits."""
         rate, n_u = self.rate.copy(), len(before)
         rate[:n_u] = np.maximum(rate[:n_u], np.maximum(self.low[:n_u] - before, before - self.high[:n_u]))
         return rate
@@ -359,7 +360,7 @@ def check_task(
     u_scale: Any = None,
 ) -> ControlTask:
     """Check the options of a predictive controller and spread them over the horizon."""
-    function = step_function(function)
+    function = as_step_function(function)
     n_u, n_y = function.size1_in(1), function.size1_out(1)
     horizon = whole(horizon, "The horizon", 1)
     low, high = _limits(inputs, "inputs", (horizon, n_u))
@@ -382,20 +383,20 @@ def check_task(
     return ControlTask(function, horizon, low, high, low_y, high_y, limited, rates, weight, y_size, u_size)
 
 
-def step_function(given: Any) -> ca.Function:
-    """Return the step `(x, u) -> (x_next, y)` of a fit, an observer or an export, or a function as it is."""
+def as_step_function(given: Any) -> ca.Function:
+    """Return the step `(x, u) -> (x_next, y)` of a fit, an observer or an export, or the function itself."""
     model = given.export() if isinstance(given, Fit) else given
     if isinstance(model, Exported) and "next" in model.reads:
         raise InputError(
-            f"The inputs of {model.name} are interpolated, so a step takes those of the next sample too, and these "
-            'are not free; export it with hold="zero" to plan with it.'
+            f"The inputs of {model.name} are interpolated, so a step also takes the inputs of the next sample, "
+            'which are not free; export it with hold="zero" to plan with it.'
         )
     function = model
     if not isinstance(model, ca.Function):  # an observer has a function, an export a step
         function = getattr(model, "function", getattr(model, "step", model))
     if not isinstance(function, ca.Function):
         raise InputError(
-            f"A {type(given).__name__} cannot be planned with; give a Fit, an observer, an export, or a "
+            f"A {type(given).__name__} cannot be used for planning; give a Fit, an observer, an export, or a "
             "casadi.Function (x, u) -> (x_next, y)."
         )
     if function.n_in() != 2 or function.n_out() != 2 or function.size1_in(0) != function.size1_out(0):
@@ -407,12 +408,12 @@ def step_function(given: Any) -> ca.Function:
 
 
 def limit_price(beyond: Array) -> float:
-    """Price of a violated limit for a reference that lies `beyond` the limits, in units of y_scale."""
+    """Compute the price of a violated limit for a reference that lies `beyond` the limits, in units of y_scale."""
     return PRICE * max(1.0, float(np.max(beyond, initial=0.0)))
 
 
 def _limits(limits: Any, of: str, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Lower and upper limit over the horizon; infinite means none."""
+    """Spread lower and upper limits over the horizon; infinite means no limit."""
     if not isinstance(limits, tuple | list) or len(limits) != 2:
         raise InputError(f"The limits of the {of} cannot be {str(limits)[:60]}; give (low, high).")
     if any(v is None for v in limits):
@@ -425,7 +426,7 @@ def _limits(limits: Any, of: str, shape: tuple[int, int]) -> tuple[Array, Array]
 
 
 def _output_scale(function: ca.Function, low: Array, high: Array, ends: tuple[Array, Array]) -> Array:
-    """Scale of the outputs from their limits (N n_y,) and from runs with the inputs at both ends (N n_u,)."""
+    """Choose the scale of the outputs from their limits (N n_y,) and from runs at the limits of the inputs (N n_u,)."""
     n_u, n_y = function.size1_in(1), function.size1_out(1)
     samples = len(low) // n_y
     width = np.min(((high - low) / 2).reshape(samples, n_y), axis=0)

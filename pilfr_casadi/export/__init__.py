@@ -12,7 +12,7 @@ if TYPE_CHECKING:
         read_model_file as read_model_file,
         write_model_file as write_model_file,
     )
-    from .smoothing import enclosed as enclosed, smoothed as smoothed
+    from .smoothing import enclose as enclose, smooth_kinks as smooth_kinks
     from .step import (
         NAMES as NAMES,
         Exported as Exported,

@@ -1,10 +1,10 @@
 """A step as C: the code that CasADi generates, behind two plain functions and a header with names and indices.
 
-    rig_x0(x);                          the state to start from
+    rig_x0(x);                          the start state
     rig_step(x, u, x_next, y);          arrays of RIG_NX, RIG_NU, RIG_NX, RIG_NY doubles; x_next may be x itself
 
-Names and units of signals come from files. They are written into comments and constants only without whatever could end
-a comment or is no letter, digit or underscore.
+Names and units of signals come from files. In comments, characters that could end the comment are replaced; in
+constants, everything but letters, digits and underscores.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ WORK = {"arg": "const casadi_real *arg", "res": "casadi_real *res", "iw": "casad
 
 
 def check_name(name: Any) -> None:
-    """Refuse a function name that CasADi, a file or C does not take."""
+    """Refuse a function name that CasADi, a file name or C does not allow."""
     if not isinstance(name, str) or not ca.Function.check_name(name):
         raise InputError(
             f"The function name {str(name)[:60]!r} cannot be used; give letters, digits and single underscores."
@@ -47,7 +47,7 @@ def check_name(name: Any) -> None:
     if len(name) > LONGEST_NAME:
         raise InputError(f"The function name {name[:20]}... has {len(name)} characters; give at most {LONGEST_NAME}.")
     if name.lower() in C_KEYWORDS | C_HEADERS:
-        kind = "a word of C" if name.lower() in C_KEYWORDS else "the name of one of C's headers"
+        kind = "a C keyword" if name.lower() in C_KEYWORDS else "the name of one of C's headers"
         raise InputError(f"The function name {name!r} is {kind}; give another one.")
 
 
@@ -71,7 +71,7 @@ def _header(names: Mapping[str, Any], interpolated: bool) -> str:
         f" *   {name}_step(x, u, x, y);      every sample: y now, and x for the next one",
         " *",
         *(
-            [" * Inputs are interpolated: behind those of this sample, u holds those of the next one.", " *"]
+            [" * Inputs are interpolated: u holds the inputs of this sample, then those of the next one.", " *"]
             * interpolated
         ),
         " * Nothing is allocated and nothing is kept between calls; several threads may call it at once.",
@@ -85,9 +85,9 @@ def _header(names: Mapping[str, Any], interpolated: bool) -> str:
     for letter, role in (("X", "states"), ("U", "inputs"), ("Y", "outputs")):
         entries = list(names[role])
         title = f"entries of {letter.lower()}"
-        constants = _constants(f"{big}_{letter}_", entries)
+        constants = _constant_names(f"{big}_{letter}_", entries)
         rows = [
-            f"#define {constant} {i} /* {_comment(_labelled(names, entry))} */"
+            f"#define {constant} {i} /* {_clean_comment(_describe_entry(names, entry))} */"
             for i, (constant, entry) in enumerate(zip(constants, entries, strict=True))
         ]
         lines += ["", f"/* {title} */", *rows]
@@ -97,7 +97,7 @@ def _header(names: Mapping[str, Any], interpolated: bool) -> str:
         'extern "C" {',
         "#endif",
         "",
-        "/* State to start from. */",
+        "/* Start state. */",
         f"void {name}_x0(double *x);",
         "",
         "/* Output at this sample and state at the next one; x_next may be x. */",
@@ -146,35 +146,35 @@ def _source(step: ca.Function, names: Mapping[str, Any]) -> str:
 
 
 def _use_all_parameters(code: str) -> str:
-    """Mark the parameters of CasADi's functions as used: some functions ignore some of them, of which -Wextra warns."""
+    """Mark the parameters of CasADi's functions as used; -Wextra warns about the ones that a function ignores."""
 
-    def marked(match: re.Match[str]) -> str:
+    def mark_used(match: re.Match[str]) -> str:
         names = [parameter.split()[-1] for parameter in match[1].split(",")]
         return "\n  ".join([match[0], " ".join(f"(void){name};" for name in names)])
 
-    return re.sub(r"^[^\n]*\(([^()\n]*\bint mem)\) \{$", marked, code, flags=re.MULTILINE)
+    return re.sub(r"^[^\n]*\(([^()\n]*\bint mem)\) \{$", mark_used, code, flags=re.MULTILINE)
 
 
 def _accuracy(smooth: float) -> str:
     return f"min and max rounded, eps = {smooth:g}" if smooth else "min and max exact"
 
 
-def _labelled(names: Mapping[str, Any], name: str) -> str:
+def _describe_entry(names: Mapping[str, Any], name: str) -> str:
     unit = names["units"].get(name)
     text = f"{name} [{unit}]" if unit else name
     return f"{text}, r = {names['thresholds'][name]:.6g}" if name in names["thresholds"] else text
 
 
-def _comment(text: str) -> str:
-    """Take out of a text whatever could end, open or continue a comment."""
+def _clean_comment(text: str) -> str:
+    """Replace everything in a text that could end, open or continue a comment."""
     kept = "".join(c if c.isprintable() and c not in "\\?" else "_" for c in text[:200])
     while "*/" in kept or "/*" in kept:
         kept = kept.replace("*/", "* ").replace("/*", " *")
     return kept.strip("/")
 
 
-def _constants(prefix: str, names: Sequence[str]) -> list[str]:
-    """Make a constant of each name: letters, digits and underscores, all different."""
+def _constant_names(prefix: str, names: Sequence[str]) -> list[str]:
+    """Make a distinct constant of each name, of letters, digits and underscores."""
     out: list[str] = []
     for name in names:
         plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name.upper()[:60]).strip("_")

@@ -1,12 +1,12 @@
 """Models on disk: a fit's values as JSON, out and in.
 
 A model file is standard JSON: format and version, structure, parameter values by name with units and standard errors,
-sampling, names, and a summary of the training, under the SHA-256 of all of it, so that a number changed afterwards does
-not go unnoticed. It holds no code, and every number comes back to the last digit. Only the equations of a PI-LFR
-(Krikelis et al. 2024, Eq. 15-17) can be rebuilt from a file; of a model of the user's own equations it has the values.
+sampling, names, and a summary of the training. Its SHA-256 reveals numbers that were changed afterwards. The file holds
+no code, and every number comes back to the last digit. A PI-LFR (Krikelis et al. 2024, Eq. 15-17) can be rebuilt from
+its file; for a model of the user's own equations the file holds only the values.
 
-Nothing in a file is trusted and nothing in it is executed. Sizes are compared with the numbers that are really there
-before anything is built, so a few bytes cannot ask for a model of a billion operators. Every value is checked for its
+Nothing in a file is trusted or executed. Sizes are compared with the numbers in the file before anything is built, so a
+few bytes cannot ask for a model of a billion operators. Every value is checked for its
 shape, for being finite, and against the bounds and fixed values of the structure (by default `w >= 0` and `r >= 0` as
 in Eq. 16).
 """
@@ -81,11 +81,11 @@ class SavedStart:
 
 @dataclass(frozen=True, eq=False)
 class FitContent:
-    """A fit as values, which is all that a model file holds of it.
+    """The values of a fit that a model file holds.
 
-    Fields have the names and meanings of those of `Fit`; `structure` is None for a model of the user's own equations,
-    `initial` and `weights` go by the recordings' fingerprints, `noise` is the one that priors are weighed against, and
-    `limits` is None in files from before these were kept.
+    Fields are named as in `Fit`; `structure` is None for a model of the user's own equations. `initial` and `weights`
+    are keyed by the recordings' fingerprints. `noise` is the noise level that priors are weighed against. `limits` is
+    None in files of the first releases, which did not keep them.
     """
 
     model: Model
@@ -108,11 +108,11 @@ class FitContent:
 
 
 class _Unusable(Exception):
-    """The end of a sentence about a file that is not damaged, but cannot be used."""
+    """A file is intact but cannot be used; the message ends the sentence about the file."""
 
 
 def write_model_file(path: str | os.PathLike[str], content: FitContent) -> None:
-    """Write a fit as JSON, atomically; of a model of the user's own equations only the values are kept."""
+    """Write a fit as JSON, atomically; for a model of the user's own equations only the values are kept."""
     write_atomically(path, model_text(content))
 
 
@@ -213,7 +213,7 @@ def _element_table(element: Any) -> dict[str, Any]:
 
 
 def _to_json(value: Any, infinite: str | None = None) -> Any:
-    """Convert numbers to JSON: arrays to nested lists, nan to null, infinity to null or to the word `infinite`."""
+    """Convert numbers to JSON: arrays to nested lists, nan to null, infinity to `infinite`."""
     if value is None:
         return None
     array = np.asarray(value, dtype=float)
@@ -235,14 +235,14 @@ def _layout(value: Any, depth: int = 0) -> str:
 def read_model_file(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> FitContent:
     """Read a file that `write_model_file` wrote, as `identify.load` describes.
 
-    Solutions of the starts have an empty `theta`: a file keeps only what they reached.
+    Solutions of the starts have an empty `theta`: a file keeps only their results.
     """
     from .model_schema import read_tables
 
     name = path_text(path, "model file")
-    text = _text(name)
+    text = _read_text(name)
     try:
-        content = _checked(_parse(text))
+        content = _check_content(_parse(text))
         if content.pop("sha256", None) is None:
             warnings.warn(
                 f"The file {short(name)} carries no digest (it has version {content['version']} of the model format), "
@@ -252,14 +252,14 @@ def read_model_file(path: str | os.PathLike[str], model: Model | PILFR | None = 
         return _fit_content(read_tables(content), model)
     except _Unusable as error:
         fault = str(error)
-    except ValueError as error:  # also of objects that cannot be made of the file's entries
+    except ValueError as error:  # includes objects that refuse the file's entries
         fault = f"is damaged: {str(error).rstrip('.')}; save the model again"
         if model is not None:
             fault = f"does not fit the model given: {str(error).rstrip('.')}; give the model it was saved from"
     raise InputError(f"The file {short(name)} {' '.join(fault.split())}.")
 
 
-def _text(path: str) -> str:
+def _read_text(path: str) -> str:
     try:
         file = existing_file(path)
         size = file.stat().st_size
@@ -275,7 +275,7 @@ def _text(path: str) -> str:
 
 
 def _parse(text: str) -> Any:
-    """Parse JSON that has each key once and no numbers beyond floating point."""
+    """Parse JSON; refuse repeated keys and numbers beyond floating point."""
 
     def finite(digits: str) -> float:
         if not math.isfinite(number := float(digits)):
@@ -305,8 +305,8 @@ def _parse(text: str) -> Any:
     raise _Unusable(fault)
 
 
-def _checked(content: Any) -> dict[str, Any]:
-    """Return the content of a model file of a known version, whose digest is that of the rest."""
+def _check_content(content: Any) -> dict[str, Any]:
+    """Check format, version and digest of a model file; return its content."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise _Unusable(f"is not a model file (its format is not {FORMAT!r}); give a file that `save` wrote")
     version = content.get("version")
@@ -361,7 +361,7 @@ def _fit_content(tables: schema.ModelTables, given: Model | PILFR | None) -> Fit
 
 
 def _equations(tables: schema.ModelTables, given: Model | PILFR | None) -> tuple[PILFR | None, Model]:
-    """Structure (None for a model of the user's own) and closed model, not yet with the file's values."""
+    """Build the structure (None for the user's own equations) and the closed model, without the file's values."""
     n_u, n_y = len(tables.model.inputs), len(tables.model.outputs)
     if isinstance(given, Model):
         if (given.n_u, given.n_y) != (n_u, n_y):
@@ -392,7 +392,7 @@ def _structure(tables: schema.ModelTables, n_u: int, n_y: int) -> PILFR:
 
 
 def _element(table: schema.ElementTable, tables: schema.ModelTables, prefix: str = "") -> Element:
-    """Build an element, after a look at its parameters in the file, which are called `prefix + name`."""
+    """Build an element after checking its parameters in the file, called `prefix + name`."""
 
     def check(names: tuple[str, ...], *shape: int) -> None:
         for name in names:
@@ -432,7 +432,7 @@ def _element(table: schema.ElementTable, tables: schema.ModelTables, prefix: str
 
 
 def _with_values(tables: schema.ModelTables, model: Model, structure: PILFR | None) -> Model:
-    """Put the file's values into the model: all of them, inside their bounds, and equal to what is fixed."""
+    """Put the file's values into the model; refuse unknown names, and values out of bounds or unlike fixed ones."""
     values = {name: _parameter(tables, name, p.value.shape) for name, p in model.parameters.items()}
     unknown = sorted(set(tables.parameters) - set(values))
     if unknown:
@@ -452,7 +452,7 @@ def _with_values(tables: schema.ModelTables, model: Model, structure: PILFR | No
 
 
 def _linear(tables: schema.ModelTables, structure: PILFR | None) -> Model | None:
-    """Linear model that the fit began with, where the file has it."""
+    """Build the linear model that the fit began with, where the file has it."""
     if tables.linear is None or structure is None:
         return None
     model = _model_of(structure.linear(), tables.model)
@@ -473,7 +473,7 @@ def _at_values(model: Model, values: Mapping[str, np.ndarray]) -> Model:
 
 
 def _solution_of_training(training: schema.Training, limits: tuple[Limit, ...] | None) -> Solution:
-    """Read the solution with its multipliers, one for each variable and constraint or none, and its history."""
+    """Build the solution with its history, and a multiplier for each variable and constraint, or none."""
     theta, multipliers = (np.array(list(v), float) for v in (training.variables.values(), training.multipliers))
     n = len(theta) + sum(limit.kind == "constraint" for limit in limits or ())
     # the first files did not name the constraints
@@ -491,29 +491,29 @@ def _solution(solve: schema.Solve, status: str) -> Solution:
 
 
 def _parameter(tables: schema.ModelTables, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Read the value of a parameter, which must have this shape."""
+    """Read the value of a parameter; refuse another shape."""
     if name not in tables.parameters:
         raise InputError(f"{name!r} is missing")
     return _array(tables.parameters[name].value, shape, f"parameter {name!r}")
 
 
 def _array(value: Any, shape: tuple[int, ...] | None, name: str, missing: float | None = None) -> np.ndarray:
-    """Return nested lists of finite numbers as an array of a shape (any where None).
+    """Convert nested lists of finite numbers to an array; None allows any shape.
 
-    Where `missing` is given, null becomes it and "inf" becomes infinite.
+    If `missing` is given, it replaces null, and "inf" is read as infinity.
     """
-    from .model_schema import number_or, shown
+    from .model_schema import number_or, show_value
 
     flat: list[float] = []
 
     def nested_shape(part: Any, depth: int = 0) -> tuple[int, ...]:
-        """Collect the numbers; the shape of nested lists, -1 where their lengths differ."""
+        """Collect the numbers; return the shape of the nested lists, -1 where their lengths differ."""
         if isinstance(part, list) and depth < DEEPEST:
             inner = {nested_shape(item, depth + 1) for item in part}
             return (len(part), *(inner.pop() if len(inner) == 1 else (-1,) if inner else ()))
         number = part if missing is None else number_or(missing, part)
         if number is part and not (is_number(part) and abs(part) <= sys.float_info.max):
-            raise InputError(f"{name} holds {shown(part)}, which is not a finite number")
+            raise InputError(f"{name} holds {show_value(part)}, which is not a finite number")
         flat.append(float(number))
         return ()
 

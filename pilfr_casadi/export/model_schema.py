@@ -1,4 +1,4 @@
-"""The schema of a model file: its tables, keys and kinds of entries, and the sentence about the first that is wrong.
+"""The schema of a model file: its tables, keys and kinds of entries, and the sentence about the first violation.
 
 Only this file imports pydantic, and `read_model_file` imports this file only when a model is read.
 """
@@ -31,7 +31,7 @@ KINDS = {
 }
 
 
-def _known(status: str) -> str:
+def _check_status(status: str) -> str:
     if status not in Status.__members__:
         raise ValueError(f"the status {status[:SHOWN]!r} is unknown")
     return status
@@ -42,7 +42,7 @@ def number_or(missing: float, value: Any) -> Any:
     return missing if value is None else math.inf if value == "inf" else value
 
 
-Ending = Annotated[str, AfterValidator(_known)]
+Ending = Annotated[str, AfterValidator(_check_status)]
 Count = Annotated[int, Field(ge=0)]
 Counts = Annotated[tuple[Count, ...], Field(strict=False)]  # a list in the file
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -92,7 +92,7 @@ class Signals(Table):
 
 
 class ElementTable(Table):
-    """An element; which entries it has beside its kind depends on the kind."""
+    """An element; its other entries depend on its kind."""
 
     kind: str
     channels: Count = 0
@@ -115,7 +115,7 @@ class PartTable(Table):
 
 
 class OuterElementTable(ElementTable):
-    """The element of a structure, which alone may combine others."""
+    """The element of a structure; only this one may combine others."""
 
     parts: list[PartTable] = []
 
@@ -188,7 +188,7 @@ class History(Table):
 
 
 class Training(Table):
-    """How the fit came about; the first files had no limits, noise, weights and errors of the linear model."""
+    """Results of the training; the first files had no limits, noise, weights and errors of the linear model."""
 
     status: Ending
     sentence: str = ""
@@ -222,7 +222,7 @@ class ModelTables(Table):
 
 
 def read_tables(content: Any) -> ModelTables:
-    """Return the content of a file as its tables, or refuse it with a sentence about its first violation."""
+    """Validate the content of a file; refuse it with a sentence about its first violation."""
     try:
         return ModelTables.model_validate(content)
     except ValidationError as error:
@@ -237,11 +237,11 @@ def read_tables(content: Any) -> ModelTables:
         "greater_than": f"{key!r} is not above zero{inside}",
         "value_error": str(first.get("ctx", {}).get("error")),
     }
-    other = f"{'.'.join([*outer, key])} is not {expected} but {shown(first['input'])}"
+    other = f"{'.'.join([*outer, key])} is not {expected} but {show_value(first['input'])}"
     raise InputError(sentences.get(first["type"], other))
 
 
-def shown(value: Any) -> str:
+def show_value(value: Any) -> str:
     """Show an entry of a file in a message."""
     if isinstance(value, list | dict):
         return "a list" if isinstance(value, list) else "a table"

@@ -1,19 +1,19 @@
-"""Steps without kinks: rounded, with a bound on the error.
+"""Smooth steps, for solvers that need derivatives everywhere, with a bound on the error.
 
 Every max, min and |·| of a step becomes smooth,
 
     max(a, b) -> (a + b + sqrt((a - b)² + eps²)) / 2,   min(a, b) = -max(-a, -b),   |a| = max(a, -a),
 
-each off by at most eps/2, max and |·| upwards, min downwards; sign(a), the slope of |a|, by its slope. A play `max(z -
-r, min(z + r, q))` and a stop are off by at most eps/2 a step, since the two signs do not add; a generalized play, whose
-upper curve is itself a max, by at most eps. In a PI-LFR model (Krikelis et al. 2024, Eq. 15-16) with plays or stops an
-output is off by at most `|D_yw| Σ_j w_j eps/2`, a state by `|B_w| Σ_j w_j eps/2`. The general bound follows by interval
-arithmetic: each value of the step is enclosed together with its rounded twin, and each rounding widens the interval by
-eps/2 (Moore, Kearfott & Cloud 2009, ch. 2).
+each off by at most eps/2: max and |·| upwards, min downwards. sign(a) becomes the slope of the rounded |a|. A play
+`max(z - r, min(z + r, q))` and a stop are off by at most eps/2 per step, because the errors of max and min have
+opposite signs; a generalized play, whose upper curve is itself a max, by at most eps. In a PI-LFR model (Krikelis et
+al. 2024, Eq. 15-16) with plays or stops an output is off by at most `|D_yw| Σ_j w_j eps/2`, a state by
+`|B_w| Σ_j w_j eps/2`. The general bound follows by interval arithmetic: each value of the step is enclosed together
+with its rounded twin, and each rounding widens the interval by eps/2 (Moore, Kearfott & Cloud 2009, ch. 2).
 
 The bound holds for one step from the same x and u. Over many steps a rounded play creeps towards its signal, by about
-eps²/4d a sample at the distance d from its edges, and so forgets; use it over the horizon of a controller, not for a
-long simulation. (`models.fmax` rounds within a narrow band instead: it keeps the memory of long records, as a fit
+eps²/4d per sample at the distance d from its edges, and so forgets; use it over the horizon of a controller, not for
+a long simulation. (`models.fmax` rounds within a narrow band instead: it keeps the memory of long records, as a fit
 needs, but its second derivative jumps, which Newton-type solvers do not take.)
 """
 
@@ -52,7 +52,7 @@ _RISING: dict[str, Callable[[float], float]] = {
 }
 
 
-def smoothed(function: ca.Function, eps: float) -> ca.Function:
+def smooth_kinks(function: ca.Function, eps: float) -> ca.Function:
     """Round every max, min, |·| and sign of a function of scalar expressions by eps."""
     arguments = [ca.SX.sym(name, int(function.numel_in(i))) for i, name in enumerate(function.name_in())]
     entries = [ca.vertsplit(a) if a.numel() else [] for a in arguments]
@@ -71,7 +71,7 @@ def smoothed(function: ca.Function, eps: float) -> ca.Function:
     return ca.Function(function.name(), arguments, results, function.name_in(), function.name_out())
 
 
-def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) -> list[list[Interval]]:
+def enclose(function: ca.Function, eps: float, *arguments: Sequence[Interval]) -> list[list[Interval]]:
     """Enclose every result of a function of scalar expressions, rounded by eps or not, in an interval."""
 
     def apply(op: str, code: int, a: Interval, b: Interval | None = None) -> Interval:
@@ -86,9 +86,9 @@ def enclosed(function: ca.Function, eps: float, *arguments: Sequence[Interval]) 
 
 
 def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any], constant: Callable[..., Any]) -> Any:
-    """Run a function's instructions on other values; a choice between the two sides of a comparison is a max or a min.
+    """Run a function's instructions on other values; treat `a > b ? a : b` as a max, its opposite as a min.
 
-    Equal expressions get one number, which shows up the choice `a > b ? a : b`: CasADi writes it as a sum of two.
+    CasADi writes such a choice as a sum of two terms. Numbering equal expressions alike makes the choice visible.
     """
     numbers: dict[Any, int] = {}  # (operation, numbers of its arguments) -> number
     nodes: list[Any] = []
@@ -96,7 +96,7 @@ def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any]
     registers: dict[int, int] = {}
     results = [[constant(0.0)] * int(function.numel_out(i)) for i in range(function.n_out())]
 
-    def numbered(node: Any, value: Callable[[], Any]) -> int:
+    def number_node(node: Any, value: Callable[[], Any]) -> int:
         if node not in numbers:
             numbers[node] = len(nodes)
             values.append(value())
@@ -110,10 +110,10 @@ def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any]
             results[written[0]][written[1]] = values[registers[read[0]]]
             continue
         if op == "INPUT":
-            found = numbered((op, *read), partial(arguments[read[0]].__getitem__, read[1]))
+            found = number_node((op, *read), partial(arguments[read[0]].__getitem__, read[1]))
         elif op == "CONST":
             number = function.instruction_constant(k)
-            found = numbered((op, number), partial(constant, number))
+            found = number_node((op, number), partial(constant, number))
         elif len(read) not in (1, 2) or len(written) != 1:
             raise InputError(
                 f"The equations hold the operation {op.lower()!r}, which has no smooth form here; leave it out."
@@ -122,7 +122,7 @@ def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any]
             node: Any = (op, *(registers[r] for r in read))
             node = _choice(nodes, node) or node
             parts = (values[i] for i in node[1:])
-            found = numbered(node, partial(apply, node[0], getattr(ca, f"OP_{node[0]}"), *parts))
+            found = number_node(node, partial(apply, node[0], getattr(ca, f"OP_{node[0]}"), *parts))
         registers[written[0]] = found
     return results
 
@@ -130,12 +130,12 @@ def _walk(function: ca.Function, arguments: list[Any], apply: Callable[..., Any]
 def _choice(nodes: list[Any], node: Any) -> Any:
     """Return (FMAX or FMIN, a, b) where the node is one of these, written as a choice; else None."""
     if node[0] == "ADD":
-        one, two = (_picked(nodes, nodes[part]) for part in node[1:])
+        one, two = (_split_choice(nodes, nodes[part]) for part in node[1:])
         if one is None or two is None or one[0] != two[0] or one[1] == two[1]:
             return None
         sides: Any = (one[2], two[2]) if one[1] else (two[2], one[2])
     else:
-        one = _picked(nodes, node)
+        one = _split_choice(nodes, node)
         if one is None:
             return None
         zero = next((i for i in nodes[one[0]][1:] if nodes[i] == ("CONST", 0.0)), None)
@@ -146,8 +146,8 @@ def _choice(nodes: list[Any], node: Any) -> Any:
     return ("FMIN", low, high) if sides == (low, high) else None
 
 
-def _picked(nodes: list[Any], node: Any) -> tuple[int, bool, int] | None:
-    """Take `comparison ? value : 0` apart: (comparison, whether it must hold, value)."""
+def _split_choice(nodes: list[Any], node: Any) -> tuple[int, bool, int] | None:
+    """Split `comparison ? value : 0` into (comparison, whether it must hold, value)."""
     if node[0] != "IF_ELSE_ZERO":
         return None
     condition, yes = node[1], True
@@ -182,7 +182,7 @@ def _unary(op: str, a: Interval, eps: float) -> Interval:
         return _binary("DIV", (1.0, 1.0), a, eps)
     if op == "NOT":
         return float(low == high == 0), float(low == 0)
-    raise InputError(f"Nothing is known of the error behind the operation {op.lower()!r}; leave it out.")
+    raise InputError(f"No error bound is known behind the operation {op.lower()!r}; leave it out.")
 
 
 def _binary(op: str, a: Interval, b: Interval, eps: float) -> Interval:
@@ -217,7 +217,7 @@ def _binary(op: str, a: Interval, b: Interval, eps: float) -> Interval:
         "CONSTPOW": np.power,
     }
     if op not in known:
-        raise InputError(f"Nothing is known of the error behind the operation {op.lower()!r}; leave it out.")
+        raise InputError(f"No error bound is known behind the operation {op.lower()!r}; leave it out.")
     corners = [known[op](np.float64(x), np.float64(y)) for x in a for y in b]
     return (math.nan, math.nan) if np.any(np.isnan(corners)) else (min(corners), max(corners))
 

@@ -1,4 +1,4 @@
-"""An exported model: one step over a whole sample, `(x, u) -> (x_next, y)`, with what a controller has to know of it.
+"""An exported model: one step over a whole sample, `(x, u) -> (x_next, y)`, with names, units and start state.
 
 A model steps from sub-step to sub-step and may read the input at the sub-step's end and the time (`Model.reads`). Here
 the sub-steps of a sample run one after the other, and y is the output at the first. The arguments stay plain: `u` is
@@ -27,7 +27,7 @@ from ..models import Model, PrandtlIshlinskii
 from ..optimise import first_state
 from ..simulators import ClosedEquations, Instant, Simulator, choose_substeps, discretise, on_grid
 from .c_code import check_name, write_c
-from .smoothing import enclosed, smoothed
+from .smoothing import enclose, smooth_kinks
 
 FORMAT, VERSION = "pilfr_casadi function", 1
 NAMES = ".names.json"  # appended to the function's file name for the file with the names
@@ -123,12 +123,16 @@ class Exported:
         eps of the rounding (`smoothing`), 0 where min and max are exact.
     rhs : casadi.Function or None
         `(x, u) -> (xdot, y)`, or `(x, u, t)`, where the model has equations in continuous time.
+    start : array, (n_x,), or None
+        State that `x0()` returns; None for zero.
     one : casadi.Function
-        An exact sub-step, `(x, row) -> (x_next, y)`, of scalar expressions; `row` holds the signals that `reads` lists.
+        An exact sub-step, `(x, row) -> (x_next, y)`, of scalar expressions.
+    reads : tuple of str
+        Signals that `row` holds, in this order: "u" the inputs, "next" the inputs at the sub-step's end, "t" the time.
     substeps : int
-        Number of these in a step.
-    held : tuple of str
-        Names of the operators' memory. A delay's shift register is not among them: it moves at every step.
+        Number of sub-steps in a step.
+    memory_names : tuple of str
+        States that are memory of operators. The shift register of a delay is not among them: it moves at every step.
     """
 
     one: ca.Function
@@ -139,7 +143,7 @@ class Exported:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     thresholds: dict[str, float]
-    held: tuple[str, ...]
+    memory_names: tuple[str, ...]
     name: str = "model"
     smooth: float = 0.0
     start: np.ndarray | None = None
@@ -149,7 +153,7 @@ class Exported:
     @cached_property
     def step(self) -> CheckedStep:
         """The function `(x, u) -> (x_next, y)`."""
-        one = smoothed(self.one, self.smooth) if self.smooth else self.one
+        one = smooth_kinks(self.one, self.smooth) if self.smooth else self.one
         own = len(self.states) - self.timed
         kind = ca.SX if self.substeps <= INLINE else ca.MX
         x, u = kind.sym("x", len(self.states)), kind.sym("u", len(self.inputs))
@@ -178,19 +182,19 @@ class Exported:
         return "next" in self.reads
 
     def x0(self) -> np.ndarray:
-        """Return the state to start from, (n_x,): that of the recording given as `start`, else zero."""
+        """Return the start state, (n_x,): `start` where it was given, else zero."""
         return np.zeros(len(self.states)) if self.start is None else self.start.copy()
 
     def bound(self, x: Any, u: Any) -> tuple[np.ndarray, np.ndarray]:
         """Bound the difference of one smoothed step from x and u to the exact one: arrays (n_x,) and (n_y,).
 
-        In a PI-LFR model with plays or stops it is never more than `|D_yw| Σ_j w_j eps/2` for y, and for the linear
-        states the same with `|B_w|`; a play's memory is off by at most eps/2. See `smoothing`.
+        With plays or stops in a PI-LFR, y is off by at most `|D_yw| Σ_j w_j eps/2`, the linear states by at most
+        `|B_w| Σ_j w_j eps/2`, and the memory of a play by at most eps/2. See `smoothing`.
 
         Raises
         ------
         InputError
-            If x or u has another size or is not finite, or the equations hold an operation without a known enclosure.
+            If x or u has another size or is not finite, or an operation in the equations has no known enclosure.
         """
         x, u = numbers(x, "The state").ravel(), numbers(u, "The input").ravel()
         for role, given, wanted in (("state", x, len(self.states)), ("input", u, len(self.inputs))):
@@ -201,7 +205,7 @@ class Exported:
         exact, enclosure = x[:own], [(v, v) for v in x[:own]]
         output_error = np.zeros(0)
         for i, row in enumerate(rows):
-            found = enclosed(one, self.smooth, enclosure, [(v, v) for v in row])
+            found = enclose(one, self.smooth, enclosure, [(v, v) for v in row])
             true = [np.asarray(part).ravel() for part in one(exact, row)]
             if i == 0:
                 output_error = _largest_error(found[1], true[1])
@@ -209,7 +213,7 @@ class Exported:
         return np.append(_largest_error(enclosure, exact), np.zeros(int(self.timed))), output_error
 
     def _rows(self, u: Any, t: Any, stack: Any) -> list[Any]:
-        """List the signals that each sub-step reads, for inputs u and the time t; `stack` joins columns."""
+        """List the signals that each sub-step reads, for inputs u and time t; `stack` joins columns."""
         n, count = self.substeps, len(self.inputs) // 2 if self.interpolated else len(self.inputs)
         now, after = u[:count], u[count:]
         out = []
@@ -241,7 +245,7 @@ class Exported:
     def serialize(self, path: str | os.PathLike[str]) -> Path:
         """Write the function for `casadi.Function.load`, and names, units, dt and start state as JSON beside it.
 
-        Neither needs this package to be read. The second file is called `<path>.names.json`.
+        Both can be read without this package. The second file is called `<path>.names.json`.
 
         Raises
         ------
@@ -256,7 +260,7 @@ class Exported:
             return write_atomically(path, function.read_bytes())
 
     def to_c(self, folder: str | os.PathLike[str]) -> tuple[Path, Path]:
-        """Write `<name>.c` and `<name>.h` into a folder: C99 that needs nothing but the C library's mathematics.
+        """Write `<name>.c` and `<name>.h` into a folder: C99 that needs only the C library's mathematics.
 
         The header declares `<name>_step(x, u, x_next, y)` and `<name>_x0(x)` with sizes and indices as constants.
 
@@ -296,12 +300,12 @@ class Exported:
         )
 
     def __str__(self) -> str:
-        def listed(names: Iterable[str]) -> str:
+        def list_names(names: Iterable[str]) -> str:
             return ", ".join(f"{n} [{self.units[n]}]" if self.units.get(n) else n for n in names) or "none"
 
         exact = f"smoothed, eps = {self.smooth:g}" if self.smooth else "min and max exact"
         lines = [f"{self.name}: (x, u) -> (x_next, y), a step of {self.dt:g} s, {exact}"]
-        lines += [f"x: {listed(self.states)}", f"u: {listed(self.inputs)}", f"y: {listed(self.outputs)}"]
+        lines += [f"x: {list_names(self.states)}", f"u: {list_names(self.inputs)}", f"y: {list_names(self.outputs)}"]
         lines.append(f"rhs in continuous time: {'none, it is sampled' if self.rhs is None else 'yes'}")
         return "\n".join(lines)
 
@@ -323,20 +327,22 @@ def exported(
     Parameters
     ----------
     model : Fit, Simulator, Model or Diagnosis
-        A simulator is taken with the laws in its ports, at its parameters' values; of a diagnosis, the corrected one.
+        A simulator is exported with the laws in its ports, at its parameters' values; a diagnosis exports its corrected
+        simulator.
     dt : float
-        Duration of a step, s: needed for a simulator and a model; a fit and a diagnosis have theirs.
+        Duration of a step, s: required for a simulator and a model; a fit and a diagnosis have their own.
     hold : {"zero", "linear"}, optional
         Inter-sample behaviour of the inputs, for a simulator; default: its own, else "zero".
     substeps : int, optional
-        Runge-Kutta steps a sample, for a simulator; by default chosen from its fastest eigenvalue.
+        Runge-Kutta steps per sample, for a simulator; by default chosen from its fastest eigenvalue.
     start : Recording or array, optional
-        The state `x0()`: at a recording's first sample, as its `initial` says, or given, with or without memory.
+        State that `x0()` returns: an array with or without memory, or the state at a recording's first sample, as its
+        `initial` says.
     smooth : float
         eps > 0 rounds min, max, |.| and sign (`smoothing`), for solvers that need derivatives everywhere; the error is
         `Exported.bound`.
     name : str
-        Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; no word of C.
+        Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; not a C keyword.
 
     Returns
     -------
@@ -345,7 +351,7 @@ def exported(
     Raises
     ------
     InputError
-        If something is missing or does not fit; one sentence says what.
+        If an option is missing or does not fit the model.
     """
     check_name(name)
     if not is_number(smooth) or not 0 <= smooth <= LARGEST:
@@ -362,24 +368,24 @@ def exported(
         return corrected
     rhs = None
     if isinstance(model, Simulator):
-        dt = _duration(dt)
-        closed = _discretised(model, dt, hold, substeps)
-        step = _named_step(closed, dt, model)
+        dt = _check_dt(dt)
+        closed = _discretise_over_sample(model, dt, hold, substeps)
+        step = _build_step(closed, dt, model)
         rhs = _right_hand_side(model, f"{name}_rhs")
     else:
         if hold is not None or substeps is not None:
             raise InputError("The model has its own steps; `hold` and `substeps` are for simulators, leave them out.")
         if not isinstance(model, Model) and dt not in (None, model.dt):
             raise InputError(f"dt = {dt!r} was given, but the fit's step is {model.dt:g} s; leave dt out.")
-        closed, dt = (model, _duration(dt)) if isinstance(model, Model) else (model.model, model.dt)
-        step = _named_step(closed, dt)
+        closed, dt = (model, _check_dt(dt)) if isinstance(model, Model) else (model.model, model.dt)
+        step = _build_step(closed, dt)
     return replace(
         step,
         name=name,
         smooth=float(smooth),
         start=_start_state(model, closed, step, start),
         units={k: v for k, v in getattr(model, "units", {}).items() if v},
-        rhs=smoothed(rhs, smooth) if rhs is not None and smooth else rhs,
+        rhs=smooth_kinks(rhs, smooth) if rhs is not None and smooth else rhs,
     )
 
 
@@ -391,9 +397,9 @@ def to_casadi(model: Any, name: str = "model", **options: Any) -> ca.Function:
     model : Fit, Simulator, Model or Diagnosis
         The model; its values become constants of the function.
     name : str
-        Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; no word of C.
+        Name of the function: up to 50 letters, digits and single underscores, beginning with a letter; not a C keyword.
     **options
-        Those of `exported`: for a simulator `dt`, `hold`, `substeps`; `smooth`.
+        As for `exported`: `smooth`, and for a simulator `dt`, `hold`, `substeps`.
 
     Returns
     -------
@@ -415,11 +421,11 @@ def _is_fitted(model: Any) -> TypeGuard[FittedModel]:
     return isinstance(getattr(model, "model", None), Model) and callable(getattr(model, "initial_state", None))
 
 
-def _duration(dt: float | None) -> float:
+def _check_dt(dt: float | None) -> float:
     return positive(dt, "dt", "the duration of a step in s")
 
 
-def _discretised(model: Simulator, dt: float, hold: str | None, substeps: int | None) -> Model:
+def _discretise_over_sample(model: Simulator, dt: float, hold: str | None, substeps: int | None) -> Model:
     """Integrate a simulator over one sample."""
     hold = hold or model.hold or "zero"
     if hold not in ("zero", "linear"):
@@ -429,7 +435,7 @@ def _discretised(model: Simulator, dt: float, hold: str | None, substeps: int | 
 
 
 def _choose_substeps_at_rest(simulator: Simulator, dt: float) -> int:
-    """Choose sub-steps a sample from the fastest eigenvalue at rest, at least as many as the laws need."""
+    """Choose sub-steps per sample from the fastest eigenvalue at rest, at least as many as the laws need."""
     if simulator.discrete:
         return 1
     # a recording needs an input, so a simulator without inputs gets one that its equations do not read
@@ -440,7 +446,7 @@ def _choose_substeps_at_rest(simulator: Simulator, dt: float) -> int:
 
 
 def _start_state(model: Any, closed: Model, step: Exported, start: Any) -> np.ndarray | None:
-    """State to start from, (n_x,), of a recording, an array or nothing."""
+    """Find the start state, (n_x,), from a recording, an array or nothing."""
     n, size = closed.n_state, len(step.states)
     if start is None:
         return None
@@ -468,7 +474,7 @@ def _check_recording(model: Model, step: Exported, recording: Recording) -> None
             f"{', '.join((*model.inputs, *model.outputs))}; they must be the same, in this order."
         )
     if abs(recording.dt / step.dt - 1) > DT_TOLERANCE:
-        raise InputError(f"The recording's step is {recording.dt:g} s, that of the export {step.dt:g} s; use one.")
+        raise InputError(f"The recording's step is {recording.dt:g} s, the export's {step.dt:g} s; use the same.")
 
 
 def _largest_error(enclosure: list[tuple[float, float]], exact: np.ndarray) -> np.ndarray:
@@ -477,8 +483,8 @@ def _largest_error(enclosure: list[tuple[float, float]], exact: np.ndarray) -> n
     return np.maximum(np.maximum(ends[:, 1] - exact, exact - ends[:, 0]), 0.0)
 
 
-def _named_step(model: Model, dt: float, simulator: Simulator | None = None) -> Exported:
-    """Put a closed model's values into its sub-steps and name its states; `simulator` names those of its laws."""
+def _build_step(model: Model, dt: float, simulator: Simulator | None = None) -> Exported:
+    """Put a closed model's values into its sub-steps and name its states; `simulator` names the states of its laws."""
     if model.n_w and model.element is None and not model.n_s:
         raise InputError("The model has an open port; close it with close_loop first.")
     if "y" in model.reads:
@@ -502,15 +508,15 @@ def _named_step(model: Model, dt: float, simulator: Simulator | None = None) -> 
         inputs=_make_unique(inputs),
         outputs=model.outputs,
         thresholds={renamed[name]: value for name, value in thresholds.items()},
-        held=tuple(renamed[name] for name in memory),
+        memory_names=tuple(renamed[name] for name in memory),
     )
 
 
 def _right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
     """Return `(x, u) -> (xdot, y)`, or `(x, u, t)` where the equations read the time.
 
-    x are the simulator's states and those of its laws; inputs are held. A simulator in discrete time, or with a law
-    whose memory moves from sample to sample, has no such function: None.
+    x holds the states of the simulator, then of its laws; inputs are held. The result is None for a simulator in
+    discrete time, or with a law whose memory moves from sample to sample.
     """
     if simulator.discrete:
         return None
@@ -528,7 +534,7 @@ def _right_hand_side(simulator: Simulator, name: str) -> ca.Function | None:
 def _name_element_states(model: Model) -> tuple[list[str], dict[str, float], list[str]]:
     """Name linear states, then the element's memory; `memory[0,3]` belongs to the threshold r[0,3].
 
-    Returns all names, the thresholds of those memories that have one, and the names of the memory.
+    Returns all names, the threshold by name of memory where there is one, and the names of the memory.
     """
     states = [*model.states, *(f"state{k + 1}" for k in range(len(model.states), model.n_x))]
     if not isinstance(model.element, PrandtlIshlinskii):
@@ -543,7 +549,7 @@ def _name_law_states(model: Model, dt: float, simulator: Simulator) -> tuple[lis
     """Name a simulator's states, then its laws' own states and memory: `ground.q1`, `ground.memory1`."""
     simulator = on_grid(simulator, dt / model.substeps)
     equations = ClosedEquations(simulator, ca.SX(simulator.parameter_set.start))
-    flows, memory, held = list[str](), list[str](), list[str]()
+    flows, memory, operators = list[str](), list[str](), list[str]()
     thresholds: dict[str, float] = {}
     for element, n_q, n_s in zip(simulator.elements, equations.n_q, equations.n_s, strict=True):
         flows += [f"{element.prefix}q{k + 1}" for k in range(n_q)]
@@ -552,8 +558,8 @@ def _name_law_states(model: Model, dt: float, simulator: Simulator) -> tuple[lis
         r = np.ravel(p.value) if p is not None else np.zeros(0)
         thresholds |= dict(zip(own, map(float, r), strict=True)) if len(r) == n_s else {}
         memory += own
-        held += [] if getattr(element.law, "shifts", False) else own
-    return [*simulator.states, *flows, *memory], thresholds, held
+        operators += [] if getattr(element.law, "shifts", False) else own
+    return [*simulator.states, *flows, *memory], thresholds, operators
 
 
 def _make_unique(names: Iterable[str]) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Scripted identification runs and campaigns: a file says what to do, a folder shows what was done."""
+"""Scripted identification runs and campaigns: a file describes the jobs, a folder holds the results."""
 
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         TABLE as TABLE,
         Manifest as Manifest,
         check_own as check_own,
-        locked as locked,
+        lock_folder as lock_folder,
     )
     from .jobs import fold as fold, input_digests as input_digests, jobs_of as jobs_of
     from .schema import (

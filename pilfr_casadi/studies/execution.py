@@ -1,12 +1,12 @@
-"""Executing a run: finished jobs stay, and those that are missing or depend on something changed are done.
+"""Execution of a run: finished jobs are kept; missing or outdated ones are executed.
 
-After every job its model is written, then the manifest, each atomically: wherever a run ends, by Ctrl-C, `kill -9` or a
-power cut, the next one goes on with the first job that is not complete, and the results are those of a run that was
-never interrupted. Executed twice on a machine, a run gives the same bytes in every file but `times.json`.
+After every job its model is written, then the manifest, each atomically. However a run ends (Ctrl-C, `kill -9`, a power
+cut), the next one continues with the first job that is not complete and gives the same results as an uninterrupted run.
+Executed twice on a machine, a run gives the same bytes in every file but `times.json`.
 
-`run` does the jobs one after the other. `campaign` does them side by side, over processes, a cluster, or any other
-executor; a job that fails, takes too long or loses its worker has an outcome too, the table of errors can be read at
-any time, and a summary with box plots ends it.
+`run` executes the jobs one after the other. `campaign` executes them side by side, in processes, on a cluster, or on
+any other executor. A job that fails, takes too long or loses its worker is recorded too. The table of errors can be
+read at any time, and a campaign ends with a summary and box plots.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from ..data import Recording, keeps_its_period, read
 from ..identify import Fit, is_drawn
 from ..models import PILFR, places
 from ..optimise import Status
-from .executor import AHEAD, do_side_by_side
-from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, locked, read_times
+from .executor import AHEAD, run_side_by_side
+from .folder import MODEL, PAGE, PICTURE, SUMMARY, TABLE, Store, check_own, lock_folder, read_times
 from .jobs import Batch, RunJob, fold, input_digests, jobs_of, outcome
 from .schema import ROLES, Cell, Run, read_run
 from .summary import (
@@ -41,13 +41,16 @@ from .summary import (
     summary_table,
 )
 
-FITTED = "the structure is chosen on what was fitted, which favours the larger; add folds or validation recordings"
-Tell = Callable[[str], None]
-Perform = Callable[[Store, Sequence[RunJob]], Iterator[Batch]]
+CHOSEN_ON_TRAINING = (
+    "the structure is chosen on the training recordings, which favours larger models; "
+    "add folds or validation recordings"
+)
+PrintLine = Callable[[str], None]
+Runner = Callable[[Store, Sequence[RunJob]], Iterator[Batch]]
 
 
 class RunInterrupted(KeyboardInterrupt):
-    """Ctrl-C in a run; `done` of `total` jobs are complete and stay so."""
+    """Ctrl-C in a run; `done` of `total` jobs are complete and are kept."""
 
     def __init__(self, done: int, total: int) -> None:
         super().__init__(f"{done} of {total} jobs are done")
@@ -55,11 +58,11 @@ class RunInterrupted(KeyboardInterrupt):
 
 
 class NoModel(InputError):
-    """No job of a run gave a model, and not because of its input; the manifest has the reason for each."""
+    """No job of a run gave a model, although its input was usable; the manifest states each reason."""
 
 
 class ConstraintsNotMet(NoModel):
-    """No job of a run meets its constraints; the manifest says by how much each misses them."""
+    """No job of a run meets its constraints; the manifest states by how much each job misses them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,25 +72,25 @@ class RunResult:
     Attributes
     ----------
     folder : Path
-        With `manifest.json`, `results.csv`, `jobs/ID/model.json`, and `model.json`, `report.html` of the job chosen; of
-        a campaign with `summary.csv` and `spread.png` too. `times.json` says how long each job took.
+        Holds `manifest.json`, `results.csv`, `jobs/ID/model.json`, and `model.json` and `report.html` of the chosen
+        job; after a campaign also `summary.csv` and `spread.png`. `times.json` holds the time of each job.
     done, skipped, failed : tuple of str
-        Ids of the jobs that were executed now, of those that had been before, and of those among both without a model.
+        Ids of the jobs executed now, of the jobs executed before, and of all jobs without a model.
     chosen : str
-        Id of the job of the smallest error on the validation recordings, without any on the training; where a structure
-        is selected, among its jobs.
+        Id of the job with the smallest validation error (training error if there are no validation recordings); if a
+        structure was selected, only its jobs count.
     scores : tuple of Score
         Errors of every job on every recording.
     fit : Fit
-        The model that is chosen.
+        The model of the chosen job.
     manifest : dict
         The content of `manifest.json`.
     summary : tuple of CellSummary
         Quartiles and failures of every cell of the grid on every recording.
     selection : Selection or None
-        The structure that is recommended, where there are several and recordings or folds to judge them by.
+        The recommended structure, if there are several, and folds or validation recordings to judge them by.
     note : str
-        A warning on the choice: that it was made among structures by what they were fitted to.
+        A warning if structures were compared on the recordings they were fitted to.
     """
 
     folder: Path
@@ -111,7 +114,7 @@ def run(
     engine: str | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-    tell: Tell | None = None,
+    print_line: PrintLine | None = None,
 ) -> RunResult:
     """Execute a run file.
 
@@ -120,17 +123,17 @@ def run(
     path : path or Run
         The file, `.toml` or `.py`, or the result of `read_run`.
     out : path, optional
-        Folder of the results, in place of the file's: an empty one, a new one, or that of an earlier run.
+        Folder of the results, instead of the folder in the file: empty, new, or from an earlier run.
     overwrite : bool
-        Compute everything again, whatever an earlier run has left in the folder.
+        Compute everything again, even if the folder has results of an earlier run.
     engine : {"auto", "c", "vm"}, optional
-        In place of the file's; results differ in the last digits, so keep to one.
+        Engine instead of the one in the file. Results of the engines may differ in the last digits, so keep to one.
     executor : concurrent.futures.Executor, optional
-        Where the starts of a job run; the numbers are the same.
+        Executor for the starts of a job; it does not change the numbers.
     progress : callable
-        Gets (stage, done, total, smallest training error so far).
-    tell : callable
-        Gets a line of text after every job.
+        Called with (stage, done, total, smallest training error so far).
+    print_line : callable
+        Called with a line of text after every job.
 
     Returns
     -------
@@ -139,18 +142,18 @@ def run(
     Raises
     ------
     InputError
-        If the run file, a recording or the folder cannot be used, or results were changed afterwards;
-        `NoModel`, which is one, if no job gives a model, and `ConstraintsNotMet` if none meets its constraints.
+        If the run file, a recording or the folder cannot be used, or results were changed afterwards. Its subclass
+        `NoModel` is raised if no job gives a model, `ConstraintsNotMet` if no job meets its constraints.
     RunInterrupted
-        On Ctrl-C; complete jobs stay.
+        On Ctrl-C; complete jobs are kept.
     """
     given = _read_run(path, "run", executor, out=out, engine=engine)
 
-    def in_turn(place: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
+    def run_in_turn(store: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
         for job in jobs:
-            yield [(job, outcome(given, place.recordings, job, executor=executor, progress=progress))]
+            yield [(job, outcome(given, store.recordings, job, executor=executor, progress=progress))]
 
-    return _execute(given, in_turn, overwrite, progress, tell)
+    return _execute(given, run_in_turn, overwrite, progress, print_line)
 
 
 def campaign(
@@ -162,24 +165,24 @@ def campaign(
     out: Any = None,
     overwrite: bool = False,
     progress: Progress | None = None,
-    tell: Tell | None = None,
+    print_line: PrintLine | None = None,
 ) -> RunResult:
     """Execute all jobs of a run file, every cell of its grid with every seed, side by side.
 
-    The numbers depend neither on the executor nor on the number of workers or the order in which they answer, as long
-    as the workers are of one kind (processor, libraries). Called again, however it ended, it goes on with the jobs that
+    The numbers depend neither on the executor nor on the number of workers or the order of their answers, provided that
+    all workers have the same kind of processor and the same libraries. Called again, it continues with the jobs that
     are not complete.
 
     Parameters
     ----------
     workers : int, optional
-        Processes, in place of the file's; 1 without a time limit is this process.
+        Number of processes, instead of the number in the file; 1 without a time limit runs in this process.
     executor : concurrent.futures.Executor, optional
-        Where jobs run in place of these, for example `dask.distributed.Client(address).get_executor()`. Each of its
-        workers does its jobs in a process beside it.
+        Runs the jobs instead of these processes, for example `dask.distributed.Client(address).get_executor()`. Each
+        worker runs its jobs in a process beside it.
     ahead : int
-        How many jobs the executor is given at a time; at least as many as it has workers.
-    path, out, overwrite, progress, tell
+        Number of jobs submitted to the executor at a time; at least its number of workers.
+    path, out, overwrite, progress, print_line
         As for `run`.
 
     Returns
@@ -189,9 +192,10 @@ def campaign(
     Raises
     ------
     InputError
-        As for `run`; also if earlier results are of other versions, the executor stops, or its workers are unfit.
+        As for `run`; also if earlier results come from other versions, the executor stops, or its workers cannot run
+        this package.
     RunInterrupted
-        On Ctrl-C; complete jobs stay.
+        On Ctrl-C; complete jobs are kept.
     """
     workers = None if workers is None else whole(workers, "workers", 1)
     given = _read_run(path, "campaign", executor, out=out, workers=workers)
@@ -200,14 +204,14 @@ def campaign(
         if advice and cell.model.element is not None:  # a linear model may be one of a grid
             raise InputError(f"{given.file}: {len(given.seeds)} seeds were given, but {advice}.")
 
-    def in_processes(place: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
-        return do_side_by_side(given, place.recordings, jobs, executor, ahead)
+    def run_in_processes(store: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
+        return run_side_by_side(given, store.recordings, jobs, executor, ahead)
 
-    return _execute(given, in_processes, overwrite, progress, tell, campaign=True)
+    return _execute(given, run_in_processes, overwrite, progress, print_line, campaign=True)
 
 
 def _read_run(path: Any, kind: str, executor: Any, **changes: Any) -> Run:
-    """Return the run with what is given in place of the file's."""
+    """Read the run, with `changes` that are not None instead of the file's values."""
     given = path if isinstance(path, Run) else read_run(path, kind)
     if executor is not None and not callable(getattr(executor, "submit", None)):
         raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")
@@ -215,12 +219,12 @@ def _read_run(path: Any, kind: str, executor: Any, **changes: Any) -> Run:
 
 
 def seeds_advice(cell: Cell) -> str:
-    """Say why every seed gives the same model of a cell, and what to do; empty where starts are random."""
+    """Explain why every seed gives the same model of a cell, with advice; empty if starts are random."""
     model, start, starts = cell.model, cell.search.get("start", ""), cell.search.get("starts", 1)
     if not isinstance(model, PILFR):
         return ""
     if model.element is None:
-        return "a linear model has no starts, so every seed gives the same one; use one seed"
+        return "a linear model has no starts, so every seed gives the same model; use one seed"
     first = len(places(model))
     if any(is_drawn(model, start, i) for i in range(min(starts, first + 1))):
         return ""
@@ -230,13 +234,13 @@ def seeds_advice(cell: Cell) -> str:
 
 def _execute(
     given: Run,
-    perform: Perform,
+    runner: Runner,
     overwrite: bool,
     progress: Progress | None,
-    tell: Tell | None,
+    print_line: PrintLine | None,
     campaign: bool = False,
 ) -> RunResult:
-    """Execute a run whose jobs `perform` does, in any order."""
+    """Execute a run; `runner` executes its jobs, in any order."""
     folder = Path(given.out)
     check_own(folder, given.file, overwrite)
     inputs = input_digests(given)
@@ -244,22 +248,22 @@ def _execute(
     if given.folds:
         fold(recordings["train"], 0, given.folds)  # refuses recordings that are too short for it
     make_folder(folder)
-    with locked(folder):
-        place = Store(folder, given, inputs, recordings, overwrite, campaign)
-        return _Execution(place, perform, progress or (lambda *_: None), tell or (lambda line: None)).execute()
+    with lock_folder(folder):
+        store = Store(folder, given, inputs, recordings, overwrite, campaign)
+        return _Execution(store, runner, progress or (lambda *_: None), print_line or (lambda line: None)).execute()
 
 
 class _Execution:
-    """The jobs of a run in a folder: those of the cross-validation first, then those on all of the training."""
+    """Execution of the jobs of a run: first the cross-validation, then the jobs on all training recordings."""
 
-    def __init__(self, place: Store, perform: Perform, progress: Progress, tell: Tell) -> None:
-        self.place, self.perform, self.progress, self.tell = place, perform, progress, tell
+    def __init__(self, store: Store, runner: Runner, progress: Progress, print_line: PrintLine) -> None:
+        self.store, self.runner, self.progress, self.print_line = store, runner, progress, print_line
         self.done: list[str] = []
         self.skipped: list[str] = []
         self.total = 0
 
     def execute(self) -> RunResult:
-        """Do all jobs that are not complete, then choose among their models."""
+        """Execute all jobs that are not complete, then choose among their models."""
         try:
             jobs, selection = self._do_jobs()
             return self._finish(jobs, selection)
@@ -267,80 +271,80 @@ class _Execution:
             raise RunInterrupted(len(self.done) + len(self.skipped), self.total) from None
 
     def _do_jobs(self) -> tuple[Sequence[RunJob], Selection | None]:
-        place, given = self.place, self.place.run
-        first = place.recordings["train"][0]
+        store, given = self.store, self.store.run
+        first = store.recordings["train"][0]
         folds: tuple[RunJob, ...] = ()
         selection = None
-        jobs = jobs_of(given, place.inputs)
+        jobs = jobs_of(given, store.inputs)
         self.total = len(jobs)
         if given.folds:
-            folds = jobs_of(given, place.inputs, place.recordings["train"])
+            folds = jobs_of(given, store.inputs, store.recordings["train"])
             self._do_missing(folds)
-            selection = select(given, folds, place.scores(folds), place.entries, first)
+            selection = select(given, folds, store.scores(folds), store.entries, first)
             jobs = tuple(j for j in jobs if j.cell == selection.cell)
         self._do_missing(jobs, folds)
         if not given.folds and given.files["validation"] and len(given.cells) > 1:
-            selection = select(given, jobs, place.scores(jobs), place.entries, first)
+            selection = select(given, jobs, store.scores(jobs), store.entries, first)
         return (*folds, *jobs), selection
 
     def _do_missing(self, jobs: Sequence[RunJob], before: Sequence[RunJob] = ()) -> None:
-        """Do those jobs that are not complete."""
-        place = self.place
+        """Execute the jobs that are not complete."""
+        store = self.store
         self.total = total = len(before) + len(jobs)
-        ready = [j for j in jobs if place.complete(j)]
+        ready = [j for j in jobs if store.complete(j)]
         self.skipped += [j.id for j in ready]
         if ready:
-            self.tell(f"{len(ready)} jobs done before")
-        place.write_table((*before, *ready))
+            self.print_line(f"{len(ready)} jobs done before")
+        store.write_table((*before, *ready))
         ready_ids = {j.id for j in ready}
         try:
-            for batch in self.perform(place, [j for j in jobs if j.id not in ready_ids]):
-                with deferred_interrupt():  # a job that is done must not be lost
-                    place.note(batch)
+            for batch in self.runner(store, [j for j in jobs if j.id not in ready_ids]):
+                with deferred_interrupt():  # a finished job must not be lost
+                    store.record(batch)
                     ready += [job for job, _ in batch]
                     self.done += [job.id for job, _ in batch]
                 for job, found in batch:
                     none = f"no model ({found.entry['status'].lower().replace('_', ' ')})"
-                    self.tell(f"{job.id}: {found.entry['sentence'] if place.ended_well(job) else none}")
-                place.write_table((*before, *ready))
-                best = min(place.entries[j.id].get("train", np.inf) for j in ready)
+                    self.print_line(f"{job.id}: {found.entry['sentence'] if store.ended_well(job) else none}")
+                store.write_table((*before, *ready))
+                best = min(store.entries[j.id].get("train", np.inf) for j in ready)
                 self.progress("jobs", len(before) + len(ready), total, best)
         finally:
-            with deferred_interrupt():  # however it ends, the table has all jobs that are done
-                place.write_table((*before, *ready), last=True)
+            with deferred_interrupt():  # however it ends, the table has all finished jobs
+                store.write_table((*before, *ready), last=True)
 
     def _finish(self, jobs: Sequence[RunJob], selection: Selection | None) -> RunResult:
-        """Write errors, tables, and model and page of the job that is chosen."""
-        place, given = self.place, self.place.run
-        manifest, entries = place.manifest, place.entries
+        """Write errors, tables, and the model and page of the chosen job."""
+        store, given = self.store, self.store.run
+        manifest, entries = store.manifest, store.entries
         usable = self._usable([j for j in jobs if j.fold is None and (selection is None or j.cell == selection.cell)])
-        scores = place.scores(jobs, last=True)
+        scores = store.scores(jobs, last=True)
         best = choose_job(scores, [j.id for j in usable])
         job = next(j for j in usable if j.id == best)
-        times = read_times(place.path)
-        fit = replace(place.load(job), engine=given.engine)
+        times = read_times(store.path)
+        fit = replace(store.load(job), engine=given.engine)
         summary = summarise(given, jobs, scores, times, entries)
-        note = FITTED if len(given.cells) > 1 and selection is None else ""
+        note = CHOSEN_ON_TRAINING if len(given.cells) > 1 and selection is None else ""
         manifest.content.pop("choice", None)
         manifest.content |= {"chosen": best, **({"choice": note} if note else {})}
         manifest.put(TABLE, results_table(scores, jobs, entries, best))
-        manifest.put(MODEL, (place.path / job.model_file).read_text(encoding="utf-8"))
-        if place.campaign:
+        manifest.put(MODEL, (store.path / job.model_file).read_text(encoding="utf-8"))
+        if store.campaign:
             manifest.put(SUMMARY, summary_table(given, summary))
             manifest.put(PICTURE, box_plots(given, jobs, scores))
         if given.report:
             self._write_page(fit)
         manifest.content.pop("writing", None)
         manifest.write()
-        failed = tuple(j.id for j in jobs if not place.ended_well(j))
+        failed = tuple(j.id for j in jobs if not store.ended_well(j))
         fit = replace(fit, seconds=times.get(best, 0.0))
         parts = tuple(self.done), tuple(self.skipped), failed
-        return RunResult(place.path, *parts, best, tuple(scores), fit, manifest.content, summary, selection, note)
+        return RunResult(store.path, *parts, best, tuple(scores), fit, manifest.content, summary, selection, note)
 
     def _usable(self, jobs: Sequence[RunJob]) -> list[RunJob]:
-        """Return the jobs with a model."""
-        file, entries = self.place.run.file, self.place.entries
-        usable = [j for j in jobs if self.place.has_model(j)]
+        """Return the jobs with a model; refuse a run without any."""
+        file, entries = self.store.run.file, self.store.entries
+        usable = [j for j in jobs if self.store.has_model(j)]
         if not usable:
             about = "; ".join(reasons(entries, [j.id for j in jobs]))
             if all(entries[j.id]["status"] == Status.INFEASIBLE.name for j in jobs):
@@ -350,23 +354,23 @@ class _Execution:
         return usable
 
     def _write_page(self, fit: Fit) -> None:
-        """Write the page about the model that is chosen, unless it is there."""
-        place, given, manifest = self.place, self.place.run, self.place.manifest
-        key = digest([manifest.content["files"][MODEL], place.inputs, given.files, str(given.reading)])
+        """Write the page about the chosen model, unless it is there."""
+        store, given, manifest = self.store, self.store.run, self.store.manifest
+        key = digest([manifest.content["files"][MODEL], store.inputs, given.files, str(given.reading)])
         if manifest.content.get("report") == key and manifest.holds(PAGE):
             return
         from ..report import fit_page
 
-        self.tell("writing the report")
+        self.print_line("writing the report")
         self.progress("writing the report", 0, 0, np.nan)
-        judged = place.recordings["validation"] + place.recordings["test"]
-        manifest.put(PAGE, fit_page(fit, place.recordings["train"], judged, model_file=MODEL).html())
+        judged = store.recordings["validation"] + store.recordings["test"]
+        manifest.put(PAGE, fit_page(fit, store.recordings["train"], judged, model_file=MODEL).html())
         manifest.content["report"] = key
 
 
 def _read(given: Run, name: str) -> Recording:
     options = dict(given.reading)
-    found = read(given.located(name), options.pop("inputs"), options.pop("outputs"), **options)
+    found = read(given.path_of(name), options.pop("inputs"), options.pop("outputs"), **options)
     if not keeps_its_period(found):
         raise InputError(
             f'{given.file}: the input of {name} does not repeat after {found.period} samples, as initial = "periodic" '

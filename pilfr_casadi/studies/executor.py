@@ -1,7 +1,7 @@
-"""Jobs side by side over an executor, in the order in which they end, and again where a worker has died.
+"""Jobs side by side on an executor: outcomes in the order in which they arrive, retries where a worker has died.
 
-Every job runs in a process of its own beside its worker, whatever the executor is made of. The result of a job does not
-depend on where, when or how often it ran.
+Every job runs in a process of its own beside its worker, with any kind of executor. The result of a job does not depend
+on where, when or how often it ran.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from concurrent.futures import (
 from typing import Any
 
 from .._base import InputError, Reply, close_workers, run_in_worker
-from .jobs import LOST, TIMED_OUT, Batch, Outcome, Recordings, RunJob, attempt, unfinished, versions
+from .jobs import LOST, TIMED_OUT, Batch, Outcome, Recordings, RunJob, attempt, outcome_without_model, versions
 from .schema import Run
 
-AHEAD = 64  # jobs that an executor is given at a time
-SCHEDULER_TIMEOUT = 10.0  # seconds that a Dask scheduler has to answer
+AHEAD = 64  # jobs submitted to an executor at a time
+SCHEDULER_TIMEOUT = 10.0  # seconds to wait for a Dask scheduler
 
 
-def do_side_by_side(
+def run_side_by_side(
     run: Run, recordings: Recordings, jobs: Sequence[RunJob], executor: Executor | None, ahead: int
 ) -> Iterator[Batch]:
-    """Do jobs by an executor, else in processes, else (one worker without a time limit) in this process."""
+    """Run jobs on an executor, else in processes, else (one worker without a time limit) in this process."""
     if executor is not None:
         yield from _outcomes(run, recordings, jobs, executor, ahead)
     elif run.workers > 1 or run.time_limit is not None:
@@ -50,7 +50,7 @@ def do_side_by_side(
 
 
 def _end(pool: ThreadPoolExecutor) -> None:
-    """End a pool and its worker processes, also those that its threads are about to begin."""
+    """End a pool and its worker processes, including processes that its threads are about to start."""
     pool.shutdown(wait=False, cancel_futures=True)
     ending = threading.Thread(target=pool.shutdown, daemon=True)
     ending.start()
@@ -63,14 +63,14 @@ def _end(pool: ThreadPoolExecutor) -> None:
 def _outcomes(
     run: Run, recordings: Recordings, jobs: Sequence[RunJob], executor: Executor, ahead: int
 ) -> Iterator[Batch]:
-    """Yield outcomes as they arrive; `ahead` jobs are with the executor at a time."""
-    shared = _pickled(functools.partial(_attempt_with_versions, run, recordings))
+    """Yield outcomes as they arrive; keep `ahead` jobs submitted at a time."""
+    shared = _pickle(functools.partial(_attempt_with_versions, run, recordings))
     waiting, running = deque((job, 1) for job in jobs), dict[Future[Reply], tuple[RunJob, int]]()
     try:
         while waiting or running:
             while waiting and len(running) < ahead:
                 job, trial = waiting.popleft()
-                running[executor.submit(run_in_worker, shared, _pickled(job), run.time_limit)] = job, trial
+                running[executor.submit(run_in_worker, shared, _pickle(job), run.time_limit)] = job, trial
             batch: Batch = []
             stop: Exception | None = None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -84,13 +84,13 @@ def _outcomes(
                 except (InputError, BrokenExecutor, CancelledError) as error:
                     stop = error
             if batch:
-                yield batch  # whatever stops a campaign, what has arrived is kept
+                yield batch  # results that have arrived are kept, whatever stops the campaign
             if stop is not None:
                 raise stop
     except (BrokenExecutor, CancelledError, RuntimeError, OSError) as error:
         reason = str(error) or type(error).__name__
         raise InputError(
-            f"The executor has stopped ({reason}); what is done stays, the same command goes on from there."
+            f"The executor has stopped ({reason}); finished jobs are kept, the same command continues from there."
         ) from None
     finally:
         for future in running:
@@ -98,43 +98,45 @@ def _outcomes(
 
 
 def _outcome(future: Future[Reply], last: bool, time_limit: float | None) -> Outcome | None:
-    """Return the outcome of a job; None where its worker was lost and it was not the last trial."""
+    """Return the outcome of a job; None if its worker was lost and trials are left."""
     try:
         reply = future.result()
     except (BrokenExecutor, CancelledError):
         raise
-    except Exception as error:  # a Dask worker was killed, or has not got the package
+    except Exception as error:  # a Dask worker was killed, or lacks the package
         name = type(error).__name__
         reply = Reply(lost=f"{name}: {error}".splitlines()[0], begun=name == "KilledWorker")
     if reply.timed_out:
-        return unfinished(TIMED_OUT, f"Failed: ended after its time limit of {time_limit:g} s.", time_limit=time_limit)
+        return outcome_without_model(
+            TIMED_OUT, f"Failed: ended after its time limit of {time_limit:g} s.", time_limit=time_limit
+        )
     if reply.lost:
         if not last:
             return None
         if not reply.begun:
-            raise InputError(f"The workers cannot begin a job ({reply.lost}); see that they run this package.")
-        return unfinished(LOST, f"Failed: its worker was lost in every trial, lastly {reply.lost}.")
+            raise InputError(f"The workers cannot start a job ({reply.lost}); check that they can import this package.")
+        return outcome_without_model(LOST, f"Failed: its worker was lost in every trial, lastly {reply.lost}.")
     outcome, used = reply.result
     for name, version in versions().items():
         if used.get(name) != version:
             raise InputError(
-                f"A worker has {name} {used.get(name)} and this process {version}; give both the same, results of "
-                "different versions are not mixed."
+                f"A worker has {name} {used.get(name)} and this process {version}; install the same version in "
+                "both, because results of different versions are not mixed."
             )
     return outcome
 
 
 def _attempt_with_versions(run: Run, recordings: Recordings, job: RunJob) -> tuple[Outcome, dict[str, str]]:
-    """Return the outcome of a job, and the versions it was computed with; workers call this."""
+    """Compute the outcome of a job in a worker; return it with the versions in use there."""
     return attempt(run, recordings, job), versions()
 
 
-def _pickled(thing: Any) -> bytes:
+def _pickle(thing: Any) -> bytes:
     try:
         return pickle.dumps(thing)
     except Exception as error:
         reason = error
-    try:  # what a run file in Python defines has no module that workers could import: cloudpickle sends the code
+    try:  # workers cannot import code of a run file in Python; cloudpickle sends it
         import cloudpickle
 
         return bytes(cloudpickle.dumps(thing))
@@ -147,13 +149,13 @@ def _pickled(thing: Any) -> bytes:
 
 @contextlib.contextmanager
 def dask_executor(address: str) -> Iterator[tuple[Executor, int, int]]:
-    """Yield an executor of a Dask cluster, how many jobs it does at a time, and how many to give it at a time."""
+    """Yield an executor of a Dask cluster, its number of threads, and the number of jobs to submit at a time."""
     try:
         from distributed import Client
     except ImportError:
         raise InputError("--dask needs the package distributed; install pilfr-casadi[dask].") from None
     for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters comes as an error of a job
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # errors that matter arrive as outcomes of jobs
     try:
         client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:

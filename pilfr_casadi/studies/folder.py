@@ -1,9 +1,8 @@
 """The folder of a run: the manifest, the models and tables, and which jobs are complete.
 
-The manifest says what was computed from which inputs, with which versions, and the SHA-256 of every file. It carries
-its own digest, so that a manifest that was edited is not taken for the run's; the digests of the files tell the same of
-models and tables. No time is in it: everything in the folder but `times.json` is the same to the last byte in every
-execution of a run on one machine.
+The manifest states what was computed, from which inputs and with which versions, and the SHA-256 of every file. It
+carries its own digest, so an edited manifest is noticed; the digests of the files do the same for models and tables. It
+holds no times: every file in the folder but `times.json` has the same bytes in every execution of a run on one machine.
 """
 
 from __future__ import annotations
@@ -43,19 +42,19 @@ FORMAT, VERSION, MANIFEST = "pilfr_casadi run", 1, "manifest.json"
 TABLE, PAGE, MODEL, TIMES, JOBS, LOCK = "results.csv", "report.html", "model.json", "times.json", "jobs", ".lock"
 SUMMARY, PICTURE = "summary.csv", "spread.png"  # of a campaign
 OWN = (MANIFEST, TABLE, PAGE, MODEL, SUMMARY, PICTURE, TIMES, JOBS)
-TABLE_PAUSE = 1.0  # seconds between two tables of a campaign at work
+TABLE_PAUSE = 1.0  # seconds between two tables of a running campaign
 ADVICE = "restore it, or give --overwrite to compute everything again"
 
 
 def check_own(folder: Path, file: Path, overwrite: bool) -> None:
-    """Refuse a folder that holds the run file, or files of somebody else."""
-    place = os.path.realpath(folder)
-    if place in map(str, Path(os.path.realpath(file)).parents):
-        raise InputError(f"The folder {folder} holds the run file {file.name}; give results a folder of their own.")
-    if not os.path.isdir(place):
+    """Refuse a folder that holds the run file, or files that no run wrote."""
+    target = os.path.realpath(folder)
+    if target in map(str, Path(os.path.realpath(file)).parents):
+        raise InputError(f"The folder {folder} holds the run file {file.name}; give the results another folder.")
+    if not os.path.isdir(target):
         return
     try:
-        found = sorted(name for name in os.listdir(place) if name != LOCK and not _is_half_written(name))
+        found = sorted(name for name in os.listdir(target) if name != LOCK and not _is_half_written(name))
     except OSError as error:
         raise InputError(f"The folder {folder} cannot be read ({error.strerror}); give another one.") from None
     if MANIFEST in found:
@@ -70,13 +69,13 @@ def check_own(folder: Path, file: Path, overwrite: bool) -> None:
 
 
 def _is_half_written(name: str) -> bool:
-    """Whether a file is the beginning of a run's file, as `write_atomically` names it."""
+    """Tell whether a file is the half-written file of a run, by the names that `write_atomically` gives."""
     return re.fullmatch(rf"\.({'|'.join(map(re.escape, OWN))})\.[0-9a-f]{{8}}\.tmp", name) is not None
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep other runs out of a folder, until the process ends, and remove half-written files."""
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Lock a folder against other runs, and remove half-written files."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(ImportError):  # on systems without such locks
             import fcntl
@@ -96,7 +95,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def read_times(folder: Path) -> dict[str, float]:
-    """Return the seconds that each job took, as far as they are known."""
+    """Read the seconds that each job took, as far as they are known."""
     try:
         found = json.loads((folder / TIMES).read_text(encoding="utf-8"))
         return {str(job): float(seconds) for job, seconds in found.items()}
@@ -105,7 +104,7 @@ def read_times(folder: Path) -> dict[str, float]:
 
 
 class Manifest:
-    """The manifest in a folder, written anew, atomically, after every step."""
+    """The manifest in a folder, rewritten atomically after every step."""
 
     def __init__(self, folder: Path, content: dict[str, Any] | None = None) -> None:
         tables: dict[str, Any] = {key: {} for key in ("jobs", "scores", "files", "inputs")}
@@ -114,7 +113,7 @@ class Manifest:
 
     @classmethod
     def read(cls, folder: Path) -> Manifest:
-        """Read the manifest of an earlier run, an empty one where there is none; refuse one that was changed."""
+        """Read the manifest of an earlier run, or start an empty one; refuse one that was changed."""
         path = folder / MANIFEST
         if not path.exists():
             return cls(folder)
@@ -137,11 +136,11 @@ class Manifest:
         write_atomically(self.folder / MANIFEST, text + "\n")
 
     def holds(self, name: str) -> bool:
-        """Whether a file of the run is there, as the run wrote it; False where it is missing. Refuse a changed one."""
+        """Tell whether a file of the run is there; refuse one that was changed."""
         path = self.folder / name
         if name not in self.content["files"] or not path.is_file():
             return False
-        # a run that ended between a file and its manifest has announced the file in the manifest before
+        # if a run ended after writing a file and before the manifest, the manifest announced the file beforehand
         expected = self.content["files"][name], self.content.get("writing", {}).get(name)
         if file_digest(path) not in expected:
             raise InputError(
@@ -151,13 +150,13 @@ class Manifest:
         return True
 
     def put(self, name: str, content: str | bytes) -> None:
-        """Write a file of the run and note its digest, in the manifest too where it has changed."""
+        """Write a file of the run and its digest in the manifest, unless both are up to date."""
         data = content.encode() if isinstance(content, str) else content
         if self.content["files"].get(name) != digest(data) or not self.holds(name):
             self.put_all({name: data})
 
     def put_all(self, contents: Mapping[str, bytes], jobs: Mapping[str, Any] | None = None) -> None:
-        """Announce files of the run, write them, then note their digests and the entries of the jobs they end."""
+        """Announce files in the manifest, write them, then record their digests and the entries of their jobs."""
         found = {name: digest(data) for name, data in contents.items()}
         if contents:
             self.content["writing"] = found
@@ -171,7 +170,7 @@ class Manifest:
 
 
 class Store:
-    """The results of a run: what it has written, and writes. Files that were changed afterwards are refused."""
+    """The results of a run on disk, read and written; files that were changed afterwards are refused."""
 
     def __init__(
         self, path: Path, run: Run, inputs: Mapping[str, str], recordings: Recordings, overwrite: bool, campaign: bool
@@ -182,8 +181,8 @@ class Store:
             self.manifest.holds(name)
         if campaign:
             _refuse_other_versions(self.manifest)
-        said = {"file": run.file.name, "said": run.said}
-        self.manifest.content |= {"run": said, "versions": versions(), "inputs": dict(inputs)}
+        described = {"file": run.file.name, "said": run.plain_tables}
+        self.manifest.content |= {"run": described, "versions": versions(), "inputs": dict(inputs)}
         self.manifest.write()
         self.written = -np.inf
 
@@ -194,26 +193,26 @@ class Store:
         return entries
 
     def complete(self, job: RunJob) -> bool:
-        """Whether a job has been done from the same inputs, and its model is there as it was written."""
+        """Tell whether a job is finished with the same inputs, and its model is unchanged on disk."""
         entry = self.entries.get(job.id, {})
         if entry.get("key") != job.key or entry["status"] == LOST:
             return False
-        if entry["status"] == TIMED_OUT:  # given more time, it is tried again
+        if entry["status"] == TIMED_OUT:  # tried again with more time
             return self.campaign and self.run.time_limit is not None and self.run.time_limit <= entry["time_limit"]
         if entry["status"] == FAILED:
             return self.campaign
         return not self.has_model(job) or self.manifest.holds(job.model_file)
 
     def ended_well(self, job: RunJob) -> bool:
-        """Whether a job gave a model that meets its constraints."""
+        """Tell whether a job gave a model that meets its constraints."""
         return self.entries[job.id]["status"] not in BAD_ENDS
 
     def has_model(self, job: RunJob) -> bool:
-        """Whether there is a model of a job."""
+        """Tell whether the folder has a model of a job."""
         return job.fold is None and self.ended_well(job)
 
-    def note(self, batch: Sequence[tuple[RunJob, Outcome]]) -> None:
-        """Write the models of jobs that have been done, then their entries in the manifest."""
+    def record(self, batch: Sequence[tuple[RunJob, Outcome]]) -> None:
+        """Write the models of finished jobs, then their entries in the manifest."""
         entries = {job.id: {**job.parameters, "key": job.key, **found.entry} for job, found in batch}
         models = {job.model_file: found.model.encode() for job, found in batch if found.model is not None}
         for job, found in batch:
@@ -224,7 +223,7 @@ class Store:
         self.manifest.put_all(models, entries)
 
     def scores(self, jobs: Sequence[RunJob], last: bool = False) -> list[Score]:
-        """Return the errors of the jobs' models, from the manifest where it has them; `last` drops all others there."""
+        """Return the errors of the jobs' models, computed where the manifest lacks them; `last` drops other entries."""
         out, used, known = [], set(), self.manifest.content["scores"]
         for job in (j for j in jobs if self.ended_well(j)):
             if job.fold is not None:
@@ -253,7 +252,7 @@ class Store:
         return digest({"model": model, "data": self.inputs[name], "reading": reading})
 
     def write_table(self, jobs: Sequence[RunJob], last: bool = False) -> None:
-        """Write the errors so far, for readers of a campaign that is at work; not too often, but for the last time."""
+        """Write the errors so far while a campaign runs, at most once per `TABLE_PAUSE` unless it is the last table."""
         if not self.campaign or (not last and time.monotonic() < self.written + TABLE_PAUSE) or not jobs:
             return
         self.manifest.put(TABLE, results_table(self.scores(jobs), jobs, self.entries, ""))
@@ -261,7 +260,7 @@ class Store:
 
 
 def _refuse_other_versions(manifest: Manifest) -> None:
-    """Refuse to mix results of different versions in one campaign, which is there to compare them."""
+    """Refuse to mix results of different versions in one campaign, which compares its results."""
     before, now = manifest.content.get("versions", {}), versions()
     for name in now:
         if manifest.content["jobs"] and before.get(name) != now[name]:

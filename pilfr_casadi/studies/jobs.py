@@ -1,15 +1,15 @@
-"""The jobs of a run: independent identifications with ids that stay, and keys that tell when one must be done again.
+"""The jobs of a run: independent identifications with stable ids, and keys that tell which of them are outdated.
 
-The id of a job names what sets it apart from the others (`seed-0`). Its key is the SHA-256 of everything that its model
+The id of a job names how it differs from the others (`seed-0`). Its key is the SHA-256 of everything that its model
 depends on: the contents of the recordings it reads, how they are read, model, solver, constraints, seed, versions, and
-in a cross-validation which samples its fold fits and holds out. A job whose key is known and whose model is there has
-been done.
+in a cross-validation the samples that its fold fits and holds out. A job is finished if the manifest has its key and
+the folder its model.
 
-In a cross-validation the training recordings are in parts, each held out once. With at least as many different inputs
-as folds, whole recordings are dealt out in turn, those of one input together. With fewer, every recording is cut into
-as many blocks as there are folds; the state after a cut is estimated, and in a block held out the samples that it is
-estimated from are not scored (`Fit.scored_from`). Blocks of an input that repeats, as in steady periods, are refused:
-the rest would show them.
+A cross-validation divides the training recordings into parts and holds each out once. With at least as many different
+inputs as folds, whole recordings are dealt out in turn, recordings of one input together. With fewer, every recording
+is cut into as many blocks as there are folds. The state after a cut is estimated; in a held-out block the samples used
+for this are not scored (`Fit.scored_from`). Blocks of a repeating input, as in steady periods, are refused, because the
+other blocks contain the same input.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from ..optimise import Solution, Status
 from .schema import ROLES, Run
 
 Recordings = Mapping[str, tuple[Recording, ...]]
-# how a job of a campaign may end besides a solver's status
+# endings of a job of a campaign besides a solver's status
 FAILED, TIMED_OUT, LOST = "FAILED", "TIMED_OUT", "LOST"
 BAD_ENDS = (FAILED, TIMED_OUT, LOST, Status.INFEASIBLE.name)  # without a model
-FEWEST_SAMPLES = 20  # of a block of a cross-validation; fewer are not enough to estimate its initial state
+FEWEST_SAMPLES = 20  # in a block of a cross-validation: needed to estimate its initial state
 
 
 @dataclass(frozen=True, eq=False)
 class RunJob:
-    """One identification: what sets it apart, what it depends on, and its place in the grid."""
+    """One identification: its parameters, the key of everything it depends on, and its cell of the grid."""
 
     parameters: Mapping[str, Any]
     key: str
@@ -48,17 +48,17 @@ class RunJob:
 
     @property
     def id(self) -> str:
-        """The name, the same in every execution of the run."""
+        """Name of the job, the same in every execution of the run."""
         return "_".join(f"{name}-{value}" for name, value in self.parameters.items())
 
     @property
     def fold(self) -> int | None:
-        """The part of the training that it holds out; None for none."""
+        """Number of the fold that the job holds out; None without cross-validation."""
         return self.parameters.get("fold")
 
     @property
     def model_file(self) -> str:
-        """The file of its model, below the folder of the run."""
+        """Path of its model file below the folder of the run."""
         return f"jobs/{self.id}/model.json"
 
 
@@ -84,7 +84,7 @@ def file_digest(path: Path) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return what the numbers of a run depend on besides its inputs."""
+    """Return the versions that the numbers of a run depend on."""
     import casadi
     import scipy
 
@@ -100,11 +100,11 @@ def versions() -> dict[str, str]:
 
 def input_digests(run: Run) -> dict[str, str]:
     """Return the SHA-256 of every recording by its name in the run file."""
-    return {name: file_digest(run.located(name)) for names in run.files.values() for name in names}
+    return {name: file_digest(run.path_of(name)) for names in run.files.values() for name in names}
 
 
 def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | None = None) -> tuple[RunJob, ...]:
-    """Return one job a cell and seed; given the training recordings, those of the cross-validation: one a fold too."""
+    """List one job per cell and seed; given the training recordings, one per cell, fold and seed."""
     read = run.files["train"] + (run.files["validation"] if run.regularization.path else ())
     common = {
         "program": file_digest(run.file) if run.own else None,
@@ -120,7 +120,7 @@ def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | No
     return tuple(
         RunJob(
             {**cell.values, **name, "seed": seed},
-            digest({**common, "said": {**run.said, "grid": None, **cell.said}, "seed": seed, **dealt}),
+            digest({**common, "said": {**run.plain_tables, "grid": None, **cell.plain_tables}, "seed": seed, **dealt}),
             number,
         )
         for number, cell in enumerate(run.cells)
@@ -130,12 +130,12 @@ def jobs_of(run: Run, inputs: Mapping[str, str], train: Sequence[Recording] | No
 
 
 def _contents(parts: Sequence[Sequence[Recording]]) -> list[list[tuple[str, int]]]:
-    """Return fingerprints of recordings."""
+    """Return the fingerprint and `skip` of each recording."""
     return [[(fingerprint(r), r.skip) for r in part] for part in parts]
 
 
 def fold(recordings: Sequence[Recording], k: int, folds: int) -> tuple[tuple[Recording, ...], tuple[Recording, ...]]:
-    """Return the recordings that are fitted and those that are held out in fold k of `folds`.
+    """Return the fitted and the held-out recordings of fold k of `folds`.
 
     Raises
     ------
@@ -156,8 +156,8 @@ def fold(recordings: Sequence[Recording], k: int, folds: int) -> tuple[tuple[Rec
         if repeats_itself(r):
             fewer = f"folds = {len(groups)}, " if len(groups) > 1 else ""
             raise InputError(
-                f"folds = {folds} was given and the input of {r.label} repeats, so whatever block is held out has the "
-                f"input of what is fitted and proves nothing; give {fewer}other realizations, or validation data."
+                f"folds = {folds} was given and the input of {r.label} repeats, so a held-out block has the same "
+                f"input as the fitted ones and proves nothing; give {fewer}other realizations, or validation data."
             )
         held.append(r.slice(first, last))
         if k > 0:
@@ -175,7 +175,7 @@ def outcome(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Outcome:
-    """Do a job: identify its model and judge it."""
+    """Execute a job: identify its model and compute its errors."""
     fit = _without_times(found := _identify(run, recordings, job, executor, progress))
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
@@ -200,16 +200,16 @@ def outcome(
 
 
 def attempt(run: Run, recordings: Recordings, job: RunJob) -> Outcome:
-    """Do a job of a campaign; one that cannot be done has an outcome too."""
+    """Execute a job of a campaign; a failure is an outcome too."""
     try:
         return outcome(run, recordings, job)
     except Exception as error:
         if isinstance(error, InputError):
-            return unfinished(FAILED, f"Failed: {error}", refused=True)
-        return unfinished(FAILED, f"Failed: {type(error).__name__}: {error}")
+            return outcome_without_model(FAILED, f"Failed: {error}", refused=True)
+        return outcome_without_model(FAILED, f"Failed: {type(error).__name__}: {error}")
 
 
-def unfinished(status: str, sentence: str, **more: Any) -> Outcome:
+def outcome_without_model(status: str, sentence: str, **more: Any) -> Outcome:
     """Make the outcome of a job without a model."""
     return Outcome({"status": status, "sentence": sentence, "operators_used": "", **more})
 
@@ -233,7 +233,7 @@ def error_of(fit: Fit, recording: Recording) -> float | None:
 def _identify(
     run: Run, recordings: Recordings, job: RunJob, executor: Executor | None, progress: Progress | None
 ) -> Fit:
-    """Identify the model of a job from its training recordings and, for a path, the validation; it sees no others."""
+    """Identify the model of a job from its training recordings, and for a path also from the validation recordings."""
     options: dict[str, Any] = {
         "solver": run.solver,
         "stable": run.stable,
@@ -258,7 +258,7 @@ def _identify(
 
 
 def _without_times(fit: Fit) -> Fit:
-    """Drop the times a fit took, which no second execution would repeat."""
+    """Drop the computing times of a fit, which differ in every execution."""
 
     def timeless(solution: Solution) -> Solution:
         return replace(solution, seconds=0.0, history=tuple(replace(h, seconds=0.0) for h in solution.history))

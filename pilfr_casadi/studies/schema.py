@@ -1,10 +1,10 @@
 """The schema of a run file: data, model, solver, constraints, grid, seeds and the folder of the results.
 
-A run file is TOML, or a Python file that sets `run` to such a table, in which the model may be a `PILFR` or a closed
-`Model`, the solver an object, and `own` a list of constraints under `constraints`. Paths are relative to the file.
-Where there are objects, the jobs depend on the contents of the Python file; modules that it imports are not looked at.
+A run file is TOML, or a Python file that sets `run` to such a table. In Python the model may be a `PILFR` or a closed
+`Model`, the solver an object, and `own` under `constraints` a list of constraints. Paths are relative to the file. If
+there are objects, the jobs depend on the contents of the Python file, but not on the modules that it imports.
 
-Each table is a pydantic model. The `description` of a field is the end of the sentence for a bad value: "'nx' in
+Each table is a pydantic model. The `description` of a field ends the sentence about a bad value: "'nx' in
 [model] is 'one'; give a whole number from 0 to 1000".
 """
 
@@ -47,35 +47,35 @@ SOLVER_KEYS = ("start", "starts", "linear")
 READING = ("period", "hold", "skip", "dt", "time_tolerance", "initial")  # fields of a Recording
 SIZE = {"nx": "states", "lags": "past outputs"}
 
-# The largest sizes that a run file or the command line may ask for, far above every model that makes sense: what is
-# larger never ends, or fills the memory.
+# The largest sizes that a run file or the command line may ask for, far above every sensible model: anything larger
+# never ends, or fills the memory.
 LARGEST_SIZE = {
     "nx": 1_000,  # states: A alone has 1e6 parameters, and the Gauss-Newton matrix 1e12 entries
-    "operators": 10_000,  # a channel: the Jacobian of the paper's 6144 samples has 1 GB then
+    "operators": 10_000,  # per channel: the Jacobian of the paper's 6144 samples has 1 GB then
     "channels": 100,  # of the element: each has all its operators
     "neurons": 1_000,  # of an envelope
     "hidden": 10_000,  # neurons of a network: as operators
     "lags": 10_000,  # samples: a recording must be longer, as the fit says
     "input_lags": 10_000,
-    "starts": 1_000_000,  # 12 days at a second each
+    "starts": 1_000_000,  # 12 days at one second per start
     "seed": 2**63 - 1,  # the largest integer of 64 bits
     "max_iterations": 1_000_000,
     "folds": 10_000,
     "retries": 1_000,
     "workers": 1_024,  # processes: each takes 100 MB and more
-    "samples": 10**9,  # of a period, or left out: 8 GB a channel
-    "jobs": 100_000,  # of a run: the manifest names each, about 300 bytes a job, and is written after every one
+    "samples": 10**9,  # of a period, or left out: 8 GB per channel
+    "jobs": 100_000,  # of a run: the manifest names each, about 300 bytes per job, and is written after every one
 }
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One model of a study with its search: `starts` and `start`, and `linear` where it is given, as for `fit`."""
+    """One model of a study, with the options of its search: `starts`, `start` and, if given, `linear`, as for `fit`."""
 
-    values: Mapping[str, Any]  # key of the grid -> value, of the keys that matter to the cell
+    values: Mapping[str, Any]  # key of the grid -> value, for the keys that matter to the cell
     model: PILFR | Lagged | Model
     search: dict[str, Any]
-    said: dict[str, Any] = field(default_factory=dict)  # its tables `model` and `solver` as plain numbers and texts
+    plain_tables: dict[str, Any] = field(default_factory=dict)  # `model` and `solver` as plain numbers and texts
 
     @property
     def name(self) -> str:
@@ -85,26 +85,26 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run, checked; fields that the run file has too are described in `demo_data/every_key.toml`.
+    """A checked run; fields that are keys of the run file are described in `demo_data/every_key.toml`.
 
     Attributes
     ----------
     file, out : Path
         The run file, and the folder of the results.
-    said : dict
-        The tables `model`, `grid`, `solver`, `constraints` and `regularization` as plain numbers and texts: what a job
-        depends on besides its data and its seed. `own` is True where Python objects are among them.
+    plain_tables : dict
+        The tables `model`, `grid`, `solver`, `constraints` and `regularization` as plain numbers and texts. With data
+        and seed, a job depends on these alone, or on the Python file too if `own` is True (objects are among them).
     files : dict
-        Recordings by role (`train`, `validation`, `test`), as they are named in the file.
+        Names of the recordings in the file, by role (`train`, `validation`, `test`).
     reading : dict
-        How they are read: `inputs`, `outputs`, `columns` and fields of `Recording`.
+        Options of reading them: `inputs`, `outputs`, `columns` and fields of `Recording`.
     cells : tuple of Cell
-        The models of the grid with their searches; one where there is no grid.
+        The models of the grid with their searches; one cell without a grid.
     """
 
     file: Path
     out: Path
-    said: dict[str, Any]
+    plain_tables: dict[str, Any]
     own: bool
     files: dict[str, tuple[str, ...]]
     reading: dict[str, Any]
@@ -121,8 +121,8 @@ class Run:
     engine: str = "auto"
     report: bool = True
 
-    def located(self, name: str) -> Path:
-        """Return where a file of the run lies."""
+    def path_of(self, name: str) -> Path:
+        """Return the path of a file of the run."""
         return self.file.parent / name
 
 
@@ -203,7 +203,7 @@ class SeedsTable(Table):
 
 
 class DataTable(Table):
-    """`[data]`: the recordings, and how they are read."""
+    """`[data]`: the recordings and the options of reading them."""
 
     train: Names = Field(min_length=1, description=NAMES)
     validation: Names = Field((), description=NAMES)
@@ -237,7 +237,7 @@ class ModelTable(Table):
     priors: dict[str, Any] | None = Field(None, description="a table of parameters and their priors")
 
     def build(self) -> PILFR | Lagged:
-        """Build the model, of keys that its structure takes."""
+        """Build the model; refuse keys that its structure does not take."""
         given = {key: value for key, value in self if value is not None and key != "structure"}
         takes = TAKES[self.structure]
         if takes[0] not in given:
@@ -272,16 +272,16 @@ class SolverTable(Table):
         return {**search, "linear": BLA_OPTION} if self.linear == BLA_OPTION else search
 
     def build(self) -> Any:
-        """Build the solver; an object stays as it is."""
+        """Build the solver; return an object unchanged."""
         given = {k: getattr(self, k) for k in ("max_iterations", "tolerance") if getattr(self, k) is not None}
         if not isinstance(self.name, str):
             if given:
                 raise InputError(
-                    f"{', '.join(given)} in [solver] goes with a name; the solver is an object that has its own."
+                    f"{', '.join(given)} in [solver] goes with a solver given by name; an object has its own options."
                 )
             return self.name
         if self.name not in ("gauss-newton", "ipopt"):
-            raise InputError(f"'name' in [solver] is {shown(self.name)}; give 'gauss-newton' or 'ipopt'.")
+            raise InputError(f"'name' in [solver] is {show_value(self.name)}; give 'gauss-newton' or 'ipopt'.")
         if self.name == "ipopt":
             return Ipopt(**given)
         return GaussNewton(**{"tolerance": DEFAULT_SOLVER.tolerance, **given}) if given else DEFAULT_SOLVER
@@ -302,7 +302,7 @@ class ConstraintsTable(Table):
     )
 
     def for_models(self, models: Sequence[PILFR | Lagged | Model]) -> tuple[Constraint, ...]:
-        """Return the constraints, which have to suit all models."""
+        """Return the constraints; refuse ones that do not suit all models."""
         given: list[Any] = [self.dc_gain, self.ordered_thresholds]  # constraints by now
         found = [c for c in given if c is not None]
         try:
@@ -341,7 +341,7 @@ class RegularizationTable(Table):
 
 
 class CampaignTable(Table):
-    """`[campaign]`: for `pilfr campaign` alone."""
+    """`[campaign]`: options of `pilfr campaign`."""
 
     time_limit: float | None = _number(0.01)
     retries: int = _whole("retries", 0, 2)
@@ -376,7 +376,7 @@ class RunTable(Table):
 
     @property
     def axes(self) -> dict[str, tuple[int | str, ...]]:
-        """The keys of the grid that are given, in their order in [model] and [solver], with their values."""
+        """Values of each given key of the grid, in the order of the keys in [model] and [solver]."""
         return {key: values for key, values in self.grid if values}
 
     @model_validator(mode="after")
@@ -392,7 +392,7 @@ class RunTable(Table):
 
 
 def validate(kind: type[T], content: Any, name: str = "") -> T:
-    """Check a table; an `InputError` says in one sentence the key, what was given, and what is expected."""
+    """Check a table; the `InputError` states the key, the value that was given, and what is expected."""
     try:
         return kind.model_validate(dict(content) if isinstance(content, Mapping) else content)
     except ValidationError as error:
@@ -400,14 +400,14 @@ def validate(kind: type[T], content: Any, name: str = "") -> T:
 
 
 def _sentence(error: ValidationError, kind: type[Table], name: str) -> str:
-    """Put the first error into a sentence; unknown keys go first, since a misspelt key leaves another one missing."""
+    """Describe the first error; unknown keys go first, since a misspelt key leaves another one missing."""
     found = error.errors(include_url=False)
     first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
     own = first.get("ctx", {}).get("error")
-    if isinstance(own, InputError):  # of a key in a table it says what is wrong, and not where
+    if isinstance(own, InputError):  # inside a table the sentence lacks the place
         return f"[{first['loc'][0]}]: {own}" if len(first["loc"]) > 1 else str(own)
     if not first["loc"]:
-        return f"{name or 'the run'} is {shown(first['input'])}; give a table."
+        return f"{name or 'the run'} is {show_value(first['input'])}; give a table."
     key, *inner = map(str, first["loc"])
     table = kind.model_fields[key].annotation if inner else None
     if isinstance(table, type) and issubclass(table, Table):
@@ -417,11 +417,11 @@ def _sentence(error: ValidationError, kind: type[Table], name: str) -> str:
         known = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(kind.model_fields)}."
         return f"{f'[{name}]' if name else 'the run'} has an unknown key {key!r}; {known}"
     where = f"{key!r} in [{name}]" if name else repr(key)
-    given = "is missing" if first["type"] == "missing" else f"is {shown(first['input'])}"
+    given = "is missing" if first["type"] == "missing" else f"is {show_value(first['input'])}"
     return f"{where} {given}; give {kind.model_fields[key].description}."
 
 
-def shown(value: Any) -> str:
+def show_value(value: Any) -> str:
     """Write a value in a sentence, shortened."""
     try:
         text = repr(value)
@@ -431,7 +431,7 @@ def shown(value: Any) -> str:
 
 
 def as_plain(value: Any) -> tuple[Any, bool]:
-    """Turn a value into what JSON can write, objects into a mark; return it and whether there are any objects."""
+    """Convert a value for JSON, objects into a mark; return it and whether there are any objects."""
     if isinstance(value, Mapping):
         parts = {str(k): as_plain(v) for k, v in sorted(value.items(), key=lambda kv: str(kv[0]))}
         return {k: v for k, (v, _) in parts.items()}, any(o for _, o in parts.values())
@@ -446,7 +446,7 @@ def as_plain(value: Any) -> tuple[Any, bool]:
 
 
 def read_run(path: Any, kind: str = "run") -> Run:
-    """Read a run file, `.toml` or `.py`; `kind` ends the name of the folder of the results where the file gives none.
+    """Read a run file, `.toml` or `.py`; `kind` ends the default name of the folder of the results.
 
     Raises
     ------
@@ -467,14 +467,14 @@ def read_run(path: Any, kind: str = "run") -> Run:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is not a TOML file ({error}); correct it.") from None
     try:
-        return _checked(file, content, kind)
+        return _check_content(file, content, kind)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 
 
-def _checked(file: Path, content: Any, kind: str) -> Run:
+def _check_content(file: Path, content: Any, kind: str) -> Run:
     table = validate(RunTable, content)
-    said, own = as_plain({k: content.get(k) for k in ("model", "grid", "solver", "constraints", "regularization")})
+    plain, own = as_plain({k: content.get(k) for k in ("model", "grid", "solver", "constraints", "regularization")})
     files = {role: getattr(table.data, role) for role in ROLES}
     _check_files(file, files)
     reading = {"inputs": table.data.inputs, "outputs": table.data.outputs, "columns": table.data.columns}
@@ -487,7 +487,7 @@ def _checked(file: Path, content: Any, kind: str) -> Run:
     return Run(
         file=file,
         out=_folder(file, f"{file.stem}-{kind}" if table.out is None else table.out),
-        said=said,
+        plain_tables=plain,
         own=own,
         files=files,
         reading=reading,
@@ -501,7 +501,7 @@ def _checked(file: Path, content: Any, kind: str) -> Run:
 
 
 def _folder(file: Path, out: str) -> Path:
-    """Return the folder of the results, which lies below that of the run file."""
+    """Return the folder of the results; refuse one that is not below the folder of the run file."""
     above = os.path.realpath(file.parent)
     try:
         inside = above in map(str, Path(os.path.realpath(os.path.join(above, out))).parents)
@@ -509,7 +509,7 @@ def _folder(file: Path, out: str) -> Path:
         inside = False
     if not inside:
         raise InputError(
-            f"'out' is {out[:60]!r}, which is no folder below that of the run file; give one, or another with --out."
+            f"'out' is {out[:60]!r}, not below the folder of the run file; give a folder there, or any with --out."
         )
     return file.parent / out
 
@@ -529,10 +529,10 @@ def _check_files(file: Path, files: Mapping[str, tuple[str, ...]]) -> None:
 
 
 def _cells(table: RunTable) -> tuple[tuple[Cell, ...], Any]:
-    """Return the cells, in the order of the grid's keys with the last varying fastest, and the solver of all.
+    """Build the cells, in the order of the grid's keys with the last varying fastest, and the solver of all.
 
-    A cell has the keys that matter to its model (a NARX has lags and no operators); combinations that differ in
-    nothing else are one cell.
+    A cell keeps the keys that matter to its model (a NARX has lags and no operators); combinations that differ only
+    in other keys are one cell.
     """
     model, solver, axes = table.model, table.solver, table.axes
     if isinstance(model, PILFR | Lagged | Model):
@@ -541,43 +541,41 @@ def _cells(table: RunTable) -> tuple[tuple[Cell, ...], Any]:
         return (_cell({}, model, {"model": model, "solver": solver}),), validate(SolverTable, solver, "solver").build()
     for name, content in (("model", model), ("solver", solver)):
         if not isinstance(content, Mapping):
-            raise InputError(f"{name} is {shown(content)}; give a table.")
+            raise InputError(f"{name} is {show_value(content)}; give a table.")
     cells: dict[str, Cell] = {}
     for combination in itertools.product(*axes.values()):
         values = dict(zip(axes, combination, strict=True))
-        said = {
+        tables = {
             "model": {**model, **{k: v for k, v in values.items() if k in MODEL_KEYS}},
             "solver": {**solver, **{k: v for k, v in values.items() if k in SOLVER_KEYS}},
         }
-        idle = _idle_keys(said["model"], axes)
-        said = {name: {k: v for k, v in content.items() if k not in idle} for name, content in said.items()}
-        built = validate(ModelTable, said["model"], "model").build()
-        cell = _cell({k: v for k, v in values.items() if k not in idle}, built, said)
-        form = "linear" if _is_linear(said["model"]) else said["model"].get("structure", "lfr")
-        cells.setdefault(str({**cell.said, "model": {**cell.said["model"], "structure": form}}), cell)
+        idle = _idle_keys(tables["model"], axes)
+        tables = {name: {k: v for k, v in content.items() if k not in idle} for name, content in tables.items()}
+        built = validate(ModelTable, tables["model"], "model").build()
+        cell = _cell({k: v for k, v in values.items() if k not in idle}, built, tables)
+        form = "linear" if _is_linear(tables["model"]) else tables["model"].get("structure", "lfr")
+        cells.setdefault(str({**cell.plain_tables, "model": {**cell.plain_tables["model"], "structure": form}}), cell)
     return tuple(cells.values()), validate(SolverTable, solver, "solver").build()
 
 
-def _cell(values: Mapping[str, Any], model: PILFR | Lagged | Model, said: dict[str, Any]) -> Cell:
-    """Return a cell, whose search has to suit its model."""
-    search = validate(SolverTable, said["solver"], "solver").search
+def _cell(values: Mapping[str, Any], model: PILFR | Lagged | Model, tables: dict[str, Any]) -> Cell:
+    """Build a cell; refuse a search that does not suit its model."""
+    search = validate(SolverTable, tables["solver"], "solver").search
     if isinstance(model, Lagged) and search["start"] != "grid":
-        raise InputError(
-            f"start = {search['start']!r} is not for a NARX or NOE, whose starts are of their own kind; leave it out."
-        )
+        raise InputError(f"start = {search['start']!r} is not for a NARX or NOE, which has other starts; leave it out.")
     if "linear" in search and not isinstance(model, PILFR):
         of = "a NARX or NOE" if isinstance(model, Lagged) else "a Model, which has its own values"
         raise InputError(f"linear = {search['linear']!r} is not for {of}; leave it out.")
-    return Cell(values, model, search, as_plain(said)[0])
+    return Cell(values, model, search, as_plain(tables)[0])
 
 
 def _is_linear(model: Mapping[str, Any]) -> bool:
-    """Whether a [model] table asks for a linear model: no operators."""
+    """Tell whether a [model] table asks for a linear model: no operators."""
     return TAKES.get(model.get("structure", "lfr")) == HYSTERETIC and model.get("operators") == 0
 
 
 def _idle_keys(model: Mapping[str, Any], axes: Mapping[str, Sequence[Any]]) -> set[str]:
-    """Return the keys that do not matter to a cell: other structures take them, or the model is the same without."""
+    """Return the keys that do not matter to a cell: keys of other structures, and keys without effect on its model."""
     structure, out = model.get("structure", "lfr"), set[str]()
     if "structure" in axes and structure in TAKES:
         others = {name for s in axes["structure"] for name in TAKES.get(s, ())}
@@ -594,6 +592,6 @@ def _idle_keys(model: Mapping[str, Any], axes: Mapping[str, Sequence[Any]]) -> s
 
 
 def grid_keys(found: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the keys of the grid that any cell has, in the order of the grid."""
+    """Return the keys of the grid that at least one cell has, in the order of the grid."""
     given = {k for values in found for k in values}
     return [k for k in (*MODEL_KEYS, *SOLVER_KEYS) if k in given]

@@ -1,11 +1,11 @@
-r"""The errors of a run in tables and box plots, the model that is chosen, and the structure that is recommended.
+r"""The errors of a run in tables and box plots, the chosen model, and the recommended structure.
 
 The box plots are those of Krikelis et al. (2024), Fig. 11.
 
-A structure is selected by cross-validation, or by a validation recording, with the rule of `select_order`: with
-:math:`e(c)` the error of a cell on recordings it has not been fitted to, take the cell of the fewest free parameters
-among :math:`\{c : e(c) \le (1 + m) \min_k e(k)\}`. In each fold the seed of the smallest training error stands for its
-cell, and :math:`e(c)` is the mean over the folds: the part held out judges, and has no part in what it judges.
+A structure is selected by cross-validation, or by a validation recording, with the rule of `select_order`. With
+:math:`e(c)` the error of a cell on recordings it has not been fitted to, take the cell with the fewest free parameters
+among :math:`\{c : e(c) \le (1 + m) \min_k e(k)\}`. In each fold the seed with the smallest training error represents
+its cell, and :math:`e(c)` is the mean over the folds. The held-out part does not influence the choice of the seed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Score:
 
 
 def choose_job(scores: Sequence[Score], jobs: Sequence[str]) -> str:
-    """Return the job of the smallest validation error; without validation recordings, smallest training error."""
+    """Return the job with the smallest validation error (training error if there are no validation recordings)."""
     judge = "validation" if any(s.role == "validation" for s in scores) else "train"
     errors: dict[str, list[float]] = {}
     for s in scores:
@@ -50,7 +50,7 @@ def choose_job(scores: Sequence[Score], jobs: Sequence[str]) -> str:
 
 
 def results_table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapping[str, Any], best: str) -> str:
-    """Write results.csv: one row a job and recording, numbers to the last digit; one row for a job without a model."""
+    """Write results.csv: one row per job and recording, one row for a job without a model; all digits."""
     keys = grid_keys(job.parameters for job in jobs) + ["fold"] * any(job.fold is not None for job in jobs)
     by_job: dict[str, list[Score]] = {}
     for s in scores:
@@ -67,7 +67,7 @@ def results_table(scores: Sequence[Score], jobs: Sequence[RunJob], entries: Mapp
 
 
 def reasons(entries: Mapping[str, Mapping[str, Any]], ids: Sequence[str]) -> list[str]:
-    """Say why jobs have no model: a line for every distinct reason, with the first job that has it."""
+    """Say why jobs have no model: one line per distinct reason, with its first job."""
     found: dict[str, list[str]] = {}
     for job in ids:
         found.setdefault(entries[job]["sentence"], []).append(job)
@@ -77,10 +77,10 @@ def reasons(entries: Mapping[str, Mapping[str, Any]], ids: Sequence[str]) -> lis
 
 @dataclass(frozen=True)
 class CellSummary:
-    """Errors of one cell's jobs on one recording; `held` and `train` on `folds` are those of the cross-validation.
+    """Errors of one cell's jobs on one recording; the roles `held` and `train` on `folds` are of the cross-validation.
 
-    A job failed if it has no model, one that explains nothing of the training (an NRMSE of 0.99 or more, that of a
-    constant), or no finite error there.
+    A job failed if it has no model, if its model explains nothing of the training (an NRMSE of 0.99 or more, as of a
+    constant), or if its error here is not finite.
     """
 
     cell: Mapping[str, Any]
@@ -135,7 +135,7 @@ def summarise(
 
 
 def summary_table(run: Run, summary: Sequence[CellSummary]) -> str:
-    """Write summary.csv: one row a recording and cell, numbers to the last digit."""
+    """Write summary.csv: one row per recording and cell, numbers to the last digit."""
     keys = grid_keys(cell.values for cell in run.cells)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -147,13 +147,13 @@ def summary_table(run: Run, summary: Sequence[CellSummary]) -> str:
 
 
 def box_plots(run: Run, jobs: Sequence[RunJob], scores: Sequence[Score]) -> bytes:
-    """Draw box plots of all cells, one picture a recording, as PNG."""
+    """Draw box plots of all cells, one panel per recording, as PNG."""
     from ..plots import compared_spread
 
     cells = [cell.values for cell in run.cells]
     keys = [k for k in grid_keys(cells) if len({values.get(k) for values in cells}) > 1]
     found = errors_by_cell(run, jobs, scores)
-    if any(role == "held" for role, _ in found):  # the models on all of the training are those of one cell
+    if any(role == "held" for role, _ in found):  # only one cell has models on all training recordings
         found = {key: cells for key, cells in found.items() if key[1] == FOLDS}
     sets = {
         f"{name} ({role})": {_label(run.cells[number], keys): list(e.values()) for number, e in cells.items()}
@@ -170,12 +170,12 @@ def _label(cell: Cell, keys: Sequence[str]) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Selection:
-    """Errors of the structures on recordings they have not been fitted to, and the structure to take."""
+    """Errors of the structures on recordings they have not been fitted to, and the recommended structure."""
 
     names: tuple[str, ...]  # the cells by their values
     parameters: tuple[int, ...]  # free parameters of each
-    errors: tuple[float, ...]  # NRMSE held out; infinite where no job of the cell, or of one of its folds, gave a model
-    cell: int  # number of the cell recommended
+    errors: tuple[float, ...]  # held-out NRMSE; infinite if the cell, or one of its folds, has no model
+    cell: int  # number of the recommended cell
     margin: float  # how much worse than the best it may be, as a share
     judge: str  # the recordings that were held out
 
@@ -194,9 +194,9 @@ def select(
     entries: Mapping[str, Mapping[str, Any]],
     recording: Recording,
 ) -> Selection:
-    """Compare the cells of a run by jobs of the cross-validation, or by the errors on the validation recordings.
+    """Compare the cells of a run by cross-validation, or by the errors on the validation recordings.
 
-    Any `recording` of the run serves, for the number of inputs and outputs.
+    Any `recording` of the run serves: only its numbers of inputs and outputs are used.
     """
     counts, errors = [], []
     judged: dict[str, list[float]] = {}

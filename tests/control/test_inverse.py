@@ -218,7 +218,7 @@ def test_a_long_delay_is_inverted_with_the_preview_it_needs():
     assert (made.delay, made.ahead, len(made.zeros)) == (8, 8, 0)
     longer = feedforward(fit, record, ahead=10)
     assert str(longer) == (
-        "An input reaches the output after 8 samples, but a longer look-ahead was asked for: an approximate inverse, "
+        "An input reaches the output after 8 samples, but a longer look-ahead was given: an approximate inverse, "
         "for a path that is known 10 samples ahead."
     )
     wanted = np.sin(np.arange(100) / 9.0) * np.ptp(record.u) / 3

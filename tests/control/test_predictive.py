@@ -448,7 +448,7 @@ def test_do_mpc_takes_what_a_controller_plans_with(small):
         model = do_mpc_model(given_model)
         assert (model.x.shape[0], model.u.shape[0]) == (5, 1)
         assert PredictiveController(given_model, 3, inputs=(-1, 1)).function.size1_in(0) == 5
-    refused(lambda: do_mpc_model("f"), "A str cannot be planned with; give a Fit")
+    refused(lambda: do_mpc_model("f"), "A str cannot be used for planning; give a Fit")
 
 
 def test_without_do_mpc_one_sentence_says_what_to_install(monkeypatch):

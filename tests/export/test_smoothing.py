@@ -7,7 +7,7 @@ from exported_fits import EVERY_LAW, lfr, mass_on_spring, one_sentence, wave, wi
 from hypothesis import given, settings, strategies as st
 
 from pilfr_casadi import GeneralizedPlay, InputError, Play, Stop, exported
-from pilfr_casadi.export import enclosed, smoothed
+from pilfr_casadi.export import enclose, smooth_kinks
 from pilfr_casadi.laws import StopHysteresis
 from pilfr_casadi.models import fmin, generalized_play, play, stop
 
@@ -47,10 +47,10 @@ PLAIN = {
 @settings(max_examples=60)
 def test_one_operator_is_off_by_what_is_said(case, z, q, r, eps):
     exact, times = PLAIN[case]
-    rounded, x = smoothed(exact, eps), [z, q, r]
+    rounded, x = smooth_kinks(exact, eps), [z, q, r]
     assert not kinks(rounded)
     error = float(rounded(x)) - float(exact(x))
-    ((low, high),) = enclosed(exact, eps, [(v, v) for v in x])[0]
+    ((low, high),) = enclose(exact, eps, [(v, v) for v in x])[0]
     assert abs(error) <= times * eps * (1 + 1e-9) + 1e-14
     assert low - 1e-12 <= float(rounded(x)) <= high + 1e-12 and low - 1e-12 <= float(exact(x)) <= high + 1e-12
     assert max(high - float(exact(x)), float(exact(x)) - low) <= times * eps * (1 + 1e-9) + 1e-12
@@ -128,7 +128,7 @@ def test_sub_steps_in_a_loop_are_smoothed_too():
 def test_what_nothing_is_known_of():
     known = ca.Function("f", [z], [ca.tan(z)], ["x"], ["y"])
     with pytest.raises(InputError, match="'tan'") as error:
-        enclosed(known, 0.1, [(0.1, 0.1)])
+        enclose(known, 0.1, [(0.1, 0.1)])
     one_sentence(error)
 
 
@@ -143,8 +143,8 @@ def test_other_operations_are_enclosed(a, b, eps):
         ca.if_else(ca.logic_and(c > 0.5, q < 1), c, 2), ca.if_else(c == z, 1, 0), ca.acos(c / 4), 2 * c,
     ]  # fmt: skip
     f = ca.Function("f", [ca.vertcat(z, q)], [ca.vertcat(*expressions)], ["x"], ["y"])
-    ends = np.array(enclosed(f, eps, [(a, a), (b, b)])[0])
-    for values in (f([a, b]), smoothed(f, eps)([a, b])):
+    ends = np.array(enclose(f, eps, [(a, a), (b, b)])[0])
+    for values in (f([a, b]), smooth_kinks(f, eps)([a, b])):
         v = np.asarray(values).ravel()
         size = 1e-9 * (1 + np.abs(v))
         assert np.all((ends[:, 0] - size <= v) | np.isnan(v)) and np.all((v <= ends[:, 1] + size) | np.isnan(v))

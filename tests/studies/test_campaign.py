@@ -106,7 +106,7 @@ def test_what_a_campaign_tells(folder, capsys):
     assert main(["campaign", str(changed(folder, few, names))]) == 0
     said = capsys.readouterr().out
     assert "2 cells x 3 seeds" in said and "6 jobs done now" in said
-    assert "chosen on what was fitted" in said  # two structures, and nothing to judge them by
+    assert "chosen on the training recordings" in said  # two structures, and nothing to judge them by
     shown = {
         tuple(line.split()[:3]): line.split()[7] for line in said.splitlines() if line.startswith(f"{long} (test)")
     }

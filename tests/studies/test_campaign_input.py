@@ -91,7 +91,7 @@ def test_unfit_workers_get_one_sentence(folder, monkeypatch):
     with pytest.raises(InputError, match=r"A worker has casadi 3.* and this process 9\.9"):
         pilfr.campaign(folder / "rig.toml")
     monkeypatch.setattr(worker_process.sys, "executable", "/bin/false")
-    with pytest.raises(InputError, match="The workers cannot begin a job"):
+    with pytest.raises(InputError, match="The workers cannot start a job"):
         pilfr.campaign(folder / "rig.toml")
 
 

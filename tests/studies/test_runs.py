@@ -304,7 +304,7 @@ def test_a_run_file_writes_only_below_its_own_folder(capsys, folder, out):
         shutil.copy(folder / f"{name}.csv", inner)
     (inner / "rig.toml").write_text(f'out = "{out}"\n' + RUN)
     before = sorted(folder.rglob("*"))
-    refused(capsys, "run", inner / "rig.toml", says=("'out' is", "no folder below that of the run file", "--out"))
+    refused(capsys, "run", inner / "rig.toml", says=("'out' is", "not below the folder of the run file", "--out"))
     assert sorted(folder.rglob("*")) == before
 
 
@@ -316,7 +316,7 @@ def test_a_link_does_not_lead_out_of_the_folder(capsys, folder):
     (folder / "elsewhere").mkdir()
     (inner / "way").symlink_to(folder / "elsewhere")
     (inner / "rig.toml").write_text('out = "way"\n' + RUN)
-    refused(capsys, "run", inner / "rig.toml", says="no folder below that of the run file")
+    refused(capsys, "run", inner / "rig.toml", says="not below the folder of the run file")
     assert not list((folder / "elsewhere").iterdir())
 
 
@@ -330,7 +330,13 @@ def test_foreign_content_is_not_written_over(capsys, folder, more):
     )
     assert sorted(p.name for p in (folder / "mine").iterdir()) == ["model.json", "thesis.tex"]
     refused(
-        capsys, "run", folder / "rig.toml", "--out", folder, *more, says=("holds the run file", "a folder of their own")
+        capsys,
+        "run",
+        folder / "rig.toml",
+        "--out",
+        folder,
+        *more,
+        says=("holds the run file", "give the results another folder"),
     )
     refused(capsys, "run", folder / "rig.toml", "--out", folder.parent, *more, says="holds the run file")
     assert not (folder / "manifest.json").exists() and not (folder.parent / "manifest.json").exists()
@@ -358,10 +364,10 @@ def test_times_that_are_damaged_do_not_matter(folder):
 
 
 def test_two_runs_do_not_share_a_folder(capsys, folder):
-    from pilfr_casadi.studies import locked
+    from pilfr_casadi.studies import lock_folder
 
     (folder / "rig-run").mkdir()
-    with locked(folder / "rig-run"):
+    with lock_folder(folder / "rig-run"):
         refused(capsys, "run", folder / "rig.toml", says="Another run is at work")
 
 
