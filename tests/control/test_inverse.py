@@ -172,8 +172,8 @@ def test_a_fitted_delay_is_found_whatever_the_noise_of_the_fit(delay, noise, smo
     samples = f"{delay + 1} sample" + "s" * (delay > 0)
     early = re.escape(f"{100 * response.early:.1g} %")
     assert re.fullmatch(
-        f"An input reaches the output after {samples}, but it has {early} of its largest response before, which counts "
-        f"as an error of the model: an approximate inverse, for a path that is known {samples} ahead.",
+        f"An input reaches the output after {samples}, but it has {early} of its largest response before, "
+        f"counted as a model error: an approximate inverse, for a path that is known {samples} ahead.",
         str(made),
     )
     if delay:
