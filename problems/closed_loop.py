@@ -177,7 +177,7 @@ def draw(outcomes: list[Outcome], task: Task, dt: float, units: tuple[str, str],
     PI control, whose errors are several times larger, is shown by its output only.
     """
     from pilfr_casadi import plots
-    from pilfr_casadi.plots.canvas import BLUE, GREEN, GREY, INK, ORANGE, VERMILLION, finish, scaled
+    from pilfr_casadi.plots.canvas import BLUE, GREEN, GREY, INK, ORANGE, VERMILLION, choose_scale, finish
 
     t = dt * np.arange(len(task.reference))
     drawn = [o for o in outcomes if o.name.count(",") < 2 and "no sensor" not in o.name]
@@ -186,7 +186,7 @@ def draw(outcomes: list[Outcome], task: Task, dt: float, units: tuple[str, str],
     close = {name: error for name, error in errors.items() if name != LINEAR}
     figure = plots.new_figure(8.0, 10.0)
     top, middle, near, low = figure.subplots(4, 1, sharex=True)
-    scale, unit = _prefixed(*scaled(task.reference, units[0]))
+    scale, unit = _prefixed(*choose_scale(task.reference, units[0]))
     for value in task.outputs:
         top.axhline(value / scale, color=GREY, linewidth=1, linestyle=":")
     for o in drawn:
@@ -195,7 +195,7 @@ def draw(outcomes: list[Outcome], task: Task, dt: float, units: tuple[str, str],
     finish(top, "", f"output [{unit}]", columns=3)
     for axes, shown in ((middle, errors), (near, close)):
         worst = max(float(np.max(np.abs(e[task.skip :]))) for e in shown.values())
-        scale, unit = _prefixed(*scaled(np.array([worst]), units[0]))
+        scale, unit = _prefixed(*choose_scale(np.array([worst]), units[0]))
         for name, error in shown.items():
             axes.plot(t, error / scale, color=looks[name], linewidth=1.0)
         axes.set_ylim(-1.1 * worst / scale, 1.1 * worst / scale)

@@ -89,20 +89,20 @@ def flag(text: str, name: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class DataOptions:
-    """How recordings are read."""
+    """Options of reading recordings."""
 
     inputs: str | None = option("Names of the inputs (default: the model's or simulator's).", "NAME[,NAME]")
     outputs: str | None = option("Names of the outputs (default: the model's or simulator's).", "NAME[,NAME]")
-    column: list[str] = option("Column of a name, or of the time t, if it differs (repeatable).", "NAME=COLUMN", [])
+    column: list[str] = option("Column of a name, or of the time t, where they differ (repeatable).", "NAME=COLUMN", [])
     initial: Literal["estimate", "zero", "periodic"] | None = option(
         "State at the first sample (default: estimate; zero where no outputs were measured)."
     )
-    period: int | None = whole("Samples per period; goes with --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
+    period: int | None = whole("Samples per period; needs --initial.", 0, MOST_SAMPLES, metavar="SAMPLES")
     hold: Literal["zero", "linear"] | None = option("Course of the inputs between samples.")
-    skip: int = whole("Leading samples that are simulated, not scored.", 0, MOST_SAMPLES, 0, "SAMPLES")
+    skip: int = whole("Leading samples that are simulated but not scored.", 0, MOST_SAMPLES, 0, "SAMPLES")
     dt: float | None = option("Step, where the file has no time column.", "SECONDS")
     time_tolerance: float | None = option(
-        "How far samples may lie off a uniform grid (default: 1e-4 steps, beyond rounding).", "STEPS"
+        "Largest deviation of samples from a uniform grid (default: 1e-4 steps, beyond rounding).", "STEPS"
     )
 
     def __post_init__(self) -> None:
@@ -113,7 +113,7 @@ class DataOptions:
             )
 
     def names(self, inputs: Sequence[str] = (), outputs: Sequence[str] = ()) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the names of inputs and outputs that were given, else these."""
+        """Return the names of inputs and outputs from the options; these are the defaults."""
         return (
             tuple(inputs) if self.inputs is None else name_list(self.inputs, "--inputs"),
             tuple(outputs) if self.outputs is None else name_list(self.outputs, "--outputs"),
@@ -124,7 +124,7 @@ class DataOptions:
         return pairs(self.column, "--column")
 
     def read(self, path: str, inputs: tuple[str, ...], outputs: tuple[str, ...], only_these: bool = False) -> Recording:
-        """Read a recording; `only_these` allows `--column` to name channels that are not among these."""
+        """Read a recording; `only_these` allows `--column` to name other channels too."""
         from ..data import TIME_NAMES, read  # here, so that `pilfr --help` is quick
 
         columns = self.columns(path)
@@ -171,7 +171,7 @@ def number(text: str, given: str) -> float:
 def check_given_once(paths: Sequence[str]) -> None:
     """Refuse a file that is given twice."""
     if len({os.path.realpath(path) for path in paths}) < len(paths):
-        raise InputError("A file is given twice, as training or test recording; a test on training data says nothing.")
+        raise InputError("A file is given twice, as training or test recording; a test needs other data.")
 
 
 def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> None:
@@ -185,13 +185,13 @@ def check_names(fitted: Fit, inputs: Sequence[str], outputs: Sequence[str]) -> N
 
 
 def describe(kind: str, path: str, recording: Recording) -> str:
-    """Say what was read from a file, in a line."""
+    """Describe a recording and its file in one line."""
     names = f"inputs {', '.join(recording.inputs)}, outputs {', '.join(recording.outputs)}"
     return f"{kind} data: {path}, {len(recording)} samples, step {recording.dt:.6g} s, {names}"
 
 
 def new_file(folder: str, name: str, overwrite: bool) -> Path:
-    """Return the path of a result."""
+    """Return the path of a result; refuse an existing file unless it may be overwritten."""
     target = Path(folder) / name
     if target.exists() and not overwrite:
         raise InputError(f"{target} exists already; give another --out, or --overwrite to replace it.")

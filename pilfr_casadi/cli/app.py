@@ -1,7 +1,7 @@
-"""The program `pilfr`: it finds the command, and turns whatever goes wrong into one sentence and an exit status.
+"""The program `pilfr`: it runs the command, and turns every failure into one sentence and an exit status.
 
 Exit status: 0 done, 1 no usable result, 2 bad input (one plain sentence on stderr), 130 interrupted (the best so far is
-written). Each family of commands has a file of its own, which is imported only when one of its commands runs.
+written). Each family of commands has its own file, imported only when one of its commands runs.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ COMMANDS = {  # name: (file, help)
     "diagnose": ("diagnose", "Find the physics that a simulator leaves out."),
     "simulate": ("models", "Simulate a saved model on a recording's inputs."),
     "export": ("models", "Write a model's step as a serialized CasADi function or as C."),
-    "run": ("studies", "Execute a run file: identifications and all they depend on; jobs that are done are skipped."),
+    "run": ("studies", "Execute the jobs of a run file one by one; finished jobs are skipped."),
     "campaign": (
         "studies",
         "Execute all jobs of a run file side by side: Monte Carlo studies, grids, cross-validation.",
     ),
     "demo": ("demo", "Identify a rig and diagnose a simulator, from recordings that come with the package."),
 }
-# keyword arguments of Python that messages of the package name, and that are options of the same name here
+# keyword arguments in messages of the package that are options of the same name here
 KEYWORDS = ("dt", "time_tolerance", "period", "hold", "initial", "skip", "starts", "seed", "workers", "engine")
 
 
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments : sequence of str, optional
-        In place of those of the process.
+        Arguments instead of the ones of the process.
 
     Returns
     -------
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UsageError as error:
         return say(_usage_sentence(error), BAD_INPUT)
     except InputError as error:
-        return say(in_options(str(error)), BAD_INPUT)
+        return say(name_options(str(error)), BAD_INPUT)
     except KeyboardInterrupt:
         return say("Interrupted before there was anything to write.", INTERRUPTED)
     except BrokenPipeError:
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    with deferred_interrupt():  # an import must not be torn apart
+    with deferred_interrupt():  # an import must not be interrupted
         program = typer.main.get_command(_program(arguments[0] if arguments else ""))
     with terminable(), warnings.catch_warnings():
         warnings.showwarning = _warn
@@ -80,7 +80,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _program(wanted: str) -> typer.Typer:
-    """Build the program; only the wanted command is imported, of the others the help has the names."""
+    """Build the program; import only the wanted command, the help shows the names of the others."""
     program = typer.Typer(
         help="Identify dynamic models with hysteresis from recordings; find the physics that a simulator lacks.",
         add_completion=False,
@@ -112,7 +112,7 @@ def _placeholder() -> None:
 
 
 def _usage_sentence(error: Any) -> str:
-    """Say what is wrong with the options, with the option's name and value first where the option's type says so."""
+    """Describe what is wrong with the options; start with the option and its value where its type gives them."""
     if " was given; " in error.message and getattr(error, "param", None) is not None:
         return f"{error.param.opts[-1]} {error.message}"
     sentence = str(error.format_message()).replace("Value error, ", "").replace(". Did you", "; did you")
@@ -121,12 +121,12 @@ def _usage_sentence(error: Any) -> str:
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
-    """Print a warning as a sentence, without the place in the code that Python adds."""
+    """Print a warning as a sentence, without the line of code that Python adds."""
     say(f"warning: {message}", DONE)
 
 
-def in_options(sentence: str) -> str:
-    """Put a message that names Python's keyword arguments into the words of the command line."""
+def name_options(sentence: str) -> str:
+    """Replace Python's keyword arguments in a message by options of the command line."""
     sentence = sentence.replace("give the model as `model=`", "use it in Python with load(FILE, model=MODEL)")
     sentence = re.sub(r"columns=\{'([^']*)': '([^']*)'\}", r"--column \1=\2", sentence)
     keyword = rf"`?(?<![\w-])({'|'.join(KEYWORDS)})=(?:'([^']*)'|([^\s;,()`]*[^\s;,.()`]))?`?"

@@ -1,4 +1,4 @@
-"""`pilfr diagnose`: read and check the files, find the physics that is missing, write and print what was found."""
+"""`pilfr diagnose`: read and check the files, find the missing physics, write and print the diagnosis."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ class DiagnoseOptions(DataOptions):
         metavar="[SIMULATOR] TRAIN",
         help="A Python file that sets `simulator` (or a model.json), then training recordings (.csv, .mat, .npz).",
     )
-    simulated: str | None = option("Inputs and outputs of the simulation, in place of the simulator file.", "SIM")
-    test: list[str] = option("Recording to judge on, never fitted (repeatable).", "FILE", [])
+    simulated: str | None = option("Recorded simulation (inputs and outputs), instead of the simulator file.", "SIM")
+    test: list[str] = option("Test recording, never fitted (repeatable).", "FILE", [])
     limit: list[str] = option(
-        "Largest amplitude of an input in the experiment that is proposed next (repeatable; default: as recorded).",
+        "Largest amplitude of an input in the proposed next experiment (repeatable; default: as recorded).",
         "INPUT=AMPLITUDE",
         [],
     )
     workers: int | None = whole(
-        "Fits side by side (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
+        "Number of parallel fits (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
     )
     out: str = option("Folder for diagnosis.json and report.html (default: diagnosis).", "DIR", "diagnosis")
-    overwrite: bool = flag("Replace a diagnosis that is in that folder already.", "--overwrite")
+    overwrite: bool = flag("Replace an existing diagnosis in that folder.", "--overwrite")
 
     @property
     def source(self) -> str | None:
@@ -71,11 +71,11 @@ class DiagnoseOptions(DataOptions):
 
     @property
     def recordings(self) -> list[str]:
-        """Every recording: the simulation's, those to train, those to test."""
+        """All recordings: of the simulation, for training, for the test."""
         return [*([self.simulated] if self.simulated else []), *self.train, *self.test]
 
     def columns(self, path: str) -> dict[str, str]:
-        """Return the column of each name in a file; one file may have the name itself, and another one the column."""
+        """Return the column of each name in a file; some files may have the name itself as a column."""
         columns = super().columns(path)
         if not columns or not self.simulated:
             return columns
@@ -131,7 +131,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
 
 
 def write_diagnosis(diagnosis: Diagnosis, folder: Path) -> int:
-    """Write diagnosis.json, then the page; print the diagnosis and where it is; return the exit status."""
+    """Write diagnosis.json, then the page; print the diagnosis and its paths; return the exit status."""
     target = folder / "diagnosis.json"
     content = json.dumps(diagnosis.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     try:
@@ -157,7 +157,7 @@ def _check_files(options: DiagnoseOptions) -> None:
     source = options.source
     if source is not None and Path(source).suffix.lower() in TABLE_SUFFIXES:
         raise InputError(
-            f"{source} is no simulator file; give SIMULATOR.py first, or the simulation's own inputs and outputs with "
+            f"{source} is not a simulator file; give SIMULATOR.py first, or inputs and outputs of the simulation with "
             "--simulated SIM.csv."
         )
     scripts = [path for path in (*options.train, *options.test) if Path(path).suffix.lower() == ".py"]
@@ -177,11 +177,13 @@ def _check_recordings(train: dict[str, Recording], tests: dict[str, Recording]) 
     for there, t in tests.items():
         for path, r in train.items():
             if len(r) == len(t) and np.array_equal(r.u, t.u) and np.array_equal(r.y, t.y):
-                raise InputError(f"{there} holds the same samples as {path}; a test on training data says nothing.")
+                raise InputError(f"{there} holds the same samples as {path}; a test needs other data.")
     path, first = next(iter(train.items()))
     for other, r in (train | tests).items():
         if abs(r.dt / first.dt - 1) > SAME_STEP:
-            raise InputError(f"{other} has a step of {r.dt:g} s, {path} one of {first.dt:g} s; resample one of them.")
+            raise InputError(
+                f"{other} has a step of {r.dt:g} s, {path} a step of {first.dt:g} s; resample one of them."
+            )
 
 
 def _announce(simulator: Simulator, name: str, train: dict[str, Recording], tests: dict[str, Recording]) -> None:
@@ -197,7 +199,7 @@ def _announce(simulator: Simulator, name: str, train: dict[str, Recording], test
 def _surrogate(
     options: DiagnoseOptions, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> tuple[Simulator, float, str]:
-    """Fit a linear model to the simulation's answers; return it, its NRMSE, and a note where it follows badly."""
+    """Fit a linear model to the simulation; return it, its NRMSE, and a note if the fit is poor."""
     with deferred_interrupt():
         from ..diagnose import POOR, TOO_POOR, surrogate
     assert options.simulated is not None
@@ -208,7 +210,7 @@ def _surrogate(
 
 
 def _simulated_names(options: DiagnoseOptions) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return inputs and outputs as given, else the columns that the files share, told apart by their values."""
+    """Return inputs and outputs as given, else sort the columns that the files share by their values."""
     if options.inputs and options.outputs:
         return options.names()
     if options.inputs or options.outputs:
@@ -232,13 +234,13 @@ def _simulated_names(options: DiagnoseOptions) -> tuple[tuple[str, ...], tuple[s
 
 
 def _column_names(options: DiagnoseOptions, path: str) -> list[str]:
-    """Return a file's columns by the names that options give them."""
+    """Return the columns of a file under the names that the options give them."""
     names = {column: name for name, column in options.columns(path).items()}
     return [names.get(column, column) for column in column_names(path)]
 
 
 def _unshared(files: Sequence[str], columns: Sequence[Sequence[str]], shared: Sequence[str]) -> Iterator[str]:
-    """Note each column that only one file has; where both have some, one may be the other under another name."""
+    """Note each column that only one file has; refuse if both have some, which may be one column with two names."""
     first, *others = ([n for n in names if n not in TIME_NAMES and n not in shared] for names in columns)
     for path, names, own in zip(files[1:], columns[1:], others, strict=True):
         lost = [n for n in first if n not in names]
@@ -249,11 +251,11 @@ def _unshared(files: Sequence[str], columns: Sequence[Sequence[str]], shared: Se
             )
         for extra, there, lacks in ((lost, files[0], path), (own, path, files[0])):
             if extra:
-                yield f"note: {listed(extra)} of {there} is left out, for {lacks} has no such column"
+                yield f"note: {listed(extra)} of {there} is left out, because {lacks} has no such column"
 
 
 def _cause(options: DiagnoseOptions, shared: Sequence[str]) -> tuple[str, ...]:
-    """Return the one of two columns that the other follows from: a linear model fits from cause to effect only."""
+    """Return which of two columns is the input: a linear model fits only from cause to effect."""
     from ..diagnose import surrogate
 
     assert options.simulated is not None
@@ -269,6 +271,6 @@ def _cause(options: DiagnoseOptions, shared: Sequence[str]) -> tuple[str, ...]:
 
 
 def _same_samples(options: DiagnoseOptions, name: str) -> bool:
-    """Whether the simulation has the samples of one of the recordings."""
+    """Tell whether the simulation has the same samples of a column as one of the recordings."""
     first, *others = (options.read(f, (name,), (), only_these=True).u for f in options.recordings)
     return any(len(o) == len(first) and bool(np.allclose(o, first, rtol=1e-6, atol=0.0)) for o in others)

@@ -1,4 +1,4 @@
-"""`pilfr fit`, `simulate` and `export`: a model is identified from recordings, saved, and used."""
+"""`pilfr fit`, `simulate` and `export`: identify a model from recordings, save it, and use it."""
 
 from __future__ import annotations
 
@@ -64,19 +64,19 @@ from ._common import (
     whole,
 )
 
-# options of a search, which a saved model to start from has already
+# options of a search, which a saved model to start from replaces
 SEARCH = ("nx", "operators", "operator", "channels", "structure", "hidden", "lags", "bound", "fix", "starts", "seed")
-STRUCTURE_NAMES = {"bound": "bounds"}  # options that the structures call otherwise
+STRUCTURE_NAMES = {"bound": "bounds"}  # options with another name in the structures
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions(DataOptions):
-    """The options of `pilfr fit`; those of a search have no default, to see which ones were given."""
+    """The options of `pilfr fit`; options of a search have no default, to show which ones were given."""
 
     train: list[str] = typer.Argument(..., help="Training recordings (.csv, .mat, .npz).", metavar="TRAIN")
     inputs: str = option("Names of the inputs.", "NAME[,NAME]", ...)
     outputs: str = option("Names of the outputs.", "NAME[,NAME]", ...)
-    test: list[str] = option("Recording to report on, never fitted (repeatable).", "FILE", [])
+    test: list[str] = option("Test recording, never fitted (repeatable).", "FILE", [])
     nx: int | None = whole("States of the linear part (default: chosen on the training data).", 0, LARGEST_SIZE["nx"])
     operators: int | None = whole(
         "Hysteresis operators per channel (default: 20); 0 for a linear model.", 0, LARGEST_SIZE["operators"]
@@ -86,8 +86,8 @@ class FitOptions(DataOptions):
     structure: Literal["lfr", "hammerstein", "wiener", "ssnn", "network_lfr", "narx", "noe"] | None = option(
         "Where the element sits (default: lfr), or a network to compare with."
     )
-    hidden: int | None = whole("Neurons of a network (default: 15; 10 of narx and noe).", 1, LARGEST_SIZE["hidden"])
-    lags: int | None = whole("Past outputs and inputs of narx and noe.", 1, LARGEST_SIZE["lags"])
+    hidden: int | None = whole("Neurons of a network (default: 15; 10 for narx and noe).", 1, LARGEST_SIZE["hidden"])
+    lags: int | None = whole("Number of past outputs and inputs of narx and noe.", 1, LARGEST_SIZE["lags"])
     bound: list[str] = option("Bounds of a parameter (repeatable).", "NAME=LOW:HIGH", [])
     fix: list[str] = option("Hold a block of parameters at a value (repeatable).", "NAME=VALUE", [])
     starts: int | None = whole("Starts (default: 8).", 1, LARGEST_SIZE["starts"])
@@ -96,11 +96,13 @@ class FitOptions(DataOptions):
     solver: Literal["gauss-newton", "ipopt"] = option(
         "Solver of the final problem (default: gauss-newton).", default="gauss-newton"
     )
-    workers: int = whole("Processes; the numbers do not depend on it (default: 1).", 1, LARGEST_SIZE["workers"], 1)
+    workers: int = whole(
+        "Number of processes; it does not change the results (default: 1).", 1, LARGEST_SIZE["workers"], 1
+    )
     engine: Literal["auto", "c", "vm"] = option(
         "Generated C or CasADi's virtual machine (default: C where there is a compiler).", default="auto"
     )
-    time_limit: float | None = seconds("Stop then and keep the best so far (default: no limit).")
+    time_limit: float | None = seconds("Stop after this time and keep the best so far (default: no limit).")
     out: str = option("Folder for model.json and report.html (default: fit).", "DIR", "fit")
     overwrite: bool = flag("Replace a model that is in that folder already.", "--overwrite")
 
@@ -147,7 +149,7 @@ def fit_command(options: FitOptions) -> int:
 
 
 def _check(options: FitOptions) -> Path:
-    """Refuse options that do not go together; return the file that is to be written."""
+    """Refuse options that exclude each other; return the path of the model file."""
     if options.start_from and options.search:
         raise InputError(
             f"{listed([f'--{name}' for name in options.search])} was given together with --from, whose model has its "
@@ -167,14 +169,14 @@ def _check(options: FitOptions) -> Path:
 def _identify(
     options: FitOptions, saved: Fit | None, train: list[Recording], progress: Progress
 ) -> tuple[Fit | PILFR | Lagged, Fit]:
-    """Return what was to be fitted, and the fit."""
+    """Return the model that was to be fitted, and the fit."""
     solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
     with worker_pool(options.workers) as pool:
         task = saved if saved is not None else _structure(options, train, progress)
-        if isinstance(task, Lagged):  # too many lags are refused before they are built
+        if isinstance(task, Lagged):  # refuse too many lags before building them
             check_for_identification(train, task.unknowns(train[0].n_u, train[0].n_y) + 2)
         progress("building the engine", 0, 0, np.nan)
-        engine = announced_engine(task, train[0], options.engine)
+        engine = announce_engine(task, train[0], options.engine)
         search: dict[str, Any] = {}
         if saved is None:
             search = {"starts": options.starts or 8, "seed": options.seed or 0, "executor": pool}
@@ -212,8 +214,8 @@ def _bounds(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     return out
 
 
-def announced_engine(task: PILFR | Lagged | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
-    """Build the engine once, say which one it is and why; return the choice that gives it without a warning."""
+def announce_engine(task: PILFR | Lagged | Fit, recording: Recording, choice: str, quiet: bool = False) -> str:
+    """Build the engine once, announce it with the reason; return the choice that gives it without a warning."""
     if choice == "vm":
         if not quiet:
             print("engine: CasADi's virtual machine, as given", flush=True)
@@ -243,16 +245,17 @@ def _write(
         from ..report import fit_report
     print(result)
     if isinstance(task, PILFR) and task.element is not None and result.structure != task:
-        print("No start was finished: this is the linear model that the starts begin with.")
+        print("No start was finished: this is the initial linear model.")
     for recording in tests:
-        print(_test_line(result, recording))
+        print(describe_test_error(result, recording))
     with progress_bar() as progress:
         progress("writing the report", 0, 0, np.nan)
         page = fit_report(result, train, tests, target.parent)
     print(f"model: {target}\nreport: {page}")
 
 
-def _test_line(result: Fit, recording: Recording) -> str:
+def describe_test_error(result: Fit, recording: Recording) -> str:
+    """Describe the error on a test recording, or say why there is none."""
     try:
         error, first = result.nrmse(recording), result.scored_from(recording)
     except InputError as reason:
@@ -261,7 +264,7 @@ def _test_line(result: Fit, recording: Recording) -> str:
     share = 100 * np.sqrt(np.mean(left**2, axis=0)) / np.ptp(recording.y[first:], axis=0)
     text = f"NRMSE on {recording.name}: {error:.4f} (rms error {', '.join(f'{s:.2f}' for s in share)} % of the range)"
     fitted = first > recording.skip
-    return text + (f"; its initial state is fitted to the first {first} samples, not scored" if fitted else "")
+    return text + (f"; the first {first} samples estimate the initial state and are not scored" if fitted else "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -272,12 +275,12 @@ class SimulateOptions(DataOptions):
     data: str = typer.Argument(
         ..., help="A recording (.csv, .mat, .npz), or several in one array (.npz, .npy: samples, channels, ...)."
     )
-    out: str = option("CSV file; of several records also .npz or .npy.", "FILE", ...)
+    out: str = option("CSV file; for several records also .npz or .npy.", "FILE", ...)
 
 
 @takes_options
 def simulate_command(options: SimulateOptions) -> int:
-    """Where the file has the outputs too, the error of the simulation is printed."""
+    """If the file has the outputs too, the error of the simulation is printed."""
     _check_out(options)
     fitted = load(options.model)
     inputs, outputs = options.names(fitted.model.inputs, fitted.model.outputs)
@@ -290,7 +293,7 @@ def simulate_command(options: SimulateOptions) -> int:
         raise InputError(f"--out {options.out} is for several records in one array; give a name that ends in .csv.")
     if kind not in (".mat", ".npz"):  # there, a matrix stands for several names
         check_names(fitted, inputs, outputs)
-    columns, measured = _measured(options, inputs, outputs)
+    columns, measured = _columns_to_read(options, inputs, outputs)
     options = replace(
         options,
         initial=options.initial or ("estimate" if measured else "zero"),
@@ -298,14 +301,14 @@ def simulate_command(options: SimulateOptions) -> int:
     )
     recording = options.read(options.data, inputs, outputs if measured else ())
     check_names(fitted, recording.inputs, recording.outputs if measured else fitted.model.outputs)
-    y = replace(fitted, engine=announced_engine(fitted, recording, "auto", quiet=True)).simulate(recording)
+    y = replace(fitted, engine=announce_engine(fitted, recording, "auto", quiet=True)).simulate(recording)
     if not np.all(np.isfinite(y)):
         return say(f"The simulation of {options.model} diverges on {options.data}; nothing was written.", NO_RESULT)
     write_atomically(Path(options.out), _table(options, fitted, recording, y, columns))
     if measured:
         print(_error_line(fitted, recording, y))
     else:
-        state = "zero" if options.initial == "zero" else "that of the periodic steady state"
+        state = "zero" if options.initial == "zero" else "periodic steady state"
         print(f"{options.data} has no outputs ({listed(outputs)}) to compare with; initial state: {state}")
     print(f"simulated outputs: {options.out}")
     return DONE
@@ -320,7 +323,9 @@ def _check_out(options: SimulateOptions) -> None:
         raise InputError(f"--out {options.out} is written as CSV; give a name that ends in .csv.")
 
 
-def _measured(options: SimulateOptions, inputs: Sequence[str], outputs: Sequence[str]) -> tuple[dict[str, str], bool]:
+def _columns_to_read(
+    options: SimulateOptions, inputs: Sequence[str], outputs: Sequence[str]
+) -> tuple[dict[str, str], bool]:
     """Return the columns to read by name, and whether the file has the outputs."""
     columns = pairs(options.column, "--column")
     there = column_names(options.data, [columns.get(name, name) for name in (*inputs, *outputs)])
@@ -364,7 +369,7 @@ def _simulate_stack(options: SimulateOptions, fitted: Fit, u: np.ndarray, y: np.
         inputs = fitted.model.inputs
         record = Recording(u[at], measured, options.dt, inputs, outputs, initial=initial, name=name, **more)
         if k == 0:
-            fitted = replace(fitted, engine=announced_engine(fitted, record, "auto", quiet=True))
+            fitted = replace(fitted, engine=announce_engine(fitted, record, "auto", quiet=True))
         found[at] = fitted.simulate(record)
         if not np.all(np.isfinite(found[at])):
             return say(f"The simulation of {options.model} diverges on {name}; nothing was written.", NO_RESULT)
@@ -407,12 +412,12 @@ class ExportOptions:
     """The options of `pilfr export`."""
 
     model: str = typer.Argument(..., help="A model.json, or a Python file that sets `simulator`.")
-    out: str = option("The file; with --c the folder for both files.", "FILE", ...)
-    casadi: bool = flag("A file for casadi.Function.load, and its names (default).", "--casadi")
-    c: bool = flag("C source and header that need no library.", "--c")
+    out: str = option("Path of the file; with --c the folder of both files.", "FILE", ...)
+    casadi: bool = flag("Write a file for casadi.Function.load, and one with its names (default).", "--casadi")
+    c: bool = flag("Write C source and header that need no library.", "--c")
     name: str = option("Name of the function (default: model).", default="model")
-    smooth: float = option("Round min and max by this much (default: exact).", "EPS", 0.0)
-    dt: float | None = option("Step of a simulator, which has none.", "SECONDS")
+    smooth: float = option("Width of the rounding of min and max (default: 0, exact).", "EPS", 0.0)
+    dt: float | None = option("Duration of a step, needed for a simulator.", "SECONDS")
     hold: Literal["zero", "linear"] | None = option("Course of a simulator's inputs between samples.")
 
 

@@ -1,4 +1,4 @@
-"""`pilfr run` and `pilfr campaign`: execute a run file, and print what its jobs amount to."""
+"""`pilfr run` and `pilfr campaign`: execute a run file, and print its results."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from ..studies import (
 )
 from ._common import DONE, INTERRUPTED, NO_RESULT, flag, make_folder, option, say, seconds, takes_options, whole
 
-LINE_WIDTH = 10_000  # characters: tables are never folded or cut off, since a number that is cut off is a wrong number
+LINE_WIDTH = 10_000  # characters: a table must not be wrapped, because a truncated number is a wrong number
 EVERY_KEY = Path(__file__).parent / "demo_data" / "every_key.toml"
 
 
@@ -44,14 +44,14 @@ class RunOptions:
     """The options of `pilfr run`."""
 
     run_file: str = typer.Argument(..., metavar="RUN.toml", help="The run file (.toml, or .py that sets `run`).")
-    out: str | None = option("Folder of the results (default: as the file says, else RUN-run).", "DIR")
+    out: str | None = option("Folder of the results (default: as in the file, else RUN-run).", "DIR")
     workers: int | None = whole(
-        "Processes; the numbers do not depend on it (default: as the file says).", 1, LARGEST_SIZE["workers"]
+        "Number of processes; it does not change the results (default: as in the file).", 1, LARGEST_SIZE["workers"]
     )
-    overwrite: bool = flag("Compute everything again, whatever is in the folder.", "--overwrite")
+    overwrite: bool = flag("Compute everything again, even finished jobs.", "--overwrite")
 
     def read(self, kind: str) -> Run:
-        """Read the run file; folder and workers of the command line go before those of the file."""
+        """Read the run file; folder and workers of the command line override the file."""
         given = read_run(self.run_file, kind)
         if self.out is not None:
             check_own(Path(self.out), given.file, self.overwrite)
@@ -64,12 +64,12 @@ class CampaignOptions(RunOptions):
     """The options of `pilfr campaign`."""
 
     dask: str | None = option("Run the jobs on the Dask cluster of this scheduler.", "ADDRESS")
-    time_limit: float | None = seconds("End a job after this time (default: as the file says, else no limit).")
+    time_limit: float | None = seconds("Stop a job after this time (default: as in the file, else no limit).")
 
 
 @takes_options
 def run_command(options: RunOptions) -> int:
-    """Jobs are done one after the other, the starts of each side by side."""
+    """Jobs run one after the other, the starts of each side by side."""
     given = options.read("run")
     count = len(given.seeds) * len(given.cells)
     print(f"run: {given.file}, {count} job{'s' * (count > 1)}, results in {given.out}", flush=True)
@@ -83,7 +83,7 @@ def run_command(options: RunOptions) -> int:
 
 @takes_options
 def campaign_command(options: CampaignOptions) -> int:
-    """Jobs are done side by side; one that fails, hangs or dies does not stop the others."""
+    """Jobs run side by side; a job that fails, hangs or dies does not stop the others."""
     if options.dask and options.workers is not None:
         raise InputError("--workers and --dask were given; the cluster has its own workers, so leave one of them out.")
     given = options.read("campaign")
@@ -114,13 +114,13 @@ def campaign_command(options: CampaignOptions) -> int:
 
 
 def _report(given: Run, execute: Callable[[], RunResult], *files: str) -> int:
-    """Execute a run; print the errors of the model chosen and where everything is; return the exit status."""
+    """Execute a run; print the errors of the chosen model and the paths of all results; return the exit status."""
     try:
         result = execute()
     except RunInterrupted as stop:
-        return say(f"Interrupted; {stop}, the same command goes on from there.", INTERRUPTED)
+        return say(f"Interrupted; {stop}, the same command continues from there.", INTERRUPTED)
     except KeyboardInterrupt:
-        return say("Interrupted; what is done stays, the same command goes on from there.", INTERRUPTED)
+        return say("Interrupted; finished jobs are kept, the same command continues from there.", INTERRUPTED)
     except NoModel as missed:
         return say(str(missed), NO_RESULT)
     for role in ROLES:
@@ -143,7 +143,7 @@ def _report(given: Run, execute: Callable[[], RunResult], *files: str) -> int:
 
 
 def _print_summary(result: RunResult) -> None:
-    """Print the quartiles of every cell, and the structure that is recommended."""
+    """Print the quartiles of every cell, and the recommended structure."""
     from rich.console import Console
     from rich.table import Table
 
@@ -167,4 +167,4 @@ def _print_line(line: str) -> None:
 
 # shown at the end of the help of both commands
 for command in (run_command, campaign_command):
-    command.__doc__ = f"{command.__doc__}\n\nEvery key of a run file, in one that runs: {EVERY_KEY}"
+    command.__doc__ = f"{command.__doc__}\n\nAn example with every key of a run file: {EVERY_KEY}"

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ..data import Recording
     from ..laws import Law
     from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
+    from .gates import Gate as Gate
     from .mismatch_map import mismatch as mismatch
     from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect, plain as plain
     from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate

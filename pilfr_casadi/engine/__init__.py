@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING
 from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
-    from .compiled import compiler as compiler, make_engine as make_engine
-    from .sensitivities import Engine as Engine, VirtualMachine as VirtualMachine
+    from .compiled import (
+        Compiled as Compiled,
+        cache_directory as cache_directory,
+        compiler as compiler,
+        make_engine as make_engine,
+        source_code as source_code,
+    )
+    from .sensitivities import Engine as Engine, VirtualMachine as VirtualMachine, linearize as linearize
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -1,14 +1,14 @@
 """The engine that runs generated C: a model's step, called from the time loops of `_kernel.c`.
 
 Most partial derivatives of a state-space model are parameters, signals or constants themselves. The loops look these
-up; only the others become code, and expressions of parameters alone are evaluated once a run. Slopes of models with
-many operators are looked up in tables, whose zeros cost nothing; those of a step of several stages, of which nearly
-none is ever zero, are written out term by term.
+up; only the others become code, and expressions of parameters alone are evaluated once per run. Slopes of models with
+many operators are looked up in tables, whose zeros cost nothing. Slopes of a step of several stages are hardly ever
+zero and are written out term by term.
 
-The loops are built once; a model's library is built once a structure. Both are kept in a private per-user cache, keyed
-by source, compiler, processor and CasADi version, in folders by the key's first letters: a cache of many thousands is
-not listed as a whole. A file name holds a digest of its content, so that a damaged library is built anew. A cache
-directory that others can write to is not used. Without a working C compiler `make_engine` falls back to the virtual
+The loops are built once, a model's library once per structure. Both are kept in a private per-user cache, keyed by
+source, compiler, processor and CasADi version, in folders by the key's first letters, so that listings stay short. A
+file name holds a digest of its content, so a damaged library is built again. A cache directory that others can write
+to is not used. Without a working C compiler `make_engine` falls back to the virtual
 machine of `sensitivities`, which gives the same numbers: bit by bit on x86-64, where neither engine fuses products
 and sums.
 """
@@ -46,11 +46,11 @@ _VALUES = ("constant", "p", "fixed", "u", "x", "s", "z", "w", "c", "computed")
 
 @dataclass(frozen=True, eq=False)
 class _Code:
-    """Code of a step, and where the kernel finds the nonzeros of each block.
+    """Code of a step, and the place of the nonzeros of each block in the kernel's stack of values.
 
-    The functions are `fixed` (p -> f), expressions of parameters alone, evaluated once a run; `step`; and `computed`,
-    the nonzeros that are neither constants nor parameters nor signals, each once. `at` says where each of `_VALUES`
-    begins in the stack of values and where it ends, `entries` the place in the stack of each nonzero, in the order of
+    The functions are `fixed` (p -> f), expressions of parameters alone, evaluated once per run; `step`; and `computed`,
+    the nonzeros that are neither constants nor parameters nor signals, each once. `at` gives the start of each of
+    `_VALUES` in the stack, and the stack's end. `entries` gives the place in the stack of each nonzero, in the order of
     the block's pattern.
     """
 
@@ -61,7 +61,7 @@ class _Code:
 
     @classmethod
     def of(cls, linear: Linearization) -> _Code:
-        """Sort the nonzeros by where they come from."""
+        """Sort the nonzeros by their source."""
         symbol = linear.symbols()
         stepped = linear.step(*(symbol[k] for k in linear.step.name_in()))
         blocks = linear.blocks(symbol)
@@ -79,15 +79,15 @@ class _Code:
                 return known[e.element_hash()]
             return "computed", computed.setdefault(e.element_hash(), (len(computed), e))[0]
 
-        def given(function: ca.Function) -> list[Any]:
+        def arguments_of(function: ca.Function) -> list[Any]:
             return [symbol[k] for k in (*function.name_in(), "fixed")]
 
         places = {key: [place(e) for e in block.nonzeros()] for key, block in blocks.items()}
         rest = ca.vertcat(ca.SX(0, 1), *(e for _, e in computed.values()))
         functions = {
             "fixed": ca.Function("pilfr_fixed", [symbol["p"]], [ca.vertcat(ca.SX(0, 1), *fixed)]),
-            "step": ca.Function("pilfr_step", given(linear.step), ca.cse(stepped)),
-            "computed": ca.Function("pilfr_computed", given(linear.partial), [rest]),
+            "step": ca.Function("pilfr_step", arguments_of(linear.step), ca.cse(stepped)),
+            "computed": ca.Function("pilfr_computed", arguments_of(linear.partial), [rest]),
         }
         sizes = {"fixed": len(names), "constant": len(constants), "computed": len(computed)}
         at, end = {}, 0
@@ -100,7 +100,7 @@ class _Code:
 
 @one_at_a_time
 def source_code(linear: Linearization) -> str:
-    """The C source of one structure: CasADi's code for the step, the term tables, and a `model_t` that names them."""
+    """Write the C source of one structure: CasADi's code for the step, the term tables, and a `model_t` of both."""
     code = _Code.of(linear)
     at, sizes = code.at, linear.sizes
     options = {"with_header": False, "main": False, "indent": 0, "casadi_int": "long long"}
@@ -123,7 +123,7 @@ def source_code(linear: Linearization) -> str:
         most = max(most, sum(map(len, terms)))
     entries = {f: f"pilfr_{f}" for f in code.functions} | {"constants": "constants"}
     if staged:
-        written, direct, n_rows = _written(linear, code)
+        written, direct, n_rows = _write_slopes(linear, code)
         lines += [*written, f"static const entered_t direct[] = {{{','.join(direct) or '{0}'}}};"]
         entries |= {"slopes": "slopes", "direct": "direct", "n_direct": str(len(direct))}
         entries["n_direct_rows"] = str(n_rows)
@@ -140,18 +140,18 @@ def source_code(linear: Linearization) -> str:
 
 
 def _entries(linear: Linearization, code: _Code, target: str) -> Iterator[tuple[str, int, int, int]]:
-    """(source, row, column, where its value is) of the slopes of a target."""
+    """Yield (source, row, column, place of the value) of the slopes of a target."""
     for source in TARGETS[target]:
         pattern = linear.partial.sparsity_out(BLOCKS.index((target, source)))
         for i, j, value in zip(*pattern.get_triplet(), code.entries[target, source], strict=True):
             yield source, i, j, value
 
 
-def _written(linear: Linearization, code: _Code) -> tuple[list[str], list[str], int]:
-    """C code of the slopes of all rows, its direct entries {row, parameter, value}, and how many rows these have.
+def _write_slopes(linear: Linearization, code: _Code) -> tuple[list[str], list[str], int]:
+    """Write C code of the slopes of all rows; return it, its direct entries {row, parameter, value}, and their rows.
 
-    The code works on a few columns at a time. What depends on a parameter directly is entered into rows of its own, in
-    the same place at every step.
+    The code works on a few columns at a time. Direct derivatives by a parameter are entered into separate rows, in the
+    same place at every step.
     """
     sizes = linear.sizes
     rows = {target: [list[str]() for _ in range(sizes[target])] for target in TARGETS}
@@ -183,7 +183,7 @@ def _text(name: str) -> str:
 
 
 def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[str, str]:
-    """C tables of the entries of all rows, one after the other, and of where each row begins."""
+    """Write C tables of the entries of all rows, one after the other, and of the start of each row."""
     first = np.cumsum([0, *map(len, rows)]).tolist()
     flat = ",".join(entry for row in rows for entry in row) or "{0}"
     begins = ",".join(map(str, first))
@@ -197,18 +197,18 @@ def loops_code() -> str:
 
 # without fused multiply-adds the generated step gives the bits of the virtual machine, so the same operators slip
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
-FLAGS = (("-march=native", *COMMON), COMMON)  # the second where the first is not understood
-# long straight lines take seconds to optimise and gain nothing from it, unlike the loops; each output is asked whether
-# it is wanted, and to thread thousands of such jumps takes GCC minutes
+FLAGS = (("-march=native", *COMMON), COMMON)  # the second if the compiler refuses the first
+# optimising long straight-line code takes seconds and gains nothing, unlike the loops; the code tests every output for
+# being wanted, and GCC needs minutes to thread thousands of such jumps
 PLAIN, LOOPS = ("-O1", "-fno-thread-jumps"), ("-O2",)
 KEPT = 40  # libraries in each of the cache's 256 folders: some hundred megabytes
 PATIENCE = 600.0  # seconds for one compilation
-_failures: dict[str, str] = {}  # what did not compile is not tried again by this process
+_failures: dict[str, str] = {}  # sources that did not compile; this process does not try them again
 
 
 @functools.cache
 def compiler() -> str | None:
-    """Path of the C compiler: `$CC`, cc, gcc or clang; None where there is none or `PILFR_COMPILER=none` is set."""
+    """Find the C compiler: `$CC`, cc, gcc or clang; None if there is none or `PILFR_COMPILER=none` is set."""
     if os.environ.get("PILFR_COMPILER") == "none":
         return None
     for name in (os.environ.get("CC"), "cc", "gcc", "clang"):
@@ -232,8 +232,8 @@ def _machine(cc: str) -> str:
     return "|".join((cc, version, cpu, ca.__version__, str(FLAGS), platform.platform()))
 
 
-def _private(directory: Path) -> bool:
-    """Whether a directory belongs to this user and nobody else can write to it, nor put another in its place."""
+def _is_private(directory: Path) -> bool:
+    """Tell whether a directory belongs to this user, and nobody else can write to it or replace it."""
     try:
         info, above = directory.lstat(), directory.parent.stat()
     except OSError:
@@ -246,7 +246,7 @@ def _private(directory: Path) -> bool:
 
 @functools.cache
 def cache_directory() -> Path:
-    """Return the private per-user cache; where it cannot be made or is not private, one for this process alone.
+    """Return the private per-user cache; if it cannot be made or is not private, one for this process alone.
 
     `platformdirs` names it: `~/.cache/pilfr_casadi` on Linux. `XDG_CACHE_HOME` moves it on every system.
     """
@@ -255,7 +255,7 @@ def cache_directory() -> Path:
         directory = Path(home) / "pilfr_casadi" if home else user_cache_path("pilfr_casadi", appauthor=False)
         directory.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         directory.mkdir(mode=0o700, exist_ok=True)
-        if _private(directory) and os.access(directory, os.W_OK | os.X_OK):
+        if _is_private(directory) and os.access(directory, os.W_OK | os.X_OK):
             return directory
     except (OSError, RuntimeError):
         pass
@@ -274,7 +274,7 @@ def _shelf(key: str) -> Path:
 
 
 def _compile(cc: str, source: str, key: str, level: tuple[str, ...]) -> Path:
-    """Compile under another name first, so that a library is never half there."""
+    """Compile to a temporary file and rename it, so that a library is never incomplete."""
     with tempfile.TemporaryDirectory(dir=cache_directory()) as folder:
         c_file, partial = Path(folder) / "model.c", Path(folder) / "model.so"
         c_file.write_text(source, encoding="utf-8")
@@ -319,7 +319,7 @@ def _pointer(array: np.ndarray | None) -> ctypes.c_void_p:
     return ctypes.c_void_p() if array is None else ctypes.c_void_p(array.ctypes.data)
 
 
-def _loaded(library: Path) -> ctypes.CDLL:
+def _load(library: Path) -> ctypes.CDLL:
     try:
         return ctypes.CDLL(str(library))
     except OSError as error:
@@ -328,8 +328,8 @@ def _loaded(library: Path) -> ctypes.CDLL:
 
 @functools.cache
 def _loops(_cache: Path) -> ctypes.CDLL:
-    """Load the time loops, once a cache."""
-    return _loaded(build(loops_code(), LOOPS))
+    """Load the time loops, once per cache directory."""
+    return _load(build(loops_code(), LOOPS))
 
 
 class Compiled:
@@ -338,7 +338,7 @@ class Compiled:
     def __init__(self, model: Model) -> None:
         self.linear = linearize(model)
         self.loops = _loops(cache_directory())
-        self.library = _loaded(build(source_code(self.linear)))
+        self.library = _load(build(source_code(self.linear)))
         self.model = ctypes.byref(ctypes.c_char.in_dll(self.library, "pilfr_model"))
 
     def _call(self, name: str, *arguments: Any) -> None:

@@ -6,8 +6,9 @@ the estimated parameters and the initial state:
     Z  = h_x X + h_p,          W = e_z Z + e_s S + e_p,      S⁺ = g_z Z + g_s S + g_p,
     X⁺ = f_x X + f_w W + f_p,  Y = y_x X + y_w W + y_p.
 
-A step of several stages, `c = k(x, u, w, c, p)` and `x⁺ = f(x, u, w, c, p)` with each entry of c made of those before
-it, has sparse derivatives by way of c; `C = k_x X + k_w W + k_c C + k_p` is then carried as well, row by row.
+A step of several stages has sparse derivatives by way of its intermediate values c: `c = k(x, u, w, c, p)`, where each
+entry depends on earlier ones only, and `x⁺ = f(x, u, w, c, p)`. Then `C = k_x X + k_w W + k_c C + k_p` is carried too,
+row by row.
 
 `Linearization` holds the step and its partial derivatives; both engines run on it: `VirtualMachine` here (CasADi only,
 a few samples unrolled at a time) and the generated C of `compiled.py`. The record is never differentiated as a whole:
@@ -34,7 +35,9 @@ TARGETS = {
     "x": ("x", "w", "c", "p"),
     "y": ("x", "w", "p"),
 }
-WRITTEN = 64  # states with memory up to which slopes by way of intermediate values fit the nearest cache
+MOST_STAGED = (
+    64  # states with memory up to which slopes by way of intermediate values fit the processor's fastest cache
+)
 BLOCKS = tuple((target, source) for target, sources in TARGETS.items() for source in sources)
 
 
@@ -45,7 +48,7 @@ class Linearization:
     step: ca.Function  # (x, s, u, p) -> (x_next, s_next, y, z, w, c)
     partial: ca.Function  # (x, s, z, w, c, u, p) -> z_x, z_p, ...: a sparse matrix for each (target, source) of BLOCKS
     sizes: dict[str, int]  # of x, s, z, w, c, u, p and y
-    substeps: int = 1  # steps a sample
+    substeps: int = 1  # steps per sample
 
     def symbols(self) -> dict[str, Any]:
         """Make symbols x, s, z, w, c, u, p."""
@@ -64,7 +67,7 @@ def linearize(model: Model) -> Linearization:
     z_now = model.port(x, u, p)
     w_now, s_now = model.memory(z_now, s, p)
     x_now, y_now = model.step(x, u, w_now, p)
-    stages = model.stages if model.n_state <= WRITTEN else None
+    stages = model.stages if model.n_state <= MOST_STAGED else None
     c = ca.SX.sym("c", stages.size1_in(4) if stages else 0)
     c_now = stages(x, u, w_now, p, c)[0] if stages else c
     outputs = ca.cse([x_now, s_now, y_now, z_now, w_now, c_now])
@@ -86,7 +89,7 @@ def linearize(model: Model) -> Linearization:
 class Engine(Protocol):
     """Run of a model over a stretch of samples; both engines give the same numbers, bit by bit on x86-64.
 
-    u has a row a step, `Model.substeps` of them a sample; outputs, derivatives and signals have one row a sample.
+    u has one row per step, `Model.substeps` per sample; outputs, derivatives and signals have one row per sample.
     """
 
     linear: Linearization
@@ -102,7 +105,7 @@ class Engine(Protocol):
         """As `simulate`, with derivatives.
 
         seed (n_x + n_s, n_c) is the state's derivative, columns (n_p,) gives each parameter's own column or -1
-        -> y, J (M, n_y, n_c), next state, next seed; all are the caller's to change.
+        -> y, J (M, n_y, n_c), next state, next seed; the caller may change all of them.
         """
 
 
@@ -119,7 +122,7 @@ def _advance(slope: dict[str, Any], block: dict[tuple[str, str], Any], target: s
 
 
 def _stages(total: Any, by_stages: Any, direct: Any) -> Any:
-    """Complete the transposed slopes of the intermediate values one after the other: each needs those before it."""
+    """Complete the transposed slopes of the intermediate values one after the other: each needs the earlier ones."""
     columns = ca.horzsplit(total) if total.shape[1] else []
     for i in range(len(columns)):
         before = by_stages[:, i]
@@ -133,7 +136,7 @@ def _stages(total: Any, by_stages: Any, direct: Any) -> Any:
 class VirtualMachine:
     """The engine that needs no compiler: CasADi's virtual machine, a few samples unrolled in each call.
 
-    The slopes are carried transposed, one row a column of J: products then run along their long side.
+    The slopes are carried transposed, one row per column of J: products then run along their long side.
     """
 
     block = 32
@@ -143,7 +146,7 @@ class VirtualMachine:
         self._functions: dict[tuple[int, int, bytes], ca.Function] = {}
 
     def _simulator(self, length: int) -> ca.Function:
-        """`(u, p, state) -> (y, z, w, next state)`; one column a sample."""
+        """`(u, p, state) -> (y, z, w, next state)`, one column per sample."""
         key = (length, -1, b"")
         if key not in self._functions:
             n, stride = self.linear.sizes, self.linear.substeps
@@ -159,7 +162,7 @@ class VirtualMachine:
         return self._functions[key]
 
     def _sensitivity(self, length: int, n_c: int, columns: np.ndarray) -> ca.Function:
-        """`(u, p, state, slope) -> (y, J, next state, next slope)`; slope (n_c, n_x + n_s), J (n_c, n_y) a sample."""
+        """`(u, p, state, slope) -> (y, J, next state, next slope)`; slope (n_c, n_x + n_s), J (n_c, n_y) per sample."""
         key = (length, n_c, columns.tobytes())
         if key not in self._functions:
             n, stride, linear = self.linear.sizes, self.linear.substeps, self._transposed(n_c, columns)
@@ -182,7 +185,7 @@ class VirtualMachine:
         return self._functions[key]
 
     def _transposed(self, n_c: int, columns: np.ndarray) -> ca.Function:
-        """`(x, s, u, p) -> (x_next, s_next, y, blocks)`, transposed; those of p have one row a column of J."""
+        """`(x, s, u, p) -> (x_next, s_next, y, blocks)`, transposed; blocks of p have one row per column of J."""
         value, used = self.linear.symbols(), np.flatnonzero(columns >= 0)
         select = ca.DM.triplet(columns[used].tolist(), used.tolist(), ca.DM.ones(len(used)), n_c, len(columns))
         arguments = [value[k] for k in ("x", "s", "u", "p")]
@@ -199,7 +202,7 @@ class VirtualMachine:
         out: list[np.ndarray],
         carried: list[np.ndarray],
     ) -> list[np.ndarray]:
-        """Fill `out`, one row a sample, block by block, and return what is carried from one block to the next."""
+        """Fill `out`, one row per sample, block by block; return the arrays carried from block to block."""
         u, p = np.ascontiguousarray(u, dtype=float), np.ascontiguousarray(p, dtype=float)
         at, stride, following = 0, self.linear.substeps, [np.empty_like(a) for a in carried]
         for length in (max(self.block // stride, 1), 1):

@@ -112,7 +112,7 @@ class OutputSpectra:
     """Spectra of the outputs at the excited lines, at the level of one experiment with its periods averaged.
 
     `power` (F, n_y) is the mean squared modulus of the output's Fourier coefficients over the experiments at each
-    `frequency` (F,) in Hz; `var_noise` is the part of it due to noise (``None`` with a single period) and `var_total`
+    `frequency` (F,) in Hz; `var_noise` is its part due to noise (``None`` with a single period) and `var_total`
     the part due to noise and nonlinear distortion (``None`` with a single realization).
     """
 
@@ -124,7 +124,7 @@ class OutputSpectra:
 
 @dataclass(frozen=True, eq=False)
 class _Spectra:
-    """Hold spectra of periodic experiments at the excited lines: `U` (M, n_u, P, F, n_u), `Y` (M, n_u, P, F, n_y)."""
+    """Spectra of periodic experiments at the excited lines: `U` (M, n_u, P, F, n_u), `Y` (M, n_u, P, F, n_y)."""
 
     frequency: Array
     U: Array

@@ -9,8 +9,8 @@ all pieces at once, joined by powers of `A`. Both are plain NumPy, for any numbe
 x = T x' leaves only 2 n_x of them free. Every diagonalizable A is similar to a matrix of blocks with a pair of poles
 each (and a single pole if n_x is odd): a complex pair, or any two real poles, since all four entries of a block are
 free. The model class stays the same (except for defective A), while sensitivities cost a tenth at 15 states. With
-`fixed={"A": modal(15)}` the model of Krikelis et al. (2024), Eq. 15, is identified in these coordinates from the linear
-model on (Sec. 5.3).
+`fixed={"A": modal(15)}` the model of Krikelis et al. (2024), Eq. 15, is identified in these coordinates, beginning with
+the linear model (Sec. 5.3).
 
 **Kalman gains** are the core of every state estimator of the package. With a state of covariance P, outputs
 `y = C x + noise` of covariance R, and a step `x⁺ = A x`,
@@ -24,7 +24,7 @@ every sample. With the steady-state gain the predictor is a model itself,
     x⁺ = f(x, u, p) + γ K (y_measured - y),
 
 which can be fitted like any other: γ is a fixed parameter named `observer`, 1 gives the predictor and 0 the simulation.
-Fits that start far from the truth are annealed through it. Anderson & Moore (1979), Optimal Filtering, ch. 4-5.
+A fit that starts far from the truth anneals γ from 1 to 0. Anderson & Moore (1979), Optimal Filtering, ch. 4-5.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ Array = np.ndarray
 DEFECTIVE = 1e10  # condition number of the eigenvectors above which A counts as defective to rounding
 REAL = 1e-12  # imaginary part, next to the largest eigenvalue, below which an eigenvalue is real
 INJECTION = "observer"  # name of the parameter γ
-FADING = 1 - 1e-4  # factor on A that makes an integrator no output sees detectable; 1e-4 a sample is far below any fit
+FADING = (
+    1 - 1e-4
+)  # factor on A that makes an integrator no output sees detectable; 1e-4 per sample is far below any fit
 
 
 def resolvent(A: Array, C: Array, z: Array) -> Array:
@@ -163,13 +165,16 @@ def in_modal_coordinates(blocks: Mapping[str, Array], recordings: tuple[Recordin
 
 
 def innovation_gain(S: Any, P: Any, C: Any, A: Any = None) -> Any:
-    """Gain `A P C' S⁻¹`, shape (n, n_y), of arrays or CasADi matrices; A is the identity by default."""
+    """Compute the gain `A P C' S⁻¹`, (n, n_y), for arrays or CasADi matrices; A is the identity by default."""
     solve = ca.solve if isinstance(P, ca.MX) else np.linalg.solve
     return solve(S, C @ P if A is None else C @ P @ A.T).T
 
 
 def measurement_update(P: Any, C: Any, R: Any) -> tuple[Any, Any, Any]:
-    """Covariance S of the innovation, filter gain, and covariance after a measurement, of arrays or CasADi matrices."""
+    """Compute the innovation covariance S, the filter gain, and the covariance after a measurement.
+
+    Takes arrays or CasADi matrices.
+    """
     S = C @ P @ C.T + R
     gain = innovation_gain(S, P, C)
     left = np.eye(P.shape[0]) - gain @ C
@@ -177,7 +182,7 @@ def measurement_update(P: Any, C: Any, R: Any) -> tuple[Any, Any, Any]:
 
 
 def steady_state_gain(a: Array, c: Array, q: Array, r: Array) -> Array:
-    """Steady-state gain of the one-step predictor, shape (n_x, n_y); zero where there is none.
+    """Compute the steady-state gain of the one-step predictor, (n_x, n_y); zero if there is none.
 
     a and c are the state and output matrices, q and r the covariances of the process and the measurement noise.
     """
@@ -199,9 +204,9 @@ def steady_state_gain(a: Array, c: Array, q: Array, r: Array) -> Array:
 
 
 def with_output_injection(model: Model, gain: Array) -> Model:
-    """Return a closed model with output injection: a parameter `observer`, fixed at 0; it reads the measured output.
+    """Add output injection to a closed model: it reads the measured output; its parameter `observer` is fixed at 0.
 
-    `gain` (k, n_y) acts on the first k states; memory is not injected into.
+    `gain` (k, n_y) acts on the first k states, never on memory.
     """
     parameters = model.parameters | {INJECTION: Parameter(0.0, bounds=(0.0, 1.0), fixed=True)}
     sizes = (("x", model.n_x), ("u", model.n_u), ("w", model.n_w), ("p", parameters.size), ("y", model.n_y))

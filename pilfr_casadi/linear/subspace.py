@@ -12,7 +12,7 @@ data best is kept. These are the start values of Krikelis et al. (2024), Sec. 5.
 
 :class:`FrequencyProblem` follows McKelvey, Akçay & Ljung (1996), Subspace-based multivariable system identification
 from frequency response data, IEEE Trans. Automatic Control 41(7), 960-979, algorithm 2 (any frequency grid, noise
-weighting), with two changes. In place of powers ``1, z, ..., z^(r-1)``, which are nearly dependent unless the
+weighting), with two changes. Instead of powers ``1, z, ..., z^(r-1)``, which are nearly dependent unless the
 frequencies fill the unit circle, it uses polynomials in ``z`` that are orthonormal on the grid (Brubeck, Nakatsukasa &
 Trefethen (2021), Vandermonde with Arnoldi, SIAM Review 63(2), 405-415); the shift structure then is the recurrence of
 the polynomials. With several outputs it solves for `C`, `D` and for `B`, `D` in turn a few times, because `C` from the
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-ROUNDING = 1e-8  # relative errors below are rounding errors
+ROUNDING = 1e-8  # smaller relative errors are rounding errors
 LADDER = tuple(round(4 * 1.5**k) for k in range(12))  # numbers of block rows to try: 4, 6, 9, 14, 20, 30, ...
 TRIALS = 4  # numbers of block rows tried for each order, besides the least
 BUDGET = 4e9  # multiplications (samples times rows squared) above which larger numbers of block rows are not tried
@@ -153,7 +153,7 @@ def subspace_matrices(
 
 @dataclass(frozen=True, eq=False)
 class Matrices:
-    """Hold `A`, `B`, `C`, `D` in the units of the data."""
+    """A linear model `A`, `B`, `C`, `D` in the units of the data."""
 
     A: Array
     B: Array
@@ -179,7 +179,7 @@ class RangeSpace(NamedTuple):
 class SubspaceProblem:
     """Turn range spaces into models and keep the best over a few numbers of block rows.
 
-    A subclass supplies the attributes, :meth:`range_space` and :meth:`reduced`.
+    A subclass supplies the attributes, :meth:`range_space` and :meth:`triangular_factors`.
     """
 
     dt: float
@@ -194,7 +194,7 @@ class SubspaceProblem:
         """Return the range space of `r` block rows."""
         raise NotImplementedError
 
-    def reduced(self, A: Array, C: Array) -> list[Array]:
+    def triangular_factors(self, A: Array, C: Array) -> list[Array]:
         """Return triangular factors ``[K y]`` of the problems ``K theta = y`` for `B` and `D`, by input."""
         raise NotImplementedError
 
@@ -256,7 +256,7 @@ class SubspaceProblem:
         If rounding makes the powers of a very non-normal `A` diverge, the model has no dynamics.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            blocks = self.reduced(A, C)
+            blocks = self.triangular_factors(A, C)
         if not all(np.all(np.isfinite(R)) for R in blocks):
             n_u, C = len(self.u_scale), self.y_scale[:, None] * C
             return Matrices(0 * A, np.zeros((len(A), n_u)), C, np.zeros((len(C), n_u))), np.inf
@@ -276,7 +276,7 @@ class SubspaceProblem:
         """Return the relative error of a model on the data of this problem."""
         C, D = model.C / self.y_scale[:, None], model.D / self.y_scale[:, None]
         BD = np.vstack([model.B * self.u_scale, D * self.u_scale]).T
-        return self.relative_error(self.reduced(model.A, C), BD)
+        return self.relative_error(self.triangular_factors(model.A, C), BD)
 
 
 class FrequencyProblem(SubspaceProblem):
@@ -328,8 +328,8 @@ class FrequencyProblem(SubspaceProblem):
         m = len(shifted)
         return RangeSpace(left[:m], np.linalg.solve(K[:m, :m], shifted), basis[0] / P[0, 0].real, values)
 
-    def reduced(self, A: Array, C: Array) -> list[Array]:
-        """See :meth:`SubspaceProblem.reduced`."""
+    def triangular_factors(self, A: Array, C: Array) -> list[Array]:
+        """See :meth:`SubspaceProblem.triangular_factors`."""
         return _response_problems(A, C, self.z, self.G, self.var)
 
     def complete(self, A: Array, C: Array) -> tuple[Matrices, float]:
@@ -388,8 +388,8 @@ class TimeProblem(SubspaceProblem):
         left, values, _ = np.linalg.svd(R[r * n_u : past, past:].T)
         return RangeSpace(left[:-n_y], left[n_y:], left[:n_y], values)
 
-    def reduced(self, A: Array, C: Array) -> list[Array]:
-        """See :meth:`SubspaceProblem.reduced`."""
+    def triangular_factors(self, A: Array, C: Array) -> list[Array]:
+        """See :meth:`SubspaceProblem.triangular_factors`."""
         n_u, n_y, nx = len(self.u_scale), len(self.y_scale), len(A)
         free = nx + n_y * self.offset  # initial state and offset, eliminated recording by recording
         total = None

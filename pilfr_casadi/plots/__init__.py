@@ -1,6 +1,6 @@
 """Every figure of the package; the only folder that imports matplotlib.
 
-Functions that draw one picture take an optional `ax` and return the axes (`axes.figure` is the figure); those that
+Functions that draw one picture take an optional `ax` and return the axes (`axes.figure` is the figure); functions that
 compose several return the `matplotlib.figure.Figure`.
 """
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from .diagnosis import (
         Signal as Signal,
         force_cloud as force_cloud,
-        force_left as force_left,
+        force_remainder as force_remainder,
         force_time as force_time,
         mismatch_bands as mismatch_bands,
         mismatch_growth as mismatch_growth,

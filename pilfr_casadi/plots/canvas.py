@@ -20,10 +20,10 @@ PALE_GREY, PALE_BLUE = "#EEEEEE", "#E8F1F7"  # areas: not scored or not visited;
 BOX = "#D6E8F4"  # inside of box plots
 SHADES, LOOPS = "cividis", "viridis"  # colormaps of maps of errors, and of loops; distinct for all, and in grey
 FONT = 10.5  # points
-MOST_POINTS = 3000  # of a line before it is thinned: more than a page has pixels
+MOST_POINTS = 3000  # points of a line before it is thinned: more than a page has pixels
 LONGEST_TITLE = 46  # letters that fit above a figure of the usual width
-DEPTH = 200.0  # dB below the largest value that are still drawn; rounding errors lie deeper
-RUNAWAY = 1e3  # times the span of the measured signal from which a simulation is not drawn
+DEPTH = 200.0  # dB below the largest value down to which curves are drawn; rounding errors lie deeper
+RUNAWAY = 1e3  # times the span of the measured signal above which a simulation is not drawn
 
 
 def new_figure(width: float = 5.2, height: float = 3.5) -> Figure:
@@ -85,7 +85,7 @@ def _columns_that_fit(ax: Axes, labels: list[str], most: int) -> int:
 
 
 def plain(text: str) -> str:
-    """Escape a text: a dollar sign in a name does not begin a formula."""
+    """Escape dollar signs, which would begin a formula."""
     return str(text).replace("$", r"\$")
 
 
@@ -94,8 +94,8 @@ def with_unit(name: str, unit: str = "") -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def scaled(values: np.ndarray, unit: str = "") -> tuple[float, str]:
-    """Choose a power of a thousand that brings the values near one; return it with the unit: (1e-3, "10⁻³ m")."""
+def choose_scale(values: np.ndarray, unit: str = "") -> tuple[float, str]:
+    """Choose a power of a thousand that brings the values near one; return it and the unit: (1e-3, "10⁻³ m")."""
     size = float(np.max(np.abs(values), initial=0.0))
     if not np.isfinite(size) or size == 0 or 0.02 <= size < 5000:
         return 1.0, unit
@@ -104,9 +104,9 @@ def scaled(values: np.ndarray, unit: str = "") -> tuple[float, str]:
     return 10.0**exponent, f"{power} {unit}".strip()
 
 
-def scaled_axis(name: str, values: np.ndarray, unit: str = "") -> tuple[float, str]:
-    """Return the power of a thousand that values are divided by on an axis, and the label of that axis."""
-    size, unit = scaled(values, unit)
+def scale_axis(name: str, values: np.ndarray, unit: str = "") -> tuple[float, str]:
+    """Choose the power of a thousand that divides the values on an axis; return it and the axis label."""
+    size, unit = choose_scale(values, unit)
     return size, with_unit(name, unit)
 
 
@@ -127,14 +127,14 @@ def thin(x: np.ndarray, y: np.ndarray, most: int = MOST_POINTS) -> tuple[np.ndar
     return x[index], y[index]
 
 
-def drawable(values: np.ndarray, span: float) -> np.ndarray:
-    """Leave gaps where a simulation runs away, far beyond the span of the measured signal."""
+def mask_divergence(values: np.ndarray, span: float) -> np.ndarray:
+    """Replace values far beyond the span of the measured signal by nan, so that lines have a gap there."""
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) <= RUNAWAY * span, values, np.nan)
 
 
 def line(ax: Axes, x: np.ndarray, y: np.ndarray, label: str, colour: str, **style: Any) -> None:
-    """Draw a line, thinned where it is dense; the legend says so where a line has nothing to draw."""
+    """Draw a line, thinned where it is dense; the legend notes a line without finite values."""
     if not np.any(np.isfinite(y)):
         label = f"{label}: nothing to draw"
     ax.plot(*thin(np.asarray(x), np.asarray(y)), label=plain(label), color=colour, **{"linewidth": 1.2, **style})
@@ -155,6 +155,6 @@ def limit_depth(ax: Axes, *curves: np.ndarray) -> None:
 
 
 def noise_line(ax: Axes, level: float, label: str = "noise floor") -> None:
-    """Draw the noise level as a dashed line, where there is one."""
+    """Draw the noise level, if it is known, as a dashed line."""
     if level > 0:
         ax.axhline(level, color=GREEN, linestyle="--", linewidth=1.4, label=label)

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: the mismatch, the error that each port and law leaves, the hidden force beside the law."""
+"""Figures of a diagnosis: the mismatch, the error with each port and law, the hidden force beside the law."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from .canvas import (
     SHADES,
     VERMILLION,
     axes_or_new,
+    choose_scale,
     finish,
     line,
     new_figure,
     noise_line,
     plain,
-    scaled,
-    scaled_axis,
+    scale_axis,
     with_unit,
 )
 
-CLOUD_POINTS = 2500  # as many as can be told apart in a figure
+CLOUD_POINTS = 2500  # more cannot be told apart in a figure
 
 
 def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
@@ -51,7 +51,7 @@ def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
     bar.ax.tick_params(labelsize=FONT - 1)
     ax.set_yscale("log")
     ax.set_facecolor(PALE_GREY)
-    finish(ax, label, "frequency [Hz]", "where it hurts")
+    finish(ax, label, "frequency [Hz]", "residual by frequency and amplitude")
     ax.grid(False)
     return ax
 
@@ -63,12 +63,12 @@ def _rows(data: Mapping[str, Any], wanted: np.ndarray) -> slice:
 
 
 def _size(found: Mapping[str, Any], unit: str, kind: str = "amplitude") -> tuple[float, str]:
-    """Choose factor and label of an axis of amplitudes or rates: in the output's own unit where there is one output."""
+    """Choose factor and label of an axis of amplitudes or rates: a single output keeps its own unit."""
     per = "/s" if kind == "rate" else ""
     if len(found["scale"]) != 1:
         return 1.0, f"{kind} of the outputs [deviations{per}]"
     ((name, scale),) = found["scale"].items()
-    factor, label = scaled(scale * np.asarray(found[kind]["edges"]), (unit + per) if unit else "")
+    factor, label = choose_scale(scale * np.asarray(found[kind]["edges"]), (unit + per) if unit else "")
     return scale / factor, with_unit(f"{kind} of {name}", label)
 
 
@@ -78,7 +78,7 @@ def _with_gaps(values: Any) -> np.ndarray:
 
 
 def mismatch_bands(found: Mapping[str, Any]) -> Axes:
-    """Draw the residual in each band of frequency beside the noise floor; bands that hold most of it are filled."""
+    """Draw the residual in each frequency band beside the noise floor; bands with a tenth or more of it are filled."""
     ax = axes_or_new(None)
     data = found["frequency"]
     low, high = np.asarray(data["low"], dtype=float), np.asarray(data["high"])
@@ -96,7 +96,7 @@ def mismatch_bands(found: Mapping[str, Any]) -> Axes:
         ax.stairs(floor, edges, color=GREEN, linewidth=1.6, linestyle="--", label="noise floor", baseline=None)
     ax.set_xscale("log")
     ax.set_yscale("log")
-    return finish(ax, "frequency [Hz]", "rms a band [% of deviation]", "over frequency")
+    return finish(ax, "frequency [Hz]", "rms per band [% of deviation]", "over frequency")
 
 
 def mismatch_growth(found: Mapping[str, Any], unit: str = "", kind: str = "amplitude") -> Axes:
@@ -119,11 +119,11 @@ def mismatch_growth(found: Mapping[str, Any], unit: str = "", kind: str = "ampli
 
 
 def mismatch_level(found: Mapping[str, Any], unit: str = "") -> Axes:
-    """Draw the residual over the value of the output that shows most of it: one side may be worse."""
+    """Draw the residual over the value of the output that shows most of it; one side may be worse."""
     ax = axes_or_new(None)
     data = found["level"]
     edges = found["scale"][data["output"]] * np.asarray(data["edges"])
-    size, across = scaled_axis(data["output"], edges, unit)
+    size, across = scale_axis(data["output"], edges, unit)
     rms = 100 * _with_gaps(data["rms"])
     ax.stairs(rms, edges / size, color=VERMILLION, linewidth=1.8, label="residual", baseline=None)
     noise_line(ax, 100 * found["floor"])
@@ -163,16 +163,16 @@ def port_law_map(
     without: float | None = None,
     floor: float | None = None,
 ) -> Axes:
-    """Draw the error on data that was not fitted, of every port and law; grey where no fit was made.
+    """Draw the error on held-out data for every port and law; grey where no fit was made.
 
     Parameters
     ----------
     rows : sequence of (port, law, error)
-        Validation errors; of several forms of a law the smallest is drawn.
+        Validation errors; the smallest of several forms of a law is drawn.
     best : sequence of (port, law)
-        Pairs that are framed.
+        Pairs to frame.
     without, floor : float, optional
-        Validation error of the simulator without any law, and error of noise alone: the ends of the scale.
+        Ends of the scale: validation error of the simulator without a law, and error of noise alone.
     """
     ports = list(dict.fromkeys(p for p, _, _ in rows))
     smallest: dict[tuple[str, str], float] = {}
@@ -198,7 +198,7 @@ def port_law_map(
                 color="white" if dark else INK, fontweight="bold" if framed else "normal")  # fmt: skip
         if framed:
             ax.add_patch(_frame(j, i))
-    ax.set_xticks(np.arange(len(ports)) + 0.5, [_wrapped(p) for p in ports], fontsize=FONT - 1)
+    ax.set_xticks(np.arange(len(ports)) + 0.5, [_wrap(p) for p in ports], fontsize=FONT - 1)
     ax.set_yticks(np.arange(len(laws)) + 0.5, [plain(law) for law in laws], fontsize=FONT - 1)
     ax.invert_yaxis()
     ax.xaxis.tick_top()
@@ -213,7 +213,7 @@ def port_law_map(
     return ax
 
 
-def _wrapped(name: str, most: int = 12, lines: int = 3) -> str:
+def _wrap(name: str, most: int = 12, lines: int = 3) -> str:
     """Break a long name after colons, hyphens and underscores, and shorten a longer one."""
     rows = [""]
     for piece in re.findall(r"[^:_-]*[:_-]*", name):
@@ -225,7 +225,7 @@ def _wrapped(name: str, most: int = 12, lines: int = 3) -> str:
 
 
 def _readable_log(axis: Any, low: float, high: float) -> None:
-    """Write the ticks of a logarithmic axis as plain numbers, few enough to be read."""
+    """Write the ticks of a logarithmic axis as a few plain numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     subs = (1.0,) if high > 300 * low else (1.0, 2.0, 5.0) if high > 3 * low else tuple(np.arange(1.0, 10.0))
@@ -242,7 +242,7 @@ def _frame(j: int, i: int) -> Any:
 
 @dataclass(frozen=True)
 class Signal:
-    """Values (K,) with the name and unit that stand at their axis."""
+    """Values (K,) with name and unit for their axis."""
 
     name: str
     values: np.ndarray
@@ -257,13 +257,13 @@ def force_cloud(
     sx, sy, across, up = _cloud(ax, x, force, alpha=0.55, label="recovered from the recording")
     if len(law):
         ax.plot(law_x / sx, law / sy, color=VERMILLION, linewidth=0.9, alpha=0.9, label=plain(name), rasterized=True)
-    ax.set_ylim(*_span(force.values / sy, law / sy))
+    ax.set_ylim(*_robust_limits(force.values / sy, law / sy))
     return finish(ax, across, up, title)
 
 
 def _cloud(ax: Axes, x: Signal, y: Signal, **style: Any) -> tuple[float, float, str, str]:
     """Draw points; return the scale and the label of both axes."""
-    (sx, across), (sy, up) = (scaled_axis(v.name, v.values, v.unit) for v in (x, y))
+    (sx, across), (sy, up) = (scale_axis(v.name, v.values, v.unit) for v in (x, y))
     every = max(len(x.values) // CLOUD_POINTS, 1)
     ax.plot(x.values[::every] / sx, y.values[::every] / sy, ".", color=BLUE, markersize=2.6, rasterized=True, **style)
     return sx, sy, across, up
@@ -272,7 +272,7 @@ def _cloud(ax: Axes, x: Signal, y: Signal, **style: Any) -> tuple[float, float, 
 def force_time(t: np.ndarray, recovered: Signal, std: np.ndarray, law: np.ndarray, name: str = "law") -> Axes:
     """Draw a recovered force over time with its uncertainty, around its largest value, and the law's force."""
     ax, force = axes_or_new(None), recovered.values
-    size, up = scaled_axis(recovered.name, force, recovered.unit)
+    size, up = scale_axis(recovered.name, force, recovered.unit)
     window = max(min(len(force), 400), len(force) // 12)
     peak = int(np.argmax(np.abs(force)))
     begin = int(np.clip(peak - window // 2, 0, len(force) - window))
@@ -282,13 +282,13 @@ def force_time(t: np.ndarray, recovered: Signal, std: np.ndarray, law: np.ndarra
     line(ax, t[part], force[part] / size, "recovered from the recording", BLUE, linewidth=1.6)
     if len(law):
         line(ax, t[part], law[: len(t)][part] / size, name, VERMILLION, linewidth=1.3)
-    ax.set_ylim(*_span(force[part] / size, law[: len(t)][part] / size))
+    ax.set_ylim(*_robust_limits(force[part] / size, law[: len(t)][part] / size))
     ax.margins(x=0.01)
     return finish(ax, "time [s]", up, "", 3)
 
 
-def force_left(x: Signal, left: Signal, std: np.ndarray) -> Axes:
-    """Draw the part of a recovered force that a law leaves, as points over the local coordinate, with the mean."""
+def force_remainder(x: Signal, left: Signal, std: np.ndarray) -> Axes:
+    """Draw a recovered force minus the law as points over the local coordinate, with the mean."""
     ax = axes_or_new(None)
     sx, sy, across, up = _cloud(ax, x, left, alpha=0.4)
     edges = np.quantile(x.values, np.linspace(0, 1, 21))
@@ -301,12 +301,12 @@ def force_left(x: Signal, left: Signal, std: np.ndarray) -> Axes:
     for side in (1, -1):
         ax.axhline(side * float(np.median(std)) / sy, color=GREEN, linestyle="--", linewidth=1.3,
                    label="± one standard deviation" if side > 0 else None)  # fmt: skip
-    ax.set_ylim(*_span(left.values / sy))
+    ax.set_ylim(*_robust_limits(left.values / sy))
     return finish(ax, across, up, "recovered − law")
 
 
-def _span(values: np.ndarray, law: np.ndarray | None = None) -> tuple[float, float]:
-    """Choose limits that a few stray points do not stretch, and that show the law whole."""
+def _robust_limits(values: np.ndarray, law: np.ndarray | None = None) -> tuple[float, float]:
+    """Choose axis limits that ignore a few outliers and show the whole law."""
     low, high = np.quantile(values[np.isfinite(values)], [0.001, 0.999])
     if law is not None and np.any(np.isfinite(law)):
         low, high = min(low, np.nanmin(law)), max(high, np.nanmax(law))

@@ -20,7 +20,7 @@ from .signals import PlottedFit, as_scored, spectrum, time
 
 Records = Recording | Sequence[Recording]
 Curve = Callable[[np.ndarray], np.ndarray]
-FEWEST_FOR_DENSITY = 4  # operators in use; the weights of fewer do not sample a density
+FEWEST_FOR_DENSITY = 4  # operators in use; fewer weights do not sample a density
 
 
 def loop(
@@ -28,7 +28,7 @@ def loop(
 ) -> Axes:
     """Draw the identified hysteresis: the element's output w over its input z along a recording, as Fig. 15.
 
-    `bare` takes off the line through the origin that fits w best, which leaves the hysteresis alone.
+    `bare` subtracts the line through the origin that fits w best, which leaves only the hysteresis.
     """
     _check_channel(fit, channel)
     signals, index = fit.signals(recording), _index(fit, channel)
@@ -89,7 +89,7 @@ def weights(
 ) -> Axes:
     """Draw the weight over threshold of every operator, and the density of weights over thresholds.
 
-    No density is drawn of fewer than four operators in use. `reference` is a density to compare with, from r (G,) to
+    With fewer than four operators in use no density is drawn. `reference` is a density to compare with, from r (G,) to
     weight per unit of r (G,), in the scale of the model.
     """
     _check_channel(fit, channel)
@@ -140,7 +140,7 @@ def _index(fit: PlottedFit, channel: int) -> str:
 
 
 def _label(fit: PlottedFit, signal: str, channel: int, name: str = "") -> str:
-    """Label an axis of an element's signal: with the unit where it is an input or output, else in the model's scale."""
+    """Label an axis of an element's signal, with a unit if the signal is an input or output."""
     index = _index(fit, channel)
     reads, writes = (("C_z", "D_zu"), fit.model.inputs), (("C_y", "D_yu", "D_yw"), fit.model.outputs)
     blocks, names = reads if signal == "z" else writes
@@ -162,7 +162,7 @@ def _reach(fit: PlottedFit, recordings: Records | None, channel: int) -> float:
 
 
 def _range(fit: PlottedFit, recordings: Records | None, channel: int) -> float:
-    """Choose how far an element is drawn: the visited range, and thresholds that lie not far beyond."""
+    """Choose the range in which an element is drawn: the visited range, and thresholds not far beyond."""
     reach, r = _reach(fit, recordings, channel), fit.parameters.get("r")
     far = 0.0 if r is None else float(np.max(r[channel]))
     limit = 1.05 * (max(reach, min(far, 1.5 * reach)) if reach else far)

@@ -27,14 +27,14 @@ from .canvas import (
     PURPLE,
     VERMILLION,
     axes_or_new,
+    choose_scale,
     decibel,
-    drawable,
     finish,
     limit_depth,
     line,
+    mask_divergence,
     plain,
-    scaled,
-    scaled_axis,
+    scale_axis,
     with_unit,
 )
 
@@ -44,11 +44,11 @@ class Start(Protocol):
 
     @property
     def solution(self) -> Solution:
-        """How its solve ended."""
+        """Result of its solve."""
 
 
 class PlottedFit(FittedModel, Protocol):
-    """The parts of a fit that figures show; a `Fit` is one, and so is any other object that has them."""
+    """The parts of a fit that figures show, as a `Fit` has them."""
 
     @property
     def linear(self) -> Model | None:
@@ -90,11 +90,11 @@ def time(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes | N
     ax, t, y = axes_or_new(ax), recording.t, _column(recording.y, output, "output")
     level = _level(y[recording.skip :])
     plain_unit = _unit(fit, recording, recording.outputs[output])
-    size, axis = scaled_axis(recording.outputs[output], y - level, plain_unit)
+    size, axis = scale_axis(recording.outputs[output], y - level, plain_unit)
     what = "measured output" + (f" less its mean {level:.6g} {plain_unit}".rstrip() if level else "")
     line(ax, t, (y - level) / size, what, BLUE, linewidth=0.9)
     for label, residual, colour in _residuals(fit, recording, output):
-        drawn, note = _without_offset(drawable(residual, np.ptp(y)), np.ptp(y), plain_unit)
+        drawn, note = _without_offset(mask_divergence(residual, np.ptp(y)), np.ptp(y), plain_unit)
         line(ax, t, drawn / size, label + note, colour, linewidth=1.1)
     return _over_time(ax, recording, axis)
 
@@ -116,13 +116,13 @@ def traces(
             f"From {begin:g} to {end:g} s there are no two samples; the recording lasts {len(y) * recording.dt:g} s."
         )
     plain_unit = _unit(fit, recording, recording.outputs[output])
-    size, label = scaled_axis(recording.outputs[output], y[part], plain_unit)
+    size, label = scale_axis(recording.outputs[output], y[part], plain_unit)
     line(ax, recording.t[part], y[part] / size, "measured", BLUE, linewidth=3.2, alpha=0.55)
     models = [("this model", fit.simulate(recording), INK)]
     if _compares(fit):
         models.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
     for model, simulated, colour in models:
-        error, note = _without_offset(drawable((simulated[:, output] - y), np.ptp(y)), np.ptp(y), plain_unit)
+        error, note = _without_offset(mask_divergence((simulated[:, output] - y), np.ptp(y)), np.ptp(y), plain_unit)
         line(ax, recording.t[part], (y + error)[part] / size, model + note, colour)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", label, recording.name, 3)
@@ -143,8 +143,8 @@ def remains(fit: PlottedFit, recording: Recording, *, output: int = 0, ax: Axes 
     """Draw the residual of the fit alone over time, in its own scale."""
     recording = as_scored(fit, recording)
     ax, y = axes_or_new(ax), _column(recording.y, output, "output")
-    residual = drawable(fit.simulate(recording)[:, output] - y, np.ptp(y))
-    size, unit = scaled(residual[np.isfinite(residual)], _unit(fit, recording, recording.outputs[output]))
+    residual = mask_divergence(fit.simulate(recording)[:, output] - y, np.ptp(y))
+    size, unit = choose_scale(residual[np.isfinite(residual)], _unit(fit, recording, recording.outputs[output]))
     rms = float(np.sqrt(np.mean((residual[recording.skip :] / size) ** 2)))
     label = f"residual, this model (rms {rms:.3g} {unit}".rstrip() + ")"
     line(ax, recording.t, residual / size, label, INK, linewidth=0.8)
@@ -158,8 +158,8 @@ def output_over_input(
     ax, u, y = axes_or_new(ax), _column(recording.u, input, "input"), _column(recording.y, output, "output")
     name, simulated = recording.outputs[output], fit.simulate(recording)[:, output]
     u, y, simulated = (column[as_scored(fit, recording).skip :] for column in (u, y, simulated))
-    size, up = scaled_axis(name, y, _unit(fit, recording, name))
-    error, note = _without_offset(drawable(simulated - y, np.ptp(y)), np.ptp(y), _unit(fit, recording, name))
+    size, up = scale_axis(name, y, _unit(fit, recording, name))
+    error, note = _without_offset(mask_divergence(simulated - y, np.ptp(y)), np.ptp(y), _unit(fit, recording, name))
     ax.plot(u, y / size, color=BLUE, linewidth=3.0, alpha=0.4, label="measured", rasterized=True)
     ax.plot(u, (y + error) / size, color=INK, linewidth=0.5, label=plain(f"this model{note}"), rasterized=True)
     across = recording.inputs[input]
@@ -248,7 +248,7 @@ def linear_simulation(fit: PlottedFit, recording: Recording) -> np.ndarray:
 
 
 def as_scored(fit: PlottedFit, recording: Recording) -> Recording:
-    """Set `skip` of a recording to the first sample that is scored, behind those that its state was fitted to."""
+    """Set `skip` of a recording to its first scored sample, after the samples used to estimate its initial state."""
     try:
         return recording.with_(skip=fit.scored_from(recording))
     except InputError:  # the recording is too short to leave a scored sample
@@ -264,13 +264,13 @@ def _over_time(ax: Axes, recording: Recording, label: str) -> Axes:
 
 
 def _level(y: np.ndarray) -> float:
-    """Choose the level to take off a signal (M,) so that its swings show beside residuals around zero: mean or 0."""
+    """Choose the level, mean or 0, to subtract from a signal (M,) so that its swings show beside residuals."""
     mean = float(np.mean(y))
     return mean if abs(mean) > np.ptp(y) > 0 else 0.0
 
 
 def _without_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarray, str]:
-    """Take the offset off an error (M,) where it exceeds the measured span and nearly is the error; return a note."""
+    """Subtract the offset of an error (M,) if it exceeds the measured span and dominates the error; return a note."""
     known = error[np.isfinite(error)]
     if not known.size or abs(np.mean(known)) <= span or np.ptp(known) > 3 * span or not span:
         return error, ""
@@ -278,12 +278,12 @@ def _without_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarr
 
 
 def _compares(fit: PlottedFit) -> bool:
-    """Whether there is a linear model beside the fit."""
+    """Tell whether there is a linear model to compare with."""
     return fit.linear is not None and fit.model.n_w > 0
 
 
 def _column(values: np.ndarray, index: int, role: str) -> np.ndarray:
-    """One of the recording's inputs or outputs, (M,)."""
+    """Return one of the recording's inputs or outputs, (M,)."""
     if not 0 <= index < values.shape[1]:
         raise InputError(f"The {role} {index} was asked for; the recording has {values.shape[1]}, counted from 0.")
     return values[:, index]
@@ -317,24 +317,24 @@ SIMULATED_COLOURS = (ORANGE, INK)
 def compared_traces(
     r: Recording, simulated: Simulated, output: int = 0, unit: str = "", *, quiet: bool = False, ax: Axes | None = None
 ) -> Axes:
-    """Draw measured output and simulations, a few swings around the largest one, or in a `quiet` stretch."""
+    """Draw measured output and simulations: a few swings around the largest one, or a `quiet` stretch."""
     ax = axes_or_new(ax)
     y = r.y[:, output]
     begin, end = busiest(y - np.mean(y), r)
     first = round(begin / r.dt)
     part = slice(first, max(round(end / r.dt), first + 2))
     part = _quiet(y, part.stop - part.start, r.skip) if quiet else part
-    size, up = scaled_axis(r.outputs[output], y[part], unit)
+    size, up = scale_axis(r.outputs[output], y[part], unit)
     line(ax, r.t[part], y[part] / size, "measured", BLUE, linewidth=4.0, alpha=0.45)
     for (label, values), colour in zip(simulated, SIMULATED_COLOURS, strict=False):
         if values is not None:
-            line(ax, r.t[part], drawable(values[part, output], np.ptp(y)) / size, label, colour, linewidth=1.4)
+            line(ax, r.t[part], mask_divergence(values[part, output], np.ptp(y)) / size, label, colour, linewidth=1.4)
     ax.margins(x=0.01)
     return finish(ax, "time [s]", up, r.name, 3)
 
 
 def _quiet(y: np.ndarray, length: int, skip: int) -> slice:
-    """Select a stretch with less motion than three quarters of all."""
+    """Select a stretch with less motion than three quarters of all stretches."""
     length = min(length, max((len(y) - skip) // 6, 2))
     starts = np.arange(skip, len(y) - length + 1, max(length // 4, 1))
     motion = np.array([np.std(y[a : a + length]) for a in starts])
@@ -349,11 +349,11 @@ def compared_residuals(
     ax = axes_or_new(ax)
     y = r.y[:, output]
     kept: list[tuple[str, np.ndarray, Any]] = [
-        (label, drawable(v[:, output] - y, np.ptp(y)), colour)
+        (label, mask_divergence(v[:, output] - y, np.ptp(y)), colour)
         for (label, v), colour in zip(simulated, SIMULATED_COLOURS, strict=False)
         if v is not None
     ]
-    size, up = scaled_axis(f"simulated − measured {r.outputs[output]}", np.nan_to_num(kept[0][1]) if kept else y, unit)
+    size, up = scale_axis(f"simulated − measured {r.outputs[output]}", np.nan_to_num(kept[0][1]) if kept else y, unit)
     for label, e, colour in kept:
         line(ax, r.t, e / size, label, colour, linewidth=0.8)
     if floor > 0:

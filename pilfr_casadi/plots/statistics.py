@@ -1,4 +1,4 @@
-"""Figures of what many records or fits say: best linear approximation, loops at several frequencies, spread of fits.
+"""Figures of many recordings or fits: best linear approximation, loops at several frequencies, spread of errors.
 
 Krikelis et al. (2024), Fig. 7 (loops), 8 and 13 (best linear approximation), 11 (spread over starts).
 """
@@ -43,7 +43,7 @@ def best_linear_approximation(
     """Draw magnitudes of the BLA and a model, their difference, and the estimate's deviations, as Fig. 8.
 
     `model` is linear (a `Model` without an element, or a `control.StateSpace`), or a response at `bla.frequency`,
-    (F, n_y, n_u). The deviations are those of the mean over realizations: a model whose error is the total deviation is
+    (F, n_y, n_u). The deviations hold for the mean over realizations: a model whose error equals the total deviation is
     as good as the data can show. `unit` is the output's unit per input unit.
     """
     ax = axes_or_new(ax)
@@ -114,7 +114,7 @@ def spread(
 ) -> Axes:
     """Draw box plots of the errors of many fits, as Fig. 11: median, quartiles, whiskers to 1.5 box heights, crosses.
 
-    `errors` maps the label of a group to its errors; infinite ones (no model, or one that ran away) are counted, not
+    `errors` maps the label of a group to its errors; infinite errors (no model, or a diverging one) are counted, not
     drawn. `published` has a reference value by group, drawn as a diamond and called `source`; `floor` is a line.
     """
     ax = axes_or_new(ax)

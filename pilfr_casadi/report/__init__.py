@@ -10,7 +10,9 @@ from .._base.lazy import lazy_face
 
 if TYPE_CHECKING:
     from .diagnosis import diagnosis_report as diagnosis_report
+    from .diagnosis_tables import usage as usage
     from .fit import fit_page as fit_page, fit_report as fit_report
+    from .fit_sections import mode_tables as mode_tables
     from .page import (
         Code as Code,
         Page as Page,
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
         Section as Section,
         Table as Table,
         Text as Text,
+        number_text as number_text,
+        uncertain_text as uncertain_text,
         write_report as write_report,
     )
 

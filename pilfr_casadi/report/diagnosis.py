@@ -47,7 +47,7 @@ def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pa
 
 
 def _draw(page: Page) -> tuple[Page, dict[str, bytes]]:
-    """Draw each picture once; return the page with the drawn pictures, and their PNG files by name."""
+    """Draw each picture once; return the page with its pictures drawn, and the PNG files by name."""
     files: dict[str, bytes] = {}
 
     def draw(block: Block) -> Block:
@@ -94,9 +94,9 @@ def diagnosis_page(diagnosis: Diagnosis) -> Page:
         *([notes] if faulty else []),
         Section(_result_title(d), _result(d)),
         Section("Where the simulator is off", _mismatch(case)),
-        Section("The hidden force", _hidden(case)),
-        Section("What was tried", _tried(d)),
-        Section("The simulator's own parameters", [tables.parameter_table(d)] if d.parameters else []),
+        Section("The hidden force", _hidden_forces(case)),
+        Section("Candidates", _candidates(d)),
+        Section("The simulator's parameters", [tables.parameter_table(d)] if d.parameters else []),
         Section("The proof" if d.test else "Measured and simulated", _proof(case)),
         *([] if faulty else [notes]),
         Section("The next experiment", _next_experiment(d)),
@@ -125,7 +125,7 @@ def _subtitle(case: _Case) -> str:
 def _result_title(d: Diagnosis) -> str:
     if d.effects:
         return "What is missing" if d.sure and d.outcome in ("better", "") else "What may be missing"
-    return "A description without a sure name" if d.description else "How well it does"
+    return "A description without a certain name" if d.description else "How good the simulator is"
 
 
 def _result(d: Diagnosis) -> list[Block]:
@@ -133,7 +133,7 @@ def _result(d: Diagnosis) -> list[Block]:
     for k in range(len(d.effects)):
         out += tables.effect_blocks(d, k)
     if d.verdict == "complete" and not d.let_go:
-        out.append(Text("Refitted inside its bounds, the simulator follows the recordings down to the noise."))
+        out.append(Text("Refitted within its bounds, the simulator follows the recordings down to the noise."))
     elif d.verdict == "unexplained":
         out.append(
             Text("No law of the catalogue explains the mismatch. The pictures below show where and how it acts.")
@@ -161,7 +161,7 @@ def _mismatch(case: _Case) -> list[Block]:
         (plots.mismatch_bands(found), "The error by frequency band, beside the noise.", "Error by frequency band."),
         (
             plots.mismatch_growth(found, unit),
-            "The error over the amplitude. The refit has bent the parameters to hide as much as it can: this shows "
+            "The error over the amplitude. The refit has bent the parameters to hide as much as possible: this shows "
             "where the simulator fails, not why.",
             "Error over amplitude.",
         ),
@@ -176,8 +176,8 @@ def _mismatch(case: _Case) -> list[Block]:
     return [*out, *(Picture(*picture) for picture in drawn)]
 
 
-def _hidden(case: _Case) -> list[Block]:
-    """The forces of the named effects; without a name, the force beside the nearest law and at the freest port."""
+def _hidden_forces(case: _Case) -> list[Block]:
+    """Draw the forces of the named effects; without a name, beside the nearest law and at the freest port."""
     d, out = case.diagnosis, list[Block]()
     for e in d.effects:
         number = next((i for i, p in enumerate(d.corrected.elements) if (p.port, p.law.id) == (e.port, e.law)), None)
@@ -222,7 +222,7 @@ def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, na
 
 
 def _force_pictures(h: HiddenForce, port: Port, name: str) -> list[Block]:
-    """Draw a force over its local coordinate, rate and time, and the part that the law leaves."""
+    """Draw a force over its local coordinate, rate and time, and the rest after subtracting the law."""
     kind, _, channel = h.port.partition(":")
     label = {"actuator": "added to the input", "sensor": "added to the output"}.get(kind, "force w")
     across, alt = channel if port.series and channel else "local coordinate z", f"Recovered force at {h.port}"
@@ -234,32 +234,32 @@ def _force_pictures(h: HiddenForce, port: Port, name: str) -> list[Block]:
         drawn.append((cloud(rate, force, h.law_dz, h.law), "The same force over the rate.", f"{alt} over its rate."))
     elif port.series and len(h.law):  # a law in series: its output over its input
         acting = Signal(f"{across} as it acts", h.z + h.force, port.across_unit)
-        caption = "The signal behind the law over the signal before it."
+        caption = "The output of the law over its input."
         drawn.append((cloud(x, acting, h.law_z, h.law_z + h.law), caption, f"{alt}: output over input."))
     caption = "The same force over time, around its largest value. The band is the uncertainty due to noise."
     drawn.append((plots.force_time(h.t, force, h.std, h.law, name), caption, f"{alt} over time."))
     if len(h.law):
-        left = plots.force_left(x, Signal("recovered − law", h.force - h.law_held, port.unit), h.std)
+        left = plots.force_remainder(x, Signal("recovered − law", h.force - h.law_held, port.unit), h.std)
         caption = "The recovered force minus the law. Where the mean bends away from zero, the law's form is wrong."
         drawn.append((left, caption, f"{alt} without the law."))
     return [Picture(*picture) for picture in drawn]
 
 
-def _tried(d: Diagnosis) -> list[Block]:
+def _candidates(d: Diagnosis) -> list[Block]:
     out: list[Block] = []
     for k, rows in enumerate(tables.candidates_by_pass(d)):
         named = d.effects[k : k + 1] if k else d.effects[: max(len(d.effects), 1)]
         chosen = {(e.port, e.law) for e in named}
-        title = "Every port and law that was fitted"
+        title = "All fitted pairs of port and law"
         if k:
             before = " and ".join(f"{words(e.law)} at {e.port}" for e in d.effects[:k]) or "the first law"
-            title = f"A second look, with {before} in place"
+            title = f"Second pass, with {before} in place"
         cells = [(r["port"], words(r["law"]), tables.held_out(r)) for r in rows]
         framed = [(port, words(law)) for port, law in chosen]
         axes = plots.port_law_map(cells, framed, tables.held_out_before(d, k), d.floor["nrmse"] or None)
         caption = (
             f"{title}: the error on the part of the training recordings that was not fitted, in %, by port and law "
-            "(best form). Grey: left out by the quick test before the fits."
+            "(best form). Grey: excluded by the quick test before the fits."
         )
         wide = len({r["port"] for r in rows}) > WIDE_MAP
         out += [Picture(axes, caption, "Errors by port and law.", wide)]
@@ -272,8 +272,8 @@ def _proof(case: _Case) -> list[Block]:
     if d.test:
         out.append(
             Text(
-                "Simulated from their inputs alone. These recordings were used neither to fit nor to choose; only an "
-                "unknown initial state was estimated from their first samples."
+                "Simulated from the inputs alone. These recordings were used neither to fit nor to choose; only an "
+                "unknown initial state was estimated from the first samples."
             )
         )
     role, recordings = ("test", d.test) if d.test else ("training", d.train)
@@ -282,11 +282,11 @@ def _proof(case: _Case) -> list[Block]:
         compared = d.compare(r)
         compared = replace(compared, recording=compared.recording.with_(name=label))
         for i in range(min(r.n_y, MOST_DRAWN)):
-            out += _compared(case, compared, i)
+            out += _draw_comparison(case, compared, i)
     return out
 
 
-def _compared(case: _Case, c: Comparison, i: int) -> list[Block]:
+def _draw_comparison(case: _Case, c: Comparison, i: int) -> list[Block]:
     """Draw one output of a recording: two stretches, the errors over time, and the spectra."""
     r, name = c.recording, c.recording.outputs[i]
     unit, floor = case.unit(name), float(case.noise[i])

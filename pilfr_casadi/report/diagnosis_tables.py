@@ -14,7 +14,7 @@ from .page import Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
 ALIKE = 1.03  # ratio of two errors up to which two laws do equally well
-RANKED = 12  # rows of the ranked table that are shown; the rest is folded
+RANKED = 12  # rows of the ranked table above the fold
 PEOPLE = ("coulomb", "stribeck")  # laws that bear a person's name
 FORMS = {"bouc_wen": "Bouc-Wen", "prandtl_ishlinskii": "Prandtl-Ishlinskii", "hertz": "Hertz"}
 STEPS = {"nominal": "as given", "before": "refitted"}
@@ -36,9 +36,9 @@ def percent(value: float | None) -> str:
 
 
 def correction_words(diagnosis: Diagnosis) -> str:
-    """Say in words how the corrected simulator differs from the refitted one; nothing where it does not.
+    """Describe how the corrected simulator differs from the refitted one; empty if it does not.
 
-    Laws are "put back" only where their names are sure and they help on the test recordings.
+    Laws are "put back" only if their names are certain and they help on the test recordings.
     """
     if diagnosis.effects:
         unsure = [g.finding == "unsure" for g in diagnosis.gates]
@@ -51,7 +51,7 @@ def correction_words(diagnosis: Diagnosis) -> str:
 
 
 def tone(diagnosis: Diagnosis) -> str:
-    """Colour of the headline: good only where the answer is sure and its correction helps on the test recordings."""
+    """Choose the colour of the headline: good only if the answer is certain and helps on the test recordings."""
     if diagnosis.outcome == "worse":
         return "bad"
     doubtful = diagnosis.outcome == "same" or (bool(diagnosis.effects) and not diagnosis.sure)
@@ -59,13 +59,13 @@ def tone(diagnosis: Diagnosis) -> str:
 
 
 def _steps(diagnosis: Diagnosis) -> dict[str, str]:
-    """Return the keys of the errors that are shown, with their names."""
+    """Return the keys of the errors to show, with their names."""
     last = correction_words(diagnosis)
     return STEPS | ({"after": last} if last else {})
 
 
 def errors_that_count(diagnosis: Diagnosis) -> tuple[str, Mapping[str, float]]:
-    """Return the kind of recording that the answer is judged on, and its errors: test where there are any."""
+    """Return the role that the answer is judged on, test if there are any, and its errors."""
     errors = diagnosis.errors.get("test")
     return ("test", errors) if errors else ("training", diagnosis.errors["train"] or {})
 
@@ -110,7 +110,7 @@ def error_table(diagnosis: Diagnosis) -> Table:
 
 
 def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
-    """Describe an effect: its law, its parameters, and the laws that could be meant instead."""
+    """Describe an effect: its law, its parameters, and the laws that cannot be told apart from it."""
     e = diagnosis.effects[number]
     form = f" ({words(e.form)})" if e.form else ""
     out: list[Block] = [
@@ -134,9 +134,9 @@ def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
     close = list(dict.fromkeys((r["port"], r["law"]) for r in best if score(r) < ALIKE * mine))
     wider = "; ".join(f"{words(law)} at {port}" for port, law in close if (port, law) not in known)
     if wider:
-        out.append(Text(f"As good, but with more freedom than needed: {wider}."))
+        out.append(Text(f"Equally good, but more flexible than needed: {wider}."))
     elif not e.indistinguishable:
-        out.append(Text("No law of another name does as well on these recordings."))
+        out.append(Text("No other law does as well on these recordings."))
     return out
 
 
@@ -163,13 +163,13 @@ def score(row: Mapping[str, Any]) -> float:
 
 
 def held_out(row: Mapping[str, Any]) -> float:
-    """Return a candidate's error on the part of the training recordings that it was not fitted to."""
+    """Return a candidate's error on the held-out part of the training recordings."""
     value = row.get("nrmse_validation")
     return np.inf if value is None else float(value)
 
 
 def held_out_before(diagnosis: Diagnosis, number: int) -> float | None:
-    """Return the same error of the simulator without the candidates of a pass; None where it is unknown."""
+    """Return this error of the simulator before a pass; None if it is unknown."""
     search = diagnosis.evidence.get("search")
     passes = [p for p in search.passes if p.candidates] if search is not None else []
     if number >= len(passes) or not np.isfinite(passes[number].before[1]):
@@ -178,7 +178,7 @@ def held_out_before(diagnosis: Diagnosis, number: int) -> float | None:
 
 
 def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, str]], title: str) -> list[Block]:
-    """Rank the candidates with their margins, best first; the tail is folded."""
+    """Rank the candidates with their margins, best first; fold the tail."""
     winner = next((i for i, r in enumerate(rows) if (r["port"], r["law"]) in chosen), None)
     best = score(rows[winner or 0])
     cells = []
@@ -208,13 +208,13 @@ def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, s
     ]
     if len(cells) > RANKED:
         rest = [i - RANKED for i in emphasis if i >= RANKED]
-        title = f"{len(cells) - RANKED} more that did worse"
+        title = f"{len(cells) - RANKED} more, with larger errors"
         out.append(Table(columns, cells[RANKED:], caption=title, emphasis=rest, folded=True))
     return out
 
 
 def flexible_table(diagnosis: Diagnosis) -> Table | None:
-    """Tabulate how much of the mismatch an arbitrary force at each port could explain."""
+    """Tabulate the share of the mismatch that a flexible force at each port could explain."""
     search = diagnosis.evidence.get("search")
     if search is None or not search.open_before:
         return None
@@ -229,7 +229,7 @@ def flexible_table(diagnosis: Diagnosis) -> Table | None:
 
 
 def parameter_table(diagnosis: Diagnosis) -> Table:
-    """Tabulate the simulator's own parameters: nominal, refitted, and with the correction in place."""
+    """Tabulate the simulator's parameters: nominal, refitted, and with the correction in place."""
     rows, what = [], correction_words(diagnosis)
     for name, p in diagnosis.parameters.items():
         known = ParameterSet({name: Parameter(p["nominal"])})
@@ -260,7 +260,7 @@ def check_table(diagnosis: Diagnosis) -> Table | None:
 
 
 def usage(diagnosis: Diagnosis) -> str:
-    """Write the lines of Python that make the corrected simulator from the user's own and simulate a recording."""
+    """Write Python code that builds the corrected simulator from the user's simulator and simulates a recording."""
     simulator = diagnosis.corrected
     fitted = {k: plain(np.asarray(p.value)) for k, p in simulator.parameter_set.items()}
     modules: dict[str, set[str]] = {}

@@ -1,4 +1,4 @@
-"""The report of a fit: how well it predicts, the hysteresis it found, its modes and parameters, and how to use it.
+"""The report of a fit: errors, hysteresis, modes, parameters, and how to use the model.
 
 Errors are NRMSE as in Krikelis et al. (2024), Eq. 27.
 """
@@ -17,6 +17,7 @@ from .._base import make_folder, write_atomically
 from ..data import Recording, as_recordings, rmse_per_output
 from ..identify import Fit
 from ..models import StaticNetwork
+from ..optimise import Status
 from .fit_sections import (
     curve,
     hysteresis,
@@ -28,7 +29,7 @@ from .fit_sections import (
 from .page import Block, Code, Page, Picture, Section, Table, Text, render
 
 Records = Recording | Sequence[Recording]
-RUNAWAY = 1e3  # NRMSE from which the page says that the simulation runs away
+RUNAWAY = 1e3  # NRMSE above which the page reports that the simulation diverges
 
 
 def fit_report(
@@ -39,8 +40,8 @@ def fit_report(
 ) -> Path:
     """Write `report.html` and `model.json` of a fit into a folder; return the page's path.
 
-    `train` are the recordings that it was fitted to, `tests` those that it is judged on; there may be none. An
-    `InputError` says that a recording does not fit the model, or why the folder cannot be written.
+    `train` are the recordings of the fit, `tests` the recordings to judge it on, possibly none. An `InputError` is
+    raised if a recording does not fit the model, or the folder cannot be written.
     """
     page = fit_page(fit, train, tests, model_file="model.json")
     target = make_folder(folder)
@@ -57,8 +58,8 @@ def fit_page(
 ) -> Page:
     """Fill the page of a fit; see `fit_report`."""
     used, judged = as_recordings(train), as_recordings(tests) if isinstance(tests, Recording) or len(tests) else ()
-    named = [(r.with_(name=r.name or _numbered("training", i, used)), "training") for i, r in enumerate(used)]
-    named += [(r.with_(name=r.name or _numbered("test", i, judged)), "test") for i, r in enumerate(judged)]
+    named = [(r.with_(name=r.name or _number("training", i, used)), "training") for i, r in enumerate(used)]
+    named += [(r.with_(name=r.name or _number("test", i, judged)), "test") for i, r in enumerate(judged)]
     rows = [row for recording, role in named for row in _errors(fit, recording, role)]
     shown = [recording for recording, role in named if role == "test"] or [named[0][0]]
     sections = [
@@ -82,7 +83,7 @@ def fit_page(
     )
 
 
-def _numbered(word: str, i: int, recordings: Sequence[Recording]) -> str:
+def _number(word: str, i: int, recordings: Sequence[Recording]) -> str:
     return word if len(recordings) == 1 else f"{word} {i + 1}"
 
 
@@ -137,7 +138,7 @@ def _error_table(rows: list[dict[str, Any]]) -> Table:
         "(0 is perfect, 1 is no better than its mean)."
     )
     if any(r["role"] == "test" for r in rows):
-        note += " Test recordings were not used to fit or to choose; samples that a state was fitted to are left out."
+        note += " Test recordings were not used to fit or to choose; samples that estimate a state are left out."
     cells = [[r[key] for key in columns.values()] for r in rows]
     emphasis = [i for i, r in enumerate(rows) if r["role"] == "test"]
     return Table(list(columns), cells, note=note, emphasis=emphasis, digits=3)
@@ -145,14 +146,14 @@ def _error_table(rows: list[dict[str, Any]]) -> Table:
 
 def _verdict(rows: list[dict[str, Any]]) -> str:
     tests = [r for r in rows if r["role"] == "test"] or rows
-    seen = "on recordings that it has never seen" if tests[0]["role"] == "test" else "on its training recordings"
+    seen = "on test recordings" if tests[0]["role"] == "test" else "on its training recordings"
     worst = max(tests, key=lambda r: r["nrmse"])
     place = (
         f"{worst['output']} in {worst['recording']}" if len({r["output"] for r in tests}) > 1 else worst["recording"]
     )
     at_worst = f" at worst ({place})" if len(tests) > 1 else ""
     if not worst["nrmse"] < RUNAWAY:
-        return f"Simulated from its inputs alone, {seen}, the model runs away{at_worst.replace(' at worst', '')}."
+        return f"Simulated from its inputs alone, {seen}, the model diverges{at_worst.replace(' at worst', '')}."
     text = f"Simulated from its inputs alone, {seen}, the model is off by {100 * worst['nrmse']:.2g}\u00a0%"
     text += f" of the output's standard deviation{at_worst}"
     linear = (
@@ -172,7 +173,7 @@ def _facts(fit: Fit, rows: list[dict[str, Any]]) -> dict[str, str]:
     judged = [r for r in rows if r["role"] == "test"] or rows
     gain = np.min([r["linear"] / r["nrmse"] if 0 < r["nrmse"] < np.inf else np.nan for r in judged])
     if gain >= 1:
-        facts["smaller error than a linear model"] = f"{gain:.2g} ×"
+        facts["error against a linear model"] = f"{gain:.2g} times smaller"
     facts["free parameters"] = str(int(fit.model.parameters.free.sum()))
     if fit.seconds:
         facts["time of the fit"] = f"{fit.seconds:.1f} s"
@@ -193,19 +194,24 @@ def _subtitle(fit: Fit) -> str:
     return ", ".join([*parts, f"step {fit.dt:.4g} s ({1 / fit.dt:.4g} Hz)"])
 
 
+def status_word(status: Status) -> str:
+    """Name a status in a word or two, for tables: `converged`, `small step`."""
+    return status.name.lower().replace("_", " ")
+
+
 def _search(fit: Fit) -> list[Block]:
     lines = [line for line in str(fit).splitlines()[1:] if line]
     out: list[Block] = [Text(". ".join(line[0].upper() + line[1:] for line in lines) + ".")]
     if fit.solution.history or any(c.solution.history for c in fit.candidates):
-        caption = "Training error over iterations, for every start and for the last solve of the best."
+        caption = "Training error over iterations: every start, and the last solve of the best one."
         out.append(Picture(plots.convergence(fit), caption, "Convergence of the starts."))
     if fit.candidates:
         timed = any(c.solution.seconds for c in fit.candidates)
         rows = [
-            [str(c.seed), c.error, c.solution.iterations, *[c.solution.seconds] * timed, c.solution.status.value]
+            [str(c.seed), c.error, c.solution.iterations, *[c.solution.seconds] * timed, status_word(c.solution.status)]
             for c in sorted(fit.candidates, key=lambda c: c.error)
         ]
-        note = "Errors at the end of the exploration, before the best ones are polished."
+        note = "Errors at the end of the exploration, before the best starts are refined."
         columns = ["start", "training error", "iterations", *["time [s]"] * timed, "status"]
         out.append(Table(columns, rows, "All starts, best first", note, folded=True, digits=3))
     return out

@@ -16,7 +16,7 @@ from ..models import BLOCKS, ParameterSet, Play, Stop
 from .page import Block, Picture, Table, Text, uncertain_text
 
 MOST_DRAWN = 4  # outputs of a recording that are drawn; the table has all of them
-ALIKE = 0.9  # correlation of an output with an input from which the device is drawn as quasi-static, over its input
+ALIKE = 0.9  # correlation of output and input above which a device counts as quasi-static and is drawn over its input
 
 
 def output_pictures(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
@@ -65,15 +65,15 @@ def curve(fit: Fit, recording: Recording) -> list[Block]:
 def hysteresis(fit: Fit, recordings: Sequence[Recording]) -> list[Block]:
     """Draw loops, loading curves and weights of every channel of the element."""
     intro = (
-        "The element turns its local input z into w. Its scale is arbitrary, because the linear part can absorb it: "
-        "look at its shape, not at its size."
+        "The element maps its local input z to w. Its scale is arbitrary, because the linear part can absorb it: "
+        "compare the shape, not the size."
     )
     out: list[Block] = [Text(intro)]
     for c in range(fit.model.n_w):
         of = f" of channel {c + 1}" if fit.model.n_w > 1 else ""
         loop, bare = (plots.loop(fit, recordings[0], channel=c, bare=k) for k in (False, True))
         curve = plots.loading_curve(fit, recordings, channel=c)
-        without = f"The same{of} without its mean slope: the hysteresis alone."
+        without = f"The loop{of} without its mean slope: the hysteresis alone."
         out += [
             Picture(loop, f"The identified loop{of}: w over z.", f"Hysteresis loop{of}, w over z."),
             Picture(bare, without, f"Hysteresis loop{of} without its slope."),
@@ -100,18 +100,18 @@ def linear_part(fit: Fit, train: Sequence[Recording]) -> list[Block]:
     for i in range(min(bla.n_y, 2)):
         for j in range(min(bla.n_u, 2)):
             if bla.var_total is not None and np.mean(bla.var_total[:, i, j] < np.abs(bla.G[:, i, j]) ** 2) < 0.5:
-                continue  # the training data excites too few frequencies for this one
+                continue  # the training data excite too few frequencies for this response
             units = [fit.units.get(n, "") for n in (fit.model.outputs[i], fit.model.inputs[j])]
             unit = "/".join(units) if all(units) else ""
             figure = plots.best_linear_approximation(bla, linear, output=i, input=j, unit=unit)
             of = f"{fit.model.outputs[i]} over {fit.model.inputs[j]}"
-            caption = f"Best linear approximation of {of} in the training data, and the linear model of the start."
+            caption = f"Best linear approximation of {of} in the training data, and the initial linear model."
             out.append(Picture(figure, caption, f"Frequency response, {of}."))
     return out
 
 
 def mode_tables(fit: Fit) -> list[Block]:
-    """Tabulate the modes in small motions, where no operator slips, and in large ones, where all do."""
+    """Tabulate the modes in small motions, where no operator slips, and in large motions, where all slip."""
     values, element = fit.parameters, fit.model.element
     a = values.get("A")
     if a is None or not len(a) or a.shape != (fit.model.n_x,) * 2:
@@ -122,8 +122,8 @@ def mode_tables(fit: Fit) -> list[Block]:
     with_slope = a + values["B_w"] @ np.diag(values["w"].sum(axis=1)) @ values["C_z"]
     small, large = (a, with_slope) if isinstance(operator, Play) else (with_slope, a)
     note = (
-        "In small motions no operator reaches its threshold; in large ones all of them slip. With growing amplitude "
-        "the hysteresis moves the modes from the first table towards the second."
+        "In small motions no operator reaches its threshold; in large motions all operators slip. With growing "
+        "amplitude the hysteresis moves the modes from the first table towards the second."
     )
     return [
         Table(*_modes(small, fit.dt), caption="Modes in small motions"),
@@ -150,13 +150,13 @@ def parameter_blocks(fit: Fit) -> list[Block]:
     parameters = fit.model.parameters
     known = any(np.any(np.isfinite(e)) for e in fit.errors.values())
     basis = (
-        " The errors of a PI-LFR hold in the scale and state basis of these values; entries that are fixed or at a "
-        "bound have none."
+        " The errors of a PI-LFR hold for the scale and state basis of these values; entries that are fixed or at a "
+        "bound have no error."
         if set(BLOCKS) <= set(parameters)
         else ""
     )
     text = (
-        f"Values with standard errors (±), the spread over records with other noise.{basis}"
+        f"Values with standard errors (±), the spread over recordings that differ in noise.{basis}"
         if known
         else "Values; standard errors are not known."
     )
@@ -230,8 +230,8 @@ def limit_blocks(fit: Fit) -> list[Block]:
         for limit in fit.limits
     ]
     note = (
-        "Multiplier: the fall of the objective (half the mean square error divided by the output's variance) per unit "
-        "by which the limit is relaxed. Spectral radii are computed from the eigenvalues of the fitted matrices."
+        "Multiplier: the decrease of the objective (half the mean square error divided by the output's variance) per "
+        "unit by which the limit is relaxed. Spectral radii are computed from the eigenvalues of the fitted matrices."
     )
     columns = ["limit", "state", "value", "lower", "upper", "multiplier", "kind"]
     return [Table(columns, rows, note=note, emphasis=[i for i, v in enumerate(fit.limits) if not v.met], digits=9)]

@@ -24,7 +24,7 @@ import numpy as np
 from .._base import InputError, write_atomically
 
 TONES = ("plain", "good", "warning", "bad")
-DPI = 160  # dots an inch of the pictures: sharp at twice the resolution of an ordinary screen
+DPI = 160  # dots per inch of the pictures: sharp at twice the resolution of an ordinary screen
 
 
 def number_text(value: float, digits: int = 4) -> str:
@@ -35,7 +35,7 @@ def number_text(value: float, digits: int = 4) -> str:
 
 
 def uncertain_text(value: float, error: float) -> str:
-    """Write `value ± error`, to two digits of the error; the value alone where the error is not finite."""
+    """Write `value ± error`, to two digits of the error; only the value if the error is not finite."""
     if not np.isfinite(error):
         return number_text(value)
     decimals = 1 - int(np.floor(np.log10(error))) if error > 0 else 9
@@ -56,7 +56,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Code:
-    """Text that the reader copies, shown as it stands."""
+    """Text for the reader to copy, shown verbatim."""
 
     code: str
     caption: str = ""
@@ -69,7 +69,7 @@ class Table:
 
     Cells are text, or numbers, which are written with `digits` significant digits; None and nan become a dash. Rows
     whose index is in `emphasis` are bold. `caption` stands above the table, `note` below; a `folded` table is closed
-    until the reader opens it. A row that has not as many cells as there are columns raises an `InputError`.
+    until the reader opens it. A row whose number of cells differs from the number of columns raises an `InputError`.
     """
 
     columns: Sequence[str]
@@ -85,7 +85,7 @@ class Table:
         for row in self.rows:
             if len(row) != len(self.columns):
                 raise InputError(
-                    f"A row of a table has {len(row)} cells and its head {len(self.columns)}; give as many as columns."
+                    f"A row has {len(row)} cells and its table {len(self.columns)} columns; give one cell per column."
                 )
 
     @property
@@ -105,7 +105,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure (of matplotlib, its axes, or the bytes of a PNG file) with its caption.
+    """A matplotlib figure, its axes, or the bytes of a PNG file, with a caption.
 
     `alt` describes it to readers who cannot see it. A `wide` picture fills the width of the page; others stand side by
     side where there is room.
@@ -188,7 +188,7 @@ class Page:
 
 
 def render(template: str, **values: Any) -> str:
-    """Fill a template of the folder `templates`; text is escaped in HTML alone."""
+    """Fill a template of the folder `templates`; text is escaped only in HTML."""
     return str(_templates().get_template(template).render(**values)).rstrip("\n")
 
 

@@ -18,8 +18,7 @@ from command_line import fit_arguments, refused, run, sentence, write_csv
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import ordered_digest
-from pilfr_casadi.cli import main
-from pilfr_casadi.cli.app import in_options
+from pilfr_casadi.cli import main, name_options
 
 
 @pytest.fixture
@@ -246,7 +245,7 @@ def test_messages_name_options_of_the_command_line(capsys, tmp_path, train, monk
     ],
 )
 def test_keywords_become_options(python, options):
-    assert in_options(python) == options
+    assert name_options(python) == options
 
 
 @pytest.mark.parametrize(
@@ -345,7 +344,7 @@ def test_inputs_alone_are_enough_to_simulate(capsys, tmp_path, train, model, suf
     assert out.read_text() == both.read_text()
     periodic = ("--initial", "periodic", "--period", 300)
     status, said, _ = run(capsys, "simulate", model, path, *periodic, "--out", out)
-    assert status == 0 and "initial state: that of the periodic steady state" in said
+    assert status == 0 and "initial state: periodic steady state" in said
     refused(capsys, "simulate", model, path, "--initial", "estimate", "--out", out, says="needs measured outputs")
     refused(capsys, "simulate", model, path, "--outputs", "y", "--out", out, says="no column 'y'")
     refused(capsys, "fit", path, "--inputs", "u", "--outputs", "y", "--out", tmp_path / "no", says="no column 'y'")

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from pilfr_casadi._base import InputError
-from pilfr_casadi.engine import VirtualMachine, compiled, compiler, make_engine
-from pilfr_casadi.engine.compiled import Compiled, cache_directory, source_code
-from pilfr_casadi.engine.sensitivities import linearize
+from pilfr_casadi.engine import (
+    Compiled,
+    VirtualMachine,
+    cache_directory,
+    compiled,
+    compiler,
+    linearize,
+    make_engine,
+    source_code,
+)
 from pilfr_casadi.models import NARX, PILFR, Play, PrandtlIshlinskii, reading_output
 from problems import speed
 

@@ -12,9 +12,15 @@ from random_models import OPERATORS, random_input, random_lfr
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.engine import VirtualMachine, compiler, make_engine as engine_of
-from pilfr_casadi.engine.compiled import Compiled, cache_directory, source_code
-from pilfr_casadi.engine.sensitivities import linearize
+from pilfr_casadi.engine import (
+    Compiled,
+    VirtualMachine,
+    cache_directory,
+    compiler,
+    linearize,
+    make_engine as engine_of,
+    source_code,
+)
 from pilfr_casadi.models import (
     PILFR,
     GeneralizedPlay,

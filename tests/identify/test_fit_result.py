@@ -279,13 +279,13 @@ def test_constraints_are_found_by_name(record, truth):
 
 
 def test_the_command_line_says_what_is_not_scored(of_record):
-    from pilfr_casadi.cli.models import _test_line
+    from pilfr_casadi.cli import describe_test_error
 
     u, y = simulated(6, 400, X0)
-    line = _test_line(of_record, Recording(u, y, 0.01, name="test"))
+    line = describe_test_error(of_record, Recording(u, y, 0.01, name="test"))
     assert line.startswith(f"NRMSE on test: {of_record.nrmse(Recording(u, y, 0.01)):.4f}")
-    assert line.endswith("its initial state is fitted to the first 60 samples, not scored")
-    assert "not scored" not in _test_line(of_record, Recording(u, y, 0.01, initial="zero"))
-    assert _test_line(of_record, Recording(u[:50], y[:50], 0.01, name="short")).startswith(
+    assert line.endswith("the first 60 samples estimate the initial state and are not scored")
+    assert "not scored" not in describe_test_error(of_record, Recording(u, y, 0.01, initial="zero"))
+    assert describe_test_error(of_record, Recording(u[:50], y[:50], 0.01, name="short")).startswith(
         "no NRMSE on short: The recording"
     )

@@ -171,7 +171,7 @@ def test_units_are_on_the_axes_and_small_signals_are_scaled(fitted, data):
     ],
 )
 def test_scaling_by_thousands(value, size, unit):
-    assert canvas.scaled(np.array([value, -value]), "m") == (pytest.approx(size), unit)
+    assert canvas.choose_scale(np.array([value, -value]), "m") == (pytest.approx(size), unit)
 
 
 def test_legends_are_honest(fitted, data):

@@ -14,10 +14,8 @@ from diagnosis_example import NOISE, PAIRS, as_it_stands, example, rig
 from test_report import EVIL, Reader
 
 from pilfr_casadi._base import InputError
-from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.gates import Gate
-from pilfr_casadi.report import diagnosis_report, diagnosis_report as same
-from pilfr_casadi.report.diagnosis_tables import usage
+from pilfr_casadi.diagnose import Gate, Workbench
+from pilfr_casadi.report import diagnosis_report, diagnosis_report as same, usage
 
 
 def test_the_checker_can_fail():
@@ -51,7 +49,7 @@ def test_every_verdict_has_its_files(verdict, tmp_path):
     if verdict == "missing-physics":
         assert titles[0] == "What is missing" and "0.1\xa0% with cubic stiffness put back" in path.read_text()
         assert "cannot tell it apart from: creep at sensor:pos" in reader.text
-        assert "3 more" not in reader.text and "6 more that did worse" in reader.text
+        assert "3 more" not in reader.text and "6 more, with larger errors" in reader.text
     if verdict == "recording-fault":
         assert titles[0] == "What the recordings" + "&#39; checks found" and "wrong way round" in reader.text
 

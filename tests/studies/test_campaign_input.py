@@ -10,7 +10,7 @@ from command_line import refused, sentence
 from run_files import changed, prepared
 
 import pilfr_casadi as pilfr
-from pilfr_casadi._base import InputError, worker_process
+from pilfr_casadi._base import InputError
 from pilfr_casadi.cli import main
 from pilfr_casadi.models import named_structure
 from pilfr_casadi.studies import Cell, Manifest, executor, reasons, seeds_advice
@@ -90,7 +90,7 @@ def test_unfit_workers_get_one_sentence(folder, monkeypatch):
     monkeypatch.setattr(executor, "versions", lambda: {**real(), "casadi": "9.9"})
     with pytest.raises(InputError, match=r"A worker has casadi 3.* and this process 9\.9"):
         pilfr.campaign(folder / "rig.toml")
-    monkeypatch.setattr(worker_process.sys, "executable", "/bin/false")
+    monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(InputError, match="The workers cannot start a job"):
         pilfr.campaign(folder / "rig.toml")
 

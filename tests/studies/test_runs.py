@@ -15,8 +15,7 @@ from run_files import PYTHON, RUN, command, contents
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.cli import main
-from pilfr_casadi.cli.studies import EVERY_KEY
+from pilfr_casadi.cli import EVERY_KEY, main
 from pilfr_casadi.optimise import Status
 from pilfr_casadi.studies import ModelTable, RunTable, SolverTable, input_digests, jobs_of, read_run
 
