@@ -11,6 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pilfr_casadi as pilfr
+from pilfr_casadi.laws import display_name
 from pilfr_casadi.plots import new_figure
 from pilfr_casadi.simulators import load_simulator
 
@@ -42,17 +43,18 @@ def main() -> None:
         axes.grid(True, color="#DDDDDD", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     effect = diagnosis.effects[0]
-    law = effect.law.replace("_", " ")
+    law = display_name(effect.law)
     above.set_title(
-        f"{law.capitalize()} is missing at {effect.port} ({100 * effect.confidence:.0f} % sure): "
+        f"{law} is missing at {effect.port} ({100 * effect.confidence:.0f} % sure): "
         f"error on unseen data {share['refitted']:.0f} % → {share['corrected']:.1f} %",
         loc="left",
         fontsize=11,
+        pad=22,  # points: room for the legend
     )
     above.set_ylabel("displacement x2 [mm]")
     below.set_ylabel("error [mm]")
     below.set_xlabel("time [s]")
-    above.legend(loc="upper right", fontsize=9, ncols=3, frameon=False, bbox_to_anchor=(1.0, 1.02))
+    above.legend(loc="lower left", fontsize=9, ncols=3, frameon=False, bbox_to_anchor=(0.0, 0.99), borderaxespad=0.2)
     figure.savefig(TARGET, dpi=130)
     print(f"{TARGET.name}: {law} at {effect.port}, {share}")
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._base import InputError
+from ..laws import display_name
 from ..simulators import Placed
 from .workbench import Fitted
 
@@ -50,8 +51,8 @@ class Description:
     @property
     def words(self) -> str:
         """The elements in words, such as "hysteresis (generalized play) at sensor:speed"."""
-        names = (f"{law}{f' ({form})' if form else ''} at {port}" for port, law, form in self.elements)
-        return " and ".join(names).replace("_", " ")
+        names = ((port, display_name(law), display_name(form)) for port, law, form in self.elements)
+        return " and ".join(f"{law}{f' ({form})' if form else ''} at {port}" for port, law, form in names)
 
     @property
     def sentence(self) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._base import InputError
+from ..laws import display_name
 from .choice import LIKE
 from .verdict import AT_FLOOR, WELL_ABOVE
 from .workbench import THOROUGH, Fitted
@@ -76,7 +77,7 @@ def held_value(search: Search) -> Held | None:
     p, value = bench.simulator.parameters[name], float(found.values[name])
     unit = f" {p.unit}" if p.unit else ""
     kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
-    words = " and ".join(f"the {c.law.id.replace('_', ' ')} at {c.port}" for c in named)
+    words = " and ".join(f"the {display_name(c.law.id)} at {c.port}" for c in named)
     like = f", no further off than with {words}" if named else ""
     sentence = (
         f"Nothing is missing but a value: with {name} = {value:.5g}{unit}, which is {kept} "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,14 +15,16 @@ from .._base import InputError
 from ..data import SAME_STEP, Recording, nrmse
 from ..engine import make_engine
 from ..identify import match_channels
+from ..laws import display_name
 from ..models import ParameterSet
-from ..simulators import Simulator, discretise
+from ..simulators import Simulator, discretise, in_series
 from .description import Description
 from .gates import Gate
 from .proof import run_free
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
+STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
 MOST = 8  # parameters of the simulator that are printed
 LEFT = 2.0  # ratio of the remaining training error to the noise from which the answer says that more is missing
 WORSE = 1.05  # ratio of the test errors after and before from which a correction makes the test recordings worse
@@ -96,7 +99,7 @@ class Diagnosis:
     floor : dict
         `nrmse` and `source`.
     substeps : int
-        Integration steps a sample with which the corrected simulator was fitted.
+        Integration steps per sample with which the corrected simulator was fitted.
     let_go : str
         Parameter that was fixed or at a bound and is free in the corrected simulator; see `held`.
     description : Description or None
@@ -332,29 +335,25 @@ class Diagnosis:
     def __str__(self) -> str:
         lines = [self.summary]
         for e in self.effects:
-            lines.append(f"{e.port}: {e.law}{f' ({e.form})' if e.form else ''}, confidence {e.confidence:.2f}")
-            lines.append(f"  {e.sentence}: {e.equation}")
-            for name, p in e.parameters.items():
-                std = "" if p["std"] is None else f" ± {p['std']:.2g}"
-                lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
-            if e.indistinguishable:
-                others = ", ".join(f"{port}: {law}" for port, law in e.indistinguishable)
-                lines.append(f"  cannot be told apart from {others}")
-        lines += self._own()
-        for kind in ("train", "test"):
-            errors = self.errors[kind]
-            if errors:
-                shown = " -> ".join("diverges" if not np.isfinite(v) else f"{v:.4f}" for v in errors.values())
-                lines.append(f"NRMSE {kind} (nominal -> refitted without -> with): {shown}")
-        lines.append(f"noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})")
+            lines += _effect_lines(e)
+        lines += [*self._own(), *self._error_lines()]
         lines += [f"note: {text}" for text in (*(g.sentence for g in self.gates), *self.warnings())]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
-        stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in self.times.items())
-        lines.append(f"{self.seconds:.1f} s{f': {stages}' if stages else ''}")
+        lines.append(f"computed in {self.seconds:.{1 if self.seconds < 10 else 0}f} s")
         return "\n".join(lines)
 
     __repr__ = __str__
+
+    def _error_lines(self) -> list[str]:
+        """The errors as a table, and the noise floor below it."""
+        lines = [f"{'NRMSE':<12}" + "".join(f"{name:>11}" for name in STEPS.values())]
+        for kind in ("train", "test"):
+            errors = self.errors[kind]
+            if errors:
+                shown = (f"{errors[k]:.4f}" if np.isfinite(errors[k]) else "diverges" for k in STEPS)
+                lines.append(f"  {kind:<10}" + "".join(f"{text:>11}" for text in shown))
+        return [*lines, f"  noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})"]
 
     def _own(self) -> list[str]:
         """The simulator's own estimated values, those that moved most first."""
@@ -369,6 +368,33 @@ class Diagnosis:
             lines.append(f"  {name} = {value:.5g}{std} {p['unit']}".rstrip() + f", given as {nominal:.5g}")
         more = [f"  and {len(moved) - MOST} more"] if len(moved) > MOST else []
         return ["the simulator's own values, refitted:", *lines, *more] if lines else []
+
+
+def _effect_lines(e: Effect) -> list[str]:
+    """An effect in words, with its equation, the numbers in it, and what cannot be told apart from it."""
+    form = f" ({display_name(e.form)})" if e.form else ""
+    symbols = (
+        "where u or z is the signal, and w is added to it"
+        if in_series(e.port)
+        else "where w is the force and z the local coordinate at the port"
+    )
+    lines = [
+        f"{display_name(e.law)}{form} at {e.port}, confidence {e.confidence:.2f}",
+        f"  {e.sentence}: {e.equation}",
+        f"  {symbols}",
+    ]
+    for name, p in e.parameters.items():
+        std = "" if p["std"] is None else f" ± {p['std']:.2g}"
+        lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
+    defined = re.search(r",  (\w+) = (\w+) (\w+)$", e.equation)  # as the F_c = k_t r of friction with presliding
+    if defined and all(name in e.parameters for name in defined.groups()[1:]):
+        name, (a, b) = defined[1], (e.parameters[key] for key in defined.groups()[1:])
+        unit = a["unit"].removesuffix(f"/{b['unit']}") if a["unit"].endswith(f"/{b['unit']}") else ""
+        lines.append(f"  {name} = {a['value'] * b['value']:.5g} {unit}".rstrip())
+    if e.indistinguishable:
+        others = ", ".join(f"{display_name(law)} at {port}" for port, law in e.indistinguishable)
+        lines.append(f"  cannot be told apart from {others}")
+    return lines
 
 
 def _percent(value: float) -> str:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..laws import display_name
 from .choice import Choice
 from .gates import Gate
 from .kinship import FLEXIBLE
@@ -51,7 +52,7 @@ def not_named(search: Search) -> tuple[Gate, ...]:
         if choice not in told:
             port, law = choice.winner.name
             sentence = (
-                f"Beside it something more is missing: {law.replace('_', ' ')} at {port} brings the error to "
+                f"Beside it something more is missing: {display_name(law)} at {port} brings the error to "
                 f"{mean_nrmse(search.bench, search.base):.3g} of the outputs' deviation. What it is is not sure: it is "
                 "in the corrected simulator, but not named."
             )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from .._base import InputError
+from ..laws import display_name
 from .gates import Gate
 from .search import Search
 from .verdict import UNSURE
@@ -29,9 +30,9 @@ def beyond_the_ports(search: Search) -> Sequence[Gate]:
     search.interrupted, named = other.interrupted, other.accepted
     if other.certainty() <= UNSURE or not named or not named[0].winner.port.startswith("equation:"):
         return ()
-    state, law = named[0].winner.port.removeprefix("equation:"), named[0].winner.law.id.replace("_", " ")
+    state, law = named[0].winner.port.removeprefix("equation:"), named[0].winner.law.id
     sentence = (
-        f"No declared port reaches it: in the equation of {state}, {law} explains it (refitted with it, the error is "
-        f"{other.base.cost**0.5:.3g} of the outputs' deviation). Declare the port that it acts through."
+        f"No declared port reaches it: in the equation of {state}, {display_name(law)} explains it (refitted with it, "
+        f"the error is {other.base.cost**0.5:.3g} of the outputs' deviation). Declare the port that it acts through."
     )
-    return (Gate(state, "undeclared", law, sentence, False),)
+    return (Gate(state, "undeclared", law.replace("_", " "), sentence, False),)

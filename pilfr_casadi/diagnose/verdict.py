@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..laws import display_name
 from ..simulators import in_series
 from .choice import Choice
 from .floor import swells_with
@@ -82,7 +83,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         return "recording-fault", faults[0].sentence
     if accepted and explains(accepted, remains, still):
         told = named(search)
-        words = " and ".join(f"{c.winner.law.id.replace('_', ' ')} at {c.winner.port}" for c in told)
+        words = " and ".join(f"{display_name(c.winner.law.id)} at {c.winner.port}" for c in told)
         common = next((c.common for c in told if c.common), None)
         words += f", or every sensor has the same ({common[0]}), as from the logger's filters" if common else ""
         sure = [confidence(c, search) for c in told]
@@ -131,7 +132,7 @@ def judge(search: Search, gates: Sequence[Gate]) -> tuple[str, str]:
         port = where
     return "unexplained", (
         f"Something is missing, most likely at {port}, and no law of the catalogue explains it: the nearest, "
-        f"{near.law.id.replace('_', ' ')} at {near.port}, leaves {remains:.0%} of the excess, and a flexible force "
+        f"{display_name(near.law.id)} at {near.port}, leaves {remains:.0%} of the excess, and a flexible force "
         f"explains {still:.0%} of what it leaves."
     )
 

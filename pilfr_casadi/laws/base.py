@@ -46,6 +46,9 @@ ONSET_WIDTH = 0.05  # of a contact, as a share of its gap
 
 MIN_SIDE = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
 
+PEOPLE = ("coulomb", "stribeck", "hertz")  # laws and forms that bear a person's name
+PROPER_NAMES = {"bouc_wen": "Bouc-Wen", "prandtl_ishlinskii": "Prandtl-Ishlinskii"}
+
 
 @dataclass(frozen=True, eq=False)
 class Local:
@@ -312,6 +315,12 @@ def _tried(entry: Tried, local: Local) -> Any:
         return entry(local)
     attribute, *multiples = entry
     return [getattr(local, attribute) * multiple if attribute else multiple for multiple in multiples]
+
+
+def display_name(law: str) -> str:
+    """Write the id of a law or of its form as words: "coulomb_friction" -> "Coulomb friction"."""
+    text = PROPER_NAMES.get(law, law.replace("_", " "))
+    return text.capitalize() if text.split(" ")[0] in PEOPLE else text
 
 
 def readable_unit(unit: str, w: str, z: str) -> str:

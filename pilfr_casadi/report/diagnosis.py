@@ -16,10 +16,10 @@ import numpy as np
 from .. import plots
 from .._base import InputError, make_folder, write_atomically
 from ..diagnose import Comparison, Diagnosis, Fitted, HiddenForce, Workbench, hidden_force
+from ..laws import display_name
 from ..plots import Signal
 from ..simulators import Port
 from . import diagnosis_tables as tables
-from .diagnosis_tables import words
 from .page import Block, Code, Page, Picture, Section, Text
 
 MOST_DRAWN = 3  # outputs and recordings that are drawn; the tables have all of them
@@ -182,14 +182,14 @@ def _hidden_forces(case: _Case) -> list[Block]:
     for e in d.effects:
         number = next((i for i, p in enumerate(d.corrected.elements) if (p.port, p.law.id) == (e.port, e.law)), None)
         if number is not None:
-            out += _force_blocks(case, case.after, e.port, number, words(e.law))
+            out += _force_blocks(case, case.after, e.port, number, display_name(e.law))
     if d.verdict != "unexplained":
         return out
     search, rows = d.evidence.get("search"), tables.candidates_by_pass(d)
     nearest = search.passes[0].choice if search is not None and search.passes else None
     if nearest is not None:
         fitted, port = nearest.winner.fitted, nearest.winner.port
-        number, name = len(fitted.simulator.elements) - 1, f"{words(nearest.winner.law.id)} (the nearest law)"
+        number, name = len(fitted.simulator.elements) - 1, f"{display_name(nearest.winner.law.id)} (the nearest law)"
         out += _force_blocks(case, fitted, port, number, name)
     elif rows:
         out += _force_blocks(case, case.before, rows[0][0]["port"], None, "")
@@ -252,10 +252,10 @@ def _candidates(d: Diagnosis) -> list[Block]:
         chosen = {(e.port, e.law) for e in named}
         title = "All fitted pairs of port and law"
         if k:
-            before = " and ".join(f"{words(e.law)} at {e.port}" for e in d.effects[:k]) or "the first law"
+            before = " and ".join(f"{display_name(e.law)} at {e.port}" for e in d.effects[:k]) or "the first law"
             title = f"Second pass, with {before} in place"
-        cells = [(r["port"], words(r["law"]), tables.held_out(r)) for r in rows]
-        framed = [(port, words(law)) for port, law in chosen]
+        cells = [(r["port"], display_name(r["law"]), tables.held_out(r)) for r in rows]
+        framed = [(port, display_name(law)) for port, law in chosen]
         axes = plots.port_law_map(cells, framed, tables.held_out_before(d, k), d.floor["nrmse"] or None)
         caption = (
             f"{title}: the error on the part of the training recordings that was not fitted, in %, by port and law "
@@ -326,7 +326,7 @@ def _next_experiment(d: Diagnosis) -> list[Block]:
         return []
     sentence = d.next_experiment.get("sentence")
     settings = {k: v for k, v in d.next_experiment.items() if isinstance(v, str | int | float) and k != "sentence"}
-    rows: Sequence[Sequence[Any]] = [[words(str(k)), v] for k, v in settings.items()]
+    rows: Sequence[Sequence[Any]] = [[display_name(str(k)), v] for k, v in settings.items()]
     out: list[Block] = [Text(str(sentence))] if sentence else []
     return [*out, *([tables.Table(["setting", "value"], rows)] if rows else [])]
 

@@ -9,23 +9,14 @@ from typing import Any
 import numpy as np
 
 from ..diagnose import Diagnosis, plain
+from ..laws import display_name
 from ..models import Parameter, ParameterSet
 from .page import Block, Code, Table, Text, number_text, render, uncertain_text
 
 TONES = {"missing-physics": "good", "complete": "good", "unexplained": "warning", "recording-fault": "bad"}
 ALIKE = 1.03  # ratio of two errors up to which two laws do equally well
 RANKED = 12  # rows of the ranked table above the fold
-PEOPLE = ("coulomb", "stribeck")  # laws that bear a person's name
-FORMS = {"bouc_wen": "Bouc-Wen", "prandtl_ishlinskii": "Prandtl-Ishlinskii", "hertz": "Hertz"}
 STEPS = {"nominal": "as given", "before": "refitted"}
-
-
-def words(law: str) -> str:
-    """Write the id of a law or form as words."""
-    if law in FORMS:
-        return FORMS[law]
-    text = law.replace("_", " ")
-    return text.capitalize() if text.split(" ")[0] in PEOPLE else text
 
 
 def percent(value: float | None) -> str:
@@ -42,7 +33,7 @@ def correction_words(diagnosis: Diagnosis) -> str:
     """
     if diagnosis.effects:
         unsure = [g.finding == "unsure" for g in diagnosis.gates]
-        names = [*(words(e.law) for e in diagnosis.effects), *(["what is not sure"] if any(unsure) else [])]
+        names = [*(display_name(e.law) for e in diagnosis.effects), *(["what is not sure"] if any(unsure) else [])]
         stated = diagnosis.sure and diagnosis.outcome in ("better", "")
         return f"with {' and '.join(names)} {'put back' if stated else 'added'}"
     if diagnosis.description:
@@ -112,9 +103,9 @@ def error_table(diagnosis: Diagnosis) -> Table:
 def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
     """Describe an effect: its law, its parameters, and the laws that cannot be told apart from it."""
     e = diagnosis.effects[number]
-    form = f" ({words(e.form)})" if e.form else ""
+    form = f" ({display_name(e.form)})" if e.form else ""
     out: list[Block] = [
-        Text(f"At {e.port}: {words(e.law)}{form}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
+        Text(f"At {e.port}: {display_name(e.law)}{form}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1."),
     ]
     out.append(Code(e.equation))
     rows = [
@@ -126,13 +117,13 @@ def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:
         note = "± one standard deviation." if given else ""
         out.append(Table(["parameter", "value", "unit"], rows, note=note))
     if e.indistinguishable:
-        others = "; ".join(f"{words(law)} at {port}" for port, law in e.indistinguishable)
+        others = "; ".join(f"{display_name(law)} at {port}" for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
     best = [r for rows in candidates_by_pass(diagnosis)[number : number + 1] for r in rows]
     mine = min((score(r) for r in best if (r["port"], r["law"]) == (e.port, e.law)), default=np.nan)
     known = {(e.port, e.law), *e.indistinguishable}
     close = list(dict.fromkeys((r["port"], r["law"]) for r in best if score(r) < ALIKE * mine))
-    wider = "; ".join(f"{words(law)} at {port}" for port, law in close if (port, law) not in known)
+    wider = "; ".join(f"{display_name(law)} at {port}" for port, law in close if (port, law) not in known)
     if wider:
         out.append(Text(f"Equally good, but more flexible than needed: {wider}."))
     elif not e.indistinguishable:
@@ -183,12 +174,12 @@ def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, s
     best = score(rows[winner or 0])
     cells = []
     for i, r in enumerate(rows):
-        form = f" ({words(r['form'])})" if r.get("form") else ""
+        form = f" ({display_name(r['form'])})" if r.get("form") else ""
         margin = score(r) / best if best > 0 and np.isfinite(score(r)) else np.inf
         gain = np.inf if r["delta_bic"] is None else r["delta_bic"]
         cells.append(
             [
-                f"{i + 1}. {words(r['law'])}{form}",
+                f"{i + 1}. {display_name(r['law'])}{form}",
                 r["port"],
                 percent(r["nrmse_train"]),
                 percent(r["nrmse_validation"]),
@@ -255,7 +246,7 @@ def check_table(diagnosis: Diagnosis) -> Table | None:
     """Tabulate the findings of the recordings' checks; None without findings."""
     if not diagnosis.gates:
         return None
-    rows = [[g.channel, words(g.finding), g.sentence, "yes" if g.corrected else "no"] for g in diagnosis.gates]
+    rows = [[g.channel, display_name(g.finding), g.sentence, "yes" if g.corrected else "no"] for g in diagnosis.gates]
     return Table(["channel", "finding", "in words", "corrected"], rows)
 
 

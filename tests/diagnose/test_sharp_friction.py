@@ -121,7 +121,7 @@ def test_what_is_missing_beside_friction_that_turns_round_is_named():
 @pytest.mark.slow
 def test_what_takes_the_place_of_the_simulators_own_is_told():
     found = pilfr.diagnose(carriage(mass=1.7, drag=5.0), ran(0, 1e-3), laws=(CoulombFriction,))
-    assert found.sentence == "The simulator leaves out coulomb friction at guide."
+    assert found.sentence == "The simulator leaves out Coulomb friction at guide."
     damped = carriage(lambda v, p: 6.2 * v + p.c * v, mass=1.7, c=pilfr.Parameter(2.0, unit="N s/m", bounds=(0, 9)))
     held = {**damped.parameters, "d": replace(damped.parameters["d"], value=0.0, fixed=True)}
     found = pilfr.diagnose(damped.with_parameters(held), ran(0, 1e-3), laws=(CoulombFriction,))
