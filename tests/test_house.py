@@ -27,7 +27,13 @@ ORDER = [
     "studies",
     "cli",
 ]
-FORWARD = {("diagnose/result", "report"), ("identify/result", "report")}  # Diagnosis.report and Fit.report
+# verbs of a class that reach forward: Diagnosis.report, Fit.report, Simulator.plot and Simulator.export
+FORWARD = {
+    ("diagnose/result", "report"),
+    ("identify/result", "report"),
+    ("simulators/simulator", "plots"),
+    ("simulators/simulator", "export"),
+}
 CIRCLES_STAY = "diagnose"  # the inside of this folder
 
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .progress import Progress as Progress, progress_bar as progress_bar
     from .workers import (
         Reply as Reply,
+        check_executor as check_executor,
         close_workers as close_workers,
         one_at_a_time as one_at_a_time,
         one_blas_thread as one_blas_thread,

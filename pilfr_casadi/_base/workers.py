@@ -34,6 +34,8 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
+from .errors import InputError
+
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T")
@@ -287,3 +289,9 @@ def _read(pipe: Any) -> Any:
     if len(size) < 8:
         raise EOFError
     return pickle.loads(pipe.read(int.from_bytes(size, "big")))
+
+
+def check_executor(executor: Any) -> None:
+    """Refuse what cannot run tasks; None stands for the package's own processes."""
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
         written_times as written_times,
     )
     from .recording import (
+        HOLDS as HOLDS,
         SAME_STEP as SAME_STEP,
         Recording as Recording,
         as_recordings as as_recordings,

@@ -7,6 +7,7 @@ file, the column and the line.
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, overload
 
@@ -148,6 +149,10 @@ class _Request:
         self.dt, self.time_tolerance, self.options = dt, time_tolerance, options
         if not self.inputs:
             raise InputError("a recording needs at least one input; name its column.")
+        known = [f.name for f in fields(Recording) if f.name not in ("u", "y", "dt", "inputs", "outputs")]
+        for name in options:
+            if name not in known:
+                raise InputError(f"{name!r} is no option of a reader; there are {listed(known)}.")
         if not isinstance(columns or {}, Mapping):
             raise InputError(f"columns={columns!r} was given; give columns={{'NAME': 'COLUMN'}}.")
         self.columns = columns or {}

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._base import InputError
-from ..data import SAME_STEP, Recording, nrmse
+from .._base import InputError, write_atomically
+from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import match_channels
 from ..laws import display_name
@@ -206,14 +207,14 @@ class Diagnosis:
         """
         return self._run(recording)[1]
 
-    def nrmse(self, recording: Recording) -> float:
-        """Error of the corrected simulator on a recording: NRMSE (Eq. 27), averaged over outputs.
+    def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
+        """Compute the NRMSE (Eq. 27) of the corrected simulator, averaged over outputs and recordings.
 
         Samples that an initial state was estimated from are not scored; see `simulate` for everything else. The error
         is infinite where the simulation diverges.
         """
-        r, y, skip = self._run(recording)
-        return nrmse(r.y, y, skip=skip) if np.all(np.isfinite(y)) else np.inf
+        runs = [self._run(recording) for recording in as_recordings(recordings)]
+        return float(np.mean([nrmse(r.y, y, skip=k) if np.all(np.isfinite(y)) else np.inf for r, y, k in runs]))
 
     def plot(self, recording: Recording) -> Any:
         """Draw a recording beside the refitted and the corrected simulator.
@@ -228,20 +229,13 @@ class Diagnosis:
         matplotlib.figure.Figure
             A row for each output: the signals around the largest swing, and the errors over the whole recording.
         """
-        from ..plots import Simulated, compared_residuals, compared_traces, new_figure
+        from ..plots import Simulated, plot_comparison
 
         found = self.compare(recording)
         r = found.recording
         simulated: Simulated = [("refitted", found.before)]
         simulated += [("corrected", found.after)] if self._changed else []
-        figure = new_figure(11.0, 3.4 * r.n_y)
-        axes = figure.subplots(r.n_y, 2, squeeze=False)
-        noise = self.floor["nrmse"] * np.std(r.y[r.skip :], axis=0)
-        for i, (left, right) in enumerate(axes):
-            unit = r.units.get(r.outputs[i], "")
-            compared_traces(r, simulated, i, unit, ax=left)
-            compared_residuals(r, simulated, i, unit, float(noise[i]), ax=right)
-        return figure
+        return plot_comparison(r, simulated, self.floor["nrmse"] * np.std(r.y[r.skip :], axis=0))
 
     def compare(self, recording: Recording) -> Comparison:
         """Simulate the refitted and the corrected simulator along a recording; see `simulate`."""
@@ -282,6 +276,16 @@ class Diagnosis:
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
         """Make the corrected simulator a `casadi.Function (x, u) -> (x_next, y)`; see `pilfr.to_casadi`."""
         return self.export(name=name, smooth=smooth).step
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the content of diagnosis.json to a file, atomically.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        """
+        write_atomically(path, json.dumps(self.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
     def report(self, folder: str | os.PathLike[str]) -> Path:
         """Write report.html, diagnosis.json and figures into a folder; return the page's path."""

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, listed, one_blas_thread, processors
-from ..data import Recording, as_recordings, check_for_identification
+from .._base import InputError, Progress, listed, one_blas_thread, processors, whole
+from ..data import HOLDS, Recording, as_recordings, check_for_identification
 from ..identify import match_channels
 from ..laws import CATALOGUE, SCALABLE, Law, readable_unit, scaled
 from ..simulators import as_simulator
@@ -50,7 +50,10 @@ def run_diagnosis(
 ) -> Diagnosis:
     """Carry out `diagnose`, whose parameters these are."""
     began = time.perf_counter()
-    workers = workers or min(processors(), 4)
+    workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
+    effects = whole(effects, "effects", 0)
+    if hold not in HOLDS:
+        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear' or None.")
     say = Stages(progress or (lambda stage, done, total, best: None))
     simulator = as_simulator(simulator, as_recordings(train))
     recordings = check_for_identification([match_channels(simulator, r) for r in as_recordings(train)], 20)
@@ -68,7 +71,10 @@ def run_diagnosis(
             )
         if not most > 0:
             raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")
-    laws = CATALOGUE if laws is None else laws
+    laws = CATALOGUE if laws is None else tuple(laws)
+    for law in laws:
+        if not (isinstance(law, type) and issubclass(law, Law)):
+            raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
     laws = (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
     asked = Asked(simulator, recordings, laws, hold, engine, workers, effects, stand_in_error, say)
     ready, search = prepared_search(asked)

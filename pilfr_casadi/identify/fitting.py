@@ -17,7 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, filled, one_blas_thread, progress_bar, whole, worker_pool
+from .._base import (
+    InputError,
+    Progress,
+    check_executor,
+    filled,
+    one_blas_thread,
+    progress_bar,
+    whole,
+    worker_pool,
+)
 from ..data import Recording, as_recordings, check_for_identification
 from ..models import PILFR, Lagged, Model, PrandtlIshlinskii, StaticNetwork
 from ..optimise import (
@@ -153,6 +162,7 @@ def fit(
     """
     solver = solver or DEFAULT_SOLVER
     _check_arguments(model, solver, starts, seed, workers, progress)
+    check_executor(executor)
     if not isinstance(start, Mapping) and start not in START_KINDS:
         raise InputError(f"The start {start!r} is unknown; use 'grid', 'paper' or 'plain', or values by name.")
     searches = isinstance(model, PILFR | Lagged) and not isinstance(start, Mapping)

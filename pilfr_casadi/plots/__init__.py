@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         compared_traces as compared_traces,
         linear_simulation as linear_simulation,
         output_over_input as output_over_input,
+        plot_comparison as plot_comparison,
         remains as remains,
         spectrum as spectrum,
         time as time,

@@ -33,6 +33,7 @@ from .canvas import (
     limit_depth,
     line,
     mask_divergence,
+    new_figure,
     plain,
     scale_axis,
     with_unit,
@@ -312,6 +313,21 @@ def _unit(fit: PlottedFit, recording: Recording, name: str) -> str:
 
 Simulated = list[tuple[str, np.ndarray | None]]  # (label, outputs (M, n_y)), before first, after last
 SIMULATED_COLOURS = (ORANGE, INK)
+
+
+def plot_comparison(r: Recording, simulated: Simulated, noise: np.ndarray | None = None) -> Any:
+    """Draw a recording beside simulations: a row per output, the largest swing on the left, all residuals on the right.
+
+    `noise` holds the standard deviation of each output's noise, shape (n_y,).
+    """
+    figure = new_figure(11.0, 3.4 * r.n_y)
+    axes = figure.subplots(r.n_y, 2, squeeze=False)
+    deviations = np.zeros(r.n_y) if noise is None else noise
+    for i, (left, right) in enumerate(axes):
+        unit = r.units.get(r.outputs[i], "")
+        compared_traces(r, simulated, i, unit, ax=left)
+        compared_residuals(r, simulated, i, unit, float(deviations[i]), ax=right)
+    return figure
 
 
 def compared_traces(

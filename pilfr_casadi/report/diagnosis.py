@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,11 +32,10 @@ def diagnosis_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pa
     """
     page, figures = _draw(diagnosis_page(diagnosis))
     html = page.html()
-    content = json.dumps(diagnosis.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     target = make_folder(Path(folder) / "figures").parent
     for name, png in figures.items():
         write_atomically(target / "figures" / name, png)
-    write_atomically(target / "diagnosis.json", content)
+    diagnosis.save(target / "diagnosis.json")
     path = write_atomically(target / "report.html", html)
     for old in (target / "figures").glob("diagnosis-[0-9][0-9]-*.png"):
         if old.name not in figures:

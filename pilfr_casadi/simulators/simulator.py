@@ -6,20 +6,21 @@ like any other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from .._base import InputError
-from ..data import Recording, nrmse
+from ..data import Recording, as_recordings, nrmse
+from ..laws import readable_unit
 from ..models import Parameter, ParameterSet, accumulate_steps
 from .equations import Equations, Placed
 from .integration import choose_substeps, discretise
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Simulator(Equations):
     """A simulator with ports.
 
@@ -97,20 +98,66 @@ class Simulator(Equations):
         values = np.broadcast_to(self.parameter_set.start, (len(drive), self.parameter_set.size))
         return accumulate_steps(model.closed, start, drive, values)[1][::substeps]
 
-    def nrmse(self, recording: Recording) -> float:
-        """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) of a simulation, averaged over the outputs.
+    def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
+        """Compute the NRMSE (Krikelis et al. 2024, Eq. 27) of a simulation, averaged over outputs and recordings.
 
         Raises
         ------
         InputError
             As `simulate`, and if the recording lacks an output of the simulator.
         """
-        simulated = self.simulate(recording)
+        given = as_recordings(recordings)
+        return float(np.mean([nrmse(self._measured(r), self.simulate(r), r.skip) for r in given]))
+
+    def plot(self, recording: Recording) -> Any:
+        """Draw a recording beside the simulation: the largest swing and the residuals of each output.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        InputError
+            As `nrmse`.
+        """
+        from ..plots import plot_comparison
+
+        measured = self._measured(recording)
+        shown = recording.with_(y=measured, outputs=self.output_names)
+        return plot_comparison(shown, [("simulated", self.simulate(recording))])
+
+    def export(self, dt: float, **options: Any) -> Any:
+        """Make it a step over `dt` seconds with the laws in its ports; options and errors are those of `exported`."""
+        from ..export import exported
+
+        return exported(self, dt=dt, **options)
+
+    def __repr__(self) -> str:
+        lines = [
+            f"Simulator with the states {', '.join(self.states) or 'none'}; inputs {', '.join(self.inputs) or 'none'}; "
+            f"outputs {', '.join(self.output_names)}",
+            *(f"  {e.port}: {e.law.id}" for e in self.elements),
+        ]
+        for name, p in self.parameters.items():
+            value = f"{float(p.value):.5g}" if p.value.ndim == 0 else np.array2string(p.value, precision=5, threshold=8)
+            lines.append(f"  {name} = {value} {self._unit(name)}{' (fixed)' if np.all(p.fixed) else ''}".rstrip())
+        return "\n".join(lines)
+
+    def _unit(self, name: str) -> str:
+        """Unit of a parameter, that of a law in the units of its port."""
+        unit = self.parameters[name].unit
+        for e in self.elements:
+            if name.startswith(e.prefix):
+                port = self.port(e.port)
+                return readable_unit(unit, port.unit, port.across_unit)
+        return unit
+
+    def _measured(self, recording: Recording) -> np.ndarray:
         for name in self.output_names:
             if name not in recording.outputs:
                 raise InputError(f"{recording.label} has no output {name!r}; it has {', '.join(recording.outputs)}.")
-        measured = recording.y[:, [recording.outputs.index(name) for name in self.output_names]]
-        return nrmse(measured, simulated, recording.skip)
+        return recording.y[:, [recording.outputs.index(name) for name in self.output_names]]
 
     def with_parameters(self, parameters: Mapping[str, Parameter]) -> Simulator:
         """Copy with other parameters of the same names."""

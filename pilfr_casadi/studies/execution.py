@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, deferred_interrupt, digest, make_folder, whole
+from .._base import InputError, Progress, check_executor, deferred_interrupt, digest, make_folder, whole
 from ..data import Recording, keeps_its_period, read
 from ..identify import Fit, is_drawn
 from ..models import PILFR, places
@@ -213,8 +213,7 @@ def campaign(
 def _read_run(path: Any, kind: str, executor: Any, **changes: Any) -> Run:
     """Read the run, with `changes` that are not None instead of the file's values."""
     given = path if isinstance(path, Run) else read_run(path, kind)
-    if executor is not None and not callable(getattr(executor, "submit", None)):
-        raise InputError(f"executor = {executor!r} was given; give a concurrent.futures.Executor, or leave it out.")
+    check_executor(executor)
     return replace(given, **{name: value for name, value in changes.items() if value is not None})
 
 

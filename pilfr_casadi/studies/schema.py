@@ -453,6 +453,8 @@ def read_run(path: Any, kind: str = "run") -> Run:
     InputError
         If it cannot be read, or asks for something impossible: one sentence with the file and the key.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"{path!r} was given for a run file; give its path, or the result of `read_run`.")
     file = Path(path)
     try:
         existing_file(file)

@@ -124,6 +124,11 @@ def test_many_rows_are_read_at_once(tmp_path):
     np.testing.assert_allclose(r.y[:1000, 0], rows[:1000, 2], atol=1e-6)
 
 
+def test_an_unknown_option_is_refused(write):
+    with pytest.raises(InputError, match="'bogus' is no option of a reader; there are units, period, initial"):
+        read_csv(write(GOOD), inputs="force", outputs="x2", bogus=1)
+
+
 # ---------------------------------------------------------------------------------------------- CSV that is refused
 
 BAD_FILES = {

@@ -136,6 +136,20 @@ def test_test_data_that_was_trained_on_is_refused():
         pilfr.diagnose(rig(), train, test=train[0])
 
 
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ({"workers": 0}, "workers is 0; give a whole number, 1 or more"),
+        ({"effects": -1}, "effects is -1"),
+        ({"hold": "cubic"}, "hold='cubic' was given"),
+        ({"laws": ["friction"]}, "laws holds 'friction'; give classes of laws"),
+    ],
+)
+def test_bad_options_are_refused_at_once(option, words):
+    with pytest.raises(pilfr.InputError, match=words):
+        pilfr.diagnose(rig(), recordings(), **option)
+
+
 def test_a_missing_column_is_said():
     train = [r.with_(outputs=("x3",)) for r in recordings()]
     with pytest.raises(pilfr.InputError, match="no output 'x2'"):

@@ -71,6 +71,7 @@ def test_one_fit_under_every_name():
     ("wrong", "words"),
     [
         (lambda r: fit(PILFR(2), r, progress=3), "progress = 3"),
+        (lambda r: fit(PILFR(2), r, executor=3), "executor = 3 was given"),
         (lambda r: fit(PILFR(2), r, l1={"w": 1e-4}), "linear model"),
         (lambda r: fit(PILFR(2, layer()), r, l1=["w"]), "by name"),
         (lambda r: fit(PILFR(100, layer()), r), "choose a smaller model"),

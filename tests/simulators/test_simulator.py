@@ -55,6 +55,31 @@ def record():
     return Recording(u, np.zeros((M, 2)), DT, ("force", "table"), ("position", "load"), initial="zero")
 
 
+def test_a_simulator_has_the_verbs_of_a_fit(record):
+    simulator = rig()
+    measured = record.with_(y=simulator.simulate(record) + [0.01, 0.0] * np.sin(record.t)[:, None])
+    one = rig(outputs=lambda x: dict(position=x.pos), ports=())
+    alone = measured.with_(y=measured.y[:, :1], outputs=("position",))
+    assert 0 < one.nrmse(alone) == pytest.approx(one.nrmse([alone, alone]))
+    assert len(one.plot(alone).axes) == 2
+    step = one.export(dt=record.dt).step
+    state, rows = np.zeros(2), []
+    for u in record.u[:20]:
+        state, y = step(state, u)
+        rows.append(float(y))
+    np.testing.assert_allclose(rows, one.simulate(record)[:20, 0], atol=1e-12)
+    shown = repr(simulator)
+    assert "states pos, vel" in shown and "  k = 90" in shown and "inputs force, table" in shown
+    with pytest.raises(InputError, match="no output 'load'"):
+        simulator.plot(alone)
+
+
+def test_a_law_is_shown_in_the_units_of_its_port():
+    port = Port("ground", dict(vel=-1.0), lambda x: x.pos, unit="N", across_unit="m")
+    simulator = rig(ports=port).with_element("ground", CubicStiffness({"k_3": 2.0}))
+    assert "ground: cubic_stiffness" in repr(simulator) and "ground.k_3 = 2 N/m^3" in repr(simulator)
+
+
 def run(simulator, record, hold="zero", substeps=1, state=None, engine=None):
     model = discretise(simulator, record.dt, hold, substeps)
     state = np.zeros(model.n_state) if state is None else state
