@@ -78,7 +78,7 @@ def seconds(text: str) -> Any:
 
 
 def option(text: str, metavar: str | None = None, default: Any = None, name: str | None = None) -> Any:
-    """Make an option of any other type; its name is that of the field, unless it is given."""
+    """Make an option of any other type; it is named after the field unless `name` is given."""
     return typer.Option(default, *([name] if name else []), metavar=metavar, help=text, show_default=False)
 
 

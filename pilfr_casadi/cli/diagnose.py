@@ -86,7 +86,7 @@ class DiagnoseOptions(DataOptions):
 
 @takes_options
 def diagnose_command(options: DiagnoseOptions) -> int:
-    """The answer goes to DIR/diagnosis.json, the report to DIR/report.html."""
+    """Writes the answer to DIR/diagnosis.json and the report to DIR/report.html."""
     _check_files(options)
     new_file(options.out, "diagnosis.json", options.overwrite)
     given = None
@@ -168,7 +168,7 @@ def _check_files(options: DiagnoseOptions) -> None:
     if not options.train:
         raise InputError("No training recording was given; give the simulator file and at least one recording.")
     if source is not None and (options.inputs or options.outputs):
-        raise InputError("--inputs and --outputs go with --simulated; a simulator file has names of its own.")
+        raise InputError("--inputs and --outputs go with --simulated; a simulator file has its own names.")
     check_given_once(options.recordings)
 
 

@@ -114,7 +114,7 @@ class FitOptions(DataOptions):
 
 @takes_options
 def fit_command(options: FitOptions) -> int:
-    """The model goes to DIR/model.json, the report to DIR/report.html."""
+    """Writes the model to DIR/model.json and the report to DIR/report.html."""
     target = _check(options)
     inputs, outputs = options.names()
     saved = load(options.start_from) if options.start_from else None
@@ -432,7 +432,7 @@ def export_command(options: ExportOptions) -> int:
         if getattr(options, key) is not None and not simulated:
             raise InputError(f"--{key} was given, but a saved model has its own step; leave it out.")
     if simulated and options.dt is None:
-        raise InputError("A simulator has no step of its own; give --dt SECONDS.")
+        raise InputError("A simulator has no fixed step; give --dt SECONDS.")
     step = exported(source, dt=options.dt, hold=options.hold, smooth=options.smooth, name=options.name)
     out = Path(options.out)
     if options.c:

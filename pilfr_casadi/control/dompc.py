@@ -23,7 +23,7 @@ def _import_do_mpc() -> Any:
     """Import do-mpc; if it is missing, explain how to install it."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it warns about each of its own optional parts
+            warnings.simplefilter("ignore")  # do-mpc warns about each missing optional part
             import do_mpc
     except ImportError:
         raise InputError(MISSING) from None

@@ -448,8 +448,8 @@ def _reasons(kind: str, names: dict[int, str], unseen: list[int], size: Array, s
         "slip one after the other tells them apart"
     )
     one = (
-        f"sticks over all {samples} samples, and its effect on the outputs drowns in noise or looks like that of "
-        "others; an excursion that makes it slip settles it"
+        f"sticks over all {samples} samples, and its effect on the outputs drowns in noise or looks like the effect "
+        "of others; an excursion that makes it slip settles it"
     )
     slipping = (
         f"{'slip' if len(faint) > 1 else 'slips'} within the window, and the trace left before drowns in noise or "

@@ -38,7 +38,7 @@ TIME, NEXT = "time", "_next"
 
 
 class FittedModel(Protocol):
-    """A model with a time step of its own, such as a `Fit`."""
+    """A model with its own time step, such as a `Fit`."""
 
     @property
     def model(self) -> Model:
@@ -114,7 +114,7 @@ class Exported:
     thresholds : dict
         Name of a memory -> half-width of its play or stop, in units of the signal that drives it.
     inputs, outputs : tuple of str
-        Names of the entries of u and y. Where inputs are interpolated, those of the next sample follow, `<input>_next`.
+        Names of the entries of u and y. Where inputs are interpolated, u also holds the next inputs, `<input>_next`.
     units : dict
         Unit by name, where it is known.
     dt : float

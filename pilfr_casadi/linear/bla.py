@@ -161,7 +161,7 @@ def robust_bla(
         Samples per period; left out, the recordings' own.
     lines : array of int, optional
         Excited harmonics, 1 being one cycle per period. Left out, they are found: every input exceeds 0.1 % of its
-        largest amplitude and, with several periods, 20 times the power of its own variation between periods.
+        largest amplitude and, with several periods, 20 times the power of its variation between periods.
 
     Returns
     -------
@@ -195,7 +195,7 @@ def output_spectra(
 ) -> OutputSpectra:
     """Estimate the spectra of the outputs, of their noise, and of noise and nonlinear distortion together.
 
-    Arguments are those of :func:`robust_bla`. The distortion is the scatter of ``Y - G U`` over the realizations, `G`
+    Takes the arguments of :func:`robust_bla`. The distortion is the scatter of ``Y - G U`` over the realizations, `G`
     being the BLA.
     """
     spectra = _periodic_spectra(recordings, period, lines)

@@ -1,6 +1,6 @@
 """Shared parts of all figures: a canvas without global state, colours, decibels, and lines thinned in long records.
 
-Colours are those of Okabe & Ito (2008), distinct for every kind of colour vision. Figures are made with matplotlib's
+The colours of Okabe & Ito (2008) are distinct for every kind of colour vision. Figures are made with matplotlib's
 object interface: no pyplot, no change of settings, so they work in scripts, notebooks and servers alike.
 """
 
@@ -32,7 +32,7 @@ def new_figure(width: float = 5.2, height: float = 3.5) -> Figure:
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
-    """Return the axes given, or those of a new figure; `axes.figure` leads back to it."""
+    """Return the axes given, or the axes of a new figure."""
     return new_figure().add_subplot() if ax is None else ax
 
 

@@ -130,9 +130,7 @@ def weights(
 
 def _check_channel(fit: PlottedFit, channel: int) -> None:
     if not 0 <= channel < fit.model.n_w:
-        raise InputError(
-            f"Channel {channel} of the element was asked for; the model has {fit.model.n_w}, counted from 0."
-        )
+        raise InputError(f"Channel {channel} of the element was given; the model has {fit.model.n_w}, counted from 0.")
 
 
 def _index(fit: PlottedFit, channel: int) -> str:

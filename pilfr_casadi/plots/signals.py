@@ -286,7 +286,7 @@ def _compares(fit: PlottedFit) -> bool:
 def _column(values: np.ndarray, index: int, role: str) -> np.ndarray:
     """Return one of the recording's inputs or outputs, (M,)."""
     if not 0 <= index < values.shape[1]:
-        raise InputError(f"The {role} {index} was asked for; the recording has {values.shape[1]}, counted from 0.")
+        raise InputError(f"The {role} {index} was given; the recording has {values.shape[1]}, counted from 0.")
     return values[:, index]
 
 

@@ -212,8 +212,8 @@ def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, na
         return [Text(f"The outputs do not show the force at {port}, so it cannot be recovered.")]
     recording = hidden.recording or (f"training recording {loud + 1}" if len(records) > 1 else "the recording")
     how = (
-        f"The blue points are the force at {port} that makes the simulator follow {recording}. A smoother found it: it "
-        "keeps the fitted parameters and assumes only that the force wanders in random steps; it knows no law."
+        f"The blue points are the force at {port} that makes the simulator follow {recording}. A smoother computed "
+        "it with the fitted parameters, assuming only that the force changes in random steps; it uses no law."
     )
     how += f" The orange line is the fitted {name} along the simulation." if name else ""
     return [Text(how), *_force_pictures(hidden, bench.simulator.port(port), name)]

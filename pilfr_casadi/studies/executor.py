@@ -1,6 +1,6 @@
 """Jobs side by side on an executor: outcomes in the order in which they arrive, retries where a worker has died.
 
-Every job runs in a process of its own beside its worker, with any kind of executor. The result of a job does not depend
+Every job runs in a separate process beside its worker, with any kind of executor. The result of a job does not depend
 on where, when or how often it ran.
 """
 

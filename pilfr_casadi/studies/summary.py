@@ -1,6 +1,6 @@
 r"""The errors of a run in tables and box plots, the chosen model, and the recommended structure.
 
-The box plots are those of Krikelis et al. (2024), Fig. 11.
+Box plots as in Krikelis et al. (2024), Fig. 11.
 
 A structure is selected by cross-validation, or by a validation recording, with the rule of `select_order`. With
 :math:`e(c)` the error of a cell on recordings it has not been fitted to, take the cell with the fewest free parameters
