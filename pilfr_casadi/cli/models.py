@@ -28,7 +28,6 @@ from ..data import (
     NOTHING_SENTENCE,
     STACK_SUFFIXES,
     Recording,
-    check_for_identification,
     column_names,
     explains_nothing,
     nrmse,
@@ -37,7 +36,7 @@ from ..data import (
 )
 from ..engine import VirtualMachine, compiler, make_engine
 from ..export import NAMES, exported
-from ..identify import Fit, fit, load
+from ..identify import Fit, check_recordings, fit, load
 from ..linear import select_order
 from ..models import ANY, PILFR, TAKES, Lagged, named_structure
 from ..optimise import GaussNewton, Ipopt, Status
@@ -173,8 +172,7 @@ def _identify(
     solver = GaussNewton() if options.solver == "gauss-newton" else Ipopt()
     with worker_pool(options.workers) as pool:
         task = saved if saved is not None else _structure(options, train, progress)
-        if isinstance(task, Lagged):  # refuse too many lags before building them
-            check_for_identification(train, task.unknowns(train[0].n_u, train[0].n_y) + 2)
+        check_recordings(task, train)  # before the engine is compiled
         progress("building the engine", 0, 0, np.nan)
         engine = announce_engine(task, train[0], options.engine)
         search: dict[str, Any] = {}

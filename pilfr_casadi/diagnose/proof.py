@@ -99,7 +99,7 @@ def covariance(bench: Workbench, fitted: Fitted, held: Sequence[int] = ()) -> tu
     problem = bench.problem(free, fitted.engine)
     n_free = int(problem.free.sum())
     theta = problem.start.copy()
-    states = [s for p, s in zip(problem._parts, fitted.initial, strict=True) if p.first is not None]
+    states = [s for p, s in zip(problem._placed, fitted.initial, strict=True) if p.first is not None]
     theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
     _, _, hessian = problem.normal(theta)
     inside = (theta > problem.lower) & (theta < problem.upper)

@@ -1,4 +1,10 @@
-"""`fit`: start values, multistart, the result, its uncertainty, and sparse fits."""
+"""`fit`: identify a model from recordings.
+
+`fitting` holds `fit`, which checks its arguments and chooses the method. `start` computes start values, `multistart`
+chooses which of them are tried and polishes the best, `context` solves with the options that all fits share,
+`penalty` adds the L1 penalty, and `lagged` trains NARX and NOE models. `result` is the `Fit`, `uncertainty` its
+standard errors, and `sparse` makes fits with fewer operators from it.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -7,6 +13,7 @@ from .._base.lazy import lazy_face
 if TYPE_CHECKING:
     from .context import (
         FitContext as FitContext,
+        check_recordings as check_recordings,
         describe_reached_gain as describe_reached_gain,
         solve_within_bounds as solve_within_bounds,
     )

@@ -1,19 +1,19 @@
-"""The context of one fit: recordings, solver, options, the solves, and the result with its note.
+"""`FitContext`: the recordings, solver and options of one fit, its solves, and its result with a note.
 
-**A search begins at rest.** A free initial state lets a search pay for a better fit with memories that no machine had.
-A prior does not prevent this, because the units of states and memories are free too. So a search begins with the state
-at rest unless the recordings contradict it, that is, unless freeing the state would lower the cost by more than the
-Bayesian information criterion charges for the new variables (`FitContext.agrees_with_rest`).
+**A search begins at rest.** With a free initial state a search improves the fit by initial memories that the machine
+never had. A prior does not prevent this, because the units of states and memories are free too. So a search begins at
+rest unless the recordings contradict it, that is, unless freeing the state lowers the cost by more than the Bayesian
+information criterion charges for the new variables (`FitContext.agrees_with_rest`).
 
-**The note of a result** says two things that the recordings leave open. An operator that never slips in a periodic
-steady state keeps its memory, whatever it is: its row of the state's slope over a period is that of the identity, every
-value in an interval is a steady state, and the outputs differ by a constant. The memory that periods from rest lead to
-is taken.
+**The note of a result** names two things that the recordings do not determine. First, an operator that never slips in a
+periodic steady state keeps any memory: its row of the state's slope over a period is that of the identity, every value
+in an interval is a steady state, and the outputs differ by a constant. The fit uses the memory that is reached from
+rest.
 
-The gain of a `dc_gain` constraint belongs to motions so large that every play slips (`slope` 1), or so small that every
-one sticks (0), after an infinite time. A fit may meet it where no data contradict it, by operators whose thresholds lie
-beyond all motions, or by a slow pole. So the gain is computed a second time, over the samples of the longest recording
-and without the operators that never slip (for small motions: with the operators that have no threshold),
+Second, the gain of a `dc_gain` constraint applies after an infinite time, to motions so large that every play slips
+(`slope` 1) or so small that every play sticks (0). A fit may meet it outside the data, by operators whose thresholds
+lie beyond all motions, or by a slow pole. So the gain is computed a second time, over the samples of the longest
+recording and without the operators that never slip (for small motions: with the operators that have no threshold),
 
     gain_M = C' (Σ_{k<M} A'^k) B' + D',   with the blocks of the constraint at S = diag(Σ_j w_ij), j slipping.
 """
@@ -29,10 +29,10 @@ from typing import Any
 import numpy as np
 
 from .._base import Progress, deferred_interrupt
-from ..data import Recording, as_recordings, fingerprint
-from ..models import LAYER, PILFR, Model, PrandtlIshlinskii, Stop
+from ..data import Recording, as_recordings, check_for_identification, fingerprint
+from ..models import LAYER, PILFR, Lagged, Model, PrandtlIshlinskii, Stop
 from ..optimise import (
-    STEP,
+    BOUND_STEP_SOLVER,
     Constraint,
     Gain,
     GaussNewton,
@@ -41,10 +41,10 @@ from ..optimise import (
     Problem,
     Solution,
     Status,
-    exactly,
+    describe_unbounded,
     limits_of,
-    unbounded_sentence,
-    within_bounds,
+    move_inside_exact,
+    solve_within_radii,
 )
 from .result import DENSITY_PRIOR, Fit, FitOptions, with_solution
 from .uncertainty import standard_errors
@@ -52,19 +52,19 @@ from .uncertainty import standard_errors
 Stage = tuple[Model, Problem, Solution, str]  # model, problem, solution, note
 Array = np.ndarray
 BOUND_SOLVER = GaussNewton()  # solves at a bound on a spectral radius for solvers other than Gauss-Newton
-DIVERGES = 1e3  # times the error of a model without outputs, from which a model diverges
-NOISE_ROUNDS, NOISE_AGREES = 5, 0.05  # most estimates of the noise, and the relative change that ends them
-CHUNK = 512  # samples of a period whose slopes are held in memory at a time
-STILL = 1e-12  # differences from the identity below this count as none
-APART = 0.05  # difference of gains, relative to the largest one asked for, that is reported
+DIVERGES = 1e3  # a fit counts as diverged from this multiple of the error of a model whose outputs are zero
+NOISE_ROUNDS, NOISE_AGREES = 5, 0.05  # limit of noise estimates, and the relative change below which they stop
+CHUNK = 512  # samples of a period whose slopes are kept in memory at a time
+STILL = 1e-12  # difference from the identity up to which a slope counts as the identity
+APART = 0.05  # difference of gains, relative to the largest wanted gain, that is reported
 
 
 @dataclass(frozen=True, eq=False)
 class FitContext:
     """The recordings, solver and options that every kind of fit shares.
 
-    `constraints` hold the bounds on spectral radii too; `threads` recordings are run at a time; `began` is the time of
-    `time.perf_counter` at which the work began.
+    `constraints` include the bounds on spectral radii; `threads` is the number of recordings run at a time; `began` is
+    the value of `time.perf_counter` when the work began.
     """
 
     recordings: tuple[Recording, ...]
@@ -95,11 +95,13 @@ class FitContext:
         if not isinstance(self.solver, GaussNewton | Ipopt):
             solution: Solution = self.solver.solve(problem, start)
             return solution
-        last = self.solver if isinstance(self.solver, GaussNewton) else BOUND_SOLVER
-        return solve_within_bounds(problem, start, self.solver, stage, self.progress, last)
+        bound_solver = self.solver if isinstance(self.solver, GaussNewton) else BOUND_SOLVER
+        return solve_within_bounds(problem, start, self.solver, stage, self.progress, bound_solver)
 
-    def settle_noise(self, problem: Problem, solution: Solution, stage: str, **others: Any) -> tuple[Problem, Solution]:
-        """Solve again with the noise at the error that was reached, until both agree, where there are priors."""
+    def iterate_noise(
+        self, problem: Problem, solution: Solution, stage: str, **others: Any
+    ) -> tuple[Problem, Solution]:
+        """Where there are priors, set the noise to the error reached and solve again, until the two agree."""
         priors = any(p.prior is not None and not np.all(p.fixed) for p in problem.model.parameters.values())
         for _ in range(NOISE_ROUNDS if priors and self.options.noise is None else 0):
             error = rms_error(problem, solution)
@@ -110,7 +112,7 @@ class FitContext:
         return problem, solution
 
     def at_rest(self) -> FitContext:
-        """Return the context with recordings at rest where their initial state is to be estimated, if there are any."""
+        """Return the context with recordings from rest in place of those with an initial state to be estimated."""
         if not any(r.begins == "estimate" for r in self.recordings):
             return self
         recordings = [r.with_(initial="zero") if r.begins == "estimate" else r for r in self.recordings]
@@ -119,8 +121,8 @@ class FitContext:
     def agrees_with_rest(self, problem: Problem, theta: np.ndarray, correlated: float = 1.0) -> bool:
         """Tell whether the recordings agree with a beginning at rest, given the solution θ of the problem from rest.
 
-        `correlated` residuals count as one, because a model's errors change slowly. Only the states are freed, in a
-        linearised step, which predicts the largest decrease of the cost. True also if θ has initial states already.
+        A linearised step in the initial states alone predicts the largest decrease of the cost. `correlated` residuals
+        count as one, because a model's errors change slowly. True also if θ has initial states already.
         """
         if problem.size > int(problem.free.sum()) or not any(r.begins == "estimate" for r in self.recordings):
             return True
@@ -134,36 +136,38 @@ class FitContext:
         if not len(slope):
             return True
         decrease = 0.5 * float(slope @ np.linalg.lstsq(curvature, slope, rcond=None)[0])
-        left = max(1 - decrease / cost, np.finfo(float).tiny)
+        remaining = max(1 - decrease / cost, np.finfo(float).tiny)
         independent = max(freed.residuals / correlated, 2.0)
-        return bool(-independent * np.log(left) < len(slope) * np.log(independent))
+        return bool(-independent * np.log(remaining) < len(slope) * np.log(independent))
 
     def result(
         self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, note: str = "", **fields: Any
     ) -> Fit:
-        """Build the `Fit` of a solution; Ctrl-C waits until it is complete and shows in its status.
+        """Build the `Fit` of a solution; Ctrl-C takes effect when it is complete and appears in its status.
 
         `fields` are further fields of the `Fit`; `errors={}` skips the standard errors.
         """
-        found: list[Fit] = []
+        built: list[Fit] = []
         try:
             with deferred_interrupt():
-                found.append(self._result(model, structure, problem, exactly(problem, solution), note, fields))
+                built.append(
+                    self._result(model, structure, problem, move_inside_exact(problem, solution), note, fields)
+                )
             if self.progress:
-                self.progress("standard errors", 1, 1, float(np.mean(found[0].train_nrmse)))
+                self.progress("standard errors", 1, 1, float(np.mean(built[0].train_nrmse)))
         except KeyboardInterrupt:
-            if not found:
+            if not built:
                 raise
-            return replace(found[0], solution=replace(found[0].solution, status=Status.INTERRUPTED))
-        return found[0]
+            return replace(built[0], solution=replace(built[0].solution, status=Status.INTERRUPTED))
+        return built[0]
 
     def _result(
         self, model: Model, structure: PILFR | None, problem: Problem, solution: Solution, note: str, fields: Any
     ) -> Fit:
-        """Build the `Fit`; its note also says what the recordings leave open.
+        """Build the `Fit`, with a note on what the recordings do not determine.
 
-        Priors that the search has put on weights and thresholds (`DENSITY_PRIOR`) leave the model and its standard
-        errors here.
+        Priors that the search added to weights and thresholds (`DENSITY_PRIOR`) are removed from the model and its
+        standard errors here.
         """
         fitted, judged, theta = with_solution(model, problem, solution), problem, solution.theta
         if note == DENSITY_PRIOR:
@@ -180,7 +184,7 @@ class FitContext:
             note,
             describe_open_memory(judged, theta),
             describe_reached_gain(problem, theta),
-            unbounded_sentence(
+            describe_unbounded(
                 structure, problem.constraints, problem.model.parameters.unpack(problem.parameters(theta))
             ),
         )
@@ -221,25 +225,25 @@ def solve_within_bounds(
     solver: Any,
     stage: str = "solve",
     progress: Progress | None = None,
-    last: GaussNewton = STEP,
-    held: bool = False,
+    bound_solver: GaussNewton = BOUND_STEP_SOLVER,
+    at_bound: bool = False,
 ) -> Solution:
-    """Solve a problem inside exact bounds on spectral radii with any solver (`within_bounds`).
+    """Solve a problem inside exact bounds on spectral radii with any solver (`solve_within_radii`).
 
     Solvers of the package report their steps under the name `stage`; `last` gets their limit on time.
     """
     start = problem.start if start is None else start
     if not isinstance(solver, GaussNewton | Ipopt):
-        return within_bounds(problem, start, solver.solve, last, held)
+        return solve_within_radii(problem, start, solver.solve, bound_solver, at_bound)
     report = report_iterations(progress, stage, solver.max_iterations)
-    last = replace(last, time_limit=solver.time_limit)
-    return within_bounds(problem, start, lambda p, s: solver.solve(p, s, report), last, held, report)
+    bound_solver = replace(bound_solver, time_limit=solver.time_limit)
+    return solve_within_radii(problem, start, lambda p, s: solver.solve(p, s, report), bound_solver, at_bound, report)
 
 
 def report_iterations(progress: Progress | None, stage: str, most: int) -> Callable[[Iteration], None] | None:
     """Turn a progress function into one of a solver's iterations.
 
-    A cost holds priors and weights of recordings too, so it says nothing about the NRMSE: the error reported is nan.
+    A cost includes priors and weights of recordings and does not tell the NRMSE, so the error reported is nan.
     """
     if progress is None:
         return None
@@ -257,10 +261,24 @@ def context_of_fit(
     weights: Any = None,
     engine: str = "auto",
 ) -> FitContext:
-    """Make the context of a fit made from an earlier one, whose options hold where no others are given."""
+    """Make the context of a fit that continues an earlier one, with its options unless others are given."""
     recordings = as_recordings(train)
     options = fit.options.updated(stable, constraints, noise, weights, recordings)
     return FitContext(recordings, solver, options.all_constraints(fit.structure), engine=engine, options=options)
+
+
+def check_recordings(
+    model: PILFR | Lagged | Model | Fit, train: Recording | Sequence[Recording]
+) -> tuple[Recording, ...]:
+    """Check that recordings fit each other and have enough samples for a model; return them as a tuple."""
+    first = as_recordings(train)[0]
+    if isinstance(model, Lagged):
+        unknowns = model.unknowns(first.n_u, first.n_y)
+    elif isinstance(model, PILFR):
+        unknowns = max(int(model.model(first.n_u, first.n_y).parameters.free.sum()), 10 * model.nx)
+    else:
+        unknowns = int((model.model if isinstance(model, Fit) else model).parameters.free.sum())
+    return check_for_identification(train, unknowns + 2)
 
 
 def mark_interrupted(model: Model, problem: Problem, solution: Solution, note: str) -> Stage:
@@ -275,7 +293,7 @@ def rms_error(problem: Problem, solution: Solution) -> float:
 
 
 def find_open_memory(problem: Problem, theta: Array, recording: Recording, state: Array) -> Array:
-    """Find the memories (indices, (k,)) that a period from a steady state does not change though outputs see them."""
+    """Find the memories (indices, (k,)) that affect the outputs but that a steady period does not determine."""
     engine, p, n_x = problem.engine, problem.parameters(theta), problem.model.n_x
     rows = CHUNK * problem.model.substeps
     period = problem.model.drive(recording)[: (recording.period or 1) * problem.model.substeps]
@@ -288,7 +306,7 @@ def find_open_memory(problem: Problem, theta: Array, recording: Recording, state
 
 
 def describe_open_memory(problem: Problem, theta: Array) -> str:
-    """Name the recordings in which memories stay undecided; empty where there are none."""
+    """Name the recordings that do not determine some memories; empty where there are none."""
     counts = {}
     for k, (r, state) in enumerate(zip(problem.recordings, problem.first_states(theta), strict=True)):
         periodic = r.begins == "periodic"
@@ -300,8 +318,8 @@ def describe_open_memory(problem: Problem, theta: Array) -> str:
     if not found:
         return ""
     return (
-        f"operators that never slip in a steady period: {', '.join(found)}; the period does not tell their memory, "
-        "which shifts the outputs and is taken as periods from rest with zero memory leave it"
+        f"operators that never slip in a steady period: {', '.join(found)}; their memory cannot be determined "
+        "from the period; it shifts the outputs, and the value reached from rest was used"
     )
 
 
@@ -324,16 +342,16 @@ def describe_reached_gain(problem: Problem, theta: Array) -> str:
 
         whole, within, odd = channel_weights(problem.model.element, values, c.expression.slope, moved)
         if far(gain_over(values, whole, None)):
-            continue  # not met at all, which the limits say
+            continue  # not met at all, which the limits report
         reached = gain_over(values, within, samples)
         if not far(reached):
             continue
-        range_alone, time_alone = far(gain_over(values, within, None)), far(gain_over(values, whole, samples))
-        both = not range_alone and not time_alone
-        why = [odd] if (range_alone or both) and odd else []
-        why += [f"it settles over more than their {samples} samples"] if time_alone or both else []
+        by_range, by_time = far(gain_over(values, within, None)), far(gain_over(values, whole, samples))
+        both = not by_range and not by_time
+        why = [odd] if (by_range or both) and odd else []
+        why += [f"the response takes more than the {samples} recorded samples to settle"] if by_time or both else []
         shown = ", ".join(f"{g:.3g}" for g in reached)
-        found.append(f"{c.name} holds only beyond the recordings: {' and '.join(why)}; within them it comes to {shown}")
+        found.append(f"{c.name} holds only beyond the recordings: {' and '.join(why)}; within them it is {shown}")
     return "; ".join(found)
 
 
@@ -357,7 +375,7 @@ def find_slipping(problem: Problem, theta: Array, values: Mapping[str, Array]) -
 def channel_weights(
     element: object, values: Mapping[str, Array], slope: float, moved: Array
 ) -> tuple[Array, Array, str]:
-    """Sum the weights of each channel (n_w,) in all and within the recordings; say how the operators differ there."""
+    """Sum each channel's weights (n_w,), in all and of the operators at work in the recordings; describe the others."""
     if not isinstance(element, PrandtlIshlinskii):
         return np.zeros(0), np.zeros(0), ""
     w, stops = values["w"], isinstance(element.operator, Stop)
@@ -374,7 +392,7 @@ def channel_weights(
 
 
 def gain_over(values: Mapping[str, Array], weight: Array, samples: int | None) -> Array:
-    """Compute the gain (n_y n_u,), row by row, for Σw of each channel, after some samples or (None) in the end."""
+    """Compute the gain (n_y n_u,), row by row, for Σw of each channel, after `samples` or, with None, in the limit."""
     a, b, c, d = (values[k] for k in ("A", "B_u", "C_y", "D_yu"))
     if len(weight):
         s = np.diag(weight)

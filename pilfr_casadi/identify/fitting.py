@@ -27,21 +27,21 @@ from .._base import (
     whole,
     worker_pool,
 )
-from ..data import Recording, as_recordings, check_for_identification
+from ..data import Recording, as_recordings
 from ..models import PILFR, Lagged, Model, PrandtlIshlinskii, StaticNetwork
 from ..optimise import (
     Constraint,
     Problem,
     Solution,
     Status,
-    beyond,
     check_gain,
     check_room,
-    loosened,
+    loosen_radii,
     stability_limits,
+    violated_exact,
 )
 from ..simulators import Simulator, choose_substeps, discretise
-from .context import FitContext, Stage, mark_interrupted, rms_error
+from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_error
 from .lagged import check_lagged_options, fit_lagged
 from .multistart import DEFAULT_SOLVER, KEEP, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
@@ -53,15 +53,16 @@ DEAD_WORKER = (
     "workers=1."
 )
 NO_GUARD = (
-    "The worker processes could not begin: where processes are spawned, each runs the script again from its top, so "
+    "The worker processes could not begin: where processes are spawned, each runs the script again from its top; "
     'put the call of fit below `if __name__ == "__main__":`, or use workers=1.'
 )
-CORRELATED_SAMPLES = 10  # residuals that count as one: a fit's errors change slowly; calibrated on the paper's rig
+# residuals that count as one independent residual, because errors of a fit change slowly; calibrated on the paper's rig
+CORRELATED_SAMPLES = 10
 
 
 @dataclass(frozen=True, eq=False)
 class StartOptions:
-    """Which starts `fit` tries, and where they run."""
+    """The starts that `fit` tries: `kind` is its option `start`, `count` its option `starts`; and where they run."""
 
     count: int
     seed: int
@@ -103,14 +104,14 @@ def fit(
         Solver of the final problem, by default `GaussNewton(tolerance=1e-4)`. At an exact bound on a spectral radius
         a Gauss-Newton SQP makes the last solve.
     starts, seed : int
-        Number of starts and the seed of all of them. With `start="grid"` the first two have the element at the output
-        and at the input (Hammerstein and Wiener models have one such start); further ones are drawn. More starts with
-        the same seed include those of fewer.
+        Number of starts (`start` says how they are chosen), and the seed of all of them. With `start="grid"` the first
+        two have the element at the output and at the input (Hammerstein and Wiener models have one such start); further
+        ones are drawn. More starts with the same seed include those of fewer.
     start : {"grid", "paper", "plain"} or mapping
-        "grid" (default) places thresholds on a grid, explores every start and polishes the best. "paper" solves every
-        start of the paper (Eq. 22-24) and places its thresholds anew, which the paper does not; "plain" only solves,
-        which with the best linear approximation for `linear` is the paper's protocol. A mapping of values by parameter
-        name is the one start of a PI-LFR with any element.
+        How start values are chosen (`starts` is their number). "grid" (default) places thresholds on a grid, explores
+        every start and polishes the best. "paper" solves every start of the paper (Eq. 22-24) and places its thresholds
+        anew, which the paper does not; "plain" only solves, which with the best linear approximation for `linear` is
+        the paper's protocol. A mapping of values by parameter name is the one start of a PI-LFR with any element.
     linear : control.StateSpace or "bla", optional
         Linear model that the search for a PI-LFR begins with; "bla" estimates the best linear approximation from
         periodic training recordings, as in the paper. By default subspace identification refined by output error.
@@ -124,13 +125,13 @@ def fit(
     constraints : sequence of Constraint, optional
         See `Problem`. Refitting a `Fit` keeps its constraints unless you pass others; `()` removes them.
     noise : float or "estimate", optional
-        Standard deviation of the noise relative to the output's, which priors are weighed against. By default the noise
+        Standard deviation of the noise relative to the output's, against which priors are weighed. By default the noise
         is estimated wherever there are priors: the problem is solved, the noise set to the error that was reached, and
         the problem solved again, until the two agree. Refitting a `Fit` keeps its noise unless you pass another.
     l1 : dict
         Weight of an L1 penalty by name, `{"w": 1e-4}`: unneeded operators get exactly zero. For a PI-LFR the problem
         is first solved without; then the weights of each channel are scaled to a sum of one and the penalty acts on the
-        element alone, all linear blocks held, so that no change of scale evades it (see `penalty`). For a closed model
+        element alone, all linear blocks fixed, so that no change of scale evades it (see `penalty`). For a closed model
         of your own see `Problem`.
     weights : sequence of float, optional
         Weight of each recording, see `Problem` and `noise_weights`; for fits from values (a `Model`, a `Simulator`, a
@@ -158,7 +159,7 @@ def fit(
     Raises
     ------
     InputError
-        If recordings and model do not fit each other, hold too little, the start is not usable, or an option is unfit.
+        If recordings and model do not match, hold too little, the start is not usable, or an option is invalid.
     """
     solver = solver or DEFAULT_SOLVER
     _check_arguments(model, solver, starts, seed, workers, progress)
@@ -187,7 +188,7 @@ def fit(
 
 
 def _check_arguments(model: Any, solver: Any, starts: Any, seed: Any, workers: Any, progress: Any) -> None:
-    """Refuse unfit arguments before any long work."""
+    """Refuse invalid arguments before any long work."""
     if not isinstance(model, PILFR | Lagged | Model | Simulator | Fit):
         raise InputError(
             f"The model is a {type(model).__name__}; give a PILFR, a NARX, a NOE, a closed Model, a Simulator or a Fit."
@@ -209,9 +210,9 @@ def _fit(
 ) -> Fit:
     """Choose the method for the kind of model and start."""
     if starts.linear is not None and not isinstance(model, PILFR):
-        raise InputError("A linear model to begin with goes with a PILFR; any other model has its own values.")
+        raise InputError("linear= is for a PILFR; any other model has its own values, leave it out.")
     if isinstance(starts.kind, Mapping) and not isinstance(model, PILFR):
-        raise InputError("Values to start from go with a PILFR; a Model and a Fit have their own.")
+        raise InputError("Start values by name are for a PILFR; a Model and a Fit have their own, leave them out.")
     options = context.options
     if isinstance(model, Lagged):
         check_gain(options.constraints, model.element)
@@ -229,7 +230,7 @@ def _fit(
     check_gain(options.constraints, closed.element)
     context = replace(context, constraints=options.all_constraints(structure))
     check_room(closed.parameters, context.constraints)
-    context = replace(context, recordings=check_for_identification(recordings, int(closed.parameters.free.sum()) + 2))
+    context = replace(context, recordings=check_recordings(closed, recordings))
     found = fit_from_values(closed, structure, context, model if isinstance(model, Fit) else None)
     return found if simulator is None else found.with_simulator(simulator)
 
@@ -242,7 +243,9 @@ def _closed_model(model: PILFR | Model | Simulator | Fit, recordings: Sequence[R
         return model.model if isinstance(model, Fit) else model
     holds = {r.hold or model.hold or "zero" for r in recordings}
     if len(holds) > 1:
-        raise InputError("The recordings differ in `hold`, which is one for a simulator; fit them one by one.")
+        raise InputError(
+            "The recordings differ in `hold`, and a simulator is integrated with one of them; fit them one by one."
+        )
     return discretise(model, recordings[0].dt, holds.pop(), choose_substeps(model, recordings))
 
 
@@ -253,12 +256,11 @@ def _fit_structure(
     check_gain(context.options.constraints, structure.element)
     if not isinstance(structure.element, PrandtlIshlinskii | StaticNetwork | None):
         raise InputError(
-            "A start is found for PrandtlIshlinskii and StaticNetwork; for others give start={name: value} or a Model."
+            "Start values are known for PrandtlIshlinskii and StaticNetwork; else give start={name: value} or a Model."
         )
     first = as_recordings(train)[0]
     shape = structure.model(first.n_u, first.n_y).parameters
-    fewest = max(int(shape.free.sum()), 10 * structure.nx) + 2
-    context = replace(context, recordings=check_for_identification(train, fewest))
+    context = replace(context, recordings=check_recordings(structure, train))
     check_room(shape, context.constraints)
     if context.l1:
         check_penalty(context.l1, shape, structure.element is None)
@@ -267,24 +269,24 @@ def _fit_structure(
     return found or _search(structure, context, context, starts)  # type: ignore[return-value]
 
 
-def _search(structure: PILFR, context: FitContext, given: FitContext, starts: StartOptions) -> Fit | None:
+def _search(structure: PILFR, context: FitContext, original: FitContext, starts: StartOptions) -> Fit | None:
     """Find the linear model, then search from it.
 
-    `context` may begin at rest where `given` does not; None if the recordings contradict such a beginning.
+    `context` may assume a beginning at rest that `original` does not; None if the recordings contradict it.
     """
-    radius = loosened(stability_limits(structure, context.options.stable)[:1])
+    radius = loosen_radii(stability_limits(structure, context.options.stable)[:1])
     options: dict[str, Any] = {"engine": context.engine, "constraints": radius, "progress": context.progress}
     linear, problem, solution = linear_model(context.recordings, structure, given=starts.linear, **options)
     if solution.status is Status.INTERRUPTED:
-        return given.result(linear, structure.linear(), problem, solution)
-    if context is not given and not given.agrees_with_rest(problem, solution.theta):
+        return original.result(linear, structure.linear(), problem, solution)
+    if context is not original and not original.agrees_with_rest(problem, solution.theta):
         return None
     fitted = transform_to_known_basis(structure, with_solution(linear, problem, solution), context)
     if structure.element is not None:
-        return _fit_from_starts(structure, fitted, (problem, solution), context, given, starts)
+        return _fit_from_starts(structure, fitted, (problem, solution), context, original, starts)
     bounded = Problem(linear, context.recordings, engine=problem.engine, constraints=context.constraints)
     own = structure.fixed or structure.bounds or structure.priors or context.options.constraints
-    changed = own or solution.status is Status.INFEASIBLE or beyond(bounded, solution.theta)
+    changed = own or solution.status is Status.INFEASIBLE or violated_exact(bounded, solution.theta)
     if not changed and context.solver == DEFAULT_SOLVER:
         return context.result(linear, structure, bounded, solution)  # the linear start is the answer
     return _fit_linear(structure, fitted, context)
@@ -321,7 +323,7 @@ def fit_from_values(model: Model, structure: PILFR | None, context: FitContext, 
         start = begin if problem.cost(begin) < problem.cost(start) else start
     latest = model, problem, context.solve(problem, "solve", start), ""
     try:
-        problem, solution = context.settle_noise(problem, latest[2], "solve", **options)
+        problem, solution = context.iterate_noise(problem, latest[2], "solve", **options)
         latest = model, problem, solution, ""
         if context.l1 and structure:
             latest = solve_with_penalty(model, problem, solution, context)
@@ -339,7 +341,7 @@ def _fit_linear(structure: PILFR, fitted: Model, context: FitContext) -> Fit:
     problem = context.problem(model)
     latest = problem, context.solve(problem, "solve")
     try:
-        latest = context.settle_noise(*latest, "solve")
+        latest = context.iterate_noise(*latest, "solve")
     except KeyboardInterrupt:
         latest = problem, replace(latest[1], status=Status.INTERRUPTED)
     return context.result(model, structure, *latest)
@@ -350,7 +352,7 @@ def _fit_from_starts(
     linear: Model,
     solved: tuple[Problem, Solution],
     context: FitContext,
-    given: FitContext,
+    original: FitContext,
     starts: StartOptions,
 ) -> Fit | None:
     """Fit a PI-LFR from many starts, given the linear model with its problem and solution; None as for `_search`."""
@@ -373,13 +375,17 @@ def _fit_from_starts(
     )
     candidates, best, stopped = search_starts(search, starts.count, starts.seed, starts.executor, report)
     if best is None:
-        return given.result(linear, structure.linear(), problem, replace(solution, status=Status.INTERRUPTED))
+        return original.result(linear, structure.linear(), problem, replace(solution, status=Status.INTERRUPTED))
     compared: dict[str, Any] = {"linear": linear, "linear_nrmse": tuple(problem.nrmse(solution.theta))}
     model, problem, result, note = _finish(structure, candidates, best, stopped, context, starts.kind == "grid")
     stopped = result.status is Status.INTERRUPTED
-    if context is not given and not stopped and not given.agrees_with_rest(problem, result.theta, CORRELATED_SAMPLES):
+    if (
+        context is not original
+        and not stopped
+        and not original.agrees_with_rest(problem, result.theta, CORRELATED_SAMPLES)
+    ):
         return None
-    return given.result(model, structure, problem, result, note, candidates=tuple(candidates), **compared)
+    return original.result(model, structure, problem, result, note, candidates=tuple(candidates), **compared)
 
 
 def _finish(
@@ -390,7 +396,7 @@ def _finish(
     context: FitContext,
     polished: bool,
 ) -> Stage:
-    """Solve the winner to the end: with the user's solver, the noise settled, and the L1 penalty."""
+    """Solve the winner to the end: with the user's solver, the noise estimated, and the L1 penalty."""
     model, note, l1 = best.model, best.note, context.l1 and not stopped
     if l1:  # the penalty and a prior towards a smooth density contradict each other
         own = {name: {"prior": structure.priors.get(name)} for name in ("w", "r")}
@@ -400,11 +406,11 @@ def _finish(
     try:
         if stopped:
             latest = mark_interrupted(*latest)
-        elif polished or beyond(problem, best.theta):
+        elif polished or violated_exact(problem, best.theta):
             latest = model, problem, context.solve(problem, "solve", best.theta), note
         model, problem, result, note = latest = _meet_constraints(latest, candidates, context)
         if structure.priors and not stopped:
-            problem, result = context.settle_noise(problem, result, "solve")
+            problem, result = context.iterate_noise(problem, result, "solve")
             latest = model, problem, result, note
         if l1:
             latest = solve_with_penalty(model, problem, latest[2], context)

@@ -1,13 +1,13 @@
-"""Fits of NARX and NOE models, which are trained in another way than they are used.
+"""Fit NARX and NOE models, which are trained by one-step prediction and used in simulation.
 
-A NARX is trained to predict one step, reading the measured outputs. A NOE begins so and then reads a smaller and
-smaller share of them, down to none: simulation errors over a long record have many minima, and a model that is guided
-by the data passes most of them. Both are judged and chosen by the simulation error over the training data.
+A NARX is trained to predict one step from the measured outputs. A NOE starts like this and then reads a decreasing
+share of the measured outputs, down to none: the simulation error over a long record has many minima, and a model guided
+by the data avoids most of them. Both are judged and chosen by the simulation error over the training data.
 
-With early stopping a part of the training data is held back, and the point with the smallest error on it is taken. For
-one recording the end is held back, and the simulation runs from the beginning; for several recordings the last ones are
-held back, with all that have the same inputs. The end of a periodic recording has the input of its beginning, so its
-mean period is cut in time.
+With early stopping a part of the training data is held back for validation, and the point with the smallest error on it
+is returned. One recording is cut in time: its end is held back, and simulated from the beginning of the recording. Of
+several recordings the last ones are held back, with all that have the same inputs. The end of a periodic recording has
+the same input as its beginning, so its mean period is cut in time.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, one_blas_thread
-from ..data import Recording, as_recordings, check_for_identification, group_by_input, mean_period, repeats_itself
+from ..data import Recording, as_recordings, group_by_input, mean_period, repeats_itself
 from ..engine import Engine, make_engine
 from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
 from ..optimise import GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
-from .context import FitContext, report_iterations
+from .context import FitContext, check_recordings, report_iterations
 from .multistart import EXPLORE, run_tasks
 from .result import Candidate, Fit, with_solution
 
-SHARES = (1.0, 0.3, 0.1, 0.0)  # of the measured output that a NOE reads while it is trained, stage by stage
-PATIENCE = 20  # points in a row that do not improve on the best
+OUTPUT_SHARES = (1.0, 0.3, 0.1, 0.0)  # shares of the measured output that a NOE reads in the stages of its training
+PATIENCE = 20  # consecutive points without improvement after which training stops
 CUT_NOTE = (
-    "the input repeats, so of the mean period the last {:.0f} % stopped the training and the rest was trained on; "
-    "validation=0 trains on all, another realization is better"
+    "the input repeats, so the last {:.0f} % of the mean period decided when training stopped and the rest was trained "
+    "on; validation=0 trains on everything, a second realization would be better"
 )
 SAME_INPUT_NOTE = (
-    "the input repeats, so what stopped the training has the input of what was trained on, which proves little; give "
-    "another realization"
+    "the input repeats, so the data that decided when training stopped have the same input as the training data, which "
+    "proves little; give another realization"
 )
 
 
@@ -47,12 +47,12 @@ class LaggedSearch:
     wanted: Lagged
     structure: PILFR
     context: FitContext
-    kept: tuple[Recording, ...]
-    held: tuple[Recording, ...]
+    training: tuple[Recording, ...]
+    validation: tuple[Recording, ...]
 
     def problem(self, model: Model, engine: Engine | None) -> Problem:
         """Make the problem of a model over the recordings that it is trained on."""
-        return replace(self.context, recordings=self.kept).problem(model, engine=engine or self.context.engine)
+        return replace(self.context, recordings=self.training).problem(model, engine=engine or self.context.engine)
 
 
 def check_lagged_options(wanted: Lagged, stable: bool | float, start: Any) -> None:
@@ -60,11 +60,11 @@ def check_lagged_options(wanted: Lagged, stable: bool | float, start: Any) -> No
     kind = type(wanted).__name__
     if not isinstance(stable, bool):
         raise InputError(
-            f"stable = {stable!r} was given for a {kind}, whose state is the past of its signals and has no spectral "
-            "radius to bound; leave it out."
+            f"stable = {stable!r} was given for a {kind}, whose state holds past signals and has no spectral radius to "
+            "bound; leave it out."
         )
     if start != "grid":
-        raise InputError(f"start = {start!r} was given for a {kind}, whose starts are of their own kind; leave it out.")
+        raise InputError(f"start = {start!r} was given for a {kind}, which has its own kind of starts; leave it out.")
 
 
 def fit_lagged(
@@ -75,26 +75,26 @@ def fit_lagged(
     seed: int,
     executor: Executor | None,
 ) -> Fit:
-    """Fit a NARX or NOE: run every start to its end, take the smallest simulation error over the training data."""
+    """Fit a NARX or NOE: solve from every start and return the smallest simulation error over the training data."""
     if context.l1:
         raise InputError("An L1 penalty is for the weights of an element; leave l1 out, or give a PILFR.")
     if not isinstance(context.solver, GaussNewton) and wanted.validation:
         raise InputError("Early stopping needs the solver GaussNewton(); give that, or validation=0.")
     first = as_recordings(train)[0]
-    context = replace(context, recordings=check_for_identification(train, wanted.unknowns(first.n_u, first.n_y) + 2))
+    context = replace(context, recordings=check_recordings(wanted, train))
     structure = wanted.structure(first.n_u, first.n_y)
     whole = context.recordings, (), ""
-    kept, held, note = split_validation(context.recordings, wanted.validation) if wanted.validation else whole
+    training, validation, note = split_validation(context.recordings, wanted.validation) if wanted.validation else whole
     shared = context if executor is None else replace(context, progress=None)  # a callable stays in its process
-    search = LaggedSearch(wanted, structure, shared, kept, held)
+    search = LaggedSearch(wanted, structure, shared, training, validation)
 
-    def report(found: list[Candidate], total: int) -> None:
+    def report(candidates: list[Candidate], total: int) -> None:
         if context.progress:
-            context.progress("starts", len(found), total, min((c.nrmse for c in found), default=np.nan))
+            context.progress("starts", len(candidates), total, min((c.nrmse for c in candidates), default=np.nan))
 
     sequences = np.random.SeedSequence(seed).spawn(starts)
-    found, stopped = run_tasks(explore_lagged, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
-    usable = [c for c in found if np.isfinite(c.error)]
+    candidates, stopped = run_tasks(explore_lagged, [(search, i, s) for i, s in enumerate(sequences)], executor, report)
+    usable = [c for c in candidates if np.isfinite(c.error)]
     if not usable and stopped:
         raise KeyboardInterrupt
     if not usable:
@@ -103,19 +103,19 @@ def fit_lagged(
         )
     best = min(usable, key=lambda c: c.error)
     solution = replace(best.solution, status=Status.INTERRUPTED) if stopped else best.solution
-    more: dict[str, Any] = {"candidates": tuple(found), "errors": {}, "note": note}
-    return context.result(best.model, search.structure, context.problem(best.model), solution, **more)
+    fields: dict[str, Any] = {"candidates": tuple(candidates), "errors": {}, "note": note}
+    return context.result(best.model, search.structure, context.problem(best.model), solution, **fields)
 
 
 @one_blas_thread
 def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequence) -> Candidate:
     """Run one start to its end."""
-    first = search.kept[0]
-    values = lagged_start(search.wanted, search.structure, search.kept, np.random.default_rng(sequence))
+    first = search.training[0]
+    values = lagged_start(search.wanted, search.structure, search.training, np.random.default_rng(sequence))
     names = {"inputs": first.inputs, "outputs": first.outputs}
     model = search.structure.model(first.n_u, first.n_y, values, **names)
     solution, engine = None, None
-    shares = SHARES[:1] if isinstance(search.wanted, NARX) else SHARES
+    shares = OUTPUT_SHARES[:1] if isinstance(search.wanted, NARX) else OUTPUT_SHARES
     for share in shares:
         trained = reading_output(model, share) if share else model
         problem = search.problem(trained, engine if share else None)
@@ -127,9 +127,9 @@ def explore_lagged(search: LaggedSearch, seed: int, sequence: np.random.SeedSequ
         options: dict[str, Any] = {}
         if isinstance(solver, GaussNewton | Ipopt):
             options["progress"] = report_iterations(search.context.progress, "steps", solver.max_iterations)
-        if search.held and solver is search.context.solver:
-            held = Problem(trained, search.held, engine=problem.engine, scale=problem.scale)
-            solution = solve_with_early_stopping(solver, problem, held, begin, **options)
+        if search.validation and solver is search.context.solver:
+            validation = Problem(trained, search.validation, engine=problem.engine, scale=problem.scale)
+            solution = solve_with_early_stopping(solver, problem, validation, begin, **options)
         else:
             solution = solver.solve(problem, begin, **options)
         if solution.status is Status.INTERRUPTED:
@@ -143,9 +143,9 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
     engine = make_engine(model, search.context.engine)
     problem = Problem(model, search.context.recordings, engine=engine)
     theta = solution.theta
-    known = [r for k, r in zip(search.kept, search.context.recordings, strict=False) if _begins_alike(k, r)]
-    known = known if len(known) == len(search.kept) else []
-    if problem.size > len(theta) or not known:  # the initial states of what was held back, or began elsewhere
+    known = [r for k, r in zip(search.training, search.context.recordings, strict=False) if _begins_alike(k, r)]
+    known = known if len(known) == len(search.training) else []
+    if problem.size > len(theta) or not known:  # add the initial states of recordings held back or cut
         fitted, n = with_solution(model, problem, solution), int(problem.free.sum())
         others = [r for r in search.context.recordings[len(known) :] if r.begins == "estimate"]
         after = theta if known else theta[:n]
@@ -161,9 +161,9 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
     return Candidate(seed, model, theta, error, replace(solution, theta=theta), nrmse=nrmse)
 
 
-def _begins_alike(kept: Recording, given: Recording) -> bool:
-    """Tell whether the data trained on are a recording, or the beginning of one."""
-    return kept.begins == given.begins and np.array_equal(kept.y, given.y[: len(kept)])
+def _begins_alike(training: Recording, given: Recording) -> bool:
+    """Tell whether the data trained on are a given recording or its beginning."""
+    return training.begins == given.begins and np.array_equal(training.y, given.y[: len(training)])
 
 
 def one_step(fit: Any, recording: Recording) -> np.ndarray:
@@ -193,46 +193,46 @@ def one_step(fit: Any, recording: Recording) -> np.ndarray:
 def split_validation(
     recordings: Sequence[Recording], share: float
 ) -> tuple[tuple[Recording, ...], tuple[Recording, ...], str]:
-    """Split training data into the part to train on and the share held back (scored there alone); add a note, or ""."""
+    """Split training data; return the part to train on, the part for validation (scored there alone), and a note."""
     groups = group_by_input(recordings)
     if len(groups) > 1:
         wanted, last = max(1, round(share * len(recordings))), set(groups[-1])
         for group in reversed(groups[1:-1]):
             last |= set(group) if len(last) + len(group) <= wanted else set()
-        kept = tuple(r for i, r in enumerate(recordings) if i not in last)
-        return kept, tuple(_from_rest(recordings[i]) for i in sorted(last)), ""
-    pairs = [_cut(r, share) for r in recordings]
+        training = tuple(r for i, r in enumerate(recordings) if i not in last)
+        return training, tuple(_begin_at_rest(recordings[i]) for i in sorted(last)), ""
+    pairs = [_cut_in_time(r, share) for r in recordings]
     note = ""
     if any(repeats_itself(r) or (r.begins == "periodic" and r.period) for r in recordings):
         note = CUT_NOTE.format(100 * share) if all(r.begins == "periodic" for r in recordings) else SAME_INPUT_NOTE
-    return tuple(kept for kept, _ in pairs), tuple(held for _, held in pairs), note
+    return tuple(training for training, _ in pairs), tuple(validation for _, validation in pairs), note
 
 
-def _cut(r: Recording, share: float) -> tuple[Recording, Recording]:
-    """Cut one recording in time: return its beginning, and the whole scored after the cut."""
+def _cut_in_time(r: Recording, share: float) -> tuple[Recording, Recording]:
+    """Cut one recording in time: return its beginning, and the whole recording scored after the cut."""
     if r.begins == "periodic" and r.period:
         whole = (len(r) - r.skip) // r.period * r.period
         mean = mean_period(r.slice(r.skip, r.skip + whole))
         cut = min(max(round((1 - share) * len(mean)), 2), len(mean) - 1)
         twice = mean.with_(u=np.tile(mean.u, (2, 1)), y=np.tile(mean.y, (2, 1)), initial="zero")
-        return mean.slice(0, cut), _scored_from(
+        return mean.slice(0, cut), _score_from(
             twice, len(mean) + cut
         )  # a period from rest before the part that is scored
     cut = min(max(r.skip + round((1 - share) * (len(r) - r.skip)), r.skip + 2), len(r) - 1)
-    return r.slice(0, cut), _scored_from(r, cut)
+    return r.slice(0, cut), _score_from(r, cut)
 
 
-def _from_rest(recording: Recording) -> Recording:
-    """Begin at zero where the initial state is to be estimated, and do not score the first fifth."""
+def _begin_at_rest(recording: Recording) -> Recording:
+    """Begin at zero in place of an initial state to be estimated, and do not score the first fifth."""
     if recording.begins != "estimate":
         return recording
-    return _scored_from(recording.with_(initial="zero"), max(recording.skip, len(recording) // 5))
+    return _score_from(recording.with_(initial="zero"), max(recording.skip, len(recording) // 5))
 
 
-def _scored_from(recording: Recording, skip: int) -> Recording:
-    """Leave more samples unscored; drop the period if no whole one is left after them."""
-    kept = recording.period if recording.period and len(recording) - skip >= recording.period else None
-    return recording.with_(skip=skip, period=kept)
+def _score_from(recording: Recording, skip: int) -> Recording:
+    """Score from sample `skip` on; drop the period if no whole one remains."""
+    training = recording.period if recording.period and len(recording) - skip >= recording.period else None
+    return recording.with_(skip=skip, period=training)
 
 
 class Watch:
@@ -243,7 +243,7 @@ class Watch:
         self.best, self.theta, self.failed = np.inf, np.zeros(0), 0
 
     def __call__(self, theta: np.ndarray) -> bool:
-        """Tell whether it is time to stop."""
+        """Tell whether to stop, after the point θ of the solve."""
         cost = self.problem.cost(theta[: self.problem.size])
         if cost < self.best or not self.theta.size:
             self.best, self.theta, self.failed = cost, theta.copy(), 0
@@ -253,10 +253,10 @@ class Watch:
 
 
 def solve_with_early_stopping(
-    solver: GaussNewton, problem: Problem, held: Problem, start: np.ndarray, progress: Progress | None = None
+    solver: GaussNewton, problem: Problem, validation: Problem, start: np.ndarray, progress: Progress | None = None
 ) -> Solution:
-    """Solve, and go back to the point with the smallest error on `held`."""
-    watch = Watch(held)
+    """Solve, and return the point with the smallest error on `validation`."""
+    watch = Watch(validation)
     solution = solver.solve(problem, start, progress, watch)
     if not watch.theta.size or solution.status is Status.INTERRUPTED:
         return solution

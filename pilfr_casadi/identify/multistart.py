@@ -1,19 +1,19 @@
 """From a linear model to a PI-LFR: many starts, and a careful polish of the best.
 
-1. Exploration (`explore`): from each start a short Gauss-Newton run. Most of what a start will ever reach shows within
-   some forty steps. The first two starts have the element at the output and at the input, the others anywhere
-   (`grid_start`); where the structure fixes the place, the thresholds are a grid in the first and drawn in the others.
-2. Polish (`polish`): the best few are re-gridded (`regrid`) and run again, which spreads thresholds that have clustered
-   or fallen asleep along the density that the fit has found. This is done twice, the second time with thresholds beyond
-   the visited range and a weak prior that holds the weights near the smoothed density and so decides what the data
-   leave open; a last run without the prior shows what it costs. The fit with the prior wins when its error is within
-   10 % of the one without.
+1. Exploration (`explore`): a short Gauss-Newton run from each start; about forty steps show how good a start is. The
+   first two starts have the element at the output and at the input, the others anywhere (`grid_start`). Where the
+   structure fixes the place, the thresholds are a grid in the first start and drawn in the others.
+2. Polish (`polish`): the thresholds of the best few are spread anew along the smoothed density of the fitted weights
+   (`regrid`), because some have clustered or never slip, and the solver runs again. This is done twice. The second time
+   thresholds reach beyond the visited range, and a weak prior keeps the weights near the smoothed density where the
+   data do not determine them. A last run without the prior shows its cost: the fit with the prior wins if its error is
+   within 10 % of the one without.
 
-With the paper's start every start goes through 1 (to the end) and 2, so that each result stands for one start. With
-"plain" it goes through 1 alone. This is the paper's protocol if the linear model is the best linear approximation, as
-in the paper; the refined linear model is at the minimum of the output error, where more starts get stuck. Elements
-without memory have their own start values (`network_start`) and nothing to re-grid; each of their starts is run to the
-end too unless the start is "grid".
+With `start="paper"` every start is solved to the end in 1 and polished in 2, so that each result stands for one start.
+With "plain" it is solved in 1 alone. This is the paper's protocol if the linear model is the best linear approximation,
+as in the paper. The refined linear model is at the minimum of the output error, where more starts get stuck. Elements
+without memory have their own start values (`network_start`) and no thresholds to spread; each of their starts is solved
+to the end too unless the start is "grid".
 
 Every task depends on its own seed alone, so the numbers are the same for any executor and any number of workers.
 """
@@ -41,7 +41,7 @@ from ..models import (
     places,
     weight_density,
 )
-from ..optimise import GaussNewton, Problem, Solution, Status, held_at_bounds, loosened
+from ..optimise import GaussNewton, Problem, Solution, Status, at_active_radius, loosen_radii
 from .context import FitContext, solve_within_bounds
 from .result import DENSITY_PRIOR, Candidate
 from .start import Blocks, envelope_start, grid_start, has_networks, network_start, paper_start, unit_states
@@ -50,7 +50,7 @@ EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
 DEFAULT_SOLVER: GaussNewton = GaussNewton(max_iterations=200, tolerance=1e-4)  # of `fit`, and of every polish
 START_KINDS: tuple[str, ...] = ("grid", "paper", "plain")
 KEEP = 4  # candidates that are polished
-MARGIN = 1.1  # times the smallest error, for the weights of a smooth density
+MARGIN = 1.1  # on the smallest error, up to which the fit with the density prior wins
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +69,13 @@ class StartSearch:
 
         Priors are weighed against the noise that the user gave, else the error `noise` that was reached, else `level`.
         """
-        constraints = loosened(self.context.constraints, least=1.0)
+        constraints = loosen_radii(self.context.constraints, least=1.0)
         engines = {} if engine is None else {"engine": engine}
         return self.context.problem(model, noise or self.level, constraints=constraints, **engines)
 
-    def solve(self, problem: Problem, start: np.ndarray | None, solver: Any, held: bool = False) -> Solution:
-        """Solve inside exact bounds on spectral radii; `held` says that they hold the start."""
-        return solve_within_bounds(problem, start, solver, "steps", self.context.progress, held=held)
+    def solve(self, problem: Problem, start: np.ndarray | None, solver: Any, at_bound: bool = False) -> Solution:
+        """Solve inside exact bounds on spectral radii; `at_bound` says that one of them is active at the start."""
+        return solve_within_bounds(problem, start, solver, "steps", self.context.progress, at_bound=at_bound)
 
     def model(self, values: dict[str, Any]) -> Model:
         """Make the closed model that starts at `values`."""
@@ -85,9 +85,9 @@ class StartSearch:
 
 @one_blas_thread
 def explore(search: StartSearch, seed: int, sequence: np.random.SeedSequence) -> Candidate:
-    """Run one start until it has shown what it is worth; with the paper's start to the end, polish included.
+    """Run one start: briefly with the grid, else to the end, with the paper's start including the polish.
 
-    The paper's start draws thresholds far smaller than z, which end in clusters and beyond the visited range: a solver
+    The paper's start draws thresholds far smaller than z, which end in clusters and beyond the visited range. A solver
     alone does not bring them back.
     """
     model, solver = search.model(start_values(search, seed, sequence)), search.context.solver
@@ -101,7 +101,7 @@ def explore(search: StartSearch, seed: int, sequence: np.random.SeedSequence) ->
     polished = polish(search, candidate)
     if solver == DEFAULT_SOLVER or polished is candidate:
         return polished
-    # the user's solver has the last word
+    # the last solve is the user's solver's
     problem = search.problem(polished.model, problem.engine, noise=polished.error)
     solution = search.solve(problem, polished.theta, solver)
     return _candidate(seed, polished.model, problem, solution, polished.note)
@@ -122,7 +122,7 @@ def start_values(search: StartSearch, seed: int, sequence: np.random.SeedSequenc
 
 
 def is_drawn(structure: Any, start: str, seed: int) -> bool:
-    """Tell whether a start depends on the seed: with the grid, by a free direction of z, or by drawn thresholds."""
+    """Tell whether a start depends on the seed; a grid start does if it draws a direction of z or thresholds."""
     element = structure.element
     if start != "grid" or isinstance(element, StaticNetwork):
         return True
@@ -141,9 +141,10 @@ def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, no
 
 @one_blas_thread
 def polish(search: StartSearch, candidate: Candidate) -> Candidate:
-    """Re-grid a candidate and run it further, with and without a prior that holds the weights near a smooth density.
+    """Spread the thresholds of a candidate anew and solve, with and without a prior that smooths the weights.
 
-    The candidate with the prior (its `note` says so) is returned if its training error is hardly above the smallest.
+    The candidate with the prior (see its `note`) is returned if its training error is at most `MARGIN` times the
+    smallest.
     """
     parameters, recordings = candidate.model.parameters, search.context.recordings
     regular = isinstance(search.structure.element, PrandtlIshlinskii)
@@ -151,48 +152,48 @@ def polish(search: StartSearch, candidate: Candidate) -> Candidate:
         return candidate
     engine = make_engine(candidate.model, search.context.engine)
     n_free = int(parameters.free.sum())
-    held = _is_held(search, candidate)
-    found = [candidate]
-    for beyond, spread in ((1.0, 0.0), (1.3, 0.02)):
-        best = min(found, key=_merit)
+    at_bound = _at_active_radius(search, candidate)
+    candidates = [candidate]
+    for extent, spread in ((1.0, 0.0), (1.3, 0.02)):
+        best = min(candidates, key=_merit)
         problem = search.problem(best.model, engine)
         values, states = problem.parameters(best.theta), problem.first_states(best.theta)
         runs = [engine.simulate(r.u, values, s, True) for r, s in zip(recordings, states, strict=True)]
         z = np.concatenate([run[2] for run in runs])
-        moved = regrid_channels(search.structure, parameters.unpack(values), z, beyond)
+        moved = regrid_channels(search.structure, parameters.unpack(values), z, extent)
         model = candidate.model.with_parameters(parameters.at(parameters.pack(moved)))
         if spread:
             model = hold_near_density(model, moved, spread)
         problem = search.problem(model, engine, noise=best.error)
         begin = np.concatenate([problem.start[:n_free], best.theta[n_free:]])
-        solution = search.solve(problem, begin, DEFAULT_SOLVER, held)
-        found.append(_candidate(candidate.seed, model, problem, solution, DENSITY_PRIOR if spread else ""))
+        solution = search.solve(problem, begin, DEFAULT_SOLVER, at_bound)
+        candidates.append(_candidate(candidate.seed, model, problem, solution, DENSITY_PRIOR if spread else ""))
         if solution.status is Status.INTERRUPTED:
-            return _best_so_far(found)
-    smooth = found[-1]
+            return _best_so_far(candidates)
+    smooth = candidates[-1]
     problem = search.problem(candidate.model, engine, noise=smooth.error)
-    solution = search.solve(problem, smooth.theta, DEFAULT_SOLVER, held)
-    found.append(_candidate(candidate.seed, candidate.model, problem, solution))
+    solution = search.solve(problem, smooth.theta, DEFAULT_SOLVER, at_bound)
+    candidates.append(_candidate(candidate.seed, candidate.model, problem, solution))
     if solution.status is Status.INTERRUPTED:
-        return _best_so_far(found)
-    best = min(found, key=_merit)
+        return _best_so_far(candidates)
+    best = min(candidates, key=_merit)
     usable = _merit(smooth)[0] == _merit(best)[0]
     return smooth if usable and smooth.error <= MARGIN * best.error else best
 
 
-def _is_held(search: StartSearch, candidate: Candidate) -> bool:
-    """Tell whether an exact bound on a spectral radius holds a candidate, by its multiplier."""
-    return held_at_bounds(search.problem(candidate.model), candidate.theta, candidate.solution)
+def _at_active_radius(search: StartSearch, candidate: Candidate) -> bool:
+    """Tell whether an exact bound on a spectral radius is active at a candidate."""
+    return at_active_radius(search.problem(candidate.model), candidate.theta, candidate.solution)
 
 
-def _best_so_far(found: list[Candidate]) -> Candidate:
+def _best_so_far(candidates: list[Candidate]) -> Candidate:
     """Return the best candidate, marked as interrupted."""
-    best = min(found, key=_merit)
+    best = min(candidates, key=_merit)
     return replace(best, solution=replace(best.solution, status=Status.INTERRUPTED))
 
 
 def _merit(candidate: Candidate) -> tuple[bool, float]:
-    """Compare candidates by whether the constraints hold, then by the error."""
+    """Return the sort key of a candidate: infeasible ones last, then by error. The smallest wins."""
     return candidate.solution.status is Status.INFEASIBLE, candidate.error
 
 
@@ -204,8 +205,8 @@ def hold_near_density(model: Model, values: dict[str, Any], spread: float) -> Mo
         "w": {"prior": (w, spread * np.maximum(w, 0.1 * np.mean(w) + 1e-12))},
         "r": {"prior": (r, spread * np.maximum(gap, 1e-12 + 1e-3 * np.max(r)))},
     }
-    own = {k: v for k, v in priors.items() if model.parameters[k].prior is None}
-    return model.with_parameters(model.parameters.change(**own))
+    changes = {k: v for k, v in priors.items() if model.parameters[k].prior is None}
+    return model.with_parameters(model.parameters.change(**changes))
 
 
 def regrid(
@@ -213,15 +214,15 @@ def regrid(
     w: np.ndarray,
     reach: float,
     *,
-    beyond: float = 1.3,
+    extent: float = 1.3,
     smooth: float = 1 / 12,
     count: int | None = None,
     spacing: float = 0.4,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Place the thresholds and weights (N,) of one channel anew along their smoothed density.
 
-    Each new threshold stands for an equal share of `density^spacing`, by default 0.4: knots of a good piecewise-linear
-    approximation of the loading curve. Beyond the visited range, where the data say nothing, its tail goes on.
+    Each new threshold represents an equal share of `density^spacing`. The default 0.4 gives the knots of a good
+    piecewise-linear approximation of the loading curve. Beyond the visited range the density is extrapolated.
 
     Parameters
     ----------
@@ -230,27 +231,27 @@ def regrid(
     reach : float
         Largest |z| visited.
     beyond : float
-        How far the thresholds may reach, in units of `reach`; the tail is extrapolated log-linearly, never rising.
+        Largest threshold, in units of `reach`; the tail is extrapolated log-linearly and never rises.
     smooth : float
         Kernel width in units of `reach`.
     count : int, optional
         Number of new thresholds, N by default.
     spacing : float
-        Power of the density that thresholds are spaced by: 0 for an even grid.
+        Power of the density by which thresholds are spaced; 0 gives an even grid.
     """
     if not (np.sum(w) > 0 and reach > 0):
         return r[:count], w[:count]
-    grid = np.linspace(0.0, beyond * reach, 600)
+    grid = np.linspace(0.0, extent * reach, 600)
     d = weight_density(r, w, grid, smooth * reach)
     if d.max() <= 1e-200 * np.sum(w):  # all thresholds lie far beyond the visited range: spread them evenly
         d = np.full_like(grid, np.sum(w) / grid[-1])
     tail = (grid >= 0.4 * reach) & (grid <= 0.85 * reach)
     log_d = np.log(d + 1e-6 * d.max())
     slope = min(float(np.polyfit(grid[tail], log_d[tail], 1)[0]), 0.0)
-    out = grid > 0.85 * reach
-    d[out] = np.exp(np.mean(log_d[tail]) + slope * (grid[out] - np.mean(grid[tail])))
-    share = _integral(d**spacing, grid)
-    edges = np.interp(np.linspace(0, 1, (count or len(r)) + 1), share / share[-1], grid)
+    outside = grid > 0.85 * reach
+    d[outside] = np.exp(np.mean(log_d[tail]) + slope * (grid[outside] - np.mean(grid[tail])))
+    cumulative = _integral(d**spacing, grid)
+    edges = np.interp(np.linspace(0, 1, (count or len(r)) + 1), cumulative / cumulative[-1], grid)
     mass = np.diff(np.interp(edges, grid, _integral(d, grid)))
     moment = np.diff(np.interp(edges, grid, _integral(d * grid, grid)))
     return moment / np.maximum(mass, 1e-300), mass
@@ -261,18 +262,21 @@ def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def regrid_channels(
-    structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, beyond: float = 1.3
+    structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, extent: float = 1.3
 ) -> dict[str, Any]:
-    """Place every channel's thresholds and weights anew; z (M, n_w) is the fitted model's signal."""
+    """Spread every channel's thresholds and weights anew; z (M, n_w) is the fitted model's signal."""
     reaches = [threshold_range(structure, values, z_i, i) for i, z_i in enumerate(z.T)]
-    rows = [regrid(r, w, most, beyond=beyond) for r, w, most in zip(values["r"], values["w"], reaches, strict=True)]
-    return {**values, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
+    channels = [
+        regrid(r, w, reach, extent=extent) for r, w, reach in zip(values["r"], values["w"], reaches, strict=True)
+    ]
+    return {**values, "r": np.array([r for r, _ in channels]), "w": np.array([w for _, w in channels])}
 
 
 def threshold_range(structure: PILFR, values: Mapping[str, np.ndarray], z: np.ndarray, channel: int) -> float:
-    """Find the threshold at which a channel's operators would rest over z (M,): its size, or half of its envelopes'.
+    """Return the smallest threshold for which an operator of a channel never moves over z (M,).
 
-    A generalized play rests when its lower curve `γ_l - r` is below its upper one `γ_r + r` at every two values of z.
+    For plays and stops it is max |z|. A generalized play rests if its lower curve `γ_l - r` lies below its upper one
+    `γ_r + r` at every two values of z, so it is half of `max γ_l - min γ_r`.
     """
     if not has_networks(structure):
         return float(np.max(np.abs(z)))
@@ -292,8 +296,8 @@ def search_starts(
 ) -> tuple[list[Candidate], Candidate | None, bool]:
     """Explore and polish; return all explored candidates, the winner, and whether the search was interrupted.
 
-    The winner is None if the search was interrupted before there was one. `report` gets the stage, its candidates so
-    far and their number in the end, first when there are none.
+    The winner is None if the search was interrupted before there was one. `report` receives the stage, its candidates
+    so far and their final number; its first call has no candidates.
     """
     sequences = np.random.SeedSequence(seed).spawn(starts)
     tasks = [(search, i, s) for i, s in enumerate(sequences)]
@@ -308,9 +312,9 @@ def search_starts(
     if search.start != "grid" or stopped:
         return found, usable[0], stopped
     chosen = usable[:keep]
-    if any(_is_held(search, c) for c in usable):
-        # At a bound the explored errors say less. Polish every candidate that was among the best when it came, so that
-        # more starts are never worse than fewer.
+    if any(_at_active_radius(search, c) for c in usable):
+        # At a bound the errors after exploration rank candidates poorly. Polish every candidate that was among the best
+        # so far when it was explored, so that more starts are never worse than fewer.
         chosen = [c for i, c in enumerate(found) if c in sorted(found[: i + 1], key=_merit)[:keep] and c in usable]
     polished, stopped = run_tasks(polish, [(search, c) for c in chosen], executor, partial(report, "polish"))
     return found, min(polished or usable[:1], key=_merit), stopped
@@ -322,10 +326,9 @@ def run_tasks(
     executor: Executor | None,
     report: Callable[[list[Candidate], int], None],
 ) -> tuple[list[Candidate], bool]:
-    """Return the results in the order of the tasks, and whether the run was interrupted.
+    """Run tasks in the executor or one by one; return the results in their order, and whether it was interrupted.
 
-    Tasks run in the executor, or one after the other. `report` gets the results so far and their number in the end,
-    first when there are none.
+    `report` receives the results so far and their final number; its first call has no results.
     """
     tasks, results = list(tasks), list[Candidate]()
     if executor is not None:

@@ -1,20 +1,20 @@
-r"""The L1 penalty on an element's weights, with the scales held that it could hide in.
+r"""L1 penalty on an element's weights, with all scales fixed that could offset it.
 
     minimise  1/2 mean(e²) + l1 Σ w_ij
 
 (Tibshirani 1996; the simulation error is that of Krikelis et al. 2024, Eq. 20). The outputs of a PI-LFR do not change
 under `w_i -> w_i / μ, (B_w, D_yw)_i -> μ (...)`, nor under a scaling of z with its thresholds and of the states, in
-every combination (`generators`). With all blocks free, units alone would drive the penalty to zero. Nor is it enough to
-hold a product such as `C_z B_w`, which no change of the states moves: it is the first sample of the response from w to
-z, next to nothing in a mechanical system, and costs next to nothing to restore. So
+every combination (`generators`). With all blocks free, a rescaling alone would drive the penalty to zero. Fixing an
+invariant product such as `C_z B_w` is not enough: it is the first sample of the response from w to z, which is tiny in
+a mechanical system and can be restored at almost no cost. Therefore
 
 1. the problem is solved without the penalty;
-2. the weights of each channel are scaled to a sum of one, which `B_w` and `D_yw` take up, unless an entry is fixed,
-   bounded or has a prior: `l1` then is in units of the cost, for all of a channel's weights;
-3. plays or stops of a channel with nearly the same threshold are merged into one, as long as the objective grows by
-   no more than `SLACK` in all: to the penalty one large weight and two halves of it are the same;
-4. the problem is solved with the penalty from there. Every linear block, every parameter of the operators and every
-   entry that is zero is held at its value; weights, thresholds, `y_0` and the initial states are free.
+2. the weights of each channel are scaled to a sum of one, with `B_w` and `D_yw` scaled inversely, unless an entry is
+   fixed, bounded or has a prior: `l1` then is in units of the cost, for the sum of a channel's weights;
+3. plays or stops of a channel with nearly the same threshold are merged as long as the objective grows by at most the
+   share `SLACK` in all, because the penalty does not distinguish one large weight from two halves of it;
+4. the problem is solved with the penalty from there. Weights, thresholds, `y_0` and the initial states are free; the
+   linear blocks, other parameters of the operators, and operators of zero weight are fixed.
 
 Only the user's fixed entries are fixed in the result.
 """
@@ -34,7 +34,7 @@ from ..optimise import Problem, Solution, Status
 from .context import FitContext, Stage
 from .result import with_solution
 
-SLACK = 0.02  # share of the objective that merging operators may cost before the last solve
+SLACK = 0.02  # relative growth of the objective that merging operators may cause before the last solve
 
 
 def check_penalty(l1: dict[str, float], parameters: ParameterSet, linear: bool) -> None:
@@ -57,15 +57,15 @@ def normalise_weights(model: Model) -> Model:
     values = {name: p.value.copy() for name, p in parameters.items()}
     for i, total in enumerate(values["w"].sum(axis=1)):
         entries = (("w", np.s_[i], 0.0), ("B_w", np.s_[:, i], -np.inf), ("D_yw", np.s_[:, i], -np.inf))
-        if total > 0 and all(_scales(parameters[name], part, low) for name, part, low in entries):
+        if total > 0 and all(_may_be_scaled(parameters[name], part, low) for name, part, low in entries):
             values["w"][i] /= total
             values["B_w"][:, i] *= total
             values["D_yw"][:, i] *= total
     return model.with_parameters(parameters.at(parameters.pack(values)))
 
 
-def _scales(p: Parameter, part: Any, low: float) -> bool:
-    """Tell whether entries may be scaled: free without a bound other than `low`, or fixed at zero; no prior."""
+def _may_be_scaled(p: Parameter, part: Any, low: float) -> bool:
+    """Tell whether entries may be scaled: no prior, and free with no bound but `low`, or fixed at zero."""
     fixed = p.fixed[part]
     free = ~fixed & (p.bounds[0][part] == low) & np.isinf(p.bounds[1][part])
     return p.prior is None and bool(np.all(free | (fixed & (p.value[part] == 0))))
@@ -74,12 +74,12 @@ def _scales(p: Parameter, part: Any, low: float) -> bool:
 def hold_all_but_element(model: Model, names: Iterable[str]) -> Model:
     """Fix all parameters but `y_0`, the penalised names and, if weights or thresholds are among them, both of these."""
     loose = {"y_0", *names} | (set(LAYER) if set(LAYER) & set(names) else set())
-    held = {name: {"fixed": True, "prior": None} for name in model.parameters if name not in loose}
-    return model.with_parameters(model.parameters.change(**held))
+    changes = {name: {"fixed": True, "prior": None} for name in model.parameters if name not in loose}
+    return model.with_parameters(model.parameters.change(**changes))
 
 
 def fix_idle_operators(model: Model) -> Model:
-    """Hold operators of no weight, so that they do not split from another one again."""
+    """Fix operators of zero weight, so that merged operators do not split again."""
     p = model.parameters
     if not isinstance(model.element, PrandtlIshlinskii):
         return model
@@ -87,17 +87,17 @@ def fix_idle_operators(model: Model) -> Model:
     return model.with_parameters(p.change(**{name: {"fixed": p[name].fixed | idle} for name in LAYER}))
 
 
-def merge_operators(held: Problem, theta: np.ndarray) -> np.ndarray:
+def merge_operators(fixed_problem: Problem, theta: np.ndarray) -> np.ndarray:
     """Merge operators of nearly the same threshold, the nearest first; return the variables."""
-    element, parameters = held.model.element, held.model.parameters
+    element, parameters = fixed_problem.model.element, fixed_problem.model.parameters
     if not (isinstance(element, PrandtlIshlinskii) and isinstance(element.operator, Play | Stop)):
         return theta
-    at = np.where(held.free, np.cumsum(held.free) - 1, -1)
+    place = np.where(fixed_problem.free, np.cumsum(fixed_problem.free) - 1, -1)
     shape = (element.channels, element.n)
-    w_at, r_at = (at[parameters.position(name)].reshape(shape, order="F") for name in LAYER)
-    size, n_x = held.model.n_x + held.model.n_s, held.model.n_x
-    first = range(int(held.free.sum()), held.size, size)
-    limit = (1 + SLACK) * held.cost(theta)
+    w_at, r_at = (place[parameters.position(name)].reshape(shape, order="F") for name in LAYER)
+    size, n_x = fixed_problem.model.n_x + fixed_problem.model.n_s, fixed_problem.model.n_x
+    state_starts = range(int(fixed_problem.free.sum()), fixed_problem.size, size)
+    limit = (1 + SLACK) * fixed_problem.cost(theta)
 
     def trial(i: int, a: int, b: int) -> np.ndarray:
         """Replace two operators of channel i by one."""
@@ -105,7 +105,7 @@ def merge_operators(held: Problem, theta: np.ndarray) -> np.ndarray:
         share = w[b] / (w[a] + w[b])
         out[w_at[i, a]], out[w_at[i, b]] = w[a] + w[b], 0.0
         out[r_at[i, a]] = (1 - share) * r[a] + share * r[b]
-        for start in first:
+        for start in state_starts:
             memory = theta[start + n_x + i * element.n :][: element.n]
             out[start + n_x + i * element.n + a] = (1 - share) * memory[a] + share * memory[b]
         return out
@@ -113,34 +113,37 @@ def merge_operators(held: Problem, theta: np.ndarray) -> np.ndarray:
     for i in range(element.channels):
         if np.any(w_at[i] < 0) or np.any(r_at[i] < 0):
             continue
-        better = True
-        while better:
-            better = False
+        merging = True
+        while merging:
+            merging = False
             used = sorted(np.flatnonzero(theta[w_at[i]] > 0), key=lambda j: theta[r_at[i, j]])
             pairs = sorted(pairwise(used), key=lambda ab: theta[r_at[i, ab[1]]] - theta[r_at[i, ab[0]]])
             for a, b in pairs:
-                there = trial(i, int(a), int(b))
-                if np.all((there >= held.lower) & (there <= held.upper)) and held.cost(there) <= limit:
-                    theta, better = there, True
+                merged = trial(i, int(a), int(b))
+                if (
+                    np.all((merged >= fixed_problem.lower) & (merged <= fixed_problem.upper))
+                    and fixed_problem.cost(merged) <= limit
+                ):
+                    theta, merging = merged, True
                     break
     return theta
 
 
-def restore_variables(solution: Solution, held: Problem, problem: Problem) -> Solution:
-    """Express the solution of a problem with held parameters in the variables of the problem without."""
-    n_held, n = int(held.free.sum()), int(problem.free.sum())
-    theta = np.concatenate([held.parameters(solution.theta)[problem.free], solution.theta[n_held:]])
+def restore_variables(solution: Solution, fixed_problem: Problem, problem: Problem) -> Solution:
+    """Express the solution of a problem with fixed parameters in the variables of the full problem."""
+    n_fixed, n = int(fixed_problem.free.sum()), int(problem.free.sum())
+    theta = np.concatenate([fixed_problem.parameters(solution.theta)[problem.free], solution.theta[n_fixed:]])
     multipliers = np.zeros(problem.size + len(problem.g_lower))
-    if len(solution.multipliers) == held.size + len(held.g_lower):
-        where = np.flatnonzero(held.free[problem.free])
-        multipliers[where], multipliers[n:] = solution.multipliers[:n_held], solution.multipliers[n_held:]
+    if len(solution.multipliers) == fixed_problem.size + len(fixed_problem.g_lower):
+        where = np.flatnonzero(fixed_problem.free[problem.free])
+        multipliers[where], multipliers[n:] = solution.multipliers[:n_fixed], solution.multipliers[n_fixed:]
     return replace(solution, theta=theta, multipliers=multipliers)
 
 
 def penalty_sentence(model: Model, l1: dict[str, float]) -> str:
-    """Say how many entries the penalty has brought to zero."""
+    """Say how many entries the penalty has set to zero."""
     counts = [f"{np.sum(model.parameters[k].value == 0)} of {model.parameters[k].size} entries of {k}" for k in l1]
-    return f"L1 penalty: {', '.join(counts)} are exactly zero; the linear blocks were held while it acted"
+    return f"L1 penalty: {', '.join(counts)} are exactly zero; the linear blocks were fixed during this solve"
 
 
 def solve_with_penalty(model: Model, problem: Problem, solution: Solution, context: FitContext) -> Stage:
@@ -150,14 +153,18 @@ def solve_with_penalty(model: Model, problem: Problem, solution: Solution, conte
     found = normalise_weights(with_solution(model, problem, solution))
     states = solution.theta[int(problem.free.sum()) :]
     options: dict[str, Any] = {"engine": problem.engine, "l1": context.l1}
-    whole, held = (
+    whole, fixed_problem = (
         context.problem(m, problem.noise, **options) for m in (found, hold_all_but_element(found, context.l1))
     )
-    begin = merge_operators(held, np.concatenate([held.start[: int(held.free.sum())], states]))
-    states = begin[int(held.free.sum()) :]
-    last = fix_idle_operators(held.model.with_parameters(held.model.parameters.at(held.parameters(begin))))
+    begin = merge_operators(
+        fixed_problem, np.concatenate([fixed_problem.start[: int(fixed_problem.free.sum())], states])
+    )
+    states = begin[int(fixed_problem.free.sum()) :]
+    last = fix_idle_operators(
+        fixed_problem.model.with_parameters(fixed_problem.model.parameters.at(fixed_problem.parameters(begin)))
+    )
     if np.any(last.parameters.free):
-        held = context.problem(last, problem.noise, **options)
-    begin = np.concatenate([held.start[: int(held.free.sum())], states])
-    result = restore_variables(context.solve(held, "L1 penalty", begin), held, whole)
+        fixed_problem = context.problem(last, problem.noise, **options)
+    begin = np.concatenate([fixed_problem.start[: int(fixed_problem.free.sum())], states])
+    result = restore_variables(context.solve(fixed_problem, "L1 penalty", begin), fixed_problem, whole)
     return found, whole, result, penalty_sentence(with_solution(found, whole, result), context.l1)

@@ -1,8 +1,8 @@
-"""`Fit`, the result of `fit`: a fitted model that simulates, judges, draws and saves itself.
+"""`Fit`, the result of `fit`, with its verbs: simulate, nrmse, plot, save, export and report.
 
-`FitOptions` are the options of `fit` that also hold for fits made from its result: the bound on spectral radii, the
-constraints, the noise that priors are weighed against, and the weights of recordings. A model file holds no code, hence
-no constraints: it holds their names, and the bound on spectral radii. A constraint known only by name must be supplied
+`FitOptions` are the options of `fit` that also apply to fits made from its result: the bound on spectral radii, the
+constraints, the noise that priors are weighed against, and the weights of recordings. A model file holds no code and so
+no constraints, only their names and the bound on spectral radii. A constraint known only by name must be supplied
 again or dropped explicitly.
 """
 
@@ -29,11 +29,11 @@ from ..optimise import (
     Problem,
     Solution,
     Status,
-    checked_weights,
+    check_weights,
+    describe_unknown_multipliers,
     first_state,
     samples_for_state,
     stability_limits,
-    unknown_multipliers,
 )
 from ..simulators import Simulator
 from .uncertainty import describe_unknown_errors
@@ -64,13 +64,13 @@ class FitOptions:
         weights: Any = None,
         train: Any = (),
     ) -> FitOptions:
-        """Return the options with some replaced; None keeps the present one. `weights` belong to recordings `train`."""
+        """Return the options with some replaced; None keeps the present value. `weights` are those of `train`."""
         if noise is not None and noise != "estimate" and not (is_number(noise) and 0 < noise < np.inf):
             raise InputError(f"noise = {noise!r} was given; give a number above zero, or 'estimate'.")
         if constraints is None and self.lost:
             raise InputError(
-                f"The fit was held by constraints that its file cannot hold ({listed(self.lost)}); give them again as "
-                "constraints=, or constraints=() to do without."
+                f"The fit had constraints that a file cannot store ({listed(self.lost)}); give them again as "
+                "constraints=, or constraints=() to drop them."
             )
         return FitOptions(
             self.stable if stable is None else stable,
@@ -87,8 +87,8 @@ class FitOptions:
         for r, name in zip(recordings, prints, strict=True):
             if name not in self.weights:
                 raise InputError(
-                    f"The fit was made with weights of its recordings, and {r.label} is none of them; give weights=, "
-                    "one for each recording."
+                    f"The fit was made with weights of its recordings, and {r.label} is not one of them; give "
+                    "weights=, one for each recording."
                 )
         return np.array([self.weights[name] for name in prints])
 
@@ -100,7 +100,7 @@ class FitOptions:
 def _weights_by_recording(weights: Any, train: Any) -> dict[str, float]:
     """Map fingerprints to weights; a recording given twice gets the root mean square of both."""
     recordings, sums = as_recordings(train), dict[str, list[float]]()
-    for r, weight in zip(recordings, checked_weights(weights, len(recordings)), strict=True):
+    for r, weight in zip(recordings, check_weights(weights, len(recordings)), strict=True):
         sums.setdefault(fingerprint(r), []).append(float(weight))
     return {name: float(np.sqrt(np.mean(np.square(some)))) for name, some in sums.items()}
 
@@ -156,7 +156,7 @@ class Fit:
         Names of the variables in `solution.theta`.
     errors : dict
         Standard errors by parameter name, in the gauge of `standard_errors`; nan where fixed or at a bound, inf where
-        the data (and the user's priors, but none of the search's own) say nothing.
+        the data and the user's priors do not determine them (priors added by the search do not count).
     active : tuple of str
         Variables that are at a bound, with their values, and constraints that are at a limit.
     limits : tuple of Limit
@@ -166,7 +166,7 @@ class Fit:
     candidates : tuple of Candidate
         Every start that was tried.
     options : FitOptions
-        Bound on spectral radii, constraints, noise and weights, which hold for fits made from this one too.
+        Bound on spectral radii, constraints, noise and weights, which also apply to fits made from this one.
     simulator : Simulator or None
         The simulator with the fitted values, if one was fitted.
     """
@@ -213,9 +213,9 @@ class Fit:
     def initial_state(self, recording: Recording, samples: int | None = None) -> np.ndarray:
         """Find the state with memory at a recording's first sample, as its `initial` says.
 
-        Where it is to be estimated, a training recording gets the state of the fit. For any other recording the model
-        stays as it is and the state is fitted to the first `samples` samples (default: ten a state, at least 50).
-        Nothing later is looked at, and `nrmse` does not score these samples.
+        A state that is to be estimated is that of the fit for a training recording. For any other recording it is
+        fitted to the first `samples` samples (default: ten per state, at least 50) at the model's parameters. Later
+        samples are not used, and `nrmse` does not score the first ones.
         """
         recording = self._matched(recording)
         known = self.initial.get(fingerprint(recording))
@@ -248,7 +248,7 @@ class Fit:
         if first >= len(recording):
             raise InputError(
                 f"The recording has {len(recording)} samples, but its initial state is fitted to the first "
-                f"{samples_for_state(self.model)} and these are not scored; give a longer one, or its initial state."
+                f"{samples_for_state(self.model)}, which are not scored; give a longer one, or its initial state."
             )
         return first
 
@@ -256,8 +256,8 @@ class Fit:
         """Compute the NRMSE (Eq. 27) over outputs, averaged over recordings, in free-run simulation.
 
         Where the initial state of a recording other than the training's is estimated, the samples that it is fitted to
-        are not scored (`scored_from`). An output that rests in one of several recordings is scaled by its deviation in
-        all of them.
+        are not scored (`scored_from`). An output that rests in one of several recordings is scaled by its deviation
+        over all of them.
 
         Raises
         ------
@@ -320,8 +320,8 @@ class Fit:
         Parameters
         ----------
         path : path
-            The file, usually `*.json`. Of a model or a simulator of the user's own it holds the values alone, which a
-            warning says for a simulator; give the model to `load`.
+            The file, usually `*.json`. For your own model or simulator it holds the values alone (a warning says so for
+            a simulator); give the model to `load`.
 
         Raises
         ------
@@ -337,7 +337,7 @@ class Fit:
             )
 
     def content(self) -> FitContent:
-        """Collect the values that a model file holds of this fit."""
+        """Collect what a model file stores of this fit."""
         shared = {f.name: getattr(self, f.name) for f in fields(FitContent) if hasattr(self, f.name)}
         starts = tuple(SavedStart(c.seed, c.error, c.solution, c.note, c.drawn) for c in self.candidates)
         return FitContent(**shared, noise=self.options.noise, weights=self.options.weights, starts=starts)
@@ -352,21 +352,24 @@ class Fit:
 
     def __str__(self) -> str:
         errors = ", ".join(map(_shown, self.train_nrmse))
-        spent = f", {self.seconds:.1f} s in all" if self.seconds else ""
+        count = len(self.candidates)
+        starts = f"{count} start{'s' if count > 1 else ''}"
+        spent = f"{self.seconds:.1f} s{f' for {starts}' if count else ''}; " if self.seconds else ""
+        steps = f"{self.solution.iterations} iteration{'' if self.solution.iterations == 1 else 's'}"
         lines = [
             self.status.value,
             *([self.status.advice] if self.status.advice else []),
             f"NRMSE on the training recording{'s' if len(self.train_nrmse) > 1 else ''}: {errors}",
-            f"{self.solution.iterations} iterations in the last solve{spent}",
+            f"{spent}the last solve took {steps}",
         ]
         if explains_nothing(self.train_nrmse):
             lines.insert(1, NOTHING_SENTENCE)
         if self.candidates:
             reached = sorted(c.error for c in self.candidates)
-            some = f"{len(reached)} starts" if len(reached) > 1 else "1 start"
-            lines.append(f"{some}, explored to NRMSE {_shown(reached[0])} ... {_shown(reached[-1])}")
+            several = f"the starts reached NRMSE {_shown(reached[0])} ... {_shown(reached[-1])}"
+            lines.append(several if count > 1 else f"the start reached NRMSE {_shown(reached[0])}")
             if not any(c.drawn for c in self.candidates):
-                lines.append("none of them is drawn, so the seed changes nothing")
+                lines.append("no start is drawn at random, so the seed has no effect")
         if self.linear_nrmse:
             alone = ", ".join(f"{e:.4f}" for e in self.linear_nrmse)
             tight = any(v.kind == "constraint" and not v.name.endswith("<= 1") for v in self.limits)
@@ -384,7 +387,7 @@ class Fit:
             rows = [limit.name.partition("[")[0] for limit in idle if "[" in limit.name]
             shown += [f"{len(rows)} not active ({', '.join(dict.fromkeys(rows))})"] if rows else []
             lines.append(f"constraints: {'; '.join(shown)}")
-            lines.append(unknown_multipliers(self.limits, self.status))
+            lines.append(describe_unknown_multipliers(self.limits, self.status))
         return "\n".join(line for line in lines if line)
 
     __repr__ = __str__
@@ -436,7 +439,7 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
         Candidate(c.seed, content.model, np.zeros(0), c.error, c.solution, note=c.note, drawn=c.drawn)
         for c in content.starts
     )
-    options = FitOptions()  # the first files did not hold them
+    options = FitOptions()  # files of the first versions have none
     if content.limits is not None:
         options = options_from_limits(content.limits, content.structure, noise=content.noise, weights=content.weights)
     return Fit(**{**shared, "limits": content.limits or ()}, candidates=candidates, options=options)

@@ -1,15 +1,15 @@
-r"""Fewer operators, stronger priors: a path of fits over the strength of a regularization, chosen by validation.
+r"""Regularization paths: fits with fewer operators or stronger priors, chosen by validation.
 
 Along the path the objective of Krikelis et al. (2024), Eq. 20, has
 
-    l1 Σ_j w_ij        (operators that are not needed get exactly no weight and are taken out; the rest is fitted again)
-    s ((θ - m) / σ)²   (or a prior of mean m and standard deviation σ, s times as strong).
+    l1 Σ_j w_ij        (unneeded operators get zero weight and are removed; the rest is fitted again), or
+    s ((θ - m) / σ)²   (a prior of mean m and standard deviation σ, s times as strong).
 
-Every fit is judged by its free-run simulation of a validation recording, which none of them has seen. Recommended is
-the strongest regularization whose validation error is within a margin of the smallest; no test recording is used.
+Every fit is judged by its free-run simulation of a validation recording that none of them was fitted to. The strongest
+regularization whose validation error is within a margin of the smallest is recommended; no test recording is used.
 Penalised estimates are biased towards zero, hence the second fit (relaxed lasso, Meinshausen 2007). It is made with the
-operators that are left, and with as many spread in several ways over the density of the first fit, which holds their
-weights; validation chooses between them too.
+remaining operators, and also with the same number of operators spread in several ways over the density of the first
+fit, with a prior on their weights; validation chooses between these too.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from .fitting import fit as identify
 from .multistart import DEFAULT_SOLVER, StartSearch, hold_near_density, polish, regrid
 from .result import DENSITY_PRIOR, Candidate, Fit
 
-FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # of priors
-STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of L1, in units of the objective that is reached without
-# (beyond, spacing) of `regrid`, by which operators are spread
-SPREADINGS = tuple((beyond, spacing) for beyond in (1.0, 1.15, 1.3) for spacing in (0.25, 0.4))
+FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # on the strength of priors
+STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of the L1 penalty, in units of the objective without it
+# (beyond, spacing) of `regrid`, for each way of spreading operators
+SPREADINGS = tuple((extent, spacing) for extent in (1.0, 1.15, 1.3) for spacing in (0.25, 0.4))
 SPREAD = 0.02  # relative deviation of the prior on weights that are spread over a density
 
 
@@ -43,7 +43,7 @@ class RegularizationPath:
     Attributes
     ----------
     strengths : tuple of float
-        Weakest first; 0 is the fit without.
+        Weakest first; 0 stands for the fit without regularization.
     fits : tuple of Fit
         One for each strength.
     operators : tuple of int
@@ -79,12 +79,12 @@ class RegularizationPath:
 
 
 def operators_used(fit: Fit) -> int:
-    """Count the operators of some weight, over all channels; 0 without an element of operators."""
+    """Count the operators with a weight above zero over all channels; 0 without a Prandtl-Ishlinskii element."""
     return int(np.sum(fit.parameters["w"] > 0)) if "w" in fit.parameters else 0
 
 
 def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> Fit:
-    """Take the operators without weight out of a fit, and fit the rest again without a penalty.
+    """Remove the operators of zero weight from a fit, and fit the rest again without a penalty.
 
     Parameters
     ----------
@@ -108,33 +108,31 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     """
     structure = getattr(fit, "structure", None)
     if structure is None or not isinstance(structure.element, PrandtlIshlinskii):
-        raise InputError(
-            "Only a PI-LFR with a Prandtl-Ishlinskii element has operators to take out; give a fit of one."
-        )
+        raise InputError("Only a PI-LFR with a Prandtl-Ishlinskii element has operators to remove; give a fit of one.")
     element, weights = structure.element, fit.parameters["w"]
     n = max(1, int(np.max(np.sum(weights > 0, axis=1))))
-    # indices of the operators that stay, one row for each channel
+    # indices of the operators that remain, one row per channel
     kept = np.sort(np.argsort(weights <= 0, axis=1, kind="stable")[:, :n], axis=1)
     full = weights.shape
 
-    def some(value: Any) -> Any:
+    def select(value: Any) -> Any:
         array = np.asarray(value, dtype=float)
         return np.take_along_axis(np.broadcast_to(array, full), kept, axis=1) if array.ndim else array
 
     smaller = replace(
         structure,
         element=replace(element, n=n),
-        fixed={k: some(v) if k in LAYER else v for k, v in structure.fixed.items()},
-        bounds={k: (some(v[0]), some(v[1])) if k in LAYER else v for k, v in structure.bounds.items()},
-        priors={k: (some(v[0]), some(v[1])) if k in LAYER else v for k, v in structure.priors.items()},
+        fixed={k: select(v) if k in LAYER else v for k, v in structure.fixed.items()},
+        bounds={k: (select(v[0]), select(v[1])) if k in LAYER else v for k, v in structure.bounds.items()},
+        priors={k: (select(v[0]), select(v[1])) if k in LAYER else v for k, v in structure.priors.items()},
     )
     old = fit.model
-    values = {k: some(v) if k in LAYER else v for k, v in fit.parameters.items()}
+    values = {k: select(v) if k in LAYER else v for k, v in fit.parameters.items()}
     model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
     memory = (np.arange(element.channels)[:, None] * element.n + kept).ravel()
     initial = {key: np.concatenate([s[: old.n_x], s[old.n_x :][memory]]) for key, s in fit.initial.items()}
-    again = identify(replace(fit, model=model, structure=smaller, initial=initial), train, **options)
-    return again if again.status is Status.INTERRUPTED else polish_fit(again, train, **options)
+    fitted = identify(replace(fit, model=model, structure=smaller, initial=initial), train, **options)
+    return fitted if fitted.status is Status.INTERRUPTED else polish_fit(fitted, train, **options)
 
 
 def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
@@ -143,7 +141,7 @@ def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
 
 
 def polish_fit(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = None, **options: Any) -> Fit:
-    """Place a fit's thresholds anew as the search does with its best starts (`polish`), unless that is worse."""
+    """Polish a fit as the search does with its best starts (`polish`); return the fit itself if that is worse."""
     structure, context = fit.structure, context_of_fit(fit, train, solver=solver or DEFAULT_SOLVER, **options)
     assert structure is not None
     search = StartSearch(context, structure, {}, level=float(np.mean(fit.train_nrmse)))
@@ -180,10 +178,10 @@ def regularization_path(
     train : Recording or sequence of Recording
         Training data of the fit.
     validation : Recording or sequence of Recording
-        Data that choose the strength: no training recording, and none that is to be a test afterwards.
+        Data by which the strength is chosen: neither training recordings nor recordings for a later test.
     strengths : sequence of float
-        L1 weights on `w` (default: 1 to 1000 times the objective of the fit), or with `priors` factors on their
-        weight (default: 0.01 to 100).
+        L1 weights on `w` (default: 1 to 1000 times the objective of the fit) or, with `priors`, factors on their
+        strength (default: 0.01 to 100).
     priors : mapping
         `(mean, std)` by parameter name, in place of the L1 penalty on `w`.
     margin : float
@@ -200,58 +198,59 @@ def regularization_path(
     Raises
     ------
     InputError
-        If the fit is not one of a PI-LFR, a strength or the margin is unfit, or validation is training.
+        If the fit is not one of a PI-LFR, a strength or the margin is invalid, or a validation recording is a training
+        recording.
     """
-    structure, seen, judged = _checked(fit, train, validation, priors is None)
-    given = _strengths(fit.solution.cost if priors is None else None, strengths, margin)
-    fits, errors = [fit], [fit.nrmse(judged)]
+    structure, training, unseen = _check_path(fit, train, validation, priors is None)
+    ascending = _sort_strengths(fit.solution.cost if priors is None else None, strengths, margin)
+    fits, errors = [fit], [fit.nrmse(unseen)]
     thin: dict[int, tuple[Fit, ...]] = {}
-    for i, strength in enumerate(given):
+    for i, strength in enumerate(ascending):
         if priors is None:
-            found = _sparser_fit(fit, seen, judged, strength, thin, options)
+            found = _fit_sparser(fit, training, unseen, strength, thin, options)
         else:
             scaled = {k: (m, np.asarray(s, dtype=float) / np.sqrt(strength)) for k, (m, s) in priors.items()}
-            found = _uninterrupted(identify(_with_priors(fit, structure, scaled), seen, **options))
+            found = _raise_if_interrupted(identify(_replace_priors(fit, structure, scaled), training, **options))
         fits.append(found)
-        errors.append(found.nrmse(judged))
+        errors.append(found.nrmse(unseen))
         if progress:
-            progress("path", i + 1, len(given), float(np.nanmin(errors)))
+            progress("path", i + 1, len(ascending), float(np.nanmin(errors)))
     usable = np.where(np.isfinite(errors), errors, np.inf)
     recommended = int(np.max(np.flatnonzero(usable <= (1 + margin) * np.min(usable))))
     return RegularizationPath(
-        strengths=(0.0, *map(float, given)),
+        strengths=(0.0, *map(float, ascending)),
         fits=tuple(fits),
         operators=tuple(operators_used(f) for f in fits),
-        train=tuple(f.nrmse(seen) for f in fits),
+        train=tuple(f.nrmse(training) for f in fits),
         validation=tuple(map(float, errors)),
         recommended=recommended,
         margin=float(margin),
     )
 
 
-def _with_priors(fit: Fit, structure: PILFR, priors: Mapping[str, tuple[Any, Any]]) -> Fit:
+def _replace_priors(fit: Fit, structure: PILFR, priors: Mapping[str, tuple[Any, Any]]) -> Fit:
     """Replace priors in the structure and the model of a fit."""
     parameters = fit.model.parameters.change(**{k: {"prior": prior} for k, prior in priors.items()})
-    held = replace(structure, priors={**structure.priors, **priors})
-    return replace(fit, structure=held, model=fit.model.with_parameters(parameters))
+    changed = replace(structure, priors={**structure.priors, **priors})
+    return replace(fit, structure=changed, model=fit.model.with_parameters(parameters))
 
 
-def _checked(
+def _check_path(
     fit: Any, train: Any, validation: Any, sparse: bool
 ) -> tuple[PILFR, tuple[Recording, ...], tuple[Recording, ...]]:
-    """Return the structure and the recordings of a path; a sparse path needs operators."""
+    """Check the arguments of a path; return the structure and the recordings. A `sparse` path needs operators."""
     if not isinstance(fit, Fit):
-        raise InputError(f"A regularization path was asked for of a {type(fit).__name__}; give a Fit.")
-    structure, seen, judged = fit.structure, as_recordings(train), as_recordings(validation)
+        raise InputError(f"A {type(fit).__name__} was given for a regularization path; give a Fit.")
+    structure, training, unseen = fit.structure, as_recordings(train), as_recordings(validation)
     if structure is None or (sparse and not isinstance(structure.element, PrandtlIshlinskii)):
         raise InputError("A regularization path needs a fit of a PI-LFR with an element; give one.")
-    if {fingerprint(r) for r in seen} & {fingerprint(r) for r in judged}:
-        raise InputError("A validation recording is a training recording too; give one that was not fitted.")
-    return structure, seen, judged
+    if {fingerprint(r) for r in training} & {fingerprint(r) for r in unseen}:
+        raise InputError("A validation recording is also a training recording; give one that was not fitted.")
+    return structure, training, unseen
 
 
-def _strengths(unit: float | None, strengths: Any, margin: Any) -> list[float]:
-    """Sort the given or the usual strengths; penalties are in units of the objective `unit`, priors have none."""
+def _sort_strengths(unit: float | None, strengths: Any, margin: Any) -> list[float]:
+    """Sort the given or default strengths; default penalties are in units of the objective `unit`, None for priors."""
     usual = FACTORS if unit is None else [unit * s for s in STRENGTHS]
     asked: Any = usual if strengths is None else strengths
     listed = isinstance(asked, Sequence | np.ndarray) and all(is_number(s) and 0 < s < np.inf for s in asked)
@@ -263,23 +262,25 @@ def _strengths(unit: float | None, strengths: Any, margin: Any) -> list[float]:
     return sorted({float(s) for s in asked})
 
 
-def _sparser_fit(
+def _fit_sparser(
     fit: Fit,
-    seen: tuple[Recording, ...],
-    judged: tuple[Recording, ...],
+    training: tuple[Recording, ...],
+    unseen: tuple[Recording, ...],
     strength: float,
     thin: dict[int, tuple[Fit, ...]],
     options: Mapping[str, Any],
 ) -> Fit:
-    """Return the best on validation: the operators that a penalty leaves, or as many spread anew (kept in `thin`)."""
-    pruned = _uninterrupted(prune(_uninterrupted(identify(fit, seen, l1={"w": strength}, **options)), seen, **options))
+    """Return the better fit on validation: the operators that a penalty leaves, or as many spread anew (see `thin`)."""
+    pruned = _raise_if_interrupted(
+        prune(_raise_if_interrupted(identify(fit, training, l1={"w": strength}, **options)), training, **options)
+    )
     n = max(1, pruned.structure.element.n)  # type: ignore[union-attr]
     if n not in thin:
-        thin[n] = tuple(_uninterrupted(f) for f in thin_operators(fit, seen, n, **options))
-    return min((pruned, *thin[n]), key=lambda f: _error(f, judged))
+        thin[n] = tuple(_raise_if_interrupted(f) for f in thin_operators(fit, training, n, **options))
+    return min((pruned, *thin[n]), key=lambda f: _error(f, unseen))
 
 
-def _uninterrupted(fit: Fit) -> Fit:
+def _raise_if_interrupted(fit: Fit) -> Fit:
     """Return the fit; if it was interrupted, raise the interrupt again."""
     if fit.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
@@ -289,10 +290,10 @@ def _uninterrupted(fit: Fit) -> Fit:
 def thin_operators(
     fit: Fit, train: Recording | Sequence[Recording], n: int, *, solver: Any = None, **options: Any
 ) -> tuple[Fit, ...]:
-    """Fit with n operators a channel, spread in several ways over the density of a fit's weights.
+    """Fit with n operators per channel, spread in several ways over the density of a fit's weights.
 
-    The options of the fit hold unless others are given. There are no fits where weights or thresholds are fixed,
-    bounded or have a prior.
+    The options of the fit apply unless others are given. Returns no fits if weights or thresholds are fixed, bounded or
+    have a prior.
     """
     structure, recordings = fit.structure, as_recordings(train)
     bound = structure is None or set(LAYER) & {*structure.fixed, *structure.bounds, *structure.priors}
@@ -303,13 +304,13 @@ def thin_operators(
     reach = np.max(np.abs(z), axis=0)
     states = [fit.initial_state(r) for r in recordings if r.begins == "estimate"]
     states = [np.concatenate([s[: old.n_x], np.zeros(n * structure.element.channels)]) for s in states]
-    found: list[Fit] = []
-    for beyond, spacing in SPREADINGS:
+    fits: list[Fit] = []
+    for extent, spacing in SPREADINGS:
         context = context_of_fit(
             replace(fit, structure=smaller), recordings, solver=solver or DEFAULT_SOLVER, **options
         )
         rows = [
-            regrid(r, w, float(top), beyond=beyond, spacing=spacing, count=n)
+            regrid(r, w, float(top), extent=extent, spacing=spacing, count=n)
             for r, w, top in zip(fit.parameters["r"], fit.parameters["w"], reach, strict=True)
         ]
         values = {**fit.parameters, "r": np.array([r for r, _ in rows]), "w": np.array([w for _, w in rows])}
@@ -319,8 +320,8 @@ def thin_operators(
         begin = np.concatenate([problem.start[: int(problem.free.sum())], *states])
         if not np.isfinite(problem.cost(begin)):
             continue
-        again = context.result(model, smaller, problem, context.solve(problem, "solve", begin), note=DENSITY_PRIOR)
-        found.append(replace(again, linear=fit.linear, linear_nrmse=fit.linear_nrmse))
-        if again.status is Status.INTERRUPTED:
+        fitted = context.result(model, smaller, problem, context.solve(problem, "solve", begin), note=DENSITY_PRIOR)
+        fits.append(replace(fitted, linear=fit.linear, linear_nrmse=fit.linear_nrmse))
+        if fitted.status is Status.INTERRUPTED:
             break
-    return tuple(found)
+    return tuple(fits)

@@ -1,8 +1,8 @@
 r"""Start values of a PI-LFR: a linear model first, then the element in it.
 
 **Linear model** (`linear_model`; Krikelis et al. 2024, Sec. 5.3): subspace identification refined by output error,
-least squares as in Eq. 20 without an element. The bound on the spectral radius is added after a solve without it: an
-integrator ends on the bound, which would otherwise obstruct its way there.
+least squares as in Eq. 20 without an element. A solve without the bound on the spectral radius comes first: an
+integrator lies on the bound, and a solver that has to stay inside all the way reaches it badly.
 
 Identification finds the linear blocks up to a change of the states' basis, `x = T x'`. Where a structure fixes entries
 of `A`, `B_u` or `C_y` (physical sub-matrices), `find_nearest_basis` chooses the basis in which these entries come
@@ -72,14 +72,14 @@ Signals = list[np.ndarray]  # one array (M, channels) for each recording
 BLA_OPTION = "bla"  # value of `linear` that asks for the best linear approximation
 LINEAR = ("A", "B_u", "C_y", "D_yu", "y_0")
 COORDINATES = ("A", "B_u", "C_y")  # blocks that depend on the basis of the states
-BASES = 30  # start bases of the search for the nearest one
-# Deviation of the signals of neurons of slope one at the start. Of 1, 0.3, 0.1 and 0.03 it gave the smallest training
-# error over two records of the two-mass rig and two sizes; no test recording was used.
-FLAT = 0.1
-BINS = 40  # of z, for the outline of a loop
-INSIDE = 0.03  # share of the samples at one z that an envelope leaves outside
-DAMPING = 0.05  # of the inverse of the linear model, in units of its largest gain
-LEAST = 0.01  # least share of the curve's height for each neuron, so that none begins without a slope
+START_BASES = 30  # start bases of the search for the nearest one
+# Deviation of the signals of neurons of slope one at the start. Among 1, 0.3, 0.1 and 0.03 this value gave the smallest
+# training error over two records of the two-mass rig and two sizes; no test recording was used.
+START_DEVIATION = 0.1
+OUTLINE_BINS = 40  # bins of z for the outline of a loop
+OUTSIDE = 0.03  # share of the samples at one z that lie outside each envelope
+DAMPING = 0.05  # damping of the inverse of the linear model, in units of its largest gain
+LEAST_SHARE = 0.01  # least height of each neuron, as a share of the curve's height, so that every neuron has a slope
 
 
 def linear_model(
@@ -94,8 +94,8 @@ def linear_model(
     """Fit a linear state-space model: subspace identification refined by output error, or the model `given`.
 
     The structure gives the order, whether there is an offset, and whether `A` is in modal coordinates; its element and
-    its other fixed blocks are ignored. In the search for an element a model `given` stays as it is: at the minimum of
-    the linear error the slope of half of the parameters has vanished, and starts get stuck.
+    its other fixed blocks are ignored. A model `given` for the search of an element is not refined: at the
+    minimum of the linear error the slope of half of the parameters vanishes, and starts get stuck.
     """
     model = _linear_start(recordings, structure, given, progress)
     problem = Problem(model, recordings, engine=engine, constraints=constraints)
@@ -116,20 +116,20 @@ def _refine(problem: Problem, progress: Progress | None) -> Solution:
     if not problem.constraints:
         return solver.solve(problem, progress=report)
     free = Problem(problem.model, problem.recordings, engine=problem.engine)
-    found = [solver.solve(free, progress=report)]
-    if found[0].status is not Status.INTERRUPTED:
-        found[0] = solver.solve(problem, found[0].theta, report)
-    limits = problem.active_constraints(found[0].theta)
-    if found[0].status is not Status.INTERRUPTED and np.any(limits):
-        found.append(solver.solve(problem, progress=report))
-    return min(found, key=lambda s: (s.status is Status.INFEASIBLE, s.cost))
+    solutions = [solver.solve(free, progress=report)]
+    if solutions[0].status is not Status.INTERRUPTED:
+        solutions[0] = solver.solve(problem, solutions[0].theta, report)
+    limits = problem.active_constraints(solutions[0].theta)
+    if solutions[0].status is not Status.INTERRUPTED and np.any(limits):
+        solutions.append(solver.solve(problem, progress=report))
+    return min(solutions, key=lambda s: (s.status is Status.INFEASIBLE, s.cost))
 
 
 def _linear_start(recordings: Sequence[Recording], structure: PILFR, given: Any, progress: Progress | None) -> Model:
     """Make the linear model before it is refined."""
     first = recordings[0]
     if given is None:
-        # the subspace's relative error is no NRMSE
+        # the relative error of the subspace method is not an NRMSE
         report = progress and (lambda stage, done, total, _: progress(stage, done, total, np.nan))
         a, b, c, d = subspace_matrices(recordings, structure.nx, offset=structure.offset, progress=report)
     elif isinstance(given, str) and given == BLA_OPTION:
@@ -176,12 +176,12 @@ def state_space_matrices(given: Any, nx: int, recording: Recording) -> tuple[Arr
 
 
 def _offset(recordings: Sequence[Recording], a: Array, b: Array, c: Array, d: Array) -> Array:
-    """Average the outputs' error (n_y,) of a linear model from rest."""
-    left = []
+    """Compute the mean output error (n_y,) of a linear model from rest."""
+    errors = []
     for r in recordings:
         states = propagate(a.T, (r.u @ b.T)[None], np.zeros((1, len(a))))[0][0] if len(a) else np.zeros((len(r), 0))
-        left.append((r.y - states @ c.T - r.u @ d.T)[r.skip :])
-    return np.asarray(np.mean(np.concatenate(left), axis=0))
+        errors.append((r.y - states @ c.T - r.u @ d.T)[r.skip :])
+    return np.asarray(np.mean(np.concatenate(errors), axis=0))
 
 
 def known_entries(structure: PILFR) -> Blocks:
@@ -193,12 +193,12 @@ def transform_to_known_basis(structure: PILFR, linear: Model, context: FitContex
     """Fit the linear model again in the basis of the structure's known entries; without any, return it as it is."""
     known = known_entries(structure)
     if not known or not structure.nx or (set(known) == {"A"} and is_modal(known, structure.nx)):
-        return linear  # which is in modal coordinates already
+        return linear  # already in modal coordinates
     blocks = {k: p.value for k, p in linear.parameters.items()}
     spread = np.sqrt(np.mean(simulate_states(blocks, np.concatenate([r.u for r in context.recordings])) ** 2, axis=0))
     blocks = find_nearest_basis(change_basis(blocks, np.diag(or_one(spread))), known)
-    alone = replace(structure.linear(), fixed=known)
-    model = alone.model(linear.n_u, linear.n_y, blocks, inputs=linear.inputs, outputs=linear.outputs)
+    form = replace(structure.linear(), fixed=known)
+    model = form.model(linear.n_u, linear.n_y, blocks, inputs=linear.inputs, outputs=linear.outputs)
     problem = replace(context, constraints=stability_limits(structure, context.options.stable)[:1]).problem(model)
     if not np.isfinite(problem.cost(problem.start)):
         return model
@@ -219,7 +219,7 @@ def find_nearest_basis(blocks: Blocks, known: Values, seed: int = 0) -> Blocks:
     want = {k: np.broadcast_to(np.asarray(v, dtype=float), blocks[k].shape) for k, v in known.items()}
     size = {k: max(float(np.sqrt(np.nanmean(v**2))), 1e-12) for k, v in want.items()}
 
-    def left(flat: Array) -> Array:
+    def residual(flat: Array) -> Array:
         t = flat.reshape(n, n)
         if not np.linalg.cond(t) < 1e10:
             return np.full(sum(int(np.sum(~np.isnan(v))) for v in want.values()), 1e6)
@@ -227,14 +227,14 @@ def find_nearest_basis(blocks: Blocks, known: Values, seed: int = 0) -> Blocks:
         return np.concatenate([((found[k] - v) / size[k])[~np.isnan(v)] for k, v in want.items()])
 
     rng, best, least = np.random.default_rng(seed), np.eye(n), np.inf
-    for k in range(BASES):
+    for k in range(START_BASES):
         t = np.eye(n) if k == 0 else rng.standard_normal((n, n))
-        for name, side in (("B_u", 1), ("C_y", -1)):  # the known size of inputs and outputs tells the states' scale
+        for name, side in (("B_u", 1), ("C_y", -1)):  # known entries of `B_u` or `C_y` give the states' scale
             if name in want:
                 norm = float(np.linalg.norm(change_basis(blocks, t)[name]))
                 t = t * (norm / (size[name] * np.sqrt(want[name].size))) ** side if norm > 0 else t
                 break
-        result: Any = least_squares(left, t.ravel(), x_scale="jac", max_nfev=200)
+        result: Any = least_squares(residual, t.ravel(), x_scale="jac", max_nfev=200)
         if result.cost < least and np.linalg.cond(result.x.reshape(n, n)) < 1e8:
             best, least = result.x.reshape(n, n), float(result.cost)
         if least < 1e-10:
@@ -269,10 +269,9 @@ def paper_start(
 
     R is `spread`. Where the structure leaves no direction of z to draw, thresholds are in units of z's deviation: z
     then has the units of an input or output, in which all of them could lie beyond it. For a Wiener model z is the
-    linear model's output: with any other z the weights, which are not negative, fall to zero, where nothing else has a
-    slope.
+    linear model's output: with any other z the non-negative weights fall to zero, where no other parameter has a slope.
     """
-    element = _layer(structure)
+    element = _pi_element(structure)
     shape = (element.channels, element.n)
     blocks = _directions(element, linear, rng)
     blocks["w"], blocks["r"] = rng.uniform(0, 1 / element.n, shape), rng.uniform(0, spread, shape)
@@ -298,7 +297,7 @@ def grid_start(
     For Hammerstein and Wiener structures the linear blocks move to the other side of the element. With other fixed
     blocks, "output" and "input" give the direction of z alone.
     """
-    element = _layer(structure)
+    element = _pi_element(structure)
     blocks, z = _place_element(structure, element, linear, inputs, states, rng, place)
     widest = np.max(np.abs(z), axis=0)
     grid = np.tile(np.arange(element.n) / element.n, (element.channels, 1))
@@ -314,18 +313,18 @@ def network_start(
 ) -> Blocks:
     """Draw directions of z of unit deviation and neurons that bend in its range; `B_w = D_yw = 0`.
 
-    As in Schoukens (2021), the network does nothing at first: the model begins as the linear one. Where slopes are
-    fixed at one, z has the deviation `FLAT`: neurons that are nearly linear at first end in better minima.
+    As in Schoukens (2021), the network has no effect at first: the model starts as the linear one. Where slopes are
+    fixed at one, z has the deviation `START_DEVIATION`: neurons that start nearly linear reach better minima.
     """
     element = structure.element
     assert isinstance(element, StaticNetwork)
     blocks, z = _place_element(structure, element, linear, inputs, states, rng, "random")
     if "slope" in structure.fixed and not {"C_z", "D_zu"} & set(structure.fixed):
-        blocks, z = blocks | {k: FLAT * blocks[k] for k in ("C_z", "D_zu")}, FLAT * z
+        blocks, z = blocks | {k: START_DEVIATION * blocks[k] for k in ("C_z", "D_zu")}, START_DEVIATION * z
     return blocks | neurons_over(structure, element, z, rng)
 
 
-def _layer(structure: PILFR) -> PrandtlIshlinskii:
+def _pi_element(structure: PILFR) -> PrandtlIshlinskii:
     assert isinstance(structure.element, PrandtlIshlinskii)
     return structure.element
 
@@ -333,8 +332,8 @@ def _layer(structure: PILFR) -> PrandtlIshlinskii:
 def _directions(element: Element, linear: Values, rng: np.random.Generator) -> Blocks:
     """Add a random direction of z to the linear blocks, Eq. 22 and 23."""
     blocks = {name: linear[name] for name in LINEAR}
-    for name, of in (("C_z", 0), ("D_zu", 1)):
-        blocks[name] = rng.uniform(-1, 1, (element.channels, linear["B_u"].shape[of]))
+    for name, axis in (("C_z", 0), ("D_zu", 1)):  # of `B_u` (nx, n_u)
+        blocks[name] = rng.uniform(-1, 1, (element.channels, linear["B_u"].shape[axis]))
     return blocks
 
 
@@ -376,12 +375,12 @@ def _signal(inputs: Signals, states: Signals, blocks: Values) -> Array:
 def _fixed_blocks(structure: PILFR, linear: Values, blocks: Blocks) -> Blocks:
     """Return the blocks that the structure fixes, and for a Wiener model z = the linear model's output."""
     out = {"C_z": linear["C_y"], "D_zu": linear["D_yu"]} if read_through(structure) else {}
-    held = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_whole(structure) if k in blocks}
-    return out | {k: np.broadcast_to(v, blocks[k].shape) for k, v in held.items()}
+    fixed = {k: np.asarray(structure.fixed[k], dtype=float) for k in fixed_whole(structure) if k in blocks}
+    return out | {k: np.broadcast_to(v, blocks[k].shape) for k, v in fixed.items()}
 
 
 def _split_path(linear: Values, size: Array, at: Array, output: bool) -> Blocks:
-    """Split the path of output or input `at[i]` in two: half direct, half through channel i of the element."""
+    """Split the path of output or input `at[i]`: half stays direct, half passes through channel i of the element."""
     through = np.zeros((len(at), len(linear["C_y"]) if output else linear["B_u"].shape[1]))
     through[np.arange(len(at)), at] = size
     carried = np.count_nonzero(through, axis=0)
@@ -389,12 +388,12 @@ def _split_path(linear: Values, size: Array, at: Array, output: bool) -> Blocks:
     return _route(linear, through.T, np.where(carried > 0, 0.5, 1.0), not output)
 
 
-def _route(linear: Values, through: Array, left: Array, before: bool) -> Blocks:
-    """Route inputs (`before`) or outputs through the element by `through` (n, channels); `left` stays direct."""
+def _route(linear: Values, through: Array, direct: Array, before: bool) -> Blocks:
+    """Route inputs (`before`) or outputs by `through` (n, channels) to the element; the share `direct` passes by."""
     b, c, d = linear["B_u"], linear["C_y"], linear["D_yu"]
     if before:
-        return {"B_w": b @ through, "D_yw": d @ through, "B_u": b * left, "D_yu": d * left}
-    return {"D_yw": through, "C_y": c * left[:, None], "D_yu": d * left[:, None]}
+        return {"B_w": b @ through, "D_yw": d @ through, "B_u": b * direct, "D_yu": d * direct}
+    return {"D_yw": through, "C_y": c * direct[:, None], "D_yu": d * direct[:, None]}
 
 
 def envelope_start(
@@ -407,10 +406,10 @@ def envelope_start(
 ) -> Blocks:
     """Choose envelopes, thresholds and weights of a generalized play from the loops of z and its answer.
 
-    `values` (from `grid_start`) say what z is. They are returned as they are where the structure fixes other blocks
-    than those of a Hammerstein or Wiener model. At `place` "random" the output is read through the element too.
+    `values` (from `grid_start`) define z. They are returned unchanged if the structure fixes other blocks than those of
+    a Hammerstein or Wiener model. At `place` "random" the output is read through the element, as at "output".
     """
-    element = _layer(structure)
+    element = _pi_element(structure)
     fixed = set(structure.fixed) - {"y_0", "A"}
     before = {"B_u", "D_zu"} <= fixed or (not fixed and place == "input")
     if fixed and not before and not {"C_y", "D_yw"} <= fixed:
@@ -418,7 +417,7 @@ def envelope_start(
     pairs = list(zip(recordings, states, strict=True))
     z = np.concatenate([(x @ values["C_z"].T + r.u @ values["D_zu"].T)[r.skip :] for r, x in pairs])
     v = np.concatenate([(deconvolve_inputs(linear, r, x) if before else r.y)[r.skip :] for r, x in pairs])
-    found, channels = dict(values), np.arange(element.channels)
+    blocks, channels = dict(values), np.arange(element.channels)
     at = channels % (linear["B_u"].shape[1] if before else len(linear["C_y"]))
     centre, size = np.mean(v, axis=0), or_one(np.std(v, axis=0))
     if fixed:
@@ -426,21 +425,23 @@ def envelope_start(
     else:
         through = np.zeros((len(size), element.channels))
         through[at, channels] = (size / np.maximum(np.bincount(at, minlength=len(size)), 1))[at]
-        left = np.bincount(at, minlength=len(size)) == 0
-        found |= _route(linear, through, left, before)
+        direct = np.bincount(at, minlength=len(size)) == 0
+        blocks |= _route(linear, through, direct, before)
         if not before:
-            found["y_0"] = np.where(left, linear["y_0"], centre)
+            blocks["y_0"] = np.where(direct, linear["y_0"], centre)
         else:
-            found["y_0"] = linear["y_0"] + _gain(linear) @ np.where(left, 0.0, centre)
+            blocks["y_0"] = linear["y_0"] + _gain(linear) @ np.where(direct, 0.0, centre)
     for i in channels:
         target = (v[:, at[i]] - centre[at[i]]) / size[at[i]]
         if not fixed and z[:, i] @ target < 0:  # envelopes rise, so z has to rise with the answer
             z[:, i] *= -1
-            found |= {name: np.where((channels == i)[:, None], -found[name], found[name]) for name in ("C_z", "D_zu")}
+            blocks |= {
+                name: np.where((channels == i)[:, None], -blocks[name], blocks[name]) for name in ("C_z", "D_zu")
+            }
         for name, row in channel_start(element, z[:, i], target).items():
-            found[name] = np.array(found.get(name, np.zeros((element.channels, row.size))), dtype=float)
-            found[name][i] = row
-    return found
+            blocks[name] = np.array(blocks.get(name, np.zeros((element.channels, row.size))), dtype=float)
+            blocks[name][i] = row
+    return blocks
 
 
 def _gain(linear: Values) -> Array:
@@ -452,7 +453,7 @@ def _gain(linear: Values) -> Array:
 
 
 def deconvolve_inputs(linear: Values, recording: Recording, states: Array) -> Array:
-    """Compute the inputs (M, n_u) with which the linear model gives the measured outputs, damped (see above)."""
+    """Compute the inputs (M, n_u) for which the linear model gives the measured outputs, by the formula above for V."""
     u, y = recording.u, recording.y
     error = np.fft.rfft(y - states @ linear["C_y"].T - u @ linear["D_yu"].T - linear["y_0"], axis=0)
     z = np.exp(2j * np.pi * np.arange(len(error)) / len(u))
@@ -460,41 +461,41 @@ def deconvolve_inputs(linear: Values, recording: Recording, states: Array) -> Ar
     g = np.where(np.isfinite(g), g, 0.0)
     conjugate = g.conj().transpose(0, 2, 1)
     damped = g @ conjugate + (DAMPING * np.max(np.abs(g))) ** 2 * np.eye(g.shape[1])
-    more = conjugate @ np.linalg.solve(damped, error[:, :, None])
-    return u + np.fft.irfft(more[:, :, 0], len(u), axis=0)
+    correction = conjugate @ np.linalg.solve(damped, error[:, :, None])
+    return u + np.fft.irfft(correction[:, :, 0], len(u), axis=0)
 
 
 def channel_start(element: PrandtlIshlinskii, z: Array, v: Array) -> Blocks:
     """Choose envelopes, thresholds and weights (a row each) of one channel from its signal z (M,) and answer v (M,)."""
-    at, low, high = loop_outline(z, v)
+    centres, low, high = loop_outline(z, v)
     n, operator = element.n, element.operator
     widest = float(np.max(high - low)) / 2
     r = 0.9 * widest * np.arange(n) / n
     inner = float(np.mean(r))
     rows = {"r": r, "w": np.full(n, 1.0 / n)}
     for side, curve in (("l", low + inner), ("r", high - inner)):
-        rows |= {f"gamma_{side}_{k}": row for k, row in fit_envelope(at, curve, operator.neurons).items()}
+        rows |= {f"gamma_{side}_{k}": row for k, row in fit_envelope(centres, curve, operator.neurons).items()}
     return rows
 
 
 def loop_outline(z: Array, v: Array) -> tuple[Array, Array, Array]:
-    """Outline where v (M,) lies over z (M,): centres of bins, and a lower and an upper curve (bins,), neither falling.
+    """Outline the cloud (z, v), both (M,): return centres of bins, and a rising lower and upper curve (bins,).
 
-    Loops that run the wrong way round get no width.
+    A play lags behind z. Loops that run the other way round, ahead of z, get no width.
     """
-    edges = np.linspace(np.quantile(z, 0.002), np.quantile(z, 0.998), BINS + 1)
-    centres, bins = (edges[1:] + edges[:-1]) / 2, np.clip(np.searchsorted(edges, z) - 1, 0, BINS - 1)
-    low, high, turn = np.full(BINS, np.nan), np.full(BINS, np.nan), 0.0
+    edges = np.linspace(np.quantile(z, 0.002), np.quantile(z, 0.998), OUTLINE_BINS + 1)
+    centres, bins = (edges[1:] + edges[:-1]) / 2, np.clip(np.searchsorted(edges, z) - 1, 0, OUTLINE_BINS - 1)
+    low, high, turn = np.full(OUTLINE_BINS, np.nan), np.full(OUTLINE_BINS, np.nan), 0.0
     rising = np.gradient(z) > 0
-    for k in range(BINS):
+    for k in range(OUTLINE_BINS):
         here = bins == k
         if np.count_nonzero(here) >= 8:
-            low[k], high[k] = np.quantile(v[here], [INSIDE, 1 - INSIDE])
+            low[k], high[k] = np.quantile(v[here], [OUTSIDE, 1 - OUTSIDE])
             if np.any(here & rising) and np.any(here & ~rising):
                 turn += float(np.mean(v[here & ~rising]) - np.mean(v[here & rising]))
     seen = ~np.isnan(low)
     if not np.any(seen):
-        return centres, np.zeros(BINS), np.zeros(BINS)
+        return centres, np.zeros(OUTLINE_BINS), np.zeros(OUTLINE_BINS)
     low, high = (np.interp(centres, centres[seen], c[seen]) for c in (low, high))
     if turn < 0:
         low = high = (low + high) / 2
@@ -502,7 +503,7 @@ def loop_outline(z: Array, v: Array) -> tuple[Array, Array, Array]:
 
 
 def _make_rising(curve: Array) -> Array:
-    """Make a curve that does not fall, between the smallest one above and the largest one below."""
+    """Average the smallest rising curve above a curve and the largest rising curve below it."""
     return (np.maximum.accumulate(curve) + np.minimum.accumulate(curve[::-1])[::-1]) / 2
 
 
@@ -516,7 +517,7 @@ def fit_envelope(z: Array, curve: Array, neurons: int) -> Blocks:
     d = -b * knots
     columns = np.column_stack([np.ones_like(z), -np.ones_like(z), z, np.tanh(z[:, None] * b + d)])
     (up, down, a0, *a), _ = nnls(columns, curve)
-    least = LEAST * float(np.ptp(curve)) / max(neurons, 1)
+    least = LEAST_SHARE * float(np.ptp(curve)) / max(neurons, 1)
     return {"c": np.array([up - down]), "a0": np.array([a0]), "a": np.maximum(a, least), "b": b, "d": d}
 
 

@@ -1,19 +1,19 @@
-"""Standard errors that respect the gauge freedoms of a PI-LFR.
+"""Standard errors of a PI-LFR, which has gauge freedoms.
 
 The outputs of a PI-LFR do not change under
 
 - any change of the basis of the states, `x = T x'` (n_x² directions);
 - a scaling of a port's signal, `(C_z, D_zu, r)_i -> α (...)` with `(B_w, D_yw)_i -> (...)/α`, memory included. The
-  generalized play has two here: the scale of z, which the envelopes take up, and that of the operators' output;
+  generalized play has two here: the scale of z, which the envelopes compensate, and the scale of the operators' output;
 - a scaling of the weights, `w_i -> μ w_i` with `(B_w, D_yw)_i -> (...)/μ`;
-- for a play with `r_ij = 0` (it passes z on), a shift of `w_ij` that the linear blocks take up;
+- for a play with `r_ij = 0` (its output is z), a shift of `w_ij` that the linear blocks compensate;
 - for a static network, the scalings of its signals, `slope_i -> slope_i/α` and `gain_i -> μ gain_i`;
 - for generalized plays, a shift of all `r_i` against the two envelopes, and a shift of the output that `y_0`, the
   envelopes and the initial state compensate.
 
 Each comes with an affine change of the initial states; `generators` gives their tangents. `covariance` works on the
-orthogonal complement of these directions, spanned by Q, in the metric `D = diag(H)`, each variable in units of its own
-sensitivity: the gauge that stays nearest to the fit.
+orthogonal complement of these directions, spanned by Q, in the metric `D = diag(H)`, that is, with each variable in
+units of its own sensitivity. This gauge stays nearest to the fit.
 
     cov = D^-1/2 Q (Q'H~Q)^-1 Q'M~Q (Q'H~Q)^-1 Q' D^-1/2,    H~ = D^-1/2 H D^-1/2,    M~ = D^-1/2 M D^-1/2
 
@@ -21,8 +21,9 @@ sensitivity: the gauge that stays nearest to the fit.
 share) with the covariance Ω of the noise (`gradient_covariance`). For white noise this is the classical `σ²/R H^-1`;
 for coloured noise it is the covariance of the least-squares estimate (Ljung 1999, Chapter 9).
 
-The errors say what another record with another noise would change. They do not cover bias: a model that is too simple,
-or another minimum. A gauge-invariant function f (an eigenvalue, a static gain) has the variance `∇f' cov ∇f`.
+The errors describe how estimates vary from record to record with the noise. They do not cover bias, from a model that
+is too simple or another minimum. A gauge-invariant function f (an eigenvalue, a static gain) has the variance
+`∇f' cov ∇f`.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ Generator = tuple[dict[str, Array], Callable[[Array], Array]]
 # powers of the scales of z and of the output in the parameters of an envelope (Eq. 14)
 ENVELOPE = {"c": (0, 1), "a0": (-1, 1), "a": (0, 1), "b": (-1, 0), "d": (0, 0)}
 STATES = ("A", "B_u", "B_w", "C_y", "C_z")  # blocks that depend on the coordinates of the states
-FADED = 1e-30  # share of its matrix's largest sensitivity below which an entry counts as not seen
+FADED = 1e-30  # share of its matrix's largest sensitivity up to which an entry has no effect
 LAGS = 40  # largest lag of the noise model
 
 
@@ -97,7 +98,7 @@ def _scale_channel(
 
 
 def _shift_weight(element: PrandtlIshlinskii, values: Mapping[str, Array], channel: int) -> Iterator[Generator]:
-    """Shift the weight of a play with r = 0, which passes z on, to the linear blocks."""
+    """Shift the weight of a play with r = 0, whose output is z, to the linear blocks."""
     b, d = values["B_w"][:, [channel]], values["D_yw"][:, [channel]]
     c, e = values["C_z"][[channel]], values["D_zu"][[channel]]
     if element.rounded and np.any(values["eps"] > 0):
@@ -128,12 +129,12 @@ def _shift_offset(
     yield change, lambda _: shift
 
 
-def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, held: Array) -> Array:
-    """Find the directions of θ (size, k) that change no output, no fixed entry and no variable in `held` (size,)."""
+def gauge_tangents(problem: Problem, theta: Array, structure: PILFR, at_bound: Array) -> Array:
+    """Find the directions of θ (size, k) that change no output, no fixed entry and no variable `at_bound` (size,)."""
     inside, outside = orbit_tangents(problem, theta, structure)
     size = np.maximum(np.sqrt(np.sum(inside**2, axis=0) + np.sum(outside**2, axis=0)), 1e-300)
     inside, outside = inside / size, outside / size
-    return inside @ null_space(np.concatenate([outside, inside[held]])) if inside.size else inside
+    return inside @ null_space(np.concatenate([outside, inside[at_bound]])) if inside.size else inside
 
 
 def orbit_tangents(problem: Problem, theta: Array, structure: PILFR) -> tuple[Array, Array]:
@@ -167,7 +168,7 @@ def _complement(columns: Array, tolerance: float = 1e-10) -> Array:
 
     q, r = np.linalg.qr(columns, mode="complete")
     diagonal = np.abs(np.diag(r))
-    if np.any(diagonal <= tolerance * diagonal.max(initial=0.0)):  # dependent: pivoting tells how many are not
+    if np.any(diagonal <= tolerance * diagonal.max(initial=0.0)):  # pivoting counts the independent columns
         q, r, _ = qr(columns, pivoting=True)
         diagonal = np.abs(np.diag(r))
     return np.asarray(q[:, int(np.sum(diagonal > tolerance * diagonal.max(initial=0.0))) :])
@@ -188,8 +189,8 @@ def covariance(problem: Problem, theta: Array, structure: PILFR | None = None) -
     Returns
     -------
     array, shape (size, size)
-        Rows and columns of variables at an active bound are zero; variables that the data leave open have an infinite
-        variance.
+        Rows and columns of variables at an active bound are zero; variables that the data do not determine have
+        an infinite variance.
     """
     return _covariance(problem, theta, structure)[0]
 
@@ -227,8 +228,8 @@ def standard_errors(problem: Problem, theta: Array, structure: PILFR | None = No
         data say nothing about it.
     """
     parameters = problem.model.parameters
-    matrix, held = _covariance(problem, theta, structure)
-    errors = np.where(held, np.nan, np.sqrt(np.diag(matrix)))
+    matrix, at_bound = _covariance(problem, theta, structure)
+    errors = np.where(at_bound, np.nan, np.sqrt(np.diag(matrix)))
     full = np.full(parameters.size, np.nan)
     full[parameters.free] = errors[: int(parameters.free.sum())]
     return parameters.unpack(full)
@@ -240,19 +241,19 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     if not np.all(np.isfinite(hessian)):
         return np.diag(np.full(problem.size, np.inf)), np.zeros(problem.size, dtype=bool)
     given = theta.copy()
-    held = snap_to_bounds(problem, theta, np.sqrt(np.diag(hessian)))
+    at_bound = snap_to_bounds(problem, theta, np.sqrt(np.diag(hessian)))
     if np.any(theta != given):  # a threshold on its bound may slip where it stuck
         _, _, hessian = problem.normal(theta)
     sensitivity = np.sqrt(np.diag(hessian))
-    # drop entries that only a transient showed which has long faded: their derivative is a number without meaning
+    # drop entries that only a transient affects that has long faded: their derivative is rounding
     sensitivity = np.where(sensitivity > FADED * Neighbours(problem.labels).largest(sensitivity), sensitivity, 0.0)
-    tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, held)
+    tangents = np.zeros((problem.size, 0)) if structure is None else gauge_tangents(problem, theta, structure, at_bound)
     slopes = problem.constraint_jacobian(theta)[problem.active_constraints(theta)]
-    # a gauge direction that an active constraint forbids is no freedom; a constraint on a spectral radius or a gain
-    # forbids none, but for rounding
+    # a gauge direction that an active constraint excludes is no freedom; constraints on a spectral radius or a gain
+    # exclude none, apart from rounding
     forbidden, size = slopes @ tangents, np.abs(slopes) @ np.abs(tangents)
     tangents = tangents @ null_space(np.where(np.abs(forbidden) > 1e-4 * size, forbidden, 0.0))
-    used = np.flatnonzero(~held & (sensitivity > 0))
+    used = np.flatnonzero(~at_bound & (sensitivity > 0))
     square, unit = np.ix_(used, used), sensitivity[used]
     removed = np.column_stack([tangents[used] * unit[:, None], slopes[:, used].T / unit[:, None]])
     length = np.linalg.norm(removed, axis=0)
@@ -264,47 +265,47 @@ def _covariance(problem: Problem, theta: Array, structure: PILFR | None) -> tupl
     weights = np.zeros((problem.size, int(seen.sum())))
     weights[used] = directions[:, seen] / np.sqrt(values[seen]) / unit[:, None]
     out = weights @ gradient_covariance(problem, theta, weights) @ weights.T
-    # a direction that is not seen counts as one about which the data say just too little
+    # a direction without effect is treated as one whose effect is just too small to count
     inverse = np.sum(directions[:, seen] ** 2 / values[seen], axis=1)
     hidden = used[np.sum(directions[:, ~seen] ** 2, axis=1) > least * inverse]
     if problem.residuals <= seen.sum():
         hidden = used
-    blind = np.flatnonzero(~held & (sensitivity == 0))
+    blind = np.flatnonzero(~at_bound & (sensitivity == 0))
     out[hidden, hidden] = out[blind, blind] = np.inf
-    return out, held
+    return out, at_bound
 
 
 def snap_to_bounds(problem: Problem, theta: Array, sensitivity: Array, tolerance: float = 1e-9) -> Array:
-    """Move variables that are within rounding of a bound onto it, in place; return which (size,), bool.
+    """Move variables within rounding of a bound onto it, in place; return which are at a bound (size,), bool.
 
     Within rounding means that the move changes the normalised outputs by less than `tolerance`, by the sensitivity at
     both ends: a variable without effect here, such as the slope of a saturated neuron, may have one at the bound.
     """
-    given, held = theta.copy(), np.zeros(problem.size, dtype=bool)
+    given, at_bound = theta.copy(), np.zeros(problem.size, dtype=bool)
     for bound in (problem.lower, problem.upper):
         near = np.isfinite(bound) & (sensitivity > 0)
         near[near] = np.abs(theta - bound)[near] * sensitivity[near] <= tolerance
         near |= theta == bound
         theta[near] = bound[near]
-        held |= near
+        at_bound |= near
     if np.any(theta != given):
         there = np.sqrt(np.diag(problem.normal(theta)[2]))
         far = ~(np.abs(theta - given) * there <= tolerance)
         theta[far] = given[far]
-        held &= ~far
-    return held
+        at_bound &= ~far
+    return at_bound
 
 
 def describe_unknown_errors(errors: Mapping[str, np.ndarray]) -> list[str]:
-    """Explain infinite standard errors; empty where there are none."""
+    """Explain infinite standard errors; an empty list where there are none."""
     count = {name: int(np.sum(np.isinf(e))) for name, e in errors.items()}
     turned = [name for name in STATES if count.get(name)]
     others = [f"{count[k]} of {np.size(e)} entries of {k}" for k, e in errors.items() if count[k] and k not in turned]
-    out = [f"the data alone says nothing about {', '.join(others)}"] if others else []
+    out = [f"the data alone do not determine {', '.join(others)}"] if others else []
     if turned:
         out.append(
-            f"entries of {', '.join(turned)} have no standard error of their own: others, as in other coordinates of "
-            "the states, give the same outputs; judge poles, zeros and responses instead"
+            f"entries of {', '.join(turned)} have no standard error, because other values (other coordinates of the "
+            "states) give the same outputs; judge poles, zeros and responses instead"
         )
     return out
 

@@ -1,9 +1,9 @@
 """The simulation-error problem, its constraints, and the solvers.
 
-`problem` states the problem and its derivatives, `constraints` what may be demanded of parameters, `gauss_newton` the
-default solver (its damping is the class `Damping`, its first value `GaussNewton(damping=...)`), `ipopt` the other one,
-`exact_limits` the solves at a bound on stability and the last step onto exact limits, and `solution` the result with
-the limits that hold it.
+`problem` states the problem and computes its derivatives, `constraints` holds constraints on named parameters,
+`gauss_newton` is the default solver (its damping is the class `Damping`, the first value `GaussNewton(damping=...)`),
+`ipopt` the other one. `exact_limits` solves at exact bounds on spectral radii and moves results inside exact
+constraints. `solution` holds the result of a solver, its status and its active limits.
 """
 
 from typing import TYPE_CHECKING
@@ -17,35 +17,35 @@ if TYPE_CHECKING:
         check_gain as check_gain,
         check_room as check_room,
         dc_gain as dc_gain,
-        loosened as loosened,
+        describe_unbounded as describe_unbounded,
+        loosen_radii as loosen_radii,
         ordered as ordered,
         stability_limits as stability_limits,
         stable as stable,
-        unbounded_sentence as unbounded_sentence,
     )
     from .exact_limits import (
-        STEP as STEP,
-        beyond as beyond,
-        exactly as exactly,
-        held_at_bounds as held_at_bounds,
-        within_bounds as within_bounds,
+        BOUND_STEP_SOLVER as BOUND_STEP_SOLVER,
+        at_active_radius as at_active_radius,
+        move_inside_exact as move_inside_exact,
+        solve_within_radii as solve_within_radii,
+        violated_exact as violated_exact,
     )
     from .gauss_newton import (
         GaussNewton as GaussNewton,
         first_state as first_state,
         samples_for_state as samples_for_state,
-        unconstrained as unconstrained,
+        unconstrained_step as unconstrained_step,
     )
     from .ipopt import Ipopt as Ipopt
-    from .problem import Problem as Problem, checked_weights as checked_weights
+    from .problem import Problem as Problem, check_weights as check_weights
     from .solution import (
         Iteration as Iteration,
         Limit as Limit,
         Progress as Progress,
         Solution as Solution,
         Status as Status,
+        describe_unknown_multipliers as describe_unknown_multipliers,
         limits_of as limits_of,
-        unknown_multipliers as unknown_multipliers,
     )
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

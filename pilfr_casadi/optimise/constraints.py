@@ -37,11 +37,11 @@ from ..models import (
     unknown_slope,
 )
 
-TOLERATED = 1e-6  # violation, in units of a constraint, that counts as met
-AT_MOST, AT_LEAST = 100.0, 1e-6  # limits that a unit comes to at most; share of the largest change, at least
-UNIT = 100.0  # unit of log ρ: a violation of 1e-4 is tolerated
+TOLERATED = 1e-6  # violation, in units of a constraint, up to which it counts as met
+LARGEST_UNIT, SMALLEST_UNIT = 100.0, 1e-6  # a unit is at most 100 limits, at least this share of the change
+LOG_RADIUS_UNIT = 100.0  # unit of log ρ: a violation of 1e-4 is tolerated
 SLACK = 1e-4  # share by which `stable` lets the radius exceed its limit
-INSIDE = 2e-7  # how far inside the logarithm of a radius an exact limit is solved: beyond what solvers tolerate
+LOG_RADIUS_MARGIN = 2e-7  # margin on log ρ of an exact bound, wider than the tolerance of solvers
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,14 +57,14 @@ class Constraint:
     name : str
         Name of the constraint in results.
     unit : float, optional
-        A change of the expression that counts: violations are judged next to it. By default the largest change that one
-        of its variables brings about when it changes by its own size, so that units do not matter, and a hundred times
-        the limit at most, so that a small one is met to 1e-4 of itself.
+        Change of the expression that violations are measured in. By default the largest change that one variable
+        causes when it changes by its own size, so that physical units do not matter, but at most a hundred times the
+        limit, so that a small limit is met to 1e-4 of itself.
     exact : bool
-        The limits hold at the numbers of the result, not up to a solver's tolerance; for inequalities.
+        Whether the limits hold on the numbers of the result, not up to a solver's tolerance; for inequalities.
     check : callable, optional
-        Of an exact constraint: how far named numbers lie beyond the limit in another measure than the expression's,
-        0 or less inside; `stable` looks at the eigenvalues.
+        For an exact constraint: how far named numbers violate the limit in another measure than the expression's (0 or
+        less: not at all). `stable` uses the eigenvalues.
     """
 
     expression: Callable[[Mapping[str, Any]], Any]
@@ -95,7 +95,7 @@ def linear_part(p: Mapping[str, Any]) -> Any:
 
 @dataclass(frozen=True)
 class LogRadius:
-    """`log_norm_of_power` of a square matrix picked from the named parameters; a class, so that it can be pickled."""
+    """`log_norm_of_power` of a square matrix of the named parameters; a class, because it has to be pickled."""
 
     matrix: Callable[[Mapping[str, Any]], Any] = linear_part
     squarings: int = 20
@@ -142,15 +142,15 @@ def stable(
             if slack >= 0
             else f"The bound on the spectral radius has a slack of {slack}; give zero or more."
         )
-    limit = float(np.log(radius) + (-INSIDE if exact else np.log1p(slack)))
+    limit = float(np.log(radius) + (-LOG_RADIUS_MARGIN if exact else np.log1p(slack)))
     check = BeyondRadius(radius, matrix) if exact else None
     return Constraint(
-        LogRadius(matrix), upper=limit, name=f"{name} <= {radius:.12g}", unit=UNIT, exact=exact, check=check
+        LogRadius(matrix), upper=limit, name=f"{name} <= {radius:.12g}", unit=LOG_RADIUS_UNIT, exact=exact, check=check
     )
 
 
-def loosened(constraints: Sequence[Constraint], least: float = 0.0) -> tuple[Constraint, ...]:
-    """Loosen exact bounds on spectral radii, of `least` or more, to at least 1 plus the slack."""
+def loosen_radii(constraints: Sequence[Constraint], least: float = 0.0) -> tuple[Constraint, ...]:
+    """Replace each exact bound on a spectral radius from `least` on by one of at least 1, with a slack."""
     return tuple(
         stable(max(c.check.radius, 1.0), c.check.matrix, c.name.partition(" <=")[0])
         if c.exact and isinstance(c.check, BeyondRadius) and c.check.radius >= least
@@ -161,7 +161,7 @@ def loosened(constraints: Sequence[Constraint], least: float = 0.0) -> tuple[Con
 
 @dataclass(frozen=True)
 class WithElement:
-    """`A + B_w S C_z` with one of an element's slopes S; a class, so that it can be sent to other processes."""
+    """`A + B_w S C_z` with one of an element's slopes S; a class, because it has to be pickled."""
 
     element: Any
     slope: str
@@ -197,16 +197,16 @@ def stability_limits(structure: PILFR, bound: bool | float) -> tuple[Constraint,
     return stability(structure, float(bound), exact=True)
 
 
-def unbounded_sentence(structure: PILFR | None, constraints: Iterable[Constraint], p: Mapping[str, Any]) -> str:
-    """Say what the bounds leave open about an element in feedback, given named numbers p; empty if nothing."""
+def describe_unbounded(structure: PILFR | None, constraints: Iterable[Constraint], p: Mapping[str, Any]) -> str:
+    """Say which motions of an element in feedback the bounds on radii do not cover at the values p; else empty."""
     radii = [c.check.radius for c in constraints if isinstance(c.check, BeyondRadius)]
     element = structure.element if structure else None
     if element is None or not radii or not np.any(np.sum(np.abs(p["C_z"]), axis=1) * np.sum(np.abs(p["B_w"]), axis=0)):
         return ""
     if unknown_slope(element, p):
         return (
-            "the spectral radius is bounded for the linear part alone: how steep the element is that is fed back is "
-            "not known, as with envelopes of your own, so judge stability by simulations beyond the recorded amplitudes"
+            "the spectral radius is bounded for the linear part alone, because the slope of the element in feedback is "
+            "unknown (as for user-defined envelopes); judge stability by simulations beyond the recorded amplitudes"
         )
     if not isinstance(element, PrandtlIshlinskii) or not isinstance(element.operator, GeneralizedPlay):
         return ""
@@ -223,7 +223,7 @@ def unbounded_sentence(structure: PILFR | None, constraints: Iterable[Constraint
 
 
 def check_room(parameters: ParameterSet, limits: Iterable[Constraint]) -> None:
-    """Refuse bounds on the entries of A under which no A has the required spectral radius."""
+    """Refuse bounds on the entries of A that no A with the required spectral radius satisfies."""
     radii = [c.check.radius for c in limits if isinstance(c.check, BeyondRadius) and c.check.matrix is linear_part]
     if not radii or "A" not in parameters or np.all(parameters["A"].fixed):
         return
@@ -240,7 +240,7 @@ def check_room(parameters: ParameterSet, limits: Iterable[Constraint]) -> None:
 
 
 def least_radius(low: np.ndarray, high: np.ndarray) -> float:
-    """Bound from below the spectral radius of every matrix between `low` and `high` (n, n), entry by entry.
+    """Compute a lower bound on the spectral radius of all matrices between `low` and `high` (n, n), entry by entry.
 
     Uses `ρ(A) >= |trace A| / n` and, where `low >= 0`, `ρ(A) >= ρ(low)` (Perron and Frobenius).
     """
@@ -253,7 +253,7 @@ def least_radius(low: np.ndarray, high: np.ndarray) -> float:
 
 
 def _numbers_or_nan(function: ca.Function, *arguments: Any) -> np.ndarray:
-    """Evaluate the first output of a function; nan where CasADi's linear solvers raise at a singular matrix."""
+    """Evaluate the first output of a function; nan where CasADi raises because a matrix is singular."""
     try:
         return np.asarray(function.call(arguments)[0])
     except RuntimeError:
@@ -263,7 +263,7 @@ def _numbers_or_nan(function: ca.Function, *arguments: Any) -> np.ndarray:
 class Rows:
     """The constraints of a problem as one Function `p -> g` of the full parameter vector p, shape (n_p,).
 
-    `lower`, `upper` and `units` (as given, nan where not) have shape (n_g,), `labels` one name an entry, `sizes` the
+    `lower`, `upper` and `units` (as given, nan where not) have shape (n_g,), `labels` one name per entry, `sizes` the
     number of entries of each constraint.
     """
 
@@ -283,14 +283,14 @@ class Rows:
         g = ca.densify(ca.vertcat(*parts))
         self.function = ca.Function("g", [vector], [g], ["p"], ["g"])
         self._slope = ca.Function("g_slope", [vector], [ca.densify(ca.jacobian(g, vector))], ["p"], ["jac"])
-        held = np.repeat([c.check is not None and c.check(values) <= 0 for c in constraints], self.sizes)
+        satisfied = np.repeat([c.check is not None and c.check(values) <= 0 for c in constraints], self.sizes)
         logs = np.repeat([isinstance(c.expression, LogRadius) for c in constraints], self.sizes)
-        self._check_start(p, parameters.free, held.astype(bool), logs.astype(bool))
+        self._check_start(p, parameters.free, satisfied.astype(bool), logs.astype(bool))
 
-    def _check_start(self, p: np.ndarray, free: np.ndarray, held: np.ndarray, logs: np.ndarray) -> None:
-        """Refuse a constraint that is no number at the start, or that no free parameter enters and that does not hold.
+    def _check_start(self, p: np.ndarray, free: np.ndarray, satisfied: np.ndarray, logs: np.ndarray) -> None:
+        """Refuse a constraint that is not finite at the start, or is violated there and depends on no free parameter.
 
-        `held` marks entries whose own check says that they hold, `logs` entries that are logarithms of the shown value.
+        `satisfied` marks entries whose own check says that they hold, `logs` entries that are logarithms.
         """
         value, slope = self.values(p), self.slope(p)[:, free]
         for i in np.flatnonzero(~np.isfinite(value) | ~np.all(np.isfinite(slope), axis=1)):
@@ -302,18 +302,18 @@ class Rows:
         reach = np.asarray(ca.DM(self.function.jac_sparsity(0, 0), 1).full(), dtype=bool)[:, free]
         room = TOLERATED * np.maximum(np.abs(value), 1.0)
         missed = (value < self.lower - room) | (value > self.upper + room)
-        for i in np.flatnonzero(missed & ~np.any(reach, axis=1) & ~held):
+        for i in np.flatnonzero(missed & ~np.any(reach, axis=1) & ~satisfied):
             found, low, high = (np.exp(v) if logs[i] else v for v in (value[i], self.lower[i], self.upper[i]))
             raise InputError(
-                f"The constraint {self.labels[i]!r} is infeasible: all that enters it is fixed and gives {found:g}, "
-                f"limits {low:g} and {high:g}; free a parameter or loosen it."
+                f"The constraint {self.labels[i]!r} is infeasible: all its parameters are fixed and give {found:g}, "
+                f"with limits {low:g} and {high:g}; free a parameter or loosen it."
             )
 
     def units_from(self, change: np.ndarray) -> np.ndarray:
         """Units as given, or from the largest change of each entry (n_g,), no larger than its limits warrant."""
         limits = np.abs([np.where(np.isfinite(b), b, 0.0) for b in (self.lower, self.upper)])
-        largest = AT_MOST * np.max(limits, axis=0, initial=0.0)
-        own = np.where(largest > 0, np.clip(largest, AT_LEAST * change, change), change)
+        largest = LARGEST_UNIT * np.max(limits, axis=0, initial=0.0)
+        own = np.where(largest > 0, np.clip(largest, SMALLEST_UNIT * change, change), change)
         return np.where(np.isnan(self.units), own, self.units)
 
     def values(self, p: np.ndarray) -> np.ndarray:
@@ -337,7 +337,7 @@ def _limits(c: Constraint, size: int) -> np.ndarray:
         raise InputError(f"The constraint {c.name!r} is infeasible: its lower bound exceeds its upper bound.")
     if c.exact and np.any(low == high):
         raise InputError(
-            f"The constraint {c.name!r} is an equation and asked for as exact, which rounding does not allow; "
+            f"The constraint {c.name!r} is an equation with exact=True, which rounding does not allow; "
             "leave exact out, or give a lower and an upper limit."
         )
     if c.unit is not None and not 0 < c.unit < np.inf:
@@ -359,7 +359,7 @@ def _expression(c: Constraint, symbols: Mapping[str, Any]) -> Any:
     except Exception as e:
         why = str(e).strip().splitlines()[-1].strip() if str(e).strip() else type(e).__name__
         if "__bool__" in str(e) or "truth value" in str(e).lower():
-            why = "it asks whether a symbol is true, as `if`, `and`, `min` and `max` of Python do"
+            why = "Python's `if`, `and`, `min` and `max` cannot be used on symbols"
         raise InputError(
             f"The expression of the constraint {c.name!r} cannot be formed ({why}); use CasADi functions of the named "
             "parameters, such as casadi.if_else, fmin and fmax."
@@ -368,10 +368,12 @@ def _expression(c: Constraint, symbols: Mapping[str, Any]) -> Any:
 
 @dataclass(frozen=True)
 class Gain:
-    """The steady gain from inputs to outputs, the element moving along its slope; see above.
+    """The steady gain from inputs to outputs, with the element replaced by its slope `S = slope diag(Σ_j w_ij)`.
 
-    What it gives is transposed, (n_u, n_y), so that its entries follow each other row by row of the gain. `shape` is
-    that of the values it is compared with, none where one number stands for all.
+        (C_y + D_yw S C_z) (I - A - B_w S C_z)^-1 (B_u + B_w S D_zu) + D_yu + D_yw S D_zu
+
+    The expression is the transpose, (n_u, n_y), so that its entries follow the gain row by row. `shape` is the shape of
+    the wanted values, `()` where one number stands for all.
     """
 
     slope: float = 1.0
@@ -394,7 +396,7 @@ class Gain:
 
 
 @dataclass(frozen=True)
-class Steps:
+class Differences:
     """Differences of neighbouring entries along each row of a parameter."""
 
     name: str = "r"
@@ -408,7 +410,7 @@ class Steps:
 def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
     """Constrain the steady gain of a linear model or a PI-LFR of plays or stops, from every input to every output.
 
-    Other elements, such as generalized plays and networks, have no slope `Σw`: with them it is refused.
+    Other elements, such as generalized plays and networks, are refused, because their slope is not `Σw`.
 
     Parameters
     ----------
@@ -431,7 +433,7 @@ def dc_gain(value: Any, *, within: Any = 0.0, slope: float = 1.0) -> Constraint:
     share = float(filled(slope, "slope of a dc_gain", ()))
     if not (np.all(room >= 0) and 0 <= share <= 1):
         raise InputError(
-            f"A gain of {value} within {within} at a slope of {slope} was asked for; give finite numbers, a deviation "
+            f"A gain of {value} within {within} at a slope of {slope} was given; give finite numbers, a deviation "
             "of 0 or more, and a slope from 0 to 1."
         )
     rows = [", ".join(f"{g:g}" for g in row) for row in np.atleast_2d(gain)]
@@ -447,13 +449,13 @@ def check_gain(constraints: Iterable[Constraint], element: Any) -> None:
     if any(isinstance(c.expression, Gain) for c in constraints):
         kind = getattr(element, "operator", element)
         raise InputError(
-            f"dc_gain is for linear models and for plays and stops, and the model has a {type(kind).__name__}, whose "
-            "gain is another; leave it out, or give a Constraint of your own."
+            f"dc_gain applies to linear models and to elements of plays or stops; the model has a "
+            f"{type(kind).__name__}, whose gain is not Σw. Leave dc_gain out, or give a Constraint of your own."
         )
 
 
 def ordered(name: str = "r", gap: float = 0.0) -> Constraint:
-    """Let the entries of a parameter ascend along each row, by `gap` at least: by default the thresholds of a channel.
+    """Make the entries of a parameter (by default the thresholds) ascend along each row, by at least `gap`.
 
     Raises
     ------
@@ -462,5 +464,5 @@ def ordered(name: str = "r", gap: float = 0.0) -> Constraint:
     """
     gap = float(filled(gap, f"The gap between the entries of {name!r}", (), infinite=True))
     if not 0 <= gap < np.inf:
-        raise InputError(f"A gap of {gap} between the entries of {name!r} was asked for; give a number of 0 or more.")
-    return Constraint(Steps(name), lower=float(gap), name=f"{name} ascending", exact=True)
+        raise InputError(f"A gap of {gap} between the entries of {name!r} was given; give a number of 0 or more.")
+    return Constraint(Differences(name), lower=float(gap), name=f"{name} ascending", exact=True)

@@ -1,4 +1,4 @@
-r"""Solve inside exact limits: bounds on spectral radii, and the last step of a result onto its limits.
+r"""Solve inside exact limits: bounds on spectral radii, and the last move of a result inside its limits.
 
 With a real Schur form `M / c = Q T Q'` at some point and `S = I + X`, X strictly block lower triangular,
 
@@ -10,18 +10,20 @@ gives F the eigenvalues of its diagonal blocks. Both eigenvalues of a block lie 
 
 and so `ρ(M) <= c`: polynomial rows in M and in the extra unknowns X (zero at the point itself), smooth also where
 eigenvalues meet. At a tight bound several eigenvalues lie on the circle at once, some of them equal, and a solver that
-starts outside ends in poor points. `within_bounds` therefore
+starts outside ends in poor points. `solve_within_radii` therefore
 
-1. solves without the bound (or with a bound of 1 and a small slack, `loosened`) and is done where the result is inside;
-2. else leads `-log ρ` from there to the bound, at most doubling it each time. Before each step `A` and `B_w` are scaled
-   by one factor, which scales every bounded matrix of a PI-LFR (Krikelis et al. 2024, Eq. 15): the start is inside;
-3. at the bound takes the Schur form anew until the cost stops falling.
+1. solves without the bound (or with a bound of 1 and a small slack, `loosen_radii`) and stops if the result is inside;
+2. otherwise tightens the bound in steps (`tighten_radii`) that at most double `-log ρ`. Before each step `A` and `B_w`
+   are scaled by one factor, which scales every bounded matrix of a PI-LFR (Krikelis et al. 2024, Eq. 15), so that the
+   start is inside;
+3. solves at the bound, with a new Schur form each time, until the cost stops falling.
 
 Radii stop a share of `MARGINS` inside, so that the eigenvalues of the result, computed in floating point, never exceed
 the bound: three digits of it are used. The result is a local minimum.
 
-A solver meets other constraints up to a tolerance. Where an exact one fails on the numbers of the result, `exactly`
-moves the point by the smallest step, in the metric of the outputs, that meets it and keeps all others to first order:
+A solver meets other constraints up to a tolerance. Where an exact one fails on the numbers of the result,
+`move_inside_exact` moves the point by the smallest step, in the metric of the outputs, that meets it and keeps all
+others to first order:
 
     minimise  1/2 d'(H + λ D)d   subject to  lower <= θ + d <= upper,  lower_g + m <= g(θ) + ∇g d <= upper_g - m
 
@@ -41,23 +43,23 @@ import casadi as ca
 import numpy as np
 
 from ..models import Neighbours
-from .constraints import TOLERATED, BeyondRadius, Constraint, loosened
-from .gauss_newton import GaussNewton, QuadraticProgram, without_rounding
+from .constraints import TOLERATED, BeyondRadius, Constraint, loosen_radii
+from .gauss_newton import GaussNewton, QuadraticProgram, replace_rounding
 from .problem import Problem
-from .solution import FELT, Progress, Solution, Status
+from .solution import ACTIVE_MULTIPLIER, Progress, Solution, Status
 
 Array = np.ndarray
 Solve = Callable[[Problem, "Array | None"], Solution]
 NEAR = 1e-3  # distance of log ρ from its bound within which a start counts as lying at the bound
-MARGINS = (2e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # shares by which radii stay inside; the next where eigenvalues exceed
+MARGINS = (2e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # shares by which radii stay inside, tried in turn
 CLOSEST = 1e-3  # distance of log ρ from the unit circle at which tightening begins, at least
-ROUNDS = 6  # Schur forms taken at the bound, at most
-GAIN = 1e-4  # relative fall of the cost for which another round is worth it
-STEP = GaussNewton(max_iterations=100, tolerance=1e-4)
+SCHUR_ROUNDS = 6  # Schur forms taken at the bound, at most
+WORTHWHILE_FALL = 1e-4  # relative fall of the cost that justifies another round
+BOUND_STEP_SOLVER = GaussNewton(max_iterations=100, tolerance=1e-4)  # for each tightening step
 ROW_UNIT = 1e-2  # unit of Jury's rows, next to which their violation is judged
 CURVATURE = 1e-2  # of the objective along X: damps X next to a cost of order 1 (calibrated on three tight fits)
-MOVES = 40  # steps onto exact limits, with margins doubled from `FIRST` to more than any constraint needs
-FIRST = 1e-9  # margin of the first of these steps, in units of a constraint
+MOST_MOVES = 40  # steps onto exact limits, with margins doubled from `FIRST_MARGIN` to more than any constraint needs
+FIRST_MARGIN = 1e-9  # margin of the first of these steps, in units of a constraint
 MOVE_DAMPING = 1e-6  # λ of these steps, only large enough that their Hessian is positive definite
 
 
@@ -74,7 +76,7 @@ def below_blocks(n: int) -> Array:
 
 @lru_cache(maxsize=32)
 def jury_rows(n: int) -> ca.Function:
-    """Build `(M, X) -> (held, low)`: Jury's rows of the diagonal blocks of F, and F below them.
+    """Build `(M, X) -> (jury, low)`: Jury's rows of the diagonal blocks of F, and F below them.
 
     M (n, n) is over its bound; X holds the entries of `below_blocks` column by column.
     """
@@ -88,15 +90,15 @@ def jury_rows(n: int) -> ca.Function:
         power = -ca.mtimes(power, step)
         inverse = inverse + power
     f = ca.mtimes([inverse, m, ca.SX.eye(n) + step])
-    held = []
+    jury = []
     for i in range(0, n, 2):
         if i + 1 < n:
             trace, det = f[i, i] + f[i + 1, i + 1], f[i, i] * f[i + 1, i + 1] - f[i, i + 1] * f[i + 1, i]
-            held += [1 - det, 1 - trace + det, 1 + trace + det]
+            jury += [1 - det, 1 - trace + det, 1 + trace + det]
         else:
-            held += [1 - f[i, i], 1 + f[i, i]]
-    out = [ca.vertcat(*held), ca.vertcat(ca.SX(0, 1), *(f[i, j] for i, j in low))]
-    return ca.Function("jury_rows", [m, x], [ca.densify(o) for o in out], ["M", "X"], ["held", "low"])
+            jury += [1 - f[i, i], 1 + f[i, i]]
+    out = [ca.vertcat(*jury), ca.vertcat(ca.SX(0, 1), *(f[i, j] for i, j in low))]
+    return ca.Function("jury_rows", [m, x], [ca.densify(o) for o in out], ["M", "X"], ["jury", "low"])
 
 
 def schur_basis(matrix: Array) -> Array:
@@ -118,7 +120,7 @@ def schur_basis(matrix: Array) -> Array:
 
 
 def _first_pair(t: Array) -> tuple[int, int]:
-    """Choose the diagonal entries of a real Schur form that form the first block."""
+    """Choose the two diagonal entries of a real Schur form that make up the first block."""
     double = np.flatnonzero(np.diag(t, -1))
     if len(double):
         return int(double[0]), int(double[0]) + 1
@@ -128,8 +130,8 @@ def _first_pair(t: Array) -> tuple[int, int]:
         return int(order[0]), int(order[1])
     # an odd number leaves one alone: the one whose removal leaves the smallest gaps
     gaps = [np.sum(np.diff(np.delete(value, k))[::2]) for k in range(0, len(order), 2)]
-    left = np.delete(order, 2 * int(np.argmin(gaps)))
-    return int(left[0]), int(left[1])
+    paired = np.delete(order, 2 * int(np.argmin(gaps)))
+    return int(paired[0]), int(paired[1])
 
 
 class _Bound:
@@ -148,18 +150,18 @@ class _Bound:
         self.unknowns = self.rows.size1_in(1)
         self.upper = np.concatenate([np.full(self.rows.size1_out(0), np.inf), np.zeros(self.rows.size1_out(1))])
 
-    def turned(self, p: Array) -> Array:
+    def rotated(self, p: Array) -> Array:
         """Return `Q' M Q`."""
         return np.asarray(self.basis.T @ np.asarray(self.matrix(p)) @ self.basis)
 
     def values(self, p: Array, x: Array) -> Array:
         """Return Jury's rows, then the entries below the blocks."""
-        return np.concatenate([np.asarray(v).ravel() for v in self.rows(self.turned(p), x)])
+        return np.concatenate([np.asarray(v).ravel() for v in self.rows(self.rotated(p), x)])
 
     def slopes(self, p: Array, x: Array) -> tuple[Array, Array]:
         """Return the rows' Jacobians with respect to `vec(Q' M Q)` and to X."""
-        held_m, held_x, low_m, low_x = map(np.asarray, self.rows_slope(self.turned(p), x, 0, 0))
-        return np.vstack([held_m, low_m]), np.vstack([held_x, low_x])
+        jury_m, jury_x, low_m, low_x = map(np.asarray, self.rows_slope(self.rotated(p), x, 0, 0))
+        return np.vstack([jury_m, low_m]), np.vstack([jury_x, low_x])
 
 
 class SchurProblem:
@@ -242,114 +244,120 @@ class SchurProblem:
         p, row, first = problem.parameters(self.theta(x)), len(self.kept), np.cumsum([0, *problem.g_sizes])
         for bound, at in zip(self.bounds, self.places, strict=True):
             by_m = bound.slopes(p, x[at])[0]
-            force = float(rows[row : row + len(by_m)] @ by_m @ bound.turned(p).ravel(order="F"))
+            force = float(rows[row : row + len(by_m)] @ by_m @ bound.rotated(p).ravel(order="F"))
             out[n + first[problem.constraints.index(bound.limit)]] = max(force, 0.0)
             row += len(by_m)
         return out
 
 
-def within_bounds(
+def solve_within_radii(
     problem: Problem,
     start: Array | None,
     solve: Solve,
-    last: GaussNewton = STEP,
-    held: bool = False,
+    bound_solver: GaussNewton = BOUND_STEP_SOLVER,
+    at_bound: bool = False,
     progress: Progress | None = None,
 ) -> Solution:
     """Solve a problem that may have exact bounds on spectral radii.
 
-    `solve` solves a problem from a start, by default the problem's own; any solver. `last` holds the options of the
-    solves at the bounds themselves, and `progress` receives their iterations. With `held` the bounds are known to hold
-    the solution, and the solve without them is left out.
+    `solve` is any solver's function of a problem and a start. `bound_solver` makes the solves at the bounds, and
+    `progress` receives their iterations. `at_bound` says that the solution is known to lie at a bound, so the solve
+    without the bounds is left out.
     """
     if not radius_limits(problem):
         return solve(problem, start)
-    ends = time.perf_counter() + last.time_limit
+    ends = time.perf_counter() + bound_solver.time_limit
     given = begin = problem.start if start is None else start
-    if not held:
-        found = solve(problem.with_constraints(loosened(problem.constraints)), start)
-        if found.status in (Status.INTERRUPTED, Status.DIVERGED_START) or _room(problem, found.theta) >= 0:
+    if not at_bound:
+        found = solve(problem.with_constraints(loosen_radii(problem.constraints)), start)
+        if found.status in (Status.INTERRUPTED, Status.DIVERGED_START) or _log_room(problem, found.theta) >= 0:
             return found
-        begin = begin if at_bounds(problem, begin) else found.theta
-    tightened = tighten(problem, begin, _until(ends, last), progress)
-    if begin is not given and _beats(problem, given, tightened):
-        tightened = tighten(problem, given, _until(ends, last), progress)
+        begin = begin if near_radius(problem, begin) else found.theta
+    tightened = tighten_radii(problem, begin, _with_time_left(ends, bound_solver), progress)
+    if begin is not given and _is_better(problem, given, tightened):
+        tightened = tighten_radii(problem, given, _with_time_left(ends, bound_solver), progress)
     return tightened
 
 
-def at_bounds(problem: Problem, theta: Array) -> bool:
-    """Whether a point is inside every exact bound on a radius and close to one; False where there is none."""
-    return bool(radius_limits(problem)) and 0 <= _room(problem, theta) <= NEAR
+def near_radius(problem: Problem, theta: Array) -> bool:
+    """Tell whether a point is inside every exact bound on a radius and close to one; False if there are no bounds."""
+    return bool(radius_limits(problem)) and 0 <= _log_room(problem, theta) <= NEAR
 
 
-def held_at_bounds(problem: Problem, theta: Array, solution: Solution) -> bool:
-    """Whether a bound on a radius holds a point in place, judged by the solution's multipliers where it has any."""
+def at_active_radius(problem: Problem, theta: Array, solution: Solution) -> bool:
+    """Tell whether a bound on a radius is active at a point, by the solution's multipliers if it has any."""
     limits, force = radius_limits(problem), np.abs(solution.multipliers[problem.size :])
     rows = np.repeat([c in limits for c in problem.constraints], problem.g_sizes).astype(bool)
-    idle = len(force) == len(rows) and bool(np.max(force[rows], initial=0.0) <= FELT * solution.cost)  # nan is unknown
-    return not idle and at_bounds(problem, theta)
+    idle = len(force) == len(rows) and bool(
+        np.max(force[rows], initial=0.0) <= ACTIVE_MULTIPLIER * solution.cost
+    )  # nan is unknown
+    return not idle and near_radius(problem, theta)
 
 
-def tighten(problem: Problem, theta: Array, last: GaussNewton, progress: Progress | None = None) -> Solution:
-    """Lead the bounds from the radii at θ to where they are wanted, and return the best solution inside."""
+def tighten_radii(
+    problem: Problem, theta: Array, bound_solver: GaussNewton, progress: Progress | None = None
+) -> Solution:
+    """Tighten the bounds step by step from the radii at θ to the wanted ones; return the best solution inside."""
     if not np.isfinite(problem.cost(theta)):
-        theta = _scaled(problem, theta)
+        theta = _scale_inside(problem, theta)
     if not np.isfinite(problem.cost(theta)):
-        return unsolved(problem, theta, Status.DIVERGED_START)
-    ends = time.perf_counter() + last.time_limit
-    for constraints in _path(problem, theta):
+        return point_as_solution(problem, theta, Status.DIVERGED_START)
+    ends = time.perf_counter() + bound_solver.time_limit
+    for constraints in _tightening_path(problem, theta):
         step = problem.with_constraints(constraints)
-        found = _solve_rows(step, _scaled(step, theta), _until(ends, STEP), MARGINS[0], progress)
+        found = _solve_jury_rows(
+            step, _scale_inside(step, theta), _with_time_left(ends, BOUND_STEP_SOLVER), MARGINS[0], progress
+        )
         if found.status is Status.INTERRUPTED:
             return found
         theta = found.theta if found.status is not Status.INFEASIBLE else theta
-    theta, iterations = _scaled(problem, theta), 0
-    best = unsolved(problem, theta, Status.RESTORED if _met(problem, theta) else Status.INFEASIBLE)
-    for _ in range(ROUNDS):
-        found = _solve_inside(problem, theta, last, ends, progress)
+    theta, iterations = _scale_inside(problem, theta), 0
+    best = point_as_solution(problem, theta, Status.RESTORED if _meets_all(problem, theta) else Status.INFEASIBLE)
+    for _ in range(SCHUR_ROUNDS):
+        found = _solve_inside(problem, theta, bound_solver, ends, progress)
         iterations += found.iterations
         if found.status is Status.INTERRUPTED:
             return found if best.status is Status.INFEASIBLE else replace(best, status=Status.INTERRUPTED)
         first = best.status is Status.INFEASIBLE
         # of two results that are equally good, prefer the one that has converged
-        allowance = GAIN if found.status.converged and not best.status.converged else 0.0
+        allowance = WORTHWHILE_FALL if found.status.converged and not best.status.converged else 0.0
         better = found.status is not Status.INFEASIBLE and (first or found.cost < (1.0 + allowance) * best.cost)
         gain = 1.0 if first else 1.0 - found.cost / max(best.cost, 1e-300)
         best, theta = (found, found.theta) if better else (best, theta)
         if found.status is Status.TIME_LIMIT:
             best = replace(best, status=found.status) if best.status is Status.RESTORED else best
             break
-        if not better or gain < GAIN:
+        if not better or gain < WORTHWHILE_FALL:
             break
     return replace(best, iterations=iterations)
 
 
-def unsolved(problem: Problem, theta: Array, status: Status) -> Solution:
-    """Return a point to which no step of a solver has led: its multipliers are not known."""
+def point_as_solution(problem: Problem, theta: Array, status: Status) -> Solution:
+    """Return a point that no solver has reached as a solution without multipliers."""
     return Solution(theta, problem.cost(theta), status, 0, 0.0)
 
 
-def _path(problem: Problem, theta: Array) -> list[tuple[Constraint, ...]]:
-    """Return the constraints with the bounds on their way from the radii at θ, the wanted bounds left out."""
-    values, limits, ways = problem.model.parameters.unpack(problem.parameters(theta)), radius_limits(problem), {}
+def _tightening_path(problem: Problem, theta: Array) -> list[tuple[Constraint, ...]]:
+    """List the constraints of each tightening step from the radii at θ, without the last (the wanted bounds)."""
+    values, limits, distances = problem.model.parameters.unpack(problem.parameters(theta)), radius_limits(problem), {}
     for c, check in limits.items():
         first = max(-np.log(max(check(values) + check.radius, 1e-300)), CLOSEST)
-        ways[c] = first, max(-np.log(check.radius), first)
-    count = max(1, int(np.ceil(np.log2(max(b / a for a, b in ways.values())))))
+        distances[c] = first, max(-np.log(check.radius), first)
+    count = max(1, int(np.ceil(np.log2(max(b / a for a, b in distances.values())))))
     steps = []
     for k in range(1, count):
-        radii = {c: float(np.exp(-(a ** (1 - k / count)) * b ** (k / count))) for c, (a, b) in ways.items()}
+        radii = {c: float(np.exp(-(a ** (1 - k / count)) * b ** (k / count))) for c, (a, b) in distances.items()}
         looser = {c: replace(check, radius=max(radii[c], check.radius)) for c, check in limits.items()}
         steps.append(tuple(replace(c, check=looser[c]) if c in looser else c for c in problem.constraints))
     return steps
 
 
-def _scaled(problem: Problem, theta: Array) -> Array:
+def _scale_inside(problem: Problem, theta: Array) -> Array:
     """Scale A and B_w so that every radius is inside; return θ as it is where they may not be scaled."""
     parameters = problem.model.parameters
     names = [name for name in ("A", "B_w") if name in parameters and parameters[name].size]
     values = parameters.unpack(problem.parameters(theta))
-    room = _room(problem, theta)
+    room = _log_room(problem, theta)
     if room > 0 or any(np.any(parameters[k].fixed & (parameters[k].value != 0)) for k in names):
         return theta
     share = 0.999 * float(np.exp(room))
@@ -358,29 +366,29 @@ def _scaled(problem: Problem, theta: Array) -> Array:
     return np.asarray(np.clip(start, problem.lower, problem.upper))
 
 
-def _room(problem: Problem, theta: Array) -> float:
+def _log_room(problem: Problem, theta: Array) -> float:
     """Return the least distance of the log radii from their bounds; negative outside."""
     values = problem.model.parameters.unpack(problem.parameters(theta))
     with np.errstate(divide="ignore"):
         return min(-float(np.log1p(check(values) / check.radius)) for check in radius_limits(problem).values())
 
 
-def _met(problem: Problem, theta: Array) -> bool:
-    """Whether θ meets every constraint."""
+def _meets_all(problem: Problem, theta: Array) -> bool:
+    """Tell whether θ meets every constraint."""
     g, unit = problem.constraint(theta), problem.constraint_units(theta)
     over = np.maximum(problem.g_lower - g, g - problem.g_upper) - TOLERATED * np.where(unit > 0, unit, 1.0)
-    own = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)  # these have a check of their own
-    return not beyond(problem, theta) and bool(np.all((over <= 0) | own))
+    exact = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)  # judged by `violated_exact`
+    return not violated_exact(problem, theta) and bool(np.all((over <= 0) | exact))
 
 
-def _beats(problem: Problem, theta: Array, found: Solution) -> bool:
-    """Whether θ meets every constraint at a lower cost than the solution found."""
-    if found.status is Status.INTERRUPTED or not _met(problem, theta):
+def _is_better(problem: Problem, theta: Array, found: Solution) -> bool:
+    """Tell whether θ meets every constraint at a lower cost than the solution found."""
+    if found.status is Status.INTERRUPTED or not _meets_all(problem, theta):
         return False
     return found.status is Status.INFEASIBLE or problem.cost(theta) < found.cost
 
 
-def _until(ends: float, solver: GaussNewton) -> GaussNewton:
+def _with_time_left(ends: float, solver: GaussNewton) -> GaussNewton:
     """Return the solver with the time that is left."""
     return replace(solver, time_limit=ends - time.perf_counter())
 
@@ -388,62 +396,62 @@ def _until(ends: float, solver: GaussNewton) -> GaussNewton:
 def _solve_inside(
     problem: Problem, theta: Array, solver: GaussNewton, ends: float, progress: Progress | None
 ) -> Solution:
-    """Solve at the bounds, with a margin wide enough that the eigenvalues of the result are inside."""
-    found = unsolved(problem, theta, Status.INFEASIBLE)
+    """Solve at the bounds with the smallest margin for which the eigenvalues of the result are inside."""
+    found = point_as_solution(problem, theta, Status.INFEASIBLE)
     for margin in MARGINS:
-        found = _solve_rows(problem, theta, _until(ends, solver), margin, progress)
+        found = _solve_jury_rows(problem, theta, _with_time_left(ends, solver), margin, progress)
         if found.status is Status.INTERRUPTED or not np.isfinite(found.cost):
             break
         if found.status is not Status.INFEASIBLE:
-            if not beyond(problem, found.theta):
+            if not violated_exact(problem, found.theta):
                 return found
             theta = found.theta
     return replace(found, status=Status.INTERRUPTED if found.status is Status.INTERRUPTED else Status.INFEASIBLE)
 
 
-def _solve_rows(
+def _solve_jury_rows(
     problem: Problem, theta: Array, solver: GaussNewton, margin: float, progress: Progress | None
 ) -> Solution:
-    """Solve once with the radii as Jury's rows."""
+    """Solve once, with the bounds on radii written as Jury's rows."""
     schur = SchurProblem(problem, theta, margin)
     found = solver.solve(schur, schur.start, progress, unfinished=True)
     multipliers = schur.multipliers(found.theta, found.multipliers)
     return replace(found, theta=schur.theta(found.theta), multipliers=multipliers)
 
 
-def beyond(problem: Problem, theta: Array) -> list[str]:
-    """Return the names of the exact constraints that do not hold at the numbers θ."""
+def violated_exact(problem: Problem, theta: Array) -> list[str]:
+    """List the names of the exact constraints that θ violates."""
     if not any(c.exact for c in problem.constraints):
         return []
     g, first = problem.constraint(theta), np.cumsum([0, *problem.g_sizes])
-    held = (g >= problem.g_lower) & (g <= problem.g_upper)
+    satisfied = (g >= problem.g_lower) & (g <= problem.g_upper)
     values = problem.model.parameters.unpack(problem.parameters(theta))
     return [
         c.name
         for c, (a, b) in zip(problem.constraints, pairwise(first), strict=True)
-        if c.exact and not (np.all(held[a:b]) if c.check is None else c.check(values) <= 0)
+        if c.exact and not (np.all(satisfied[a:b]) if c.check is None else c.check(values) <= 0)
     ]
 
 
-def exactly(problem: Problem, solution: Solution) -> Solution:
-    """Move a solution inside its exact constraints; its status is infeasible where no small step does it."""
+def move_inside_exact(problem: Problem, solution: Solution) -> Solution:
+    """Move a solution inside its exact constraints; the status becomes infeasible if no small step suffices."""
     theta = solution.theta
-    if solution.status is Status.INFEASIBLE or not np.isfinite(solution.cost) or not beyond(problem, theta):
+    if solution.status is Status.INFEASIBLE or not np.isfinite(solution.cost) or not violated_exact(problem, theta):
         return solution
     exact = np.repeat([c.exact for c in problem.constraints], problem.g_sizes)
     hessian = problem.normal(theta)[2]
-    floor = without_rounding(np.diag(hessian), theta, Neighbours(problem.labels))
+    floor = replace_rounding(np.diag(hessian), theta, Neighbours(problem.labels))
     unit = problem.constraint_units(theta, floor)
     unit = np.where(unit > 0, unit, 1.0)
     damped = hessian + MOVE_DAMPING * np.diag(floor)
     damped += np.diag(np.where(np.diag(damped) > 0, 0.0, 1.0))
-    qp, margin = QuadraticProgram(problem.size, len(unit), "daqp"), FIRST
+    qp, margin = QuadraticProgram(problem.size, len(unit), "daqp"), FIRST_MARGIN
 
     def excess(point: Array) -> Array:
         g = problem.constraint(point)
         return np.maximum(problem.g_lower - g, g - problem.g_upper)
 
-    for _ in range(MOVES):
+    for _ in range(MOST_MOVES):
         g = problem.constraint(theta)
         room = np.where(exact, np.minimum(margin * unit, 0.25 * (problem.g_upper - problem.g_lower)), 0.0)
         d, _, good = qp(
@@ -456,14 +464,14 @@ def exactly(problem: Problem, solution: Solution) -> Solution:
             problem.g_upper - room - g,
         )
         trial = np.clip(theta + d, problem.lower, problem.upper)
-        if not good or not np.all(excess(trial) <= unit):  # the step has led astray
+        if not good or not np.all(excess(trial) <= unit):  # the linearisation no longer holds
             break
         theta = trial
-        if not beyond(problem, theta):
+        if not violated_exact(problem, theta):
             break
         margin *= 2.0
     cost, over = problem.cost(theta), np.maximum(excess(theta), 0.0)
-    if beyond(problem, theta) or not np.isfinite(cost) or np.any(over > TOLERATED * unit):
+    if violated_exact(problem, theta) or not np.isfinite(cost) or np.any(over > TOLERATED * unit):
         failed = Status.INFEASIBLE if solution.status.converged else solution.status
         return replace(solution, status=failed)
     return replace(solution, theta=theta, cost=cost, violation=float(np.max(over, initial=0.0)))

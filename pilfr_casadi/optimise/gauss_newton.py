@@ -5,16 +5,16 @@ Each step solves the quadratic program
     minimise  1/2 d'(H + λ D)d + g'd   subject to  lower <= θ + d <= upper,  lower_g <= g(θ) + ∇g d <= upper_g,
 
 with `H` the Gauss-Newton Hessian and `D` the largest diagonal of `H` seen so far (Marquardt 1963; Moré 1978), in which
-`without_rounding` replaces entries that are rounding. At the usual start (`B_w = 0`) whole columns of the Jacobian
+`replace_rounding` replaces entries that are rounding. At the usual start (`B_w = 0`) whole columns of the Jacobian
 vanish and a state space is over-parametrised, so damping is needed and has to know the scales. Trial points are judged
 by simulation alone. `Damping` holds λ and the rule by which it follows the gain ratio (Nielsen 1999).
 
 General constraints enter an exact penalty `μ Σ violation` (`ExactPenalty`), with a second-order correction when a step
-along their tangent violates them. A run may stray to where violating the constraints pays and linear steps do not lead
-back. A run that ends worse than its cheapest feasible point (`BestFeasible`) goes on from there, with more damping and
-a larger penalty.
+along their tangent violates them. A run may stray into a region where violating the constraints lowers the merit and
+linear steps do not lead back. A run that ends worse than its cheapest feasible point (`BestFeasible`) is continued from
+that point, with more damping and a larger penalty.
 
-`first_state` fits with it the state at the beginning of a recording, of a model whose parameters are known.
+`first_state` uses the solver to fit the state at the beginning of a recording to a model with known parameters.
 """
 
 from __future__ import annotations
@@ -36,27 +36,28 @@ from ..data import Recording
 from ..engine import Engine
 from ..models import Model, Neighbours
 from .constraints import TOLERATED
-from .problem import STATE_NOISE, Penalties, Problem, given_state, settled, state_precision
+from .problem import STATE_NOISE, Penalties, Problem, given_state, state_precision, steady_state
 from .solution import Iteration, Progress, Solution, Status
 
-FEASIBLE = 1e-9  # violation, in units of the constraints, that counts as none
-ROUNDED = 1e-12  # violation that rounding alone makes
-RETURNS = 4  # times that a run which has strayed goes on from its best feasible point
+FEASIBLE = 1e-9  # violation, in units of the constraints, up to which a point is feasible
+ROUNDING_VIOLATION = 1e-12  # violation that rounding alone can cause
+MOST_RETURNS = 4  # returns of a run that has strayed to its best feasible point, at most
 ENDED = (Status.CONVERGED, Status.SMALL_STEP, Status.SOLVER_FAILED)  # the run got as far as it can
-STATE_ROUNDS = 20  # solves for a first state, at most, with wider and wider priors
-WIDE = 1.1  # mean square of a first state in units of its prior up to which the prior stays
-KINK = 1e-3  # share of the cost promised in vain from which the point is a kink and multipliers mean nothing
-NOTHING = 1e-24  # cost that is rounding: outputs are off by 1e-12 of their size
-ROUNDING = 1e-20  # squared column norm, next to the largest of its matrix, that is rounding
-NONE = 1e-100  # size of a variable that was driven to zero
-SHRUNK = 1e-2  # share of its first unit below which the unit of a constraint is taken anew
-ACCEPTED = 1e-4  # share of the predicted improvement from which a step is taken: any real descent (Moré 1978)
-IDLE = 1e-3  # share of the tolerance below which a predicted improvement is no reason to damp further
-LEAST_DAMPING, MOST_DAMPING = 1e-12, 1e12  # λ beyond which H + λ D is H, or D, to rounding
-RESTART = 10.0  # factor on the first λ of each return to the best feasible point
-PENALTY = 1.5  # times the largest multiplier: an exact penalty needs more than 1 (Powell 1978)
-SHARES = (1.0, 0.5, 0.1, 0.01, 0.0)  # of the violation that a step removes, where the quadratic program allows no more
-NO_DIVISOR = 1e-300  # keeps quotients of numbers that may be zero finite
+STATE_ROUNDS = 20  # solves for a first state, at most, each with a wider prior
+LARGEST_STATE = 1.1  # mean square of a first state, in units of its prior, above which the prior is widened
+KINK_SHARE = 1e-3  # predicted but unreachable improvement, as a share of the cost, that reveals a kink
+ZERO_COST = 1e-24  # cost that counts as zero: outputs are off by 1e-12 of their size
+ZERO_COLUMN = 1e-20  # squared column norm, relative to the largest of its matrix, that counts as zero
+ZERO_SIZE = 1e-100  # size of a variable that counts as zero
+SHRUNKEN_UNIT = 1e-2  # share of its first unit below which the unit of a constraint is replaced
+ACCEPTED_RATIO = 1e-4  # gain ratio from which a step is accepted: any real descent (Moré 1978)
+NEGLIGIBLE = 1e-3  # share of the tolerance below which a predicted improvement does not justify more damping
+LEAST_DAMPING, MOST_DAMPING = 1e-12, 1e12  # λ outside which H + λ D equals H, or λ D, to rounding
+RESTART_FACTOR = 10.0  # factor on the first λ of each return to the best feasible point
+PENALTY_FACTOR = 1.5  # on the largest multiplier: an exact penalty needs more than 1 (Powell 1978)
+# shares of the violation that a step removes, tried in turn until the quadratic program is feasible
+VIOLATION_SHARES = (1.0, 0.5, 0.1, 0.01, 0.0)
+SMALLEST_DIVISOR = 1e-300  # keeps quotients of numbers that may be zero finite
 Watch = Callable[[np.ndarray], bool]
 
 
@@ -87,7 +88,7 @@ class Minimisation(Protocol):
         """Return their Jacobian (n_g, n)."""
 
     def constraint_units(self, theta: np.ndarray, squares: np.ndarray | None = None, /) -> np.ndarray:
-        """Return a change of each general constraint that counts (n_g,)."""
+        """Return the unit of each general constraint (n_g,), see `Problem.constraint_units`."""
 
 
 @dataclass(frozen=True)
@@ -110,23 +111,23 @@ class Damping:
         return Damping(min(max(self.value, low), high), self.growth)
 
 
-def without_rounding(squares: np.ndarray, theta: np.ndarray, neighbours: Neighbours) -> np.ndarray:
+def replace_rounding(squares: np.ndarray, theta: np.ndarray, neighbours: Neighbours) -> np.ndarray:
     """Replace squared column norms (n,) that are zero or rounding.
 
-    A column is rounding if it is so next to the others of its matrix and if changing its variable by its own size
-    changes the outputs by nothing, as for a state that nothing excites. It gets the norm with which that change would
-    change the outputs by their own size, so that steps along rounding are damped away.
+    A column is rounding if it is negligible beside the others of its matrix and if a change of its variable by its own
+    size does not change the outputs, as for a state that is not excited. It gets the norm with which that change would
+    change the outputs by their own size, so that damping suppresses steps along it.
     """
     size = neighbours.sizes(theta)
-    idle = (squares <= ROUNDING * neighbours.largest(squares)) & (squares * size**2 <= ROUNDING)
-    return np.asarray(np.where(idle, 1.0 / np.where(size > NONE, size, 1.0) ** 2, squares))
+    idle = (squares <= ZERO_COLUMN * neighbours.largest(squares)) & (squares * size**2 <= ZERO_COLUMN)
+    return np.asarray(np.where(idle, 1.0 / np.where(size > ZERO_SIZE, size, 1.0) ** 2, squares))
 
 
 class QuadraticProgram:
     """Dense quadratic program for a step inside limits.
 
-    If the unconstrained step lies inside all limits it is the solution, at the price of a Cholesky factorisation. Only
-    otherwise `ca.conic` is built and finds the active limits.
+    The unconstrained step costs one Cholesky factorisation and is the solution if it lies inside all limits. Otherwise
+    `ca.conic` is built and finds the active limits.
     """
 
     def __init__(self, n: int, n_g: int, plugin: str) -> None:
@@ -151,8 +152,8 @@ class QuadraticProgram:
     ) -> tuple[np.ndarray, np.ndarray, bool]:
         """Minimise `1/2 d'h d + g'd` over `lbx <= d <= ubx, lba <= a d <= uba`; return d, multipliers and success.
 
-        h has a positive diagonal. Solvers have absolute tolerances, so they get unit diagonal and unit rows, and the
-        step in units of the steepest slope or, where there is none, of the violation of the rows at d = 0.
+        h has a positive diagonal. Solvers have absolute tolerances, so the diagonal and the rows are scaled to one,
+        and the step to the steepest slope or, if all slopes are zero, to the violation of the rows at d = 0.
         """
         unit = 1.0 / np.sqrt(np.diag(h))
         a, g = a * unit, g * unit
@@ -160,7 +161,7 @@ class QuadraticProgram:
         row = np.where(row > 0, row, 1.0)
         low, high = lba / row, uba / row
         size = float(np.max(np.abs(g))) or float(np.max(np.maximum(low, -high), initial=0.0))
-        size = max(size, NO_DIVISOR)
+        size = max(size, SMALLEST_DIVISOR)
         rows = a / row[:, None], low / size, high / size
         d, multipliers, good = self._solve(
             h * unit * unit[:, None], g / size, lbx / unit / size, ubx / unit / size, *rows
@@ -170,13 +171,13 @@ class QuadraticProgram:
     def _solve(self, h: np.ndarray, g: np.ndarray, *limits: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
         """Solve the scaled program."""
         lbx, ubx, a, lba, uba = limits
-        d = unconstrained(h, g)
+        d = unconstrained_step(h, g)
         if d is not None and np.all((lbx <= d) & (d <= ubx)):
             slack = a @ d
             if np.all((lba <= slack) & (slack <= uba)):
                 return d, np.zeros(len(d) + len(slack)), True
         low, high = np.concatenate([lbx, lba]), np.concatenate([ubx, uba])
-        if not np.all((low < np.inf) & (high > -np.inf)):  # an overflow or NaN, for which a plugin would raise
+        if not np.all((low < np.inf) & (high > -np.inf)):  # an overflow or NaN, at which a plugin raises
             return np.zeros(len(g)), np.zeros(len(g) + len(a)), False
         out = self._solver(h=h, g=g, lbx=lbx, ubx=ubx, a=a, lba=lba, uba=uba)
         d = np.asarray(out["x"]).ravel()
@@ -184,7 +185,7 @@ class QuadraticProgram:
         return d, multipliers, bool(self._solver.stats()["success"]) and bool(np.all(np.isfinite(d)))
 
 
-def unconstrained(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
+def unconstrained_step(h: np.ndarray, g: np.ndarray) -> np.ndarray | None:
     """Return `-h⁻¹ g` for a positive definite h, else None."""
     from scipy.linalg import cho_factor, cho_solve
 
@@ -199,8 +200,9 @@ class ExactPenalty:
     """General constraints in their units, and the exact penalty `μ Σ violation` by which steps are judged.
 
     The weight μ follows the multipliers by Powell's rule (1978): 1.5 times the largest, or half-way down to that from
-    its last value, and `least` at least. A weight that only grows keeps what multipliers far from the solution
-    required, and crawls. The units (n_g,) are taken where a constraint first has a slope (`Problem.constraint_units`).
+    its last value, but not below `least`. A weight that only grew would stay as large as multipliers far from the
+    solution demanded and make the solver crawl. The units (n_g,) are fixed at the first point where a constraint has a
+    slope (`Problem.constraint_units`).
     """
 
     def __init__(self, problem: Minimisation) -> None:
@@ -208,22 +210,22 @@ class ExactPenalty:
         self.unit, self._known = np.ones(n_g), np.zeros(n_g, dtype=bool)
         self.weight, self.least = 0.0, 0.0
 
-    def measure(self, theta: np.ndarray, squares: np.ndarray) -> None:
-        """Take the units of constraints that have a slope at θ and had none before."""
+    def measure_units(self, theta: np.ndarray, squares: np.ndarray) -> None:
+        """Fix the units of constraints that have a slope at θ and had none before."""
         if not np.all(self._known):
             unit = self.problem.constraint_units(theta, squares)
             first = ~self._known & (unit > 0)
             self.unit[first], self._known[first] = unit[first], True
 
-    def shrink(self, theta: np.ndarray) -> bool:
-        """Adopt units at θ that are far smaller than before; return whether only these reveal a violation.
+    def shrink_units(self, theta: np.ndarray) -> bool:
+        """Adopt units at θ that are far smaller than before; tell whether a violation shows in the new units alone.
 
-        Where a constraint has a pole nearby, such as a gain beside an integrator, its first unit may be immense.
+        The first unit of a constraint near a pole, such as a gain beside an integrator, may be immense.
         """
         if not len(self.unit):
             return False
         unit, before = self.problem.constraint_units(theta), self.violations(theta)
-        smaller = self._known & (unit > 0) & (unit < SHRUNK * self.unit)
+        smaller = self._known & (unit > 0) & (unit < SHRUNKEN_UNIT * self.unit)
         self.unit = np.where(smaller, unit, self.unit)
         return bool(np.any((before <= TOLERATED) & (self.violations(theta) > TOLERATED)))
 
@@ -240,7 +242,7 @@ class ExactPenalty:
         return self.problem.g_lower / self.unit - values, self.problem.g_upper / self.unit - values
 
     def violations(self, theta: np.ndarray) -> np.ndarray:
-        """Return the violation of each constraint in its unit, shape (n_g,); infinite where it has no value."""
+        """Return the violation of each constraint in its unit, shape (n_g,); infinite where it cannot be evaluated."""
         if not len(self.unit):
             return np.zeros(0)
         low, high = self.room(self.values(theta))
@@ -252,47 +254,47 @@ class ExactPenalty:
         return float(self.violations(theta).sum())
 
     def follow(self, multipliers: np.ndarray) -> None:
-        """Let the weight follow the constraints' multipliers (n_g,)."""
+        """Adapt the weight to the constraints' multipliers (n_g,)."""
         if len(multipliers):
-            needed = PENALTY * float(np.max(np.abs(multipliers)))
+            needed = PENALTY_FACTOR * float(np.max(np.abs(multipliers)))
             self.weight = max(needed, 0.5 * (self.weight + needed), self.least)
 
     def raise_to(self, weight: float) -> None:
-        """Set the weight and its lower bound, which at least doubles."""
+        """Raise the weight and its lower bound to `weight`, at least to twice the present lower bound."""
         self.weight = self.least = max(weight, 2.0 * self.least)
 
 
 class BestFeasible:
-    """Cheapest feasible point of a run, and the penalty under which straying from it would not have paid.
-
-    No infeasible point is better than the best feasible one for a penalty of
+    """Cheapest feasible point of a run, and the weight μ of the penalty above which no infeasible point beats it.
 
         μ > max (cost of the best - cost) / violation.
 
-    Another feasible point is worse if it is dearer by more than the share `tolerance` of its cost.
+    Another feasible point is worse if its cost is higher by more than the share `tolerance`.
     """
 
     def __init__(self, tolerance: float) -> None:
-        self.tolerance, self.cost, self.tempting = tolerance, np.inf, 0.0
+        self.tolerance, self.cost, self.weight_needed = tolerance, np.inf, 0.0
         self.theta = self.multipliers = np.zeros(0)
 
-    def see(self, cost: float, violation: float, theta: np.ndarray, multipliers: np.ndarray) -> None:
-        """Take note of a point with its summed violation."""
+    def update(self, cost: float, violation: float, theta: np.ndarray, multipliers: np.ndarray) -> None:
+        """Update the best point, or the weight needed, with a point and its summed violation."""
         if violation > TOLERATED:
-            self.tempting = max(self.tempting, (self.cost - cost) / violation if np.isfinite(self.cost) else 0.0)
+            self.weight_needed = max(
+                self.weight_needed, (self.cost - cost) / violation if np.isfinite(self.cost) else 0.0
+            )
         elif cost < self.cost:
             self.cost, self.theta, self.multipliers = cost, theta, multipliers
 
-    def better(self, cost: float, violation: float) -> bool:
-        """Whether the best feasible point beats one of this cost and violation."""
+    def beats(self, cost: float, violation: float) -> bool:
+        """Tell whether the best feasible point beats one of this cost and violation."""
         return bool(np.isfinite(self.cost)) and (violation > TOLERATED or cost > self.cost * (1.0 + self.tolerance))
 
 
 @contextlib.contextmanager
 def handled_interrupt(handle: Callable[[], None]) -> Iterator[None]:
-    """Let Ctrl-C call `handle` in place of raising KeyboardInterrupt, which CasADi may swallow.
+    """Call `handle` on Ctrl-C in place of raising KeyboardInterrupt, which CasADi may swallow.
 
-    Has no effect outside the main thread, or where somebody else handles Ctrl-C.
+    Has no effect outside the main thread, or where other code handles Ctrl-C.
     """
     ours = threading.current_thread() is threading.main_thread()
     ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -320,7 +322,7 @@ class GaussNewton:
     damping : float
         First Levenberg-Marquardt λ (see `Damping`); larger values give shorter first steps.
     time_limit : float
-        Seconds of a solve; at a bound on a spectral radius of all its repetitions. A fit makes several solves.
+        Seconds for one solve, including its repetitions at a bound on a spectral radius. A fit makes several solves.
     qp : str
         CasADi conic plugin.
 
@@ -339,7 +341,9 @@ class GaussNewton:
 
     def __post_init__(self) -> None:
         if not ca.has_conic(str(self.qp)):
-            raise InputError(f"The QP solver {self.qp!r} is not there; use 'daqp', or another conic plugin of CasADi.")
+            raise InputError(
+                f"The QP solver {self.qp!r} is not available; use 'daqp', or another conic plugin of CasADi."
+            )
 
     def solve(
         self,
@@ -351,8 +355,9 @@ class GaussNewton:
     ) -> Solution:
         """Minimise from `start` (n,), by default the problem's own.
 
-        `watch` receives every accepted point and ends the run by returning True. A run that a limit ends returns its
-        best feasible point or, with `unfinished`, its last point, feasible or not, from which another run can go on.
+        `watch` receives every accepted point and ends the run by returning True. A run that stops at the limit of
+        iterations or time returns its best feasible point. With `unfinished` it returns its last point, feasible or
+        not, so that another run can continue from there.
         """
         return _Run(self, problem, problem.start if start is None else start, progress, watch).run(unfinished)
 
@@ -397,30 +402,30 @@ class _Run:
         try:
             with handled_interrupt(self._interrupt):
                 status = self._iterate()
-                for k in range(RETURNS):
-                    if status in ENDED and self.penalty.shrink(self.theta):
+                for k in range(MOST_RETURNS):
+                    if status in ENDED and self.penalty.shrink_units(self.theta):
                         self.best = BestFeasible(self.options.tolerance)
-                    elif self._strayed(status):
+                    elif self._has_strayed(status):
                         self._go_back()
-                        self.penalty.raise_to(2.0 * self.best.tempting)
+                        self.penalty.raise_to(2.0 * self.best.weight_needed)
                     else:
                         break
-                    self.damping = Damping(self.options.damping * RESTART**k)
+                    self.damping = Damping(self.options.damping * RESTART_FACTOR**k)
                     status = self._iterate()
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
         goes_on = unfinished and status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT)
-        if not goes_on and self.best.better(self.cost, self.penalty.violation(self.theta)):
-            status = Status.SOLVER_FAILED if self._strayed(status) else status
+        if not goes_on and self.best.beats(self.cost, self.penalty.violation(self.theta)):
+            status = Status.SOLVER_FAILED if self._has_strayed(status) else status
             self._go_back()
-        self.penalty.shrink(self.theta)
+        self.penalty.shrink_units(self.theta)
         if status in ENDED and np.any(self.penalty.violations(self.theta) > TOLERATED):
             status = Status.INFEASIBLE
         return self._finish(status)
 
-    def _strayed(self, status: Status) -> bool:
-        """Whether the run ended by itself, and worse than a feasible point that it has seen."""
-        return status in (*ENDED, Status.INFEASIBLE) and self.best.better(self.cost, self.penalty.violation(self.theta))
+    def _has_strayed(self, status: Status) -> bool:
+        """Tell whether the run ended by itself, and worse than a feasible point that it has visited."""
+        return status in (*ENDED, Status.INFEASIBLE) and self.best.beats(self.cost, self.penalty.violation(self.theta))
 
     def _go_back(self) -> None:
         self.cost, self.theta, self.multipliers = self.best.cost, self.best.theta, self.best.multipliers
@@ -437,26 +442,26 @@ class _Run:
         problem, options = self.problem, self.options
         scale, neighbours = np.zeros(problem.size), Neighbours(problem.labels)
         recent: list[tuple[float, float]] = []  # cost and violation
-        fresh = True
+        accepted = True
         while self.tried < options.max_iterations:
             self.tried += 1
             if self.interrupted:
                 return Status.INTERRUPTED
             if time.perf_counter() - self.began > options.time_limit:
                 return Status.TIME_LIMIT
-            if fresh:
+            if accepted:
                 self.cost, gradient, hessian = problem.normal(self.theta)
                 scale = np.maximum(scale, np.diag(hessian))
-                floor = without_rounding(scale, self.theta, neighbours)
-                self.penalty.measure(self.theta, floor)
+                floor = replace_rounding(scale, self.theta, neighbours)
+                self.penalty.measure_units(self.theta, floor)
                 slope, violation = self.penalty.slope(self.theta), self.penalty.violation(self.theta)
                 recent.append((self.cost, violation))
-                self.best.see(self.cost, violation, self.theta, self.multipliers)
+                self.best.update(self.cost, violation, self.theta, self.multipliers)
                 if self.progress:
                     self.progress(self.history[-1] if self.history else Iteration(0, self.cost, 0.0))
                 if self.watch and self.watch(self.theta):
                     return Status.STOPPED_EARLY
-                if self._settled(recent):
+                if self._has_converged(recent):
                     return Status.CONVERGED if violation <= FEASIBLE else Status.INFEASIBLE
             damped = hessian + self.damping.value * np.diag(floor)
             step = self._step(damped, gradient, slope)
@@ -466,27 +471,27 @@ class _Run:
             predicted = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d)
             trial, cost, improvement = self._judge(step, damped, gradient, slope)
             expected = predicted + self.penalty.weight * violation
-            fresh = bool(step.good and improvement > ACCEPTED * expected and improvement > 0)
+            accepted = bool(step.good and improvement > ACCEPTED_RATIO * expected and improvement > 0)
             length = float(np.max(np.abs(step.d) * np.sqrt(floor))) if step.good else 0.0
-            if fresh:
+            if accepted:
                 self.theta, self.cost = trial, cost
-                self.damping = self.damping.after_success(improvement / max(expected, NO_DIVISOR)).within(
+                self.damping = self.damping.after_success(improvement / max(expected, SMALLEST_DIVISOR)).within(
                     LEAST_DAMPING, np.inf
                 )
                 self._record(length)
                 continue
-            if step.good and expected < IDLE * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
-                return self._stalled(hessian, floor, gradient, slope)
+            if step.good and expected < NEGLIGIBLE * options.tolerance * abs(self.cost) and violation <= FEASIBLE:
+                return self._judge_stalled(hessian, floor, gradient, slope)
             self.damping = self.damping.after_failure()
             if self.damping.value > MOST_DAMPING:
-                stalled = self._stalled(hessian, floor, gradient, slope)
+                stalled = self._judge_stalled(hessian, floor, gradient, slope)
                 return Status.INFEASIBLE if violation > TOLERATED else stalled
         return Status.MAX_ITERATIONS
 
-    def _settled(self, recent: list[tuple[float, float]]) -> bool:
-        """Whether the last few steps changed next to nothing, all feasible or all as infeasible as the last."""
+    def _has_converged(self, recent: list[tuple[float, float]]) -> bool:
+        """Tell whether the last steps changed the cost by less than the tolerance, at an unchanged violation."""
         options = self.options
-        if self.cost <= NOTHING and recent[-1][1] <= FEASIBLE:
+        if self.cost <= ZERO_COST and recent[-1][1] <= FEASIBLE:
             return True
         if len(recent) <= options.patience:
             return False
@@ -497,14 +502,15 @@ class _Run:
             return violation - left < options.tolerance * left and merits[0] - merits[1] < options.tolerance * merits[1]
         return max(violation, left) <= FEASIBLE and cost - now < options.tolerance * abs(now)
 
-    def _stalled(self, hessian: np.ndarray, floor: np.ndarray, gradient: np.ndarray, slope: np.ndarray) -> Status:
-        """Judge a step that promises nothing: a minimum, unless only its damping makes it so small.
+    def _judge_stalled(self, hessian: np.ndarray, floor: np.ndarray, gradient: np.ndarray, slope: np.ndarray) -> Status:
+        """Tell a minimum from a point where only the damping makes the step so small.
 
-        Multipliers are taken from a step with little damping; at a kink, where it promises much in vain, they are NaN.
+        Multipliers are taken from a step with little damping. At a kink that step predicts an improvement that no step
+        reaches, and the multipliers are NaN.
         """
         step = self._step(hessian + min(self.damping.value, self.options.damping) * np.diag(floor), gradient, slope)
         promised = -float(gradient @ step.d + 0.5 * step.d @ hessian @ step.d) if step.good else np.inf
-        self.multipliers = step.multipliers * (1.0 if promised < KINK * abs(self.cost) else np.nan)
+        self.multipliers = step.multipliers * (1.0 if promised < KINK_SHARE * abs(self.cost) else np.nan)
         return Status.CONVERGED if promised < self.options.tolerance * abs(self.cost) else Status.SMALL_STEP
 
     def _step(
@@ -513,7 +519,7 @@ class _Run:
         """Solve the quadratic program, removing less of the violation where it is infeasible."""
         problem = self.problem
         low, high = self.penalty.room(self.penalty.values(self.theta) if correction is None else correction)
-        for share in SHARES if self.n_g else SHARES[:1]:
+        for share in VIOLATION_SHARES if self.n_g else VIOLATION_SHARES[:1]:
             d, multipliers, good = self.qp(
                 damped,
                 gradient,
@@ -534,18 +540,18 @@ class _Run:
         if not step.good:
             return self.theta, self.cost, -np.inf
         problem, here = self.problem, self.penalty.violation(self.theta)
-        trial = self._end_of(step)
+        trial = self._end_of_step(step)
         there = self.penalty.violation(trial)
-        if self.n_g and there > max(here, ROUNDED):
+        if self.n_g and there > max(here, ROUNDING_VIOLATION):
             corrected = self._step(damped, gradient, slope, self.penalty.values(trial) - slope @ step.d)
             if corrected.good:
-                candidate = self._end_of(corrected)
+                candidate = self._end_of_step(corrected)
                 if self.penalty.violation(candidate) < there:
                     trial, there = candidate, self.penalty.violation(candidate)
         cost = problem.cost(trial)
         return trial, cost, self.cost - cost + self.penalty.weight * (here - there)
 
-    def _end_of(self, step: _Step) -> np.ndarray:
+    def _end_of_step(self, step: _Step) -> np.ndarray:
         """Return the end of a step: exactly on its active bounds, and inside the others."""
         problem, force, theta = self.problem, step.multipliers[: self.problem.size], self.theta + step.d
         theta = np.where((force < 0) & np.isfinite(problem.lower), problem.lower, theta)
@@ -566,41 +572,41 @@ class _Run:
 
 
 def samples_for_state(model: Model) -> int:
-    """Samples that an unknown initial state is fitted to: ten a state, at least 50."""
+    """Return the number of samples that an unknown initial state is fitted to: ten per state, at least 50."""
     return max(10 * model.n_state, 50)
 
 
 def first_state(
     model: Model, engine: Engine, recording: Recording, samples: int | None = None, *, state_prior: bool = False
 ) -> np.ndarray:
-    """State with memory at a recording's first sample, as its `initial` says; the model's parameters are held.
+    """Find the state with memory at a recording's first sample, as its `initial` says, at the model's parameters.
 
-    Where it is to be estimated, it is fitted to the first `samples` outputs, and later outputs are not looked at. With
-    `state_prior` it has a prior around rest, whose scale is that of a run over all inputs (`state_precision`).
+    A state that is to be estimated is fitted to the first `samples` outputs alone. With `state_prior` it has a prior
+    around rest, on the scale of the states in a run over all inputs (`state_precision`).
     """
     n, values, state = model.n_state, model.parameters.start, given_state(model, recording)
     if recording.begins == "periodic":
         period = model.drive(recording)[: (recording.period or 1) * model.substeps]
-        return settled(engine, period, values, state)
+        return steady_state(engine, period, values, state)
     if recording.begins != "estimate" or not n:
         return state
     head = recording.slice(0, max(min(len(recording), samples or samples_for_state(model)), 2)).with_(skip=0)
     spread = np.std(head.y, axis=0)
     spread = np.where(spread > 0, spread, np.max(spread) or 1.0)
-    held = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
+    fixed = model.parameters.change(**{k: {"fixed": True, "prior": None} for k in model.parameters})
     problem, solver = (
-        Problem(model.with_parameters(held), head, engine=engine, scale=spread),
+        Problem(model.with_parameters(fixed), head, engine=engine, scale=spread),
         GaussNewton(max_iterations=50),
     )
     square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None
     if square is None:
         return solver.solve(problem).theta
     state, wider = problem.start, 1.0
-    for _ in range(STATE_ROUNDS):  # a machine that is let go from afar is no machine in forced motion
-        problem.penalties = Penalties(held, {}, 1.0, problem.residuals, problem.size, [(0, square / wider)])
+    for _ in range(STATE_ROUNDS):  # free decay from a large state exceeds the states of forced motion
+        problem.penalties = Penalties(fixed, {}, 1.0, problem.residuals, problem.size, [(0, square / wider)])
         state = solver.solve(problem, state).theta
         size = float(state @ square @ state) / STATE_NOISE**2 / n
-        if size <= WIDE * wider:
+        if size <= LARGEST_STATE * wider:
             break
         wider = size
     return state

@@ -3,12 +3,12 @@
 IPOPT is given the problem in the units of `Scaled`, with bounds and constraints as they are, and the damped
 Gauss-Newton Hessian of `DampedHessian`: an interior-point iteration turned Levenberg-Marquardt method, with a barrier
 for bounds and a filter for constraints (Wächter & Biegler 2006). With an undamped or the exact Hessian trials diverged.
-Only where IPOPT restores feasibility, and the cost is out of its sight, is the curvature of the constraints used.
+Only while IPOPT restores feasibility, ignoring the cost, the curvature of the constraints is used instead.
 
 An interior-point method pushes away from bounds, and thresholds start on theirs (r = 0): push and barrier are kept
-small next to the first cost, which is 1. Bounds are never relaxed. At the end, variables whose multiplier outweighs
-their distance to a bound are put onto it, where that costs nothing. A diverging simulation is an evaluation error, from
-which the line search backs off.
+small next to the first cost, which is 1. Bounds are never relaxed. At the end, variables whose multiplier exceeds
+their distance to a bound are set to it if that does not raise the cost. A diverging simulation is an evaluation error,
+from which the line search backs off.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ import numpy as np
 
 from .._base import InputError
 from .gauss_newton import (
-    ACCEPTED,
+    ACCEPTED_RATIO,
     LEAST_DAMPING,
     MOST_DAMPING,
-    NO_DIVISOR,
-    ROUNDING,
+    SMALLEST_DIVISOR,
+    ZERO_COLUMN,
     Damping,
     handled_interrupt,
 )
@@ -58,25 +58,22 @@ ENDINGS = {
     "Infeasible_Problem_Detected": Status.INFEASIBLE,
 }
 Sparsities = dict[str, ca.Sparsity]
-FEASIBLE = 1e-8  # violation of a constraint, in units of the change that one scaled variable makes
-MISSED = 1e-6  # the same at the end of a run, from which it counts as infeasible
-ROUNDS = 4  # solves: where IPOPT's line search fails, the next one starts from the best point with more damping
+FEASIBLE = 1e-8  # violation up to which a point is feasible, in units of the change that one scaled variable causes
+INFEASIBLE_FROM = 1e-6  # the same, above which the end of a run is infeasible
+MOST_SOLVES = 4  # when IPOPT's line search fails, the next solve starts from the best point with more damping
 MORE_DAMPING, LEAST_RAISED = 100.0, 1e-2  # factor on λ for the next solve, and the λ that is raised at least
-RAISED, MOST_RAISED = (
-    4.0,
-    100.0,
-)  # factor on λ for each step that the line search shortened, and for all of them at most
-STEPS = 20  # rejected first steps at most, from which norms of the Jacobian's columns are taken
-ONTO = 3  # Newton steps back onto the constraints after variables were put onto their bounds
-SLOWER = 4  # times the patience with a quasi-Newton Hessian, whose steps gain less
+RAISED, MOST_RAISED = 4.0, 100.0  # factor on λ for each shortening by the line search, and the largest factor in all
+MOST_FIRST_STEPS = 20  # most trials of the first step, from which column norms of the Jacobian are computed
+MOST_CORRECTIONS = 3  # Newton steps back onto the constraints after variables were set to their bounds
+QUASI_NEWTON_PATIENCE = 4  # factor on the patience with a quasi-Newton Hessian, whose steps gain less
 
 
 class _Callback(ca.Callback):
     """CasADi Function around a Python function, with its inputs and outputs by name.
 
-    The function takes one flat array an input and returns one value an output. An exception must not cross a solver's
-    C++ frames: CasADi would turn it into a failed evaluation and forget it. `failed` takes it instead, and the solver
-    sees NaN.
+    The function takes one flat array per input and returns one value per output. An exception must not cross a
+    solver's C++ frames: CasADi would turn it into a failed evaluation and forget it. It is passed to `failed` instead,
+    and the solver receives NaN.
     """
 
     def __init__(
@@ -152,12 +149,12 @@ class DampedHessian:
                 self.damping = Damping(raised, self.damping.growth)
             else:
                 ratio = self._ratio(self.before, point, multipliers)
-                poor = ratio < ACCEPTED
+                poor = ratio < ACCEPTED_RATIO
                 self.damping = self.damping.after_failure() if poor else self.damping.after_success(ratio)
             self.damping = self.damping.within(LEAST_DAMPING, MOST_DAMPING)
         self.largest = np.maximum(self.largest, np.diag(point.hessian))
-        # the variables are scaled to order 1: smaller entries have been zero or rounding so far
-        diagonal = np.where(self.largest > ROUNDING, self.largest, 1.0)
+        # the variables are scaled to order 1, so smaller entries are zero or rounding
+        diagonal = np.where(self.largest > ZERO_COLUMN, self.largest, 1.0)
         self.damped = point.hessian + self.damping.value * np.diag(diagonal)
         self.before = point
         return self.damped
@@ -168,7 +165,7 @@ class DampedHessian:
         curvature = 0.5 * float(d @ before.hessian @ d)
         predicted = float((before.gradient + multipliers @ before.slope) @ d) + curvature
         change = after.value - before.value + float(multipliers @ (after.constraints - before.constraints))
-        return 1.0 + (predicted - change) / max(float(d @ self.damped @ d) - curvature, NO_DIVISOR)
+        return 1.0 + (predicted - change) / max(float(d @ self.damped @ d) - curvature, SMALLEST_DIVISOR)
 
 
 class Scaled:
@@ -177,7 +174,7 @@ class Scaled:
         x = s θ,    F(x) = cost(x / s) / cost(θ_0),    G(x) = g(x / s) / u
 
     s are the column norms of the Jacobian over the root of the first cost: a unit of any variable changes the residuals
-    by about their own size. u are the largest entries of each row of ∇g, so results do not depend on anybody's units.
+    by about their own size. u are the largest entries of each row of ∇g. So results do not depend on physical units.
     At the usual start (`B_w = 0`, Krikelis et al. (2024), Eq. 24) whole columns vanish; norms are therefore the larger
     ones of the start, inside the bounds and with a finite cost, and of one damped Gauss-Newton step from it, whose λ is
     raised until it lowers the cost. Derivatives at the start that are not finite raise a FloatingPointError.
@@ -190,7 +187,7 @@ class Scaled:
         if not (np.all(np.isfinite(h)) and np.all(np.isfinite(g))):
             raise FloatingPointError("the derivatives at the start are not finite")
         unit, trial = 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0)), start
-        for _ in range(STEPS):
+        for _ in range(MOST_FIRST_STEPS):
             step = -unit * np.linalg.solve(h * unit * unit[:, None] + self.damping * np.eye(len(g)), g * unit)
             trial = np.clip(start + step, problem.lower, problem.upper)
             there = np.diag(problem.normal(trial)[2]) if problem.cost(trial) <= cost else np.full(len(g), np.nan)
@@ -199,14 +196,14 @@ class Scaled:
                 break
             self.damping *= RAISED
         self.unit = cost if cost > 0 else 1.0
-        self.s = np.sqrt(_filled(squares, problem.labels, start, self.unit) / self.unit)
+        self.s = np.sqrt(_fill_zero_columns(squares, problem.labels, start, self.unit) / self.unit)
         rows = np.max(np.abs(problem.constraint_jacobian(trial) / self.s), axis=1, initial=0.0)
         self.g_unit = np.where(rows > 0, rows, 1.0)
         self.lower, self.upper = problem.lower * self.s, problem.upper * self.s
         self.g_lower, self.g_upper = problem.g_lower / self.g_unit, problem.g_upper / self.g_unit
 
     def theta(self, x: np.ndarray) -> np.ndarray:
-        """θ at x, rounding taken back into the bounds."""
+        """Return θ at x, clipped to the bounds against rounding."""
         return np.asarray(np.clip(x / self.s, self.problem.lower, self.problem.upper))
 
     def constraints(self, theta: np.ndarray) -> np.ndarray:
@@ -218,11 +215,11 @@ class Scaled:
         return self.problem.constraint_jacobian(self.theta(x)) / self.s / self.g_unit[:, None]
 
     def excess(self, g: np.ndarray) -> np.ndarray:
-        """By how much G lies above (positive) or below (negative) its limits, shape (n_g,)."""
+        """Return how far G lies above (positive) or below (negative) its limits, shape (n_g,)."""
         return np.maximum(g - self.g_upper, 0.0) - np.maximum(self.g_lower - g, 0.0)
 
     def point(self, x: np.ndarray) -> Point:
-        """Everything at x, with derivatives."""
+        """Evaluate objective and constraints with derivatives at x."""
         with np.errstate(all="ignore"):
             f, g, h = self.problem.normal(self.theta(x))
             scale = self.s * self.unit
@@ -252,8 +249,8 @@ class Scaled:
         return self.unit * np.concatenate([lam_x * self.s, lam_g / self.g_unit])
 
 
-def _filled(squares: np.ndarray, labels: tuple[str, ...], start: np.ndarray, unit: float) -> np.ndarray:
-    """Give columns that vanish at both points the norm of others of their name, else one that fits their value."""
+def _fill_zero_columns(squares: np.ndarray, labels: tuple[str, ...], start: np.ndarray, unit: float) -> np.ndarray:
+    """Give columns that vanish at both points the median norm of their parameter, else one that fits their value."""
     names, out = np.array([label.split("[")[0] for label in labels]), squares.copy()
     for name in set(names[~(squares > 0)]):
         alike = names == name
@@ -271,7 +268,7 @@ class Ipopt:
     hessian : {"gauss-newton", "limited-memory"}
         Damped Gauss-Newton Hessian, or IPOPT's own quasi-Newton approximation (many more iterations).
     max_iterations : int
-        Iterations in all.
+        Limit of iterations over all solves.
     tolerance : float
         Stop when the cost changed by less than this share over `patience` iterations.
     damping : float
@@ -309,7 +306,7 @@ class Ipopt:
                 ca.nlpsol("check", "ipopt", {"x": x, "f": x**2}, settings)
             except (RuntimeError, TypeError, NotImplementedError):
                 raise InputError(
-                    f"IPOPT does not take the option {name!r} with the value {value!r}; see its own list of options."
+                    f"IPOPT rejects the option {name!r} with the value {value!r}; see its list of options."
                 ) from None
 
     def solve(self, problem: Problem, start: np.ndarray | None = None, progress: Progress | None = None) -> Solution:
@@ -346,16 +343,16 @@ class _Run:
                 return self._solution(Status.DIVERGED_START, message)
             self._keep(start, self.cost)
             damping = self.scaled.damping
-            for _ in range(ROUNDS):
+            for _ in range(MOST_SOLVES):
                 before = (self.violation, self.cost)
                 with handled_interrupt(lambda: self._failed(KeyboardInterrupt())):
                     message = self._nlpsol(damping)
-                status = self._ending(message, *before)
+                status = self._status_of(message, *before)
                 if status is not None:
                     break
                 damping = MORE_DAMPING * max(self.hessian.damping.value, LEAST_RAISED)
             if self.error is None:
-                self._onto_bounds()
+                self._snap_to_bounds()
         except KeyboardInterrupt as interrupt:
             self.error = interrupt
         if isinstance(self.error, KeyboardInterrupt):
@@ -363,11 +360,11 @@ class _Run:
         elif self.error is not None:
             raise self.error
         stopped = status in (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
-        if self.violation > MISSED and not stopped:
+        if self.violation > INFEASIBLE_FROM and not stopped:
             status = Status.INFEASIBLE
         return self._solution(status or Status.SOLVER_FAILED, message)
 
-    def _ending(self, message: str, violation: float, cost: float) -> Status | None:
+    def _status_of(self, message: str, violation: float, cost: float) -> Status | None:
         """Translate IPOPT's return status, given violation and cost before; None to try again."""
         status = self.stopped or ENDINGS.get(message)
         if status is Status.INFEASIBLE and self.violation <= FEASIBLE:
@@ -418,7 +415,7 @@ class _Run:
         return g
 
     def _value(self, x: np.ndarray, _: Any) -> Sequence[Any]:
-        """F and G; infinite where the simulation diverges, from which IPOPT backs off."""
+        """Evaluate F and G; infinite where the simulation diverges, so that IPOPT backs off."""
         if self.stopped:
             return [np.nan, np.full(len(self.problem.g_lower), np.nan)]
         if x.tobytes() != self.at:
@@ -451,7 +448,7 @@ class _Run:
         return [ca.triu(ca.DM(h))]
 
     def _iteration(self, *iterate: np.ndarray) -> Sequence[Any]:
-        """History, progress, and the test for convergence at an accepted iterate; 1 tells IPOPT to stop."""
+        """Record an accepted iterate and test for convergence; 1 tells IPOPT to stop."""
         x, f, g, lam_x, lam_g, _ = iterate
         scaled, options, cost = self.scaled, self.options, float(f[0]) * self.scaled.unit
         step = float(np.max(np.abs(x - self.x)) * np.sqrt(scaled.unit)) if self.history else 0.0
@@ -464,7 +461,7 @@ class _Run:
         low, high = np.concatenate([scaled.lower, scaled.g_lower]), np.concatenate([scaled.upper, scaled.g_upper])
         gap = np.where(multipliers < 0, value - low, high - value)
         barrier = float(np.sum(np.abs(multipliers * np.where(np.isfinite(gap), gap, 0.0)))) * scaled.unit
-        span = options.patience * (1 if options.hessian == "gauss-newton" else SLOWER)
+        span = options.patience * (1 if options.hessian == "gauss-newton" else QUASI_NEWTON_PATIENCE)
         recent = [entry.cost for entry in self.history[-1 - span :]]
         calm = len(recent) > span and max(recent) - min(recent) < options.tolerance * cost
         feasible = np.max(np.abs(scaled.excess(g)), initial=0.0) <= FEASIBLE
@@ -472,15 +469,15 @@ class _Run:
             self.stopped = self.stopped or Status.CONVERGED
         return [int(self.stopped is not None)]
 
-    def _onto_bounds(self) -> None:
-        """Put variables onto the bounds that hold them, mending the constraints, where that costs nothing."""
+    def _snap_to_bounds(self) -> None:
+        """Set variables to their active bounds and restore the constraints, if that does not raise the cost."""
         problem, scaled = self.problem, self.scaled
         theta, force = self.theta.copy(), self.multipliers[: problem.size] / scaled.s / scaled.unit
         for bound, pull in ((problem.lower, -force), (problem.upper, force)):
             near = np.abs(theta - bound) * scaled.s <= np.maximum(pull, 0.0)
             theta[near] = bound[near]
         loose = (theta > problem.lower) & (theta < problem.upper)
-        for _ in range(ONTO):
+        for _ in range(MOST_CORRECTIONS):
             excess = scaled.excess(scaled.constraints(theta))
             rows = np.abs(excess) > 0.1 * FEASIBLE
             if not np.any(rows):
@@ -490,7 +487,7 @@ class _Run:
             theta = np.clip(theta, problem.lower, problem.upper)
         self._keep(theta, problem.cost(theta), margin=self.options.tolerance)
         inside = (self.theta > problem.lower) & (self.theta < problem.upper)
-        self.multipliers[: problem.size][inside] = 0.0  # what the barrier has left there
+        self.multipliers[: problem.size][inside] = 0.0  # the barrier leaves small values there
 
     def _solution(self, status: Status, message: str) -> Solution:
         g = self.problem.constraint(self.theta) if len(self.problem.g_lower) else np.zeros(0)

@@ -28,23 +28,23 @@ from .constraints import Constraint, Rows, check_gain
 
 Array = np.ndarray
 T = TypeVar("T")
-# share of the outputs' deviation that a fitted model is trusted to: its errors change slowly, so the samples of a
-# beginning are not independent; calibrated on fits of the rig, begun at rest and in motion (problems.initial_state)
+# model error assumed when an initial state is estimated, as a share of the outputs' deviation; model errors change
+# slowly, so samples are not independent; calibrated on fits of the rig (problems.initial_state)
 STATE_NOISE = 0.2
-STATE_SAMPLES = 256  # states along a run whose second moments are taken
-STILL_STATE = 1e-3  # deviation of a state that does not move, next to the largest of its kind
-CORRELATED = 1e-6  # variance left to each direction of the correlation matrix
-SETTLED = 1e-10  # change over a period, relative to the largest entry of the state, that counts as none
-NEARLY = 1e-6  # the same change, accepted when the periods run out
-MOST, WAIT = 200, 10  # periods run at most; periods between two Newton steps
-WRITTEN_OUT = 50  # periods at most that `to_nlp` writes out before a recording in steady state
-STILL_MEMORY = 1e-12  # slope of a memory by itself over a period, next to 1, from which nothing moves it
-CHUNK = 512  # samples of a period whose slopes are kept in memory at a time
-STRETCH = 2_000_000  # entries of the Jacobian kept in memory at a time (16 MB)
+STATE_SAMPLES = 256  # states of a run from which second moments are computed
+STILL_STATE = 1e-3  # least deviation of a state, relative to the largest of its kind
+LEAST_CORRELATION_VARIANCE = 1e-6  # added to the diagonal of the correlation matrix
+STEADY = 1e-10  # relative change of the state over a period that counts as none
+NEARLY_STEADY = 1e-6  # the same, accepted after the last period
+MOST_PERIODS, PERIODS_PER_NEWTON_STEP = 200, 10  # limit of periods; periods run between two Newton steps
+MOST_WRITTEN_PERIODS = 50  # most periods that `to_nlp` writes out before a recording in steady state
+STILL_MEMORY = 1e-12  # distance of a memory's slope over a period from 1 up to which nothing moves it
+CHUNK_SAMPLES = 512  # samples of a period whose slopes are kept in memory at a time
+STRETCH_ENTRIES = 2_000_000  # entries of the Jacobian kept in memory at a time (16 MB)
 
 
 @dataclass(frozen=True)
-class Part:
+class PlacedRecording:
     """Recording with its place in the problem.
 
     `first` is the first of its variables, where its initial state is estimated; `state` (n_state,) its first state;
@@ -61,19 +61,23 @@ class Part:
     period: int
 
 
-def lay_out(model: Model, recordings: Sequence[Recording], at: int, scales: Sequence[Array]) -> Iterator[Part]:
-    """Lay out each recording with its first state, which is a variable from index `at` on where it is estimated."""
+def place_recordings(
+    model: Model, recordings: Sequence[Recording], at: int, scales: Sequence[Array]
+) -> Iterator[PlacedRecording]:
+    """Place each recording in the problem; an estimated first state takes the variables from index `at` on."""
     for r, scale in zip(recordings, scales, strict=True):
         steady, estimated = r.begins == "periodic", r.begins == "estimate"
         if steady and r.period is None:
             raise InputError("A recording in periodic steady state needs its period in samples; give `period=`.")
         period = (r.period or len(r)) * model.substeps
-        yield Part(r, at if estimated else None, given_state(model, r), model.drive(r), scale, steady, period)
+        yield PlacedRecording(
+            r, at if estimated else None, given_state(model, r), model.drive(r), scale, steady, period
+        )
         at += estimated * model.n_state
 
 
 def given_state(model: Model, recording: Recording) -> Array:
-    """State with memory (n_state,) at a recording's first sample, where it is given; memory may be left out, else 0."""
+    """Return the given state with memory (n_state,) at a recording's first sample; what is not given is 0."""
     state = np.zeros(model.n_state)
     if not isinstance(recording.initial, str):
         given = np.asarray(recording.initial, dtype=float).ravel()
@@ -85,7 +89,7 @@ def given_state(model: Model, recording: Recording) -> Array:
     return state
 
 
-def checked_weights(given: Sequence[float] | Array | None, count: int) -> Array:
+def check_weights(given: Sequence[float] | Array | None, count: int) -> Array:
     """Return one weight above zero for each recording; ones where none are given."""
     weights = numbers(np.ones(count) if given is None else given, "A weight of a recording").ravel()
     if len(weights) != count or not np.all(weights > 0):
@@ -138,14 +142,14 @@ class Penalties:
         self.weight, self.mean, self.slope = (np.concatenate([a[parameters.free], pad]) for a in (weight, mean, slope))
 
     def value(self, theta: Array) -> float:
-        """Sum of all terms."""
+        """Sum all terms."""
         value = float(0.5 * self.weight @ (theta - self.mean) ** 2 + self.slope @ theta)
         for part, square in self.states:
             value += 0.5 * float(theta[part] @ square @ theta[part])
         return value
 
     def gradient(self, theta: Array) -> Array:
-        """Gradient of `value`, shape (n,)."""
+        """Compute the gradient of `value`, shape (n,)."""
         slope = np.asarray(self.weight * (theta - self.mean) + self.slope)
         for part, square in self.states:
             slope[part] += square @ theta[part]
@@ -161,13 +165,11 @@ class Penalties:
 
 
 def state_precision(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) -> Array | None:
-    """Prior precision (n_state, n_state) of an initial state with memory around rest, in units of the outputs.
+    """Compute the prior precision (n_state, n_state) of an initial state with memory, in units of the outputs.
 
-    The state is taken from `N(0, S)` with the second moments S of the states that a run from rest on the same inputs
-    passes through: an operator that such a run does not move begins at rest, and states and memories go together as
-    they do in motion. The prior is weighed against errors of `STATE_NOISE` a sample.
-
-    None where the run diverges, which says nothing.
+    The prior is `N(0, S)`. S holds the second moments of the states that a run from rest on the same inputs passes
+    through, so an operator that this run does not move begins at rest, and states and memories are correlated as they
+    are in motion. The prior is weighed against errors of `STATE_NOISE` per sample. None if the run diverges.
     """
     state, found = np.zeros(n_x + n_s), []
     with np.errstate(over="ignore", invalid="ignore"):
@@ -181,32 +183,32 @@ def state_precision(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) 
     for group in (slice(0, n_x), slice(n_x, None)):  # states, and memories
         largest = np.max(size[group], initial=0.0)
         size[group] = np.maximum(size[group], STILL_STATE * largest) if largest > 0 else 1.0
-    together = moments / size / size[:, None] + CORRELATED * np.eye(len(size))
+    together = moments / size / size[:, None] + LEAST_CORRELATION_VARIANCE * np.eye(len(size))
     return np.asarray(STATE_NOISE**2 * np.linalg.inv(together) / size / size[:, None])
 
 
-def settled(engine: Engine, period: Array, p: Array, state: Array, tolerance: float = SETTLED) -> Array:
-    """Find the state at the beginning of a steady period; not finite where none is reached.
+def steady_state(engine: Engine, period: Array, p: Array, state: Array, tolerance: float = STEADY) -> Array:
+    """Find the state at the beginning of a steady period; nan where no steady state is reached.
 
-    Periods are run from the given state; for slow poles, where that takes long, Newton's rule on `x = Φ(x)` helps.
-    A period does not determine the memory of operators that never slip in it: that keeps its given value.
+    Periods are run from the given state, with a Newton step on `x = Φ(x)` now and then to speed up slow poles. A period
+    does not determine the memory of operators that never slip in it, so that memory keeps its given value.
     """
     change, size = np.inf, 1.0
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(1, MOST + 1):
+        for k in range(1, MOST_PERIODS + 1):
             before, state = state, engine.simulate(period, p, state)[1]
             change, size = np.max(np.abs(state - before), initial=0.0), np.max(np.abs(state), initial=1e-300)
             if not np.isfinite(change) or change <= tolerance * size:
                 return state
-            if k % WAIT == 0:
-                state = _leap(engine, period, p, state)
-    return state if change <= NEARLY * size else np.full_like(state, np.nan)
+            if k % PERIODS_PER_NEWTON_STEP == 0:
+                state = _newton_step(engine, period, p, state)
+    return state if change <= NEARLY_STEADY * size else np.full_like(state, np.nan)
 
 
-def _leap(engine: Engine, period: Array, p: Array, state: Array) -> Array:
+def _newton_step(engine: Engine, period: Array, p: Array, state: Array) -> Array:
     """Take one Newton step towards the fixed point of a period if that brings it nearer, else run one period."""
     after, slope = state, np.eye(len(state))
-    rows = CHUNK * engine.linear.substeps
+    rows = CHUNK_SAMPLES * engine.linear.substeps
     for a in range(0, len(period), rows):
         _, _, after, slope = engine.sensitivity(period[a : a + rows], p, after, slope, np.full(len(p), -1))
     if not np.all(np.isfinite(slope)):
@@ -220,9 +222,9 @@ def _leap(engine: Engine, period: Array, p: Array, state: Array) -> Array:
 
 
 def steady_slope(after: Array, n: int) -> Array:
-    """`(I - Φ_x)^-1 Φ_θ` from the slope behind one period, columns of θ (n) first: shape (n_state, n).
+    """Compute `(I - Φ_x)^-1 Φ_θ`, (n_state, n), from the slope after one period, whose first n columns belong to θ.
 
-    Memory that nothing moves in a whole period stays where it is: it has no slope.
+    Memory that nothing moves in a whole period has zero slope.
     """
     size = len(after)
     matrix, right = np.eye(size) - after[:, n:], after[:, :n].copy()
@@ -251,12 +253,12 @@ class Problem:
     scale : array, (n_y,), optional
         Divisors of the residuals; by default the outputs' standard deviations over all recordings.
     weights : sequence of float, optional
-        One a recording: its residuals are multiplied by it (see `periods.noise_weights`). The mean stays one over R.
+        One per recording, which multiplies its residuals (see `periods.noise_weights`). The mean still divides by R.
 
     Attributes
     ----------
     threads : int
-        Recordings that are run at a time, where the engine is compiled; the numbers are the same. 1 at first.
+        Recordings run at a time if the engine is compiled (default 1); the numbers do not depend on it.
 
     Raises
     ------
@@ -289,13 +291,13 @@ class Problem:
                     f"the model {len(model.inputs)} and {model.n_y}; they must match."
                 )
         self.scale = output_scale(self.recordings) if scale is None else np.asarray(scale, dtype=float)
-        self.weights = checked_weights(weights, len(self.recordings))
+        self.weights = check_weights(weights, len(self.recordings))
         scales = [self.scale / weight for weight in self.weights]
-        self._parts = list(lay_out(model, self.recordings, self.n_free, scales))
+        self._placed = list(place_recordings(model, self.recordings, self.n_free, scales))
         self.residuals = sum((len(r) - r.skip) * model.n_y for r in self.recordings)  # number of scored residuals R
-        states = [p.state for p in self._parts if p.first is not None]
+        states = [p.state for p in self._placed if p.first is not None]
         self.labels = tuple(np.array(parameters.labels, dtype=object)[self.free]) + tuple(
-            f"initial[{i}].{k}" for i, p in enumerate(self._parts) if p.first is not None for k in range(model.n_state)
+            f"initial[{i}].{k}" for i, p in enumerate(self._placed) if p.first is not None for k in range(model.n_state)
         )
         unbounded = np.full(model.n_state * len(states), np.inf)
         self.lower = np.concatenate([parameters.lower[self.free], -unbounded])
@@ -327,26 +329,29 @@ class Problem:
         return len(self.start)
 
     def parameters(self, theta: Array) -> Array:
-        """The model's full parameter vector (n_p,) at θ."""
+        """Return the model's full parameter vector (n_p,) at θ."""
         p = self._base.copy()
         p[self.free] = theta[: self.n_free]
         return p
 
     def initial_states(self, theta: Array) -> list[Array]:
-        """State with memory from which each recording is run; in steady state the run that leads there begins at it."""
+        """Return the initial state with memory of each recording.
+
+        For a recording in steady state it is the state from which periods are run until they repeat.
+        """
         n = self.model.n_state
-        return [p.state if p.first is None else theta[p.first : p.first + n] for p in self._parts]
+        return [p.state if p.first is None else theta[p.first : p.first + n] for p in self._placed]
 
     def first_states(self, theta: Array) -> list[Array]:
-        """State with memory at each recording's first sample."""
+        """Return the state with memory at each recording's first sample."""
         p = self.parameters(theta)
 
-        def first(part: Part, state: Array) -> Array:
-            return settled(self.engine, part.drive[: part.period], p, state) if part.steady else state
+        def first(part: PlacedRecording, state: Array) -> Array:
+            return steady_state(self.engine, part.drive[: part.period], p, state) if part.steady else state
 
-        return self._each(first, self._parts, self.initial_states(theta))
+        return self._map(first, self._placed, self.initial_states(theta))
 
-    def _each(self, function: Callable[..., T], *items: Sequence[Any]) -> list[T]:
+    def _map(self, function: Callable[..., T], *items: Sequence[Any]) -> list[T]:
         """Map the function over the items, a few at a time."""
         if self.threads == 1 or len(items[0]) == 1 or isinstance(self.engine, VirtualMachine):
             return list(map(function, *items))
@@ -354,15 +359,15 @@ class Problem:
             return list(pool.map(function, *items))
 
     def simulate(self, theta: Array) -> list[Array]:
-        """Simulate all recordings: outputs, one (M, n_y) array each."""
+        """Simulate the outputs of all recordings, one (M, n_y) array per recording."""
         p = self.parameters(theta)
-        drives = [part.drive for part in self._parts]
-        return self._each(lambda u, x: self.engine.simulate(u, p, x)[0], drives, self.first_states(theta))
+        drives = [part.drive for part in self._placed]
+        return self._map(lambda u, x: self.engine.simulate(u, p, x)[0], drives, self.first_states(theta))
 
     def residual(self, theta: Array) -> Array:
-        """Normalised residuals `(y_hat - y) / σ_y` of all scored samples, shape (R,)."""
+        """Compute the normalised residuals `(y_hat - y) / σ_y` of all scored samples, shape (R,)."""
         with np.errstate(over="ignore", invalid="ignore"):
-            pairs = zip(self._parts, self.simulate(theta), strict=True)
+            pairs = zip(self._placed, self.simulate(theta), strict=True)
             return np.concatenate([((y - p.recording.y) / p.scale)[p.recording.skip :].ravel() for p, y in pairs])
 
     def cost(self, theta: Array) -> float:
@@ -372,18 +377,20 @@ class Problem:
             value = 0.5 * float(e @ e) / self.residuals + self.penalties.value(theta)
         return value if np.isfinite(value) else np.inf
 
-    def _first_slope(self, part: Part) -> Array:
-        """Slope of a recording's first state by the free parameters and, where it is not known, by itself."""
+    def _first_slope(self, part: PlacedRecording) -> Array:
+        """Return the slope of a recording's first state by the free parameters and, if it is unknown, by itself."""
         n_state, wide = self.model.n_state, part.first is not None or part.steady
         return np.hstack([np.zeros((n_state, self.n_free)), np.eye(n_state)[:, : n_state * wide]])
 
-    def _run(self, part: Part, theta: Array, state: Array, slope: Array) -> Iterator[tuple[Array, Array, Array | None]]:
-        """Residuals (R_b,), their Jacobian (R_b, n_c) and, behind the first period, the slope of the state.
+    def _run(
+        self, part: PlacedRecording, theta: Array, state: Array, slope: Array
+    ) -> Iterator[tuple[Array, Array, Array | None]]:
+        """Run one recording: yield residuals (R_b,), their Jacobian (R_b, n_c) and the state's slope after a period.
 
-        The run begins at a state with its slope (n_state, n_c).
+        The run begins at a state with its slope (n_state, n_c). Except after the first period the last item is None.
         """
         r, n, p = part.recording, self.model.substeps, self.parameters(theta)
-        length = max(1, STRETCH // max(1, slope.shape[1] * self.model.n_y))
+        length = max(1, STRETCH_ENTRIES // max(1, slope.shape[1] * self.model.n_y))
         a, period = 0, part.period // n
         while a < len(r):
             b = min(a + length, len(r), period if a < period else len(r))
@@ -394,30 +401,30 @@ class Problem:
             yield e, jac[cut:].reshape(e.size, jac.shape[2]), slope if b == period else None
             a = b
 
-    def _places(self, part: Part) -> Array:
-        """Variables that the columns of a recording's Jacobian belong to."""
+    def _variables(self, part: PlacedRecording) -> Array:
+        """Return the variables that the columns of a recording's Jacobian belong to."""
         shared = np.arange(self.n_free)
         return shared if part.first is None else np.append(shared, part.first + np.arange(self.model.n_state))
 
     def stretches(self, theta: Array) -> Iterator[tuple[Array, Array, Array]]:
-        """Residuals (R_b,), their Jacobian (R_b, n_c) and its columns in θ, stretch by stretch of each recording."""
-        for part, state in zip(self._parts, self.first_states(theta), strict=True):
+        """Yield residuals (R_b,), their Jacobian (R_b, n_c) and its columns in θ for each stretch of each recording."""
+        for part, state in zip(self._placed, self.first_states(theta), strict=True):
             slope = self._first_slope(part)
             if part.steady:
                 run = self._run(part, theta, state, slope)
                 slope = steady_slope(next(behind for *_, behind in run if behind is not None), self.n_free)
             for e, jac, _ in self._run(part, theta, state, slope):
-                yield e, jac, self._places(part)
+                yield e, jac, self._variables(part)
 
     def jacobian(self, theta: Array) -> Array:
-        """Jacobian of `residual`, shape (R, size)."""
+        """Compute the Jacobian of `residual`, shape (R, size)."""
         out, at = np.zeros((self.residuals, self.size)), 0
         for e, jac, columns in self.stretches(theta):
             out[at : at + e.size, columns] = jac
             at += e.size
         return out
 
-    def _sums(self, part: Part, theta: Array, state: Array) -> tuple[float, Array, Array]:
+    def _accumulate(self, part: PlacedRecording, theta: Array, state: Array) -> tuple[float, Array, Array]:
         """Accumulate `e'e`, `J'e` and `J'J` over a recording."""
         slope, n = self._first_slope(part), self.n_free
         n_c, after = slope.shape[1], slope
@@ -438,10 +445,10 @@ class Problem:
     def normal(self, theta: Array) -> tuple[float, Array, Array]:
         """Return the objective, its gradient and Gauss-Newton Hessian at θ."""
         value, gradient, hessian = 0.0, np.zeros(self.size), np.zeros((self.size, self.size))
-        found = self._each(lambda part, x: self._sums(part, theta, x), self._parts, self.first_states(theta))
+        found = self._map(lambda part, x: self._accumulate(part, theta, x), self._placed, self.first_states(theta))
         with np.errstate(over="ignore", invalid="ignore"):
-            for part, (more, slope, square) in zip(self._parts, found, strict=True):
-                columns = self._places(part)
+            for part, (more, slope, square) in zip(self._placed, found, strict=True):
+                columns = self._variables(part)
                 value += more
                 gradient[columns] += slope
                 hessian[np.ix_(columns, columns)] += square
@@ -454,18 +461,18 @@ class Problem:
         return self.rows.values(self.parameters(theta))
 
     def constraint_jacobian(self, theta: Array) -> Array:
-        """Jacobian of `constraint`, shape (n_g, size)."""
+        """Compute the Jacobian of `constraint`, shape (n_g, size)."""
         jac = np.zeros((len(self.g_lower), self.size))
         if len(jac):
             jac[:, : self.n_free] = self.rows.slope(self.parameters(theta))[:, self.free]
         return jac
 
     def constraint_units(self, theta: Array, squares: Array | None = None) -> Array:
-        """Return a change of each general constraint that counts, shape (n_g,): as given, else from its variables.
+        """Return the unit of each general constraint, in which its violation is judged, shape (n_g,).
 
-        The largest change that one variable brings about which moves by its size (`Neighbours`) or, where that is zero,
-        by what changes the outputs by their own size, `squares` (size,) being the diagonal of the Gauss-Newton Hessian.
-        Zero where the constraint has no slope.
+        A unit that was not given is the largest change that one variable causes when it moves by its size
+        (`Neighbours`). A variable of size zero moves by what changes the outputs by their own size, according to
+        `squares` (size,), the diagonal of the Gauss-Newton Hessian. The unit is zero if the constraint has no slope.
         """
         size = Neighbours(self.labels).sizes(theta)
         still = np.ones(self.size) if squares is None else 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
@@ -473,13 +480,16 @@ class Problem:
         return self.rows.units_from(np.max(change, axis=1, initial=0.0))
 
     def active_constraints(self, theta: Array, tolerance: float = 1e-7) -> Array:
-        """Which general constraints are at a limit, or beyond, up to a share of their unit: (n_g,), bool."""
+        """Tell which general constraints are at or beyond a limit, within `tolerance` of their unit: (n_g,), bool."""
         g, unit = self.constraint(theta), self.constraint_units(theta)
         slack = tolerance * np.where(unit > 0, unit, 1.0)
         return (g >= self.g_upper - slack) | (g <= self.g_lower + slack)
 
     def nrmse(self, theta: Array) -> list[float]:
-        """NRMSE of each recording (Eq. 27, averaged over outputs); a resting output counts next to all recordings'."""
+        """Compute the NRMSE of each recording (Eq. 27, averaged over outputs).
+
+        An output that rests in a recording is scaled by its deviation over all recordings.
+        """
         out = []
         for r, y in zip(self.recordings, self.simulate(theta), strict=True):
             measured = r.y[r.skip :]
@@ -490,12 +500,12 @@ class Problem:
         return out
 
     def to_nlp(self, periods: int | None = None) -> Horizon:
-        """Write the problem out over the horizon as CasADi expressions, to add costs and constraints of one's own.
+        """Write the problem as CasADi expressions over the whole horizon, to which you can add costs and constraints.
 
         Parameters
         ----------
         periods : int, optional
-            Periods before a recording in periodic steady state; by default as many as the start model takes to settle.
+            Periods simulated before a recording in periodic steady state; by default until the start model settles.
 
         Returns
         -------
@@ -508,7 +518,7 @@ class Problem:
         if self.n_free:
             p[np.flatnonzero(self.free).tolist()] = theta[: self.n_free]
         simulated, residual, initial = [], [], []
-        for part in self._parts:
+        for part in self._placed:
             first, r = part.first, part.recording
             state = ca.MX(ca.DM(part.state)) if first is None else theta[first : first + model.n_state]
             warm_up = np.tile(part.drive[: part.period], (self._periods_before(part, periods), 1))
@@ -535,21 +545,21 @@ class Problem:
             parameters=model.parameters.symbols(p),
         )
 
-    def _periods_before(self, part: Part, periods: int | None) -> int:
-        """Count the periods before a recording in steady state: as asked, else until the start model is settled."""
+    def _periods_before(self, part: PlacedRecording, periods: int | None) -> int:
+        """Return the periods before a recording in steady state: as given, else those until the start model settles."""
         if not part.steady or periods is not None:
             return (periods or 0) * part.steady
         p, state = self.model.parameters.start, part.state
-        for count in range(1, WRITTEN_OUT + 1):
+        for count in range(1, MOST_WRITTEN_PERIODS + 1):
             before, state = state, self.engine.simulate(part.drive[: part.period], p, state)[1]
-            if not np.max(np.abs(state - before), initial=0.0) > NEARLY * np.max(np.abs(state), initial=0.0):
+            if not np.max(np.abs(state - before), initial=0.0) > NEARLY_STEADY * np.max(np.abs(state), initial=0.0):
                 return max(count, 2)
-        return WRITTEN_OUT
+        return MOST_WRITTEN_PERIODS
 
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """A problem as CasADi expressions of its variables θ, in the words of `casadi.nlpsol`.
+    """A problem as CasADi expressions of its variables θ, with the names of `casadi.nlpsol`.
 
     Attributes
     ----------
@@ -566,7 +576,7 @@ class Horizon:
     residual : casadi.MX
         Normalised residuals of the scored samples, shape (R,).
     simulated : tuple of casadi.MX
-        Simulated outputs of each recording, one column a sample, shape (n_y, M), in the recording's units.
+        Simulated outputs of each recording, one column per sample, shape (n_y, M), in the recording's units.
     initial : tuple of casadi.MX
         State with the element's memory before each recording, and before the periods of a periodic one.
     parameters : mapping of str to casadi.MX

@@ -1,4 +1,4 @@
-"""What every solver returns: the best point with a status that is a sentence."""
+"""`Solution`, the result of every solver: the best point, and a status whose value is a sentence."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Status(Enum):
     TIME_LIMIT = "Not converged: the time limit was reached; the best point so far is returned."
     INTERRUPTED = "Not converged: interrupted; the best point so far is returned."
     DIVERGED_START = "Failed: the simulation diverges at the start values; start from a stable model."
-    DIVERGES = "Failed: the model diverges along the training recordings; bound its radius, or free what is fixed."
+    DIVERGES = "Failed: the model diverges on the training recordings; bound its spectral radius, or free parameters."
     INFEASIBLE = "Failed: the constraints cannot be met from this start; loosen them or start elsewhere."
-    RESTORED = "Not converged: the exact bounds are met by scaling the model alone; loosen them or start elsewhere."
+    RESTORED = "Not converged: the exact bounds are met only by scaling the model; loosen them or start elsewhere."
     SOLVER_FAILED = "Not converged: the solver stopped early; the best point so far is returned."
 
     @property
@@ -89,7 +89,7 @@ Progress = Callable[[Iteration], None]
 
 
 AT_RADIUS = 1e-3  # share of a bound within which a radius counts as lying at it
-FELT = 1e-3  # multiplier of a log radius, in units of the objective, from which its bound counts as active
+ACTIVE_MULTIPLIER = 1e-3  # multiplier of log ρ, relative to the objective, above which its bound counts as active
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,11 @@ class Limit:
     kind : str
         "constraint" or "bound".
     value, lower, upper : float
-        The expression's value and its limits; infinite where there is none. Of a bound on a spectral radius the radius
-        itself, by the eigenvalues of the result, and what it is to be at most.
+        Value of the expression and its limits (infinite where there is none). For a bound on a spectral radius, the
+        radius computed from the eigenvalues of the result, and its bound.
     multiplier : float
-        Fall of the objective per unit that the limit is moved outwards; 0 where it is not active, nan where the solver
-        gave none or ended at a kink of the error, where no such rate exists.
+        Decrease of the objective per unit by which the limit is moved outwards; 0 if the limit is not active, nan if
+        the solver gave none or ended at a kink of the error, where no such rate exists.
     active : bool
         Whether the value is at a limit.
     met : bool
@@ -131,7 +131,7 @@ class Limit:
         return f"{self.name}: {self.value:.9g}, {f'active{cost}' if self.active else 'not active'}"
 
 
-def unknown_multipliers(limits: Sequence[Limit], status: Status) -> str:
+def describe_unknown_multipliers(limits: Sequence[Limit], status: Status) -> str:
     """Say why multipliers of active constraints are unknown; empty where they are known."""
     names = [
         limit.name for limit in limits if limit.kind == "constraint" and limit.active and np.isnan(limit.multiplier)
@@ -139,9 +139,9 @@ def unknown_multipliers(limits: Sequence[Limit], status: Status) -> str:
     if not names:
         return ""
     why = (
-        "the solver ended in steps too small to matter, as at a kink of the error, where no rate holds on both sides"
+        "the solver ended in very small steps, as at a kink of the error, where the rate differs on both sides"
         if status is Status.SMALL_STEP
-        else "no step of a solver has led to this point"
+        else "the point was not reached by a step of a solver"
     )
     return f"multipliers are not known ({', '.join(names)}): {why}"
 
@@ -156,15 +156,15 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
         g, low, high = problem.constraint(theta), problem.g_lower, problem.g_upper
         unit = np.maximum(problem.constraint_units(theta), 1e-300)
         met = np.maximum(low - g, g - high) <= TOLERATED * unit
-        # a solver may stop a little short of a limit that holds it
+        # a solver may stop a little short of an active limit
         near = (size[n:] > 0) & (np.minimum(g - low, high - g) <= 10 * TOLERATED * unit)
         active = problem.active_constraints(theta) | near
         checks = [c.check for c, k in zip(problem.constraints, problem.g_sizes, strict=True) for _ in range(k)]
         values = problem.model.parameters.unpack(problem.parameters(theta))
         for i, (name, check) in enumerate(zip(problem.g_labels, checks, strict=True)):
             if isinstance(check, BeyondRadius):
-                felt = not known or bool(size[n + i] > FELT * solution.cost)
-                out.append(_radius(name, check, values, float(size[n + i]), felt))
+                pushes = not known or bool(size[n + i] > ACTIVE_MULTIPLIER * solution.cost)
+                out.append(_radius_limit(name, check, values, float(size[n + i]), pushes))
                 continue
             numbers = float(g[i]), float(low[i]), float(high[i]), float(size[n + i] if active[i] else 0.0)
             out.append(Limit(name, "constraint", *numbers, active=bool(active[i]), met=bool(met[i])))
@@ -175,9 +175,9 @@ def limits_of(problem: Problem, solution: Solution) -> tuple[Limit, ...]:
     return tuple(out)
 
 
-def _radius(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, felt: bool) -> Limit:
-    """Describe a bound on a spectral radius; `force` is the multiplier of its logarithm, `felt` whether it counts."""
+def _radius_limit(name: str, check: BeyondRadius, values: Mapping[str, Any], force: float, pushes: bool) -> Limit:
+    """Describe a bound on a spectral radius; `force` is the multiplier of its logarithm, `pushes` whether it counts."""
     excess, bound = check(values), check.radius
-    active = -excess <= AT_RADIUS * bound and (felt or -excess <= 10 * TOLERATED * bound)
+    active = -excess <= AT_RADIUS * bound and (pushes or -excess <= 10 * TOLERATED * bound)
     multiplier = force / bound if active else 0.0
     return Limit(name, "constraint", excess + bound, -np.inf, bound, multiplier, active, met=excess <= 0)

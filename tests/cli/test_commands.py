@@ -133,6 +133,7 @@ def test_mismatched_recordings_are_refused(capsys, tmp_path, train):
 def test_too_few_samples_for_the_order(capsys, tmp_path):
     path = write_csv(tmp_path / "train.csv", m=40)
     refused(capsys, *fit_arguments(path, tmp_path, "--nx", 8), says=("samples", "smaller model"))
+    assert "engine" not in run(capsys, *fit_arguments(path, tmp_path, "--nx", 8))[1]  # refused before compiling
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from pilfr_casadi._base import InputError
 from pilfr_casadi.identify import Fit, fit, hold_all_but_element, linear_model, normalise_weights
 from pilfr_casadi.linear import select_order
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii, hammerstein, wiener
-from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, unconstrained
+from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, unconstrained_step
 from pilfr_casadi.optimise.gauss_newton import QuadraticProgram
 from problems.zoo_case import excitation, noisy, plays, simulate_lfr
 
@@ -265,8 +265,8 @@ def test_a_step_inside_its_limits_is_that_of_the_quadratic_program():
 
 
 def test_an_indefinite_or_broken_matrix_is_left_to_the_solver():
-    assert unconstrained(-np.eye(2), np.ones(2)) is None
-    assert unconstrained(np.full((2, 2), np.nan), np.ones(2)) is None
+    assert unconstrained_step(-np.eye(2), np.ones(2)) is None
+    assert unconstrained_step(np.full((2, 2), np.nan), np.ones(2)) is None
 
 
 def test_limits_too_far_away_for_numbers_are_no_step():

@@ -80,7 +80,7 @@ def test_weights_belong_to_recordings_whatever_their_order(records, weighted):
     pilfr.fit(weighted, records[1], solver=watching)
     assert [tuple(p.weights) for p in watching.problems] == [(8.0, 1.0), (8.0,)]
     other = three_plays(5, 400).with_(name="other")
-    with pytest.raises(InputError, match=r"recording 'other' is none of them; give weights="):
+    with pytest.raises(InputError, match=r"recording 'other' is not one of them; give weights="):
         pilfr.fit(weighted, [records[0], other])
     with pytest.raises(InputError, match="3 weights"):
         pilfr.prune(weighted, records, weights=(1, 2, 3))

@@ -130,7 +130,7 @@ def test_what_cannot_be_a_constraint(make, words):
     "expression, words",
     [
         (lambda p: p["gain"] if p["A"][0, 0] > 0 else p["A"], "cannot be formed"),
-        (lambda p: max(p["gain"], 1.0), "whether a symbol is true"),
+        (lambda p: max(p["gain"], 1.0), "cannot be used on symbols"),
         (lambda p: None, "cannot be formed"),
         (lambda p: p["A"][5, 5], "cannot be formed"),
     ],

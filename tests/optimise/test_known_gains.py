@@ -43,15 +43,13 @@ def test_a_unit_from_beside_a_pole_is_taken_anew(record):
     model = pilfr.PILFR(1).model(1, 1, {"A": [[1 - 1e-9]], "B_u": [[1.0]], "C_y": [[1.0]]})
     problem = Problem(model, record, constraints=[dc_gain(1.0)])
     penalty, away = ExactPenalty(problem), np.array([0.9, 1.0, 1.0, 0.0, 0.0])
-    penalty.measure(problem.start, np.ones(problem.size))
+    penalty.measure_units(problem.start, np.ones(problem.size))
     assert penalty.unit[0] > 1e11 and penalty.violation(away) < 1e-10  # off by 9, and it seems nothing
-    assert penalty.shrink(away) and penalty.unit[0] < 200 and penalty.violation(away) > 0.05
-    assert not penalty.shrink(away)
+    assert penalty.shrink_units(away) and penalty.unit[0] < 200 and penalty.violation(away) > 0.05
+    assert not penalty.shrink_units(away)
 
 
-@pytest.mark.parametrize(
-    "gain, says", [(1.0, ""), (3.0, "1 of 3 operators never slip in them; within them it comes to 1.0")]
-)
+@pytest.mark.parametrize("gain, says", [(1.0, ""), (3.0, "1 of 3 operators never slip in them; within them it is 1.0")])
 def test_a_gain_that_plays_reach_beyond_the_recording_alone_is_told(record, gain, says):
     fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=2, constraints=[dc_gain(gain)])
     assert fit.limits[-1].met and (says in str(fit) if says else "beyond the recordings" not in str(fit))
@@ -64,8 +62,8 @@ def test_a_gain_that_a_slow_pole_reaches_is_told(record):
     known = {"A": slow.fixed["A"], "B_u": [[0.2], [1e-5]], "C_y": [[1.0, 1.0]]}
     problem = Problem(slow.model(1, 1, known), record, constraints=[dc_gain(2.0)])
     assert describe_reached_gain(problem, problem.start) == (
-        "DC gain = 2 holds only beyond the recordings: it settles over more than their 1200 samples; within them it "
-        "comes to 1.01"
+        "DC gain = 2 holds only beyond the recordings: the response takes more than the 1200 recorded samples to "
+        "settle; within them it is 1.01"
     )
     fast = Problem(slow.model(1, 1, {**known, "C_y": [[2.0, 0.0]]}), record, constraints=[dc_gain(2.0)])
     assert describe_reached_gain(fast, fast.start) == ""

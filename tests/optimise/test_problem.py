@@ -152,7 +152,7 @@ def test_stretches_of_any_length_give_the_same(kind, numbers, monkeypatch):
     p, _ = problem(RECORDINGS[kind]())
     theta = somewhere(p)
     whole, jac = p.normal(theta), p.jacobian(theta)
-    monkeypatch.setattr(module, "STRETCH", numbers)
+    monkeypatch.setattr(module, "STRETCH_ENTRIES", numbers)
     assert len(list(p.stretches(theta))) > len(p.recordings)
     for a, b in zip(p.normal(theta), whole, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.max(np.abs(b)))

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
-from pilfr_casadi.optimise import Problem, Status, stable, unbounded_sentence, within_bounds
+from pilfr_casadi.optimise import Problem, Status, describe_unbounded, solve_within_radii, stable
 from pilfr_casadi.optimise.constraints import least_radius, stability
 from pilfr_casadi.optimise.exact_limits import SchurProblem, below_blocks, jury_rows, schur_basis
 from problems.constrained import radius, three_plays
@@ -178,7 +178,7 @@ def test_a_bound_where_a_is_known(record):
 
 def test_the_seed_of_starts_that_are_not_drawn(record):
     few, more = (pilfr.fit(pilfr.PILFR(1, PLAYS), record, starts=n) for n in (2, 3))
-    assert "the seed changes nothing" in str(few) and "the seed changes nothing" not in str(more)
+    assert "the seed has no effect" in str(few) and "the seed has no effect" not in str(more)
 
 
 def test_every_step_of_a_tightened_fit_is_told(record, monkeypatch):
@@ -219,7 +219,7 @@ def test_a_limit_on_time_holds_for_all_solves_at_a_bound(record, monkeypatch):
     monkeypatch.setattr(pilfr.GaussNewton, "solve", slow)
     solver = pilfr.GaussNewton(time_limit=0.1)
     problem = Problem(linear.model, record, constraints=(stable(0.3, exact=True),))
-    found = within_bounds(problem, None, solver.solve, solver)
+    found = solve_within_radii(problem, None, solver.solve, solver)
     values = problem.model.parameters.unpack(problem.parameters(found.theta))
     assert found.status is Status.TIME_LIMIT and radius_of(values["A"]) <= 0.3
     assert 3 <= len(limits) <= 8 and np.all(np.diff(limits) < 0)
@@ -323,10 +323,10 @@ def test_envelopes_are_bounded_where_large_motions_go():
         assert far == pytest.approx([0.5, 0.5 + a0, 0.6])
         assert radius_by_simulation(structure, p, 1e4) == pytest.approx(0.5 + a0, abs=0.01)
         assert (far[1] > 1) == grows
-        assert "steepest the spectral radius is" in unbounded_sentence(structure, stability(structure, exact=True), p)
+        assert "steepest the spectral radius is" in describe_unbounded(structure, stability(structure, exact=True), p)
     flat, p = generalized({"w": w, "gamma_l_a0": [[0.3]], "gamma_r_a0": [[0.3]]})
-    assert unbounded_sentence(flat, stability(flat, exact=True), p) == ""
-    assert unbounded_sentence(flat, (), p) == ""
+    assert describe_unbounded(flat, stability(flat, exact=True), p) == ""
+    assert describe_unbounded(flat, (), p) == ""
 
 
 @given(seed=st.integers(0, 10_000))
@@ -371,7 +371,7 @@ def test_combined_elements_are_bounded_by_the_sum_of_their_parts():
     }
     limits = stability(structure, exact=True)
     assert [c.check(p) + 1 for c in limits] == pytest.approx([0.5, 0.5 + 0.2 * 3.0 + 0.1 * 1.0])
-    assert unbounded_sentence(structure, limits, p) == ""  # products are bounded
+    assert describe_unbounded(structure, limits, p) == ""  # products are bounded
     assert pickle.loads(pickle.dumps(limits))[1].name == "spectral radius with the element's full slope <= 1"
 
 
@@ -391,10 +391,10 @@ def test_what_no_slope_is_known_of_is_told(record):
     }
     fit = pilfr.fit(structure, record, start=start, solver=pilfr.GaussNewton(max_iterations=3))
     assert [c.name for c in stability(structure)] == ["spectral radius <= 1"]
-    assert "the spectral radius is bounded for the linear part alone: how steep the element is" in str(fit)
+    assert "the spectral radius is bounded for the linear part alone: because the slope of the element" in str(fit)
     wiener = pilfr.wiener(1, pilfr.PrandtlIshlinskii(own, 2))
     values = {k: v.value for k, v in wiener.model(1, 1, {"A": [[0.5]], "C_z": [[1.0]]}).parameters.items()}
-    assert unbounded_sentence(wiener, stability(wiener, exact=True), values) == ""  # nothing is fed back
+    assert describe_unbounded(wiener, stability(wiener, exact=True), values) == ""  # nothing is fed back
 
 
 def gamma(z, p):

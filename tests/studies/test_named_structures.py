@@ -129,7 +129,10 @@ def test_a_campaign_does_each_model_once_and_leaves_columns_empty(folder, capsys
         ("nx = 2\nhidden = 3", "'hidden' in [model] is not for structure = 'lfr'"),
         ('structure = "rnn"\nnx = 2', "'structure' in [model] is 'rnn'; give 'lfr'"),
         ('structure = "narx"\nlags = 2\n[constraints]\nspectral_radius = 0.9', "'spectral_radius' in [constraints]"),
-        ('structure = "narx"\nlags = 2\n[constraints]\ndc_gain = 2.0', "[constraints]: dc_gain is for linear models"),
+        (
+            'structure = "narx"\nlags = 2\n[constraints]\ndc_gain = 2.0',
+            "[constraints]: dc_gain applies to linear models",
+        ),
         (
             '[grid]\nstructure = ["lfr", "ssnn"]\nnx = [1]\n[constraints]\ndc_gain = 2.0',
             "[constraints]: dc_gain is for",
