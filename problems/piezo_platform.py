@@ -78,7 +78,7 @@ class Platform:
         u : array, shape (experiments, period)
             One period of each experiment's voltage, V.
         substeps : int
-            Steps a sample.
+            Steps per sample.
         settle : int
             Periods that are run before.
         """

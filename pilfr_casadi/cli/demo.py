@@ -91,7 +91,10 @@ def identify_rig(folder: Path, workers: int, console: Console) -> int:
     from ..report import fit_report
 
     recordings = demo_recordings()
-    console.print("A force drives one mass, its displacement is measured; a second mass hangs on a hysteretic spring.")
+    console.print(
+        "A force drives one mass, its displacement is measured; a second mass hangs on a hysteretic spring.",
+        soft_wrap=True,
+    )
     found = _fit_rows(recordings, workers)
     interrupted = len(found) < len(SHOWN) or any(f.status is Status.INTERRUPTED for f in found)
     console.print(_table(found, recordings))
@@ -131,7 +134,7 @@ def _fit_rows(recordings: Mapping[str, Recording], workers: int) -> list[Fit]:
 def _table(found: Sequence[Fit], recordings: Mapping[str, Recording]) -> Table:
     from rich.table import Table
 
-    title = "Error of the simulation (NRMSE); published: Krikelis et al. (2024), Table 2"
+    title = "Simulation error (NRMSE); published: Krikelis et al. (2024)"
     table = Table("model", *SETS, "time", title=title)
     for (row, name), result in zip(SHOWN.items(), found, strict=False):
         note = ", interrupted" if result.status is Status.INTERRUPTED else ""

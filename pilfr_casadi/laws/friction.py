@@ -14,7 +14,7 @@ from .base import Law, Local
 KNEE = 0.15  # width of the reversal over the speed at which friction has fallen; above it the two cannot be told apart
 FALL = 0.05  # smallest excess of friction at rest over dry friction
 SPRINGY = 0.08  # threshold of presliding over half the travel; above it the element is a stop of a hysteresis
-MOST = 0.6  # largest threshold tried, over half the travel
+MAX_THRESHOLD = 0.6  # largest threshold tried, over half the travel
 SHARP = 2e-3  # narrowest reversal that is tried in any case, over the speed
 SHARPEST = 1e-4  # narrowest reversal that is tried where the steps resolve it, over the speed
 STABLE = 2.5  # |λ| h up to which a Runge-Kutta step is stable
@@ -85,7 +85,7 @@ class PreslidingFriction(Law):
     dissipative = True
     memory = 1
     starts = {"r": ("half", 0.003, 0.01, 0.03, 0.1, 0.25)}
-    ranges = {"r": ("half", 0.0005, MOST)}
+    ranges = {"r": ("half", 0.0005, MAX_THRESHOLD)}
 
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         following = play(z, s, p["r"])
@@ -93,7 +93,7 @@ class PreslidingFriction(Law):
 
     def doubtful(self, values: Mapping[str, Any]) -> bool:
         """Tell whether the contact springs back over much of the travel: then it is one stop of a hysteresis."""
-        return bool(values["r"] > SPRINGY / MOST * self.parameters()["r"].bounds[1])
+        return bool(values["r"] > SPRINGY / MAX_THRESHOLD * self.parameters()["r"].bounds[1])
 
 
 class StribeckFriction(CoulombFriction):

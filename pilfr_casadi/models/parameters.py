@@ -192,7 +192,7 @@ class ParameterSet(Mapping[str, Parameter]):
 
     @property
     def free(self) -> Array:
-        """Which entries are estimated, shape (size,), bool."""
+        """Mask of the entries that are estimated, shape (size,), bool."""
         return self._stack({n: ~p.fixed for n, p in self.items()}).astype(bool)
 
     @property
