@@ -95,14 +95,14 @@ def fit(
     Parameters
     ----------
     model : PILFR, NARX, NOE, Model, Simulator or Fit
-        A structure (start values are found), a closed model or a simulator of your own, or an earlier fit. The last
-        three start at their values. A simulator is integrated on the recordings' grid, with the `hold` of the
+        A structure, for which start values are computed, or a closed model, a simulator or an earlier fit, whose
+        values are the start. A simulator is integrated on the recordings' grid, with the `hold` of the
         recordings or else its own.
     train : Recording or sequence of Recording
         Training data.
     solver : GaussNewton or Ipopt
         Solver of the final problem, by default `GaussNewton(tolerance=1e-4)`. At an exact bound on a spectral radius
-        a Gauss-Newton SQP makes the last solve.
+        the last solve is always by Gauss-Newton.
     starts, seed : int
         Number of starts (`start` says how they are chosen), and the seed of all of them. With `start="grid"` the first
         two have the element at the output and at the input (Hammerstein and Wiener models have one such start); further

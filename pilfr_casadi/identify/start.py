@@ -466,7 +466,7 @@ def deconvolve_inputs(linear: Values, recording: Recording, states: Array) -> Ar
 
 
 def channel_start(element: PrandtlIshlinskii, z: Array, v: Array) -> Blocks:
-    """Choose envelopes, thresholds and weights (a row each) of one channel from its signal z (M,) and answer v (M,)."""
+    """Choose envelopes, thresholds and weights (one row per name) of a channel from its signal z (M,) and answer v (M,)."""
     centres, low, high = loop_outline(z, v)
     n, operator = element.n, element.operator
     widest = float(np.max(high - low)) / 2
@@ -508,7 +508,7 @@ def _make_rising(curve: Array) -> Array:
 
 
 def fit_envelope(z: Array, curve: Array, neurons: int) -> Blocks:
-    """Fit the parameters `c, a0, a, b, d` (a row each) of an envelope network to a curve (G,) over z (G,)."""
+    """Fit the parameters `c, a0, a, b, d` (one row per name) of an envelope network to a curve (G,) over z."""
     from scipy.optimize import nnls
 
     span = float(z[-1] - z[0]) or 1.0

@@ -77,7 +77,7 @@ def place_recordings(
 
 
 def given_state(model: Model, recording: Recording) -> Array:
-    """Return the given state with memory (n_state,) at a recording's first sample; what is not given is 0."""
+    """Return the given state with memory (n_state,) at a recording's first sample, zero where nothing is given."""
     state = np.zeros(model.n_state)
     if not isinstance(recording.initial, str):
         given = np.asarray(recording.initial, dtype=float).ravel()
@@ -239,7 +239,7 @@ class Problem:
     Parameters
     ----------
     model : Model
-        Closed model; its parameters give start, bounds and what is fixed.
+        Closed model; its parameters give the start, the bounds and the fixed entries.
     recordings : Recording or sequence of Recording
         Data, with their initial states.
     engine : {"auto", "c", "vm"}

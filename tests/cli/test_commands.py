@@ -418,7 +418,7 @@ def test_a_model_that_misses_its_constraints_is_no_usable_result(capsys, tmp_pat
     """What contradicts itself is bad input (2), what no solver could meet no usable result (1), as in a run."""
     write_csv(tmp_path / "train.csv", seed=0, m=200)
     data = fit_arguments(tmp_path / "train.csv", tmp_path, "--operators", 2, "--starts", 1)
-    says = ("'spectral radius <= 1' is infeasible", "gives 2, limits 0 and 1")
+    says = ("'spectral radius <= 1' is infeasible", "give 2, with limits 0 and 1")
     refused(capsys, *data, "--fix", "A=2", says=says)
     refused(capsys, *data, "--bound", "A=1.01:2", says=("bounds of A, 1.01 to 2, allow no", "widen the bounds of A"))
     loop = [option for name in ("B_w", "C_z", "w") for option in ("--bound", f"{name}=0.4:2")]
