@@ -466,7 +466,7 @@ def deconvolve_inputs(linear: Values, recording: Recording, states: Array) -> Ar
 
 
 def channel_start(element: PrandtlIshlinskii, z: Array, v: Array) -> Blocks:
-    """Choose envelopes, thresholds and weights (one row per name) of a channel from its signal z (M,) and answer v (M,)."""
+    """Choose one channel's envelopes, thresholds and weights by name from its signal z (M,) and answer v (M,)."""
     centres, low, high = loop_outline(z, v)
     n, operator = element.n, element.operator
     widest = float(np.max(high - low)) / 2

@@ -391,7 +391,7 @@ def test_what_no_slope_is_known_of_is_told(record):
     }
     fit = pilfr.fit(structure, record, start=start, solver=pilfr.GaussNewton(max_iterations=3))
     assert [c.name for c in stability(structure)] == ["spectral radius <= 1"]
-    assert "the spectral radius is bounded for the linear part alone: because the slope of the element" in str(fit)
+    assert "the spectral radius is bounded for the linear part alone, because the slope of the element" in str(fit)
     wiener = pilfr.wiener(1, pilfr.PrandtlIshlinskii(own, 2))
     values = {k: v.value for k, v in wiener.model(1, 1, {"A": [[0.5]], "C_z": [[1.0]]}).parameters.items()}
     assert describe_unbounded(wiener, stability(wiener, exact=True), values) == ""  # nothing is fed back
