@@ -299,7 +299,7 @@ def test_what_a_compensator_cannot_work_on(small):
     changed = fit.model.parameters.change(w={"value": [[0.5, 0.3, 0.21]]})
     for other in (replace(fit, model=fit.model.with_parameters(changed)), fitted(pilfr.PILFR(3), {})[0]):
         theirs = kalman_filter(other, record, share=1e-3)
-        refused(lambda theirs=theirs: feedforward(fit, record, observer=theirs), "one of another model")
+        refused(lambda theirs=theirs: feedforward(fit, record, observer=theirs), "belongs to another model")
     with_disturbance = kalman_filter(fit, record, share=1e-3, disturbance=True)
     for own, n in ((observer, 5), (with_disturbance, 6)):
         assert feedforward(fit, record, observer=own).step.size1_in(0) == n
@@ -308,4 +308,4 @@ def test_what_a_compensator_cannot_work_on(small):
 @pytest.mark.parametrize("limits", [3, "a", ("a", "b"), (np.nan, 1.0), (1.0, -1.0), (1.0, 2.0, 3.0)])
 def test_a_compensator_without_usable_limits_is_refused(small, limits):
     fit, record = small[:2]
-    refused(lambda: feedforward(fit, record, limits=limits), "Limits of the input")
+    refused(lambda: feedforward(fit, record, limits=limits), "The input limits")
