@@ -76,7 +76,7 @@ def run_command(options: RunOptions) -> int:
 
     def execute() -> RunResult:
         with worker_pool(given.workers) as pool, progress_bar() as progress:
-            return run(given, overwrite=options.overwrite, executor=pool, progress=progress, print_line=_print_line)
+            return run(given, overwrite=options.overwrite, executor=pool, progress=progress, tell=_print_line)
 
     return _report(given, execute, TABLE, MODEL)
 
@@ -105,7 +105,7 @@ def campaign_command(options: CampaignOptions) -> int:
                 executor=executor,
                 ahead=ahead,
                 progress=progress,
-                print_line=_print_line,
+                tell=_print_line,
             )
         _print_summary(result)
         return result

@@ -91,6 +91,12 @@ class Local:
         """Largest z, without the outermost 0.1 %."""
         return float(np.quantile(self.z, 0.999))
 
+    def __getattr__(self, name: str) -> Any:
+        renamed = {"stiffest": "max_stiffness", "firmest": "max_damping"}  # old spellings
+        if name not in renamed:
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+        return getattr(self, renamed[name])
+
     @property
     def reach(self) -> float:
         """Largest |z|."""
@@ -203,6 +209,9 @@ class Law:
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
 
     def __init_subclass__(cls) -> None:
+        own = vars(cls)
+        if "applies" in own and "why_not" not in own:  # the old name of the method
+            cls.why_not = own["applies"]  # type: ignore[method-assign]
         if "units" in vars(cls) and "strength" not in vars(cls):
             cls.strength = tuple(name for name, unit in cls.units.items() if re.match(r"w\b", unit))
 

@@ -114,7 +114,7 @@ def run(
     engine: str | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
-    print_line: PrintLine | None = None,
+    tell: PrintLine | None = None,
 ) -> RunResult:
     """Execute a run file.
 
@@ -132,7 +132,7 @@ def run(
         Executor for the starts of a job; it does not change the numbers.
     progress : callable
         Called with (stage, done, total, smallest training error so far).
-    print_line : callable
+    tell : callable
         Called with a line of text after every job.
 
     Returns
@@ -153,7 +153,7 @@ def run(
         for job in jobs:
             yield [(job, outcome(given, store.recordings, job, executor=executor, progress=progress))]
 
-    return _execute(given, run_in_turn, overwrite, progress, print_line)
+    return _execute(given, run_in_turn, overwrite, progress, tell)
 
 
 def campaign(
@@ -165,7 +165,7 @@ def campaign(
     out: Any = None,
     overwrite: bool = False,
     progress: Progress | None = None,
-    print_line: PrintLine | None = None,
+    tell: PrintLine | None = None,
 ) -> RunResult:
     """Execute all jobs of a run file, every cell of its grid with every seed, side by side.
 
@@ -182,7 +182,7 @@ def campaign(
         worker runs its jobs in a process beside it.
     ahead : int
         Number of jobs submitted to the executor at a time; at least its number of workers.
-    path, out, overwrite, progress, print_line
+    path, out, overwrite, progress, tell
         As for `run`.
 
     Returns
@@ -207,7 +207,7 @@ def campaign(
     def run_in_processes(store: Store, jobs: Sequence[RunJob]) -> Iterator[Batch]:
         return run_side_by_side(given, store.recordings, jobs, executor, ahead)
 
-    return _execute(given, run_in_processes, overwrite, progress, print_line, campaign=True)
+    return _execute(given, run_in_processes, overwrite, progress, tell, campaign=True)
 
 
 def _read_run(path: Any, kind: str, executor: Any, **changes: Any) -> Run:
