@@ -37,7 +37,7 @@ from ..engine import Engine
 from ..models import Model, Neighbours
 from .constraints import TOLERATED
 from .problem import STATE_NOISE, Penalties, Problem, given_state, state_precision, steady_state
-from .solution import Iteration, Progress, Solution, Status
+from .solution import Iteration, Progress, Solution, Status, check_solver_options
 
 FEASIBLE = 1e-9  # violation, in units of the constraints, up to which a point is feasible
 ROUNDING_VIOLATION = 1e-12  # violation that rounding alone can cause
@@ -340,6 +340,7 @@ class GaussNewton:
     qp: str = "daqp"
 
     def __post_init__(self) -> None:
+        check_solver_options(self)
         if not ca.has_conic(str(self.qp)):
             raise InputError(
                 f"The QP solver {self.qp!r} is not available; use 'daqp', or another conic plugin of CasADi."

@@ -33,7 +33,7 @@ from .gauss_newton import (
     handled_interrupt,
 )
 from .problem import Problem
-from .solution import Iteration, Progress, Solution, Status
+from .solution import Iteration, Progress, Solution, Status, check_solver_options
 
 SETTINGS = {
     "print_level": 0,
@@ -293,6 +293,7 @@ class Ipopt:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check_solver_options(self)
         if self.hessian not in ("gauss-newton", "limited-memory"):
             raise InputError(f"The Hessian {self.hessian!r} is unknown; use 'gauss-newton' or 'limited-memory'.")
         if not isinstance(self.options, Mapping):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base import InputError, is_number, positive, whole
 from .constraints import TOLERATED, BeyondRadius
 from .problem import Problem
 
@@ -181,3 +182,13 @@ def _radius_limit(name: str, check: BeyondRadius, values: Mapping[str, Any], for
     active = -excess <= AT_RADIUS * bound and (pushes or -excess <= 10 * TOLERATED * bound)
     multiplier = force / bound if active else 0.0
     return Limit(name, "constraint", excess + bound, -np.inf, bound, multiplier, active, met=excess <= 0)
+
+
+def check_solver_options(solver: Any) -> None:
+    """Refuse limits of a solver that are no numbers, or below zero."""
+    for name in ("max_iterations", "patience"):
+        whole(getattr(solver, name), name, 0)
+    for name in ("tolerance", "damping"):
+        positive(getattr(solver, name), name, zero=True)
+    if not is_number(solver.time_limit) or not solver.time_limit >= 0:
+        raise InputError(f"time_limit={solver.time_limit!r} was given; give seconds, zero or more.")
