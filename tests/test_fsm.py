@@ -68,7 +68,7 @@ def test_the_linear_family_is_found_again():
     assert normal(found, reached, data, 7, jacobian=False)[0] < 1e-6
 
 
-@pytest.mark.parametrize("kind", ["pure", "envelope", "combined"])
+@pytest.mark.parametrize("kind", [pytest.param("pure", marks=pytest.mark.slow), "envelope", "combined"])
 def test_hysteretic_models_begin_near_the_linear_family(kind):
     family, theta = two_modes()
     data = made_up(family, theta)

@@ -190,5 +190,5 @@ def check_solver_options(solver: Any) -> None:
         whole(getattr(solver, name), name, 0)
     for name in ("tolerance", "damping"):
         positive(getattr(solver, name), name, zero=True)
-    if not is_number(solver.time_limit) or not solver.time_limit >= 0:
-        raise InputError(f"time_limit={solver.time_limit!r} was given; give seconds, zero or more.")
+    if not is_number(solver.time_limit) or np.isnan(solver.time_limit):  # below zero, no time is left
+        raise InputError(f"time_limit={solver.time_limit!r} was given; give a number of seconds.")

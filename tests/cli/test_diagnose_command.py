@@ -207,7 +207,7 @@ def test_bad_recordings_are_refused(capsys, files, truth, case):
 def test_a_test_that_equals_the_training_is_refused(capsys, files, truth):
     refused(capsys, *arguments(files, test="train.csv"), says="twice")
     write_csv(files / "copy.csv", *truth["train"])
-    refused(capsys, *arguments(files, test="copy.csv"), says=("copy.csv", "train.csv", "says nothing"))
+    refused(capsys, *arguments(files, test="copy.csv"), says=("copy.csv", "train.csv", "needs other data"))
 
 
 def test_files_that_are_missing_or_in_the_wrong_place(capsys, files):

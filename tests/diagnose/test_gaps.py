@@ -62,6 +62,7 @@ def test_several_gaps_are_found_and_the_recordings_told_apart():
     assert "sample 700 of recording 'a'" in gate.sentence and "sample 1700 of recording 'a'" in gate.sentence
 
 
+@pytest.mark.slow
 def test_friction_is_named_beside_a_gap():
     train = recordings(laws.CoulombFriction(values={"F_c": 3.0, "v_0": 0.01}))
     some = (laws.CoulombFriction, laws.CubicStiffness, laws.QuadraticDrag)

@@ -70,6 +70,7 @@ def test_what_the_dead_zone_made_look_like_an_offset_is_none(opened):
     assert not [g for g in opened.gates if g.finding == "offset"]
 
 
+@pytest.mark.slow
 def test_a_clipped_input_is_a_fault_of_the_recording():
     rng = np.random.default_rng(5)
     t, f = np.arange(1200) * DT, rng.uniform(0.2, 3, 25)

@@ -84,7 +84,7 @@ def test_one_fit_under_every_name():
         (lambda r: GaussNewton(qp="foo"), "'foo'"),
         (lambda r: GaussNewton(max_iterations=-1), "max_iterations is -1"),
         (lambda r: GaussNewton(tolerance=np.nan), "tolerance=nan"),
-        (lambda r: GaussNewton(time_limit=-1.0), "time_limit=-1.0"),
+        (lambda r: GaussNewton(time_limit=np.nan), "time_limit=nan"),
         (lambda r: Ipopt(max_iterations="x"), "max_iterations is 'x'"),
         (lambda r: Ipopt(options={"foo": 1}), "'foo' with the value 1"),
         (lambda r: Ipopt(options={"print_level": "loud"}), "'print_level'"),

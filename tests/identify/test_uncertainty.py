@@ -221,7 +221,7 @@ def well_spread(pivots):
     )
 
 
-@pytest.mark.parametrize("colour", [0.0, 0.8])
+@pytest.mark.parametrize("colour", [pytest.param(0.0, marks=pytest.mark.slow), 0.8])
 def test_monte_carlo_of_a_grey_box(colour):
     """100 noise seeds; with coloured noise the classical formula would be off by a factor of up to three."""
     pivots, classical = [], []

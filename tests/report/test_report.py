@@ -240,7 +240,7 @@ def test_a_folder_that_cannot_be_made(tmp_path):
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("width", [390, pytest.param(1280, marks=pytest.mark.slow)])
 def test_in_a_browser(width, tmp_path):
     fitted = example(n_u=2, n_y=2, channels=2)
     long_name = "a_recording_with_a_name_that_goes_on_and_on_without_a_single_blank_in_it"

@@ -174,7 +174,7 @@ def test_an_interrupted_campaign_goes_on(folder, serial, capsys):
     wait_for(lambda: (folder / "taken").exists() and list(out.glob("jobs/*/model.json")))
     driver.send_signal(signal.SIGINT)  # one job is done at least, and one hangs: the campaign cannot have ended
     _, err = driver.communicate(timeout=30)
-    assert driver.returncode == 130 and "goes on" in sentence(err)
+    assert driver.returncode == 130 and "continues from there" in sentence(err)
     assert {r["job"] for r in rows(out)} == {p.parent.name for p in out.glob("jobs/*/model.json")}
     assert main(["campaign", str(path)]) == 0
     assert "jobs done before" in capsys.readouterr().out
@@ -224,7 +224,7 @@ def test_ctrl_c_ends_a_hand_that_is_about_to_begin(folder, monkeypatch):
 @pytest.mark.parametrize(
     "what, status",
     [
-        ("time.sleep(600)", "TIMED_OUT"),
+        pytest.param("time.sleep(600)", "TIMED_OUT", marks=pytest.mark.slow),
         ("os.kill(os.getpid(), 9)", ""),
         pytest.param("os.rmdir(f'{self.folder}/taken'); os.kill(os.getpid(), 9)", "LOST", marks=pytest.mark.slow),
         ("raise ValueError(7)", "FAILED"),

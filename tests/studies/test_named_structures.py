@@ -135,7 +135,7 @@ def test_a_campaign_does_each_model_once_and_leaves_columns_empty(folder, capsys
         ),
         (
             '[grid]\nstructure = ["lfr", "ssnn"]\nnx = [1]\n[constraints]\ndc_gain = 2.0',
-            "[constraints]: dc_gain is for",
+            "[constraints]: dc_gain applies to",
         ),
         ('[grid]\nstructure = ["narx"]\nlags = [1]\nstart = ["paper"]', "start = 'paper' is not for a NARX or NOE"),
         ('structure = "narx"\nlags = 2\n[constraints]\nordered_thresholds = true', "'r'"),

@@ -101,7 +101,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(folder, finished, kind):
     _, err = process.communicate(timeout=60)
     assert process.returncode == (130 if kind == signal.SIGINT else -signal.SIGKILL), err
     if kind == signal.SIGINT:
-        assert "Interrupted" in sentence(err) and "goes on" in sentence(err)
+        assert "Interrupted" in sentence(err) and "continues from there" in sentence(err)
     assert not (out / "results.csv").exists()
     result = pilfr.run(folder / "rig.toml")
     assert result.done and len(result.done) + len(result.skipped) == 3
