@@ -27,13 +27,7 @@ ORDER = [
     "studies",
     "cli",
 ]
-# verbs of a class that reach forward: Diagnosis.report, Fit.report, Simulator.plot and Simulator.export
-FORWARD = {
-    ("diagnose/result", "report"),
-    ("identify/result", "report"),
-    ("simulators/simulator", "plots"),
-    ("simulators/simulator", "export"),
-}
+FORWARD = {("diagnose/result", "report"), ("identify/result", "report")}  # Diagnosis.report and Fit.report
 CIRCLES_STAY = "diagnose"  # the inside of this folder
 
 

@@ -4,7 +4,7 @@ The files by stage:
 
 - The whole: `run` (the steps in their order), `workbench` (what all steps share), `stages` (progress).
 - Preparation: `preparation` calls the checks of recordings `glitches`, `settling`, `stale`, `gates` (sign, unit,
-  exchange, hold), `clipping`, `gaps`, `timing` and `offset`; `arranged` and `standing` set how recordings begin,
+  exchange, hold), `clipping`, `gaps`, `timing` and `offset`; `standing` sets how recordings begin,
   `finer_steps` the integration steps, `floor` the noise.
 - Search: `search_start`, `search`; candidates are found by `linearise`, `screen`, `remainder` and `flexible`, fitted by
   `candidate` and `explain`, and compared by `choice`, `kinship`, `imitated`, `knees` and `passed_over`; `first_effect`,

@@ -16,9 +16,9 @@ from ..data import Recording
 from ..engine import make_engine
 from ..laws import Law
 from ..simulators import Placed, Simulator, in_series
-from .arranged import opened_at_the_start
 from .knees import knees, moved, on_finer_steps
 from .proof import deviations, shown
+from .standing import opened_at_the_start
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 HEAD = 0.7  # share of each recording that candidates are fitted to

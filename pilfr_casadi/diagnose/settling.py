@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..data import Recording
-from .arranged import opened_at_the_start
 from .gates import Gate
+from .standing import opened_at_the_start
 
 MORE = 1.5  # times the least difference of neighbouring periods that the first one is, where it dies away
 

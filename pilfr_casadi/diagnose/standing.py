@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
+from ..data import Recording
 from ..models import ParameterSet, map_points
 from ..simulators import ClosedEquations, Instant, Simulator, on_grid
 
@@ -50,3 +51,8 @@ def standing(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, 
         for i, value in zip(moved, map_points(z, state[None], u, vector[: p.numel()])[0].ravel(), strict=True):
             state[spans[i]] = simulator.elements[i].law.standing(float(value))
     return state
+
+
+def opened_at_the_start(recording: Recording) -> Recording:
+    """A recording that is not on its steady cycle: the initial state is to be estimated."""
+    return recording.with_(initial="estimate", period=None) if recording.begins == "periodic" else recording

@@ -13,11 +13,11 @@ import numpy as np
 from .._base import InputError
 from ..data import Recording
 from ..simulators import states_along
-from .arranged import opened_at_the_start
 from .floor import effective_size
 from .gates import Gate
 from .proof import deviations
 from .search import Search
+from .standing import opened_at_the_start
 from .workbench import Fitted, Workbench
 
 SHARE = 0.25  # of the mean square that values of their own leave at most

@@ -81,6 +81,10 @@ class Local:
     inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
     from_zero: tuple[bool, ...] = ()
 
+    # old spellings, which laws of users may name in `starts` and `ranges`
+    stiffest = property(lambda self: self.max_stiffness)
+    firmest = property(lambda self: self.max_damping)
+
     @cached_property
     def low(self) -> float:
         """Smallest z, without the outermost 0.1 %."""
@@ -90,12 +94,6 @@ class Local:
     def high(self) -> float:
         """Largest z, without the outermost 0.1 %."""
         return float(np.quantile(self.z, 0.999))
-
-    def __getattr__(self, name: str) -> Any:
-        renamed = {"stiffest": "max_stiffness", "firmest": "max_damping"}  # old spellings
-        if name not in renamed:
-            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
-        return getattr(self, renamed[name])
 
     @property
     def reach(self) -> float:

@@ -109,30 +109,6 @@ class Simulator(Equations):
         given = as_recordings(recordings)
         return float(np.mean([nrmse(self._measured(r), self.simulate(r), r.skip) for r in given]))
 
-    def plot(self, recording: Recording) -> Any:
-        """Draw a recording beside the simulation: the largest swing and the residuals of each output.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        InputError
-            As `nrmse`.
-        """
-        from ..plots import plot_comparison
-
-        measured = self._measured(recording)
-        shown = recording.with_(y=measured, outputs=self.output_names)
-        return plot_comparison(shown, [("simulated", self.simulate(recording))])
-
-    def export(self, dt: float, **options: Any) -> Any:
-        """Make it a step over `dt` seconds with the laws in its ports; options and errors are those of `exported`."""
-        from ..export import exported
-
-        return exported(self, dt=dt, **options)
-
     def __repr__(self) -> str:
         lines = [
             f"Simulator with the states {', '.join(self.states) or 'none'}; inputs {', '.join(self.inputs) or 'none'}; "

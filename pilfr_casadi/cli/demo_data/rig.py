@@ -17,7 +17,7 @@ def dynamics(x: Any, u: Any, p: Any) -> dict[str, Any]:
 
 
 def outputs(x: Any) -> dict[str, Any]:
-    """What is measured."""
+    """Return the measured output."""
     return {"x2": x.x2}
 
 
