@@ -6,6 +6,7 @@ missing; `diagnose` compares it with recordings of the machine and returns a `Di
     import pilfr_casadi as pilfr
 
     train = pilfr.read_csv("train.csv", inputs="force", outputs="x2")
+    print(pilfr.check(simulator, train))  # what these recordings can and cannot tell
     diagnosis = pilfr.diagnose(simulator, train, test=pilfr.read_csv("test.csv", inputs="force", outputs="x2"))
     print(diagnosis)  # where, what, how sure, error before and after
     diagnosis.report("report")  # report.html, diagnosis.json, figures
@@ -72,7 +73,7 @@ if TYPE_CHECKING:
         sine_sweep as sine_sweep,
         tukey_realizations as tukey_realizations,
     )
-    from .diagnose import Diagnosis as Diagnosis
+    from .diagnose import Check as Check, Diagnosis as Diagnosis, check as check
     from .export import Exported as Exported, exported as exported, to_casadi as to_casadi
     from .identify import (
         Fit as Fit,

@@ -204,7 +204,9 @@ def fingerprint(recording: Recording) -> str:
     return hashlib.sha256(recording.u.tobytes() + recording.y.tobytes() + kind).hexdigest()[:16]
 
 
-def check_for_identification(data: Recording | Iterable[Recording], n_min: int = 2) -> tuple[Recording, ...]:
+def check_for_identification(
+    data: Recording | Iterable[Recording], n_min: int = 2, excited: bool = True
+) -> tuple[Recording, ...]:
     """Check that recordings can be fitted together and are excited; return them as a tuple.
 
     Parameters
@@ -213,6 +215,8 @@ def check_for_identification(data: Recording | Iterable[Recording], n_min: int =
         The recordings to fit.
     n_min : int
         Smallest number of scored samples over all recordings, e.g. the number of free parameters.
+    excited : bool
+        Whether recordings are refused where no input ever changes.
 
     Raises
     ------
@@ -243,7 +247,7 @@ def check_for_identification(data: Recording | Iterable[Recording], n_min: int =
             f"there are {scored} scored samples in {len(recordings)} recording(s), but at least {n_min} are needed; "
             "record longer or choose a smaller model."
         )
-    if not any(_varies(r.u[:, i]) for r in recordings for i in range(r.n_u)):
+    if excited and not any(_varies(r.u[:, i]) for r in recordings for i in range(r.n_u)):
         still = "s {} never change" if first.n_u > 1 else " {} never changes"
         raise InputError(
             f"the input{still.format(listed(first.inputs))} in {listed([r.label for r in recordings])}; "

@@ -14,6 +14,7 @@ The files by stage:
 - Verdict: `verdict`, `conclusion`, `description` (the corrected simulator where no name is sure).
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
+- Before any of it: `checkup` tells what the recordings can tell, by `identifiability` and `detectability`.
 - In place of a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
 """
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from .._base import Progress
     from ..data import Recording
     from ..laws import Law
+    from .checkup import BlindSpot as BlindSpot, Check as Check, check as check
     from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
     from .gates import Gate as Gate
     from .mismatch_map import mismatch as mismatch

@@ -276,7 +276,7 @@ def test_version_and_help(capsys):
     assert run(capsys, "--version") == (0, f"pilfr {pilfr.__version__}\n", "")
     status, out, err = run(capsys, "--help")
     assert status == 0 and "pilfr: " not in err
-    for name in ("fit", "diagnose", "simulate", "export", "run", "campaign", "demo"):
+    for name in ("fit", "check", "diagnose", "simulate", "export", "run", "campaign", "demo"):
         assert f"\n  {name} " in out
         assert run(capsys, name, "--help")[0] == 0
 

@@ -1,0 +1,300 @@
+"""Check before solve: what recordings and sensors can tell, from the simulator alone, before a law is fitted.
+
+The simulator's own parameters are refitted once; everything else follows from the simulator linearised along that run:
+`identifiability` says which parameters are told, `detectability` which laws could be seen at which ports.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, one_blas_thread
+from ..data import HOLDS, Recording, as_recordings, check_for_identification
+from ..identify import match_channels
+from ..laws import Law
+from ..simulators import as_simulator
+from .blind_spots import BlindSpot, Excitation, excitations, find_blind_spots, helpful_sensors, next_record
+from .detectability import LawRow, seen_laws, words
+from .floor import Floor, measured_floor, white_part
+from .gates import said_hold
+from .identifiability import ParameterRow, Sensitivity, Tie, told_parameters
+from .linearise import linearised
+from .result import LEFT, plain
+from .workbench import Workbench
+
+FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a sensor of 20 bits
+HALF = 0.5  # of the outputs' power that the refit leaves, from which its linearisation is that of another machine
+FEWEST = 20  # samples, as `diagnose` asks for
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What recordings can tell of a simulator and of what it leaves out.
+
+    Attributes
+    ----------
+    blind_spots : tuple of BlindSpot
+        What they cannot tell, the gravest first.
+    parameters, ties : tuple of ParameterRow, tuple of Tie
+        Free parameters as refitted, and groups that are traded off.
+    laws : tuple of LawRow
+        Every law at every port, and from what strength on it could be seen.
+    classes : tuple of tuple of (port, law)
+        What could not be told apart.
+    excitation : tuple of Excitation
+        Motion at each port.
+    noise : dict
+        `source`, and `deviation` and `share` of the output's deviation by output.
+    error : float
+        NRMSE of the refitted simulator.
+    hold, starts : str, tuple of str
+        Course of the inputs between samples as it was stated ("" where it was not), and the start of each recording.
+    next_record : str
+        The further record that would help most.
+    seconds : float
+    """
+
+    blind_spots: tuple[BlindSpot, ...]
+    parameters: tuple[ParameterRow, ...]
+    ties: tuple[Tie, ...]
+    laws: tuple[LawRow, ...]
+    classes: tuple[tuple[tuple[str, str], ...], ...]
+    excitation: tuple[Excitation, ...]
+    noise: dict[str, Any]
+    error: float
+    hold: str
+    starts: tuple[str, ...]
+    next_record: str
+    seconds: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of check.json; numbers that are not finite are None."""
+        clean: dict[str, Any] = plain(
+            {
+                "schema": 1,
+                "blind_spots": [asdict(b) for b in self.blind_spots],
+                "parameters": [asdict(p) for p in self.parameters],
+                "ties": [{**asdict(t), "sentence": t.sentence} for t in self.ties],
+                "laws": [
+                    {
+                        **asdict(r),
+                        "strength": dict(zip(("name", "value", "unit"), r.strength or (), strict=False)) or None,
+                    }
+                    for r in self.laws
+                ],
+                "classes": [[{"port": p, "law": law} for p, law in group] for group in self.classes],
+                "excitation": [asdict(e) for e in self.excitation],
+                "noise": self.noise,
+                "error": self.error,
+                "hold": self.hold or None,
+                "starts": list(self.starts),
+                "next_record": self.next_record,
+            }
+        )
+        return clean
+
+    def __str__(self) -> str:
+        lines = ["What these recordings cannot tell:"] if self.blind_spots else ["No blind spot was found."]
+        lines += [f"- {b.sentence}" for b in self.blind_spots]
+        lines += ["", *self._parameter_lines(), "", *self._law_lines()]
+        if groups := list(self._group_lines()):
+            lines += ["", "Could not be told apart, one line a group:", *groups]
+        lines += ["", *self._excitation_lines(), "", *self._circumstances(), f"next record: {self.next_record}"]
+        return "\n".join([*lines, f"computed in {self.seconds:.1f} s"])
+
+    def _parameter_lines(self) -> Iterator[str]:
+        if not self.parameters:
+            yield "The simulator has no free parameter."
+            return
+        yield from table(
+            ("parameter", "refitted", "std. error", "told"),
+            [
+                (p.name, f"{p.value:.4g} {p.unit}", "-" if p.std is None else f"{p.std:.2g} {p.unit}", TOLD[p.told])
+                for p in self.parameters
+            ],
+        )
+
+    def _label(self, port: str) -> str:
+        """The port's name, with those of the ports that look the same."""
+        groups = (b.names for b in self.blind_spots if b.kind == "alike-ports")
+        return " = ".join(next((names for names in groups if port in names), (port,)))
+
+    def _group_lines(self) -> Iterator[str]:
+        """Groups of laws that look the same, beyond those at ports that all look the same."""
+        for group in self.classes:
+            names = dict.fromkeys(words((self._label(port), law)) for port, law in group)
+            if len(names) > 1:
+                yield f"- {', '.join(names)}"
+
+    def _law_lines(self) -> Iterator[str]:
+        rows = []
+        ports = dict.fromkeys(r.port for r in self.laws)
+        first = {self._label(name): name for name in reversed(ports)}
+        for port, shown in reversed(first.items()):
+            own = [r for r in self.laws if r.port == shown]
+            seen = sorted((r for r in own if r.seen == "yes"), key=lambda r: r.share or 0.0)
+            rows += [(port, words_of(r.law), _force(r), _percent(r.share), _strength(r)) for r in seen]
+            for reason, laws in _unseen(own).items():
+                rows.append((port, ", ".join(map(words_of, laws)), reason, "", ""))
+        columns = ("port", "law", "seen from (rms)", "share", "strength")
+        yield from table(columns, rows) if rows else ["No law could be seen at any port."]
+
+    def _excitation_lines(self) -> Iterator[str]:
+        rows = [
+            (e.port, f"{e.travel:.3g} {e.unit}", str(e.reversals), str(e.amplitudes), str(e.rests))
+            for e in self.excitation
+        ]
+        yield from table(("local coordinate", "travel", "reversals", "amplitudes", "rests"), rows)
+
+    def _circumstances(self) -> Iterator[str]:
+        noise = ", ".join(f"{name} {value:.2g}" for name, value in self.noise["deviation"].items())
+        yield f"noise ({self.noise['source']}): {noise}"
+        floor = float(np.mean(list(self.noise["share"].values())))
+        times = self.error / max(floor, 1e-300)
+        yield f"refitted: error {_percent(self.error)} of the outputs' deviation, {times:.2g} times the noise"
+        if self.error**2 > HALF:
+            yield "  The simulator explains less than half of the outputs' power: take all of the above as rough."
+        elif times > LEFT:
+            yield "  Something is missing or the noise is slow: the strengths above count the noise alone."
+        yield f"inputs between samples: {HOLD_WORDS[self.hold]}"
+        yield f"start of each recording: {', '.join(self.starts)}"
+
+
+TOLD = {
+    "yes": "yes",
+    "dead": "dead: no output reacts",
+    "flat": "flat: not told within its bounds",
+    "tied": "traded off, see above",
+    "start": "traded off with the unknown start",
+}
+HOLD_WORDS = {
+    "zero": "held",
+    "linear": "interpolated",
+    "": "not stated, here taken as held; say hold='zero' or hold='linear' if you know",
+}
+SOURCES = {
+    "periods": "from the periods",
+    "repeats": "from repeated recordings",
+    "estimated": "from the refit's residual",
+}
+
+
+@one_blas_thread
+def check(
+    simulator: Any,
+    train: Recording | Sequence[Recording],
+    hold: str | None = None,
+    laws: Sequence[type[Law]] | None = None,
+    engine: str = "auto",
+) -> Check:
+    """Tell what recordings can and cannot tell of a simulator and of what it leaves out, before a law is fitted.
+
+    Parameters
+    ----------
+    simulator : Simulator, control.StateSpace, or a fitted PI-LFR
+        The simulator, with nominal parameters, bounds and ports.
+    train : Recording or sequence of Recording
+        The recordings that are to be diagnosed.
+    hold : {"zero", "linear"}, optional
+        Course of the inputs between samples, if neither recordings nor simulator say; held by default.
+    laws : sequence of Law classes, optional
+        By default the plainest form of each law of the catalogue.
+    engine : {"auto", "c", "vm"}
+        Generated C or CasADi's virtual machine; by default C where there is a compiler.
+
+    Returns
+    -------
+    Check
+
+    Raises
+    ------
+    InputError
+        If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
+    """
+    began = time.perf_counter()
+    if hold not in HOLDS:
+        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear' or None.")
+    simulator = as_simulator(simulator, as_recordings(train))
+    recordings = check_for_identification(
+        [match_channels(simulator, r) for r in as_recordings(train)], FEWEST, excited=False
+    )
+    for law in laws or ():
+        if not (isinstance(law, type) and issubclass(law, Law)):
+            raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
+    stated = said_hold(simulator, recordings, hold)
+    bench = Workbench.of(simulator, recordings, stated or "zero", engine)
+    fitted = bench.fit(simulator)
+    bench.check_followed(fitted)
+    floor = measured_floor(bench.recordings) or Floor(white_part(fitted.residual), "estimated")
+    noise = np.maximum(floor.deviation, FINEST * bench.scale)
+    quiet = replace(bench, scale=noise)  # everything from here on is counted in units of the noise
+    probe, runs = linearised(quiet, fitted)
+    seen = Sensitivity.of(quiet, probe, runs)
+    parameters, ties = told_parameters(seen, quiet, fitted)
+    law_rows, classes = seen_laws(quiet, fitted, probe, runs, laws, seen.names)
+    moving = tuple(excitations(quiet, probe, runs))
+    sensors = helpful_sensors(quiet, fitted, probe, runs, seen) if ties else ()
+    blind = tuple(find_blind_spots(bench, parameters, ties, law_rows, classes, moving))
+    by_output = dict(zip(simulator.output_names, zip(noise, noise / bench.scale, strict=True), strict=True))
+    return Check(
+        blind_spots=blind,
+        parameters=parameters,
+        ties=ties,
+        laws=law_rows,
+        classes=classes,
+        excitation=moving,
+        noise={
+            "source": SOURCES[floor.source],
+            "deviation": {k: float(v[0]) for k, v in by_output.items()},
+            "share": {k: float(v[1]) for k, v in by_output.items()},
+        },
+        error=fitted.cost**0.5,
+        hold=stated or "",
+        starts=tuple(_start(r) for r in bench.recordings),
+        next_record=next_record(bench, blind, ties, sensors),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _start(r: Recording) -> str:
+    words = {"zero": "at zero", "estimate": "estimated", "periodic": "periodic", "given": "as given"}
+    return words[r.begins]
+
+
+def words_of(law: str) -> str:
+    """A law's id in lower case words."""
+    return law.replace("_", " ")
+
+
+def _unseen(rows: Sequence[LawRow]) -> dict[str, list[str]]:
+    """Laws that could not be seen, by the reason in words."""
+    out: dict[str, list[str]] = {}
+    for r in rows:
+        if r.seen != "yes":
+            reason = {"followed": f"no: followed by {r.why}", "weak": "no: below the noise", "no data": f"no: {r.why}"}
+            out.setdefault(reason[r.seen], []).append(r.law)
+    return out
+
+
+def _force(r: LawRow) -> str:
+    return f"{r.force:.2g} {r.unit}".rstrip()
+
+
+def _strength(r: LawRow) -> str:
+    return f"{r.strength[0]} = {r.strength[1]:.2g} {r.strength[2]}".rstrip() if r.strength else ""
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:.2g} %"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Rows of text in aligned columns."""
+    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+    for row in (head, *rows):
+        yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()

@@ -1,0 +1,198 @@
+"""Check before solve: known blind spots are told, well excited rigs are clear, and the numbers hold in simulation."""
+
+import importlib
+import json
+
+import numpy as np
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, check, multisine
+from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicStiffness
+from pilfr_casadi.models import close_loop
+from problems.blind_spots import DT, NOISE, SAMPLES, controls, noise_like, plain, record, rigs
+
+MASS = plain()
+
+
+@pytest.fixture(scope="module")
+def checked():
+    return {rig.name: (rig, check(rig.simulator, rig.train)) for rig in [*rigs(), *controls()]}
+
+
+def test_blind_spots_of_twenty_rigs_are_told(checked):
+    known = [rig.name for rig in rigs()]
+    assert len(known) == 20
+    missed = [name for name in known if not checked[name][0].told(checked[name][1])]
+    assert len(missed) <= 1, missed
+
+
+def test_well_excited_rigs_have_no_blind_spot(checked):
+    for rig in controls():
+        found = checked[rig.name][1]
+        assert not found.blind_spots, (rig.name, [b.sentence for b in found.blind_spots])
+        assert all(p.told == "yes" for p in found.parameters)
+
+
+def test_it_takes_little_time(checked):
+    assert np.median([found.seconds for _, found in checked.values()]) < 3.0
+
+
+def test_every_answer_prints_and_is_standard_json(checked):
+    for rig, found in checked.values():
+        assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["next_record"]
+        assert "next record: " in str(found)
+        for spot in found.blind_spots:
+            assert spot.sentence in str(found) and spot.sentence[0].strip() and spot.sentence.endswith("."), rig.name
+
+
+def test_a_further_record_is_named_by_the_gravest_blind_spot(checked):
+    says = {
+        "one amplitude": "A second amplitude of force",
+        "one push": "A slow triangle of force",
+        "one temperature": "temperature varies",
+        "sensor upstream": "slow triangle",
+        "offset of an integrator": "begins at rest",
+        "two gains": "another sensor, at x: it would help to tell gain, k_sensor apart",
+        "free scale": "measure m by itself",
+        "no thermometer": "another sensor",
+        "two ports at one joint": "measures the force at bearing",
+    }
+    for name, words in says.items():
+        assert words in checked[name][1].next_record, (name, checked[name][1].next_record)
+
+
+def test_a_sensor_that_parts_two_parameters_is_proposed():
+    """A motor's gain and its gear are a product at the output, and apart at the shaft between them."""
+    train = Simulator(
+        lambda x, u, p: {"shaft": (p.gain * u.u - x.shaft) / 0.2, "load": (p.gear * x.shaft - x.load) / 0.3},
+        lambda x: {"y": x.load},
+        states=("shaft", "load"),
+        inputs=("u",),
+        parameters={"gain": Parameter(3.0, bounds=(1, 9)), "gear": Parameter(0.5, bounds=(0.1, 2))},
+    )
+    found = check(train, record(train, noise_like(3)))
+    assert [t.only_as for t in found.ties] == [("gain*gear",)]
+    assert "another sensor, at shaft:" in found.next_record
+
+
+def test_standard_errors_are_those_of_many_noises():
+    clean = MASS.simulate(record(MASS, noise_like(1)))
+    first = record(MASS, noise_like(1))
+    found = check(MASS, first)
+    rng, values = np.random.default_rng(5), []
+    for _ in range(12):
+        noisy = first.with_(y=clean + NOISE * np.std(clean) * rng.standard_normal(clean.shape))
+        values.append([p.value for p in check(MASS, noisy, laws=[CubicStiffness]).parameters])
+    for row, spread in zip(found.parameters, np.std(values, axis=0, ddof=1), strict=True):
+        assert 0.5 < row.std / spread < 2.0, row.name  # twelve draws tell it to a fifth
+
+
+@pytest.mark.parametrize("law", [CubicStiffness, CoulombFriction])
+def test_a_law_of_the_strength_named_moves_the_outputs_as_much_as_is_detected(law):
+    """Ten times that strength, without noise: a refit leaves ten detection limits."""
+    given = record(MASS, noise_like(1, 10.0))
+    row = next(r for r in check(MASS, given).laws if r.port == "mount" and r.law == law.id)
+    name, value, _ = row.strength
+    shape = {} if law is CubicStiffness else {"v_0": 0.06 * np.quantile(np.abs(np.gradient(given.y[:, 0], DT)), 0.99)}
+    world = close_loop(MASS, law({name: 10 * value, **shape}), "mount")
+    y = world.simulate(given)
+    noise = check(MASS, given).noise["deviation"]["position"]
+    left = check(MASS, given.with_(y=y), laws=[law]).error * np.std(y) * np.sqrt(SAMPLES) / noise
+    assert 32.9 / 2 < left < 32.9 * 2
+
+
+def test_a_second_amplitude_and_reversals_are_counted():
+    both = [record(MASS, noise_like(1, a)) for a in (1.0, 4.0)]
+    rows = {e.port: e for e in check(MASS, both).excitation}
+    assert rows["mount"].reversals > 50 and rows["mount"].amplitudes > 1
+    assert rows["mount"].unit == "m"
+
+
+def test_reversals_and_amplitudes_of_steps_are_counted():
+    steps = np.repeat([0.0, 30.0, 0.0, 60.0, 10.0, 40.0], SAMPLES // 6)
+    row = next(e for e in check(MASS, record(MASS, steps)).excitation if e.port == "actuator:force")
+    assert (row.reversals, row.amplitudes) == (4, 3)  # swings of 30, 50 and 60
+
+
+def test_holds_between_ramps_are_rests():
+    ramps = np.concatenate([np.linspace(0, 40, 50), np.full(SAMPLES - 50, 40.0)])
+    found = check(MASS, record(MASS, ramps, initial="estimate"))
+    row = next(e for e in found.excitation if e.port == "actuator:force")
+    assert (row.reversals, row.rests) == (0, 1)
+
+
+def test_simulators_that_cannot_be_followed_get_a_sentence():
+    falling = Simulator(
+        lambda x, u: {"q": x.v, "v": 400 * x.q + u.f},
+        lambda x: {"y": x.q},
+        states=("q", "v"),
+        inputs=("f",),
+    )
+    drive = noise_like(1)
+    r = Recording(drive, drive, DT, ("f",), ("y",), hold="zero")
+    with pytest.raises(InputError, match=r"put the controller into the simulator"):
+        check(falling, r)
+
+
+def test_wrong_input_gets_a_sentence():
+    given = record(MASS, noise_like(1))
+    with pytest.raises(InputError, match="hold='cubic' was given"):
+        check(MASS, given, hold="cubic")
+    with pytest.raises(InputError, match="give classes of laws"):
+        check(MASS, given, laws=[CoulombFriction()])
+    with pytest.raises(InputError, match="give a Simulator"):
+        check("rig.py", given)
+    with pytest.raises(InputError, match="never changes"):
+        check(MASS, given.with_(y=np.ones(SAMPLES)))
+    with pytest.raises(InputError, match="has no outputs"):
+        check(MASS, given.with_(y=np.zeros((SAMPLES, 0)), outputs=()))
+
+
+def test_hold_and_start_are_told():
+    given = record(MASS, noise_like(1))
+    assert check(MASS, given).hold == "zero" and check(MASS, given).starts == ("at zero",)
+    unsaid = check(MASS, given.with_(hold=None, initial="estimate"))
+    assert unsaid.hold == "" and "not stated" in str(unsaid) and unsaid.starts == ("estimated",)
+
+
+def test_noise_from_periods_is_told_as_such():
+    u = np.tile(multisine(500, f_max=8.0, fs=1 / DT, rng=np.random.default_rng(0)), 4)
+    given = record(MASS, u).slice(500, 2000).with_(initial="periodic", period=500)
+    found = check(MASS, given)
+    assert found.noise["source"] == "from the periods"
+    assert found.noise["share"]["position"] == pytest.approx(NOISE, rel=0.2)
+
+
+def test_laws_of_ones_own_and_other_systems():
+    given = record(MASS, noise_like(1))
+    rows = check(MASS, given, laws=[CubicStiffness]).laws
+    assert {r.law for r in rows} == {"cubic_stiffness"} and {r.port for r in rows} == {"mount"}
+    control = pytest.importorskip("control")
+    system = control.ss([[0, 1], [-100, -2]], [[0], [1]], [[1, 0]], [[0]], inputs="force", outputs="position")
+    assert check(system, given).parameters
+
+
+def test_matrix_parameters_are_told_entry_by_entry():
+    simulator = Simulator(
+        lambda x, u, p: {"x": p.g[0] * u.u - p.g[1] * x.x},
+        lambda x: {"y": x.x},
+        states=("x",),
+        inputs=("u",),
+        parameters={"g": Parameter([2.0, 3.0], unit="1/s", bounds=(0.5, 9))},
+        ports=Port("valve", {"x": -1.0}, lambda x: x.x),
+    )
+    found = check(simulator, record(simulator, noise_like(4)))
+    assert len(found.parameters) == 2 and all(p.told == "yes" for p in found.parameters)
+
+
+def test_every_law_of_the_catalogue_is_in_the_table():
+    found = check(MASS, record(MASS, noise_like(1)))
+    for port in MASS.all_ports():
+        wanted = {law.id for law in CATALOGUE if port.kinds & set(law.places)}
+        assert {r.law for r in found.laws if r.port == port.name} == wanted
+
+
+def test_its_name_stays_a_function():
+    importlib.import_module("pilfr_casadi.diagnose.checkup")
+    assert pilfr.check is check and "before a law is fitted" in check.__doc__
