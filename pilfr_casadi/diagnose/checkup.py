@@ -112,7 +112,7 @@ class Check:
             yield "The simulator has no free parameter."
             return
         yield from table(
-            ("parameter", "refitted", "std. error", "told"),
+            ("parameter", "refitted", "std. error by noise", "told"),
             [
                 (p.name, f"{p.value:.4g} {p.unit}", "-" if p.std is None else f"{p.std:.2g} {p.unit}", TOLD[p.told])
                 for p in self.parameters
