@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -59,6 +59,18 @@ class PlacedRecording:
     scale: Array
     steady: bool
     period: int
+    scored: Array | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of scored samples."""
+        skip = self.recording.skip
+        return len(self.recording) - skip if self.scored is None else int(np.sum(self.scored[skip:]))
+
+    def rows(self, a: int, b: int) -> slice | Array:
+        """Select the scored ones of the samples from a to b, counted from a."""
+        cut = min(max(self.recording.skip - a, 0), b - a)
+        return slice(cut, b - a) if self.scored is None else cut + np.flatnonzero(self.scored[a + cut : b])
 
 
 def place_recordings(
@@ -173,7 +185,10 @@ def state_precision(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) 
     """
     state, found = np.zeros(n_x + n_s), []
     with np.errstate(over="ignore", invalid="ignore"):
-        for piece in np.array_split(drive, min(STATE_SAMPLES, len(drive))):
+        rows = engine.linear.substeps  # of each sample
+        samples = drive.reshape(-1, rows, drive.shape[1])
+        for piece in np.array_split(samples, min(STATE_SAMPLES, len(samples))):
+            piece = piece.reshape(-1, drive.shape[1])
             state = engine.simulate(piece, p, state)[1]
             found.append(state)
         moments = np.transpose(found) @ np.array(found) / len(found)
@@ -254,6 +269,8 @@ class Problem:
         Divisors of the residuals; by default the outputs' standard deviations over all recordings.
     weights : sequence of float, optional
         One per recording, which multiplies its residuals (see `periods.noise_weights`). The mean still divides by R.
+    scored : sequence of bool array (M,), optional
+        One per recording: the samples whose errors count, among those after `skip`. All are simulated.
 
     Attributes
     ----------
@@ -277,6 +294,7 @@ class Problem:
         noise: float = 1.0,
         scale: Array | None = None,
         weights: Sequence[float] | Array | None = None,
+        scored: Sequence[Array] | None = None,
     ) -> None:
         self.model, parameters = model, model.parameters
         self.recordings = as_recordings(recordings)
@@ -294,7 +312,9 @@ class Problem:
         self.weights = check_weights(weights, len(self.recordings))
         scales = [self.scale / weight for weight in self.weights]
         self._placed = list(place_recordings(model, self.recordings, self.n_free, scales))
-        self.residuals = sum((len(r) - r.skip) * model.n_y for r in self.recordings)  # number of scored residuals R
+        if scored is not None:
+            self._placed = [replace(p, scored=keep) for p, keep in zip(self._placed, scored, strict=True)]
+        self.residuals = sum(p.count for p in self._placed) * model.n_y  # number of scored residuals R
         states = [p.state for p in self._placed if p.first is not None]
         self.labels = tuple(np.array(parameters.labels, dtype=object)[self.free]) + tuple(
             f"initial[{i}].{k}" for i, p in enumerate(self._placed) if p.first is not None for k in range(model.n_state)
@@ -368,7 +388,7 @@ class Problem:
         """Compute the normalised residuals `(y_hat - y) / σ_y` of all scored samples, shape (R,)."""
         with np.errstate(over="ignore", invalid="ignore"):
             pairs = zip(self._placed, self.simulate(theta), strict=True)
-            return np.concatenate([((y - p.recording.y) / p.scale)[p.recording.skip :].ravel() for p, y in pairs])
+            return np.concatenate([((y - p.recording.y) / p.scale)[p.rows(0, len(y))].ravel() for p, y in pairs])
 
     def cost(self, theta: Array) -> float:
         """Return the objective; infinite where the simulation diverges."""
@@ -395,10 +415,10 @@ class Problem:
         while a < len(r):
             b = min(a + length, len(r), period if a < period else len(r))
             y, jac, state, slope = self.engine.sensitivity(part.drive[a * n : b * n], p, state, slope, self._columns)
-            cut = min(max(r.skip - a, 0), b - a)
-            e = ((y - r.y[a:b]) / part.scale)[cut:].ravel()
+            rows = part.rows(a, b)
+            e = ((y - r.y[a:b]) / part.scale)[rows].ravel()
             jac /= part.scale[:, None]
-            yield e, jac[cut:].reshape(e.size, jac.shape[2]), slope if b == period else None
+            yield e, jac[rows].reshape(e.size, jac.shape[2]), slope if b == period else None
             a = b
 
     def _variables(self, part: PlacedRecording) -> Array:

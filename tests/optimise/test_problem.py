@@ -1,5 +1,7 @@
 """The simulation-error problem: cost, derivatives, initial states, penalties, constraints."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from random_models import OPERATORS, random_input, random_lfr, reference
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
 from pilfr_casadi.data import Recording
+from pilfr_casadi.engine import make_engine
 from pilfr_casadi.models import Parameter, ParameterSet, Play, open_model
 from pilfr_casadi.optimise import Constraint, Problem, problem as module, stable
 
@@ -167,6 +170,37 @@ def test_what_is_skipped_is_simulated_but_does_not_count():
     np.testing.assert_array_equal(a.normal(a.start)[1], b.normal(b.start)[1])
     whole, _ = problem(r.with_(skip=0), options={"scale": a.scale})
     np.testing.assert_array_equal(whole.residual(a.start)[30:], a.residual(a.start))
+
+
+def test_samples_that_are_not_scored_are_simulated_but_do_not_count():
+    r = recording(0, skip=5, n_y=2, initial="estimate")
+    keep = np.random.default_rng(3).random(len(r)) > 0.4
+    whole, _ = problem(r, n_y=2)
+    part, _ = problem(r, n_y=2, options={"scored": [keep], "scale": whole.scale})
+    theta, rows = somewhere(whole), np.repeat(keep[5:], 2)
+    assert part.residuals == rows.sum()
+    np.testing.assert_array_equal(part.residual(theta), whole.residual(theta)[rows])
+    np.testing.assert_array_equal(part.jacobian(theta), whole.jacobian(theta)[rows])
+    np.testing.assert_allclose(part.normal(theta)[1], part.jacobian(theta).T @ part.residual(theta) / part.residuals)
+
+
+def test_a_prior_of_initial_states_runs_whole_samples():
+    structure, values = random_lfr(0)
+    engine = make_engine(structure.model(1, 1, values), "vm")
+    lengths = []
+
+    class Counting:
+        linear = replace(engine.linear, substeps=3)
+
+        def simulate(self, u, p, state):
+            lengths.append(len(u))
+            return engine.simulate(u, p, state)
+
+    model = engine.linear.sizes
+    p = structure.model(1, 1, values).parameters.start
+    drive = random_input(1, 3 * 1000, 1)
+    assert module.state_precision(Counting(), drive, p, model["x"], model["s"]) is not None
+    assert sum(lengths) == 3000 and all(n % 3 == 0 for n in lengths)
 
 
 def test_diverging_is_infinite_and_no_exception():
