@@ -6,7 +6,7 @@ missing; `diagnose` compares it with recordings of the machine and returns a `Di
     import pilfr_casadi as pilfr
 
     train = pilfr.read_csv("train.csv", inputs="force", outputs="x2")
-    print(pilfr.check(simulator, train))  # what these recordings can and cannot tell
+    print(pilfr.check(simulator, train))  # what these recordings can reveal
     diagnosis = pilfr.diagnose(simulator, train, test=pilfr.read_csv("test.csv", inputs="force", outputs="x2"))
     print(diagnosis)  # where, what, how sure, error before and after
     diagnosis.report("report")  # report.html, diagnosis.json, figures

@@ -1,4 +1,4 @@
-"""Twenty small rigs with known blind spots, and five without: what is blind, what `check` says, and how long it takes.
+"""Twenty small rigs with known blind spots, and five without: what is blind, what `check` says, and its processor time.
 
 python -m problems.blind_spots
 """
@@ -41,7 +41,7 @@ def spot(kind: str, *names: str, says: str = "") -> Told:
 
 
 def tied(*names: str, only_as: Sequence[str] = ()) -> Told:
-    """Whether these parameters are told only as some expressions."""
+    """Whether these parameters are identifiable only as some expressions."""
     return lambda found: any(set(t.names) == set(names) and set(t.only_as) == set(only_as) for t in found.ties)
 
 
@@ -51,7 +51,7 @@ def alike(*names: tuple[str, str]) -> Told:
 
 
 def nothing(found: Check) -> bool:
-    """Whether no blind spot is told."""
+    """Whether no blind spot is found."""
     return not found.blind_spots
 
 
@@ -218,7 +218,7 @@ def parameter_rigs() -> list[Rig]:
         ),
         Rig(
             "above the resonance",
-            "k: within its bounds not told",
+            "k: flat within its bounds",
             soft,
             (soft_run,),
             spot("flat", "k"),
@@ -343,7 +343,7 @@ def motion_rigs() -> list[Rig]:
         ),
         Rig(
             "sensor upstream",
-            "nothing at drain is seen",
+            "nothing at drain is detectable",
             tanks,
             (record(tanks, 1 + noise_like(18, 0.3, 1.0)),),
             spot("hidden-port", "drain"),
@@ -414,14 +414,14 @@ def main() -> None:
     print(f"{'rig':<26}{'blind':<34}{'told':<6}{'s':>5}  sentences")
     right = []
     for rig in [*rigs(), *controls()]:
-        began = time.perf_counter()
+        began = time.process_time()
         found = check(rig.simulator, rig.train)
-        seconds = time.perf_counter() - began
+        seconds = time.process_time() - began
         right.append(rig.told(found))
         told = [b.sentence for b in found.blind_spots]
         said = " | ".join(told) or f"{len(found.classes)} groups of laws look the same" * bool(found.classes) or "-"
         print(f"{rig.name:<26}{rig.blind or '(control)':<34}{'yes' if right[-1] else 'NO':<6}{seconds:5.1f}  {said}")
-    print(f"{sum(right[:20])} of 20 blind spots told, {sum(right[20:])} of {len(right) - 20} controls clear")
+    print(f"{sum(right[:20])} of 20 blind spots found, {sum(right[20:])} of {len(right) - 20} controls clear")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""`pilfr check`: read the files, tell what the recordings can tell, and write check.json where a folder is given."""
+"""`pilfr check`: read the files, print what the recordings can reveal, and write check.json where a folder is given."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from ._common import (
     option,
     takes_options,
 )
+from .app import name_options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,7 @@ class CheckOptions(DataOptions):
 
 @takes_options
 def check_command(options: CheckOptions) -> int:
-    """Prints what the recordings can and cannot tell, before anything but the simulator itself is fitted."""
+    """Refits only the simulator itself; with --out, the answer is in DIR/check.json."""
     source, train = options.files[0], options.files[1:]
     if Path(source).suffix.lower() in TABLE_SUFFIXES:
         raise InputError(f"{source} is not a simulator file; give SIMULATOR.py first, then the recordings.")
@@ -62,7 +63,7 @@ def check_command(options: CheckOptions) -> int:
     with deferred_interrupt():
         from ..diagnose import check
     found = check(as_simulator(given, recordings), recordings, hold=options.hold)
-    print(found)
+    print(name_options(str(found)))
     if folder is not None:
         target = folder / "check.json"
         content = json.dumps(found.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"

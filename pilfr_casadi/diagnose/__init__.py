@@ -14,7 +14,8 @@ The files by stage:
 - Verdict: `verdict`, `conclusion`, `description` (the corrected simulator where no name is sure).
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
-- Before any of it: `checkup` tells what the recordings can tell, by `identifiability` and `detectability`.
+- Before any of it: `checkup` (what the recordings can reveal), by `identifiability`,
+  `detectability` and `blind_spots`.
 - In place of a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
 """
 

@@ -1,4 +1,4 @@
-"""How the ports move in recordings, what recordings cannot tell, and which further record would help most."""
+"""How the ports move in recordings, what recordings cannot reveal, and which further record would help most."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .._base import listed
+from ..laws import display_name
 from ..simulators import in_series
-from .detectability import LINEAR, TENTH, LawRow, port_units
-from .identifiability import ParameterRow, Sensitivity, Tie, untold
+from .detectability import LINEAR, TENTH, LawRow, idle_ports, port_units
+from .identifiability import ParameterRow, Sensitivity, Tie, count_undetermined, in_words
 from .linearise import Probe, Run, along
 from .workbench import Fitted, Workbench
 
@@ -44,7 +44,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """Something that the recordings cannot tell: its kind, the names that it concerns, and a sentence."""
+    """Something that the recordings cannot reveal: its kind, the names that it concerns, and a sentence."""
 
     kind: str
     names: tuple[str, ...]
@@ -53,9 +53,8 @@ class BlindSpot:
 
 def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator[Excitation]:
     """The motion of every port's local coordinate along the refitted run."""
-    hidden = {f"equation:{name}" for name in bench.simulator.kinematic}
     for j, name in enumerate(probe.ports):
-        if name not in hidden:
+        if name not in idle_ports(bench.simulator):
             unit = port_units(bench.simulator.port(name), bench.recordings[0])[1]
             yield excitation(name, unit, [r.z[:, j] for r in runs])
 
@@ -125,26 +124,26 @@ def find_blind_spots(
     classes: Sequence[Sequence[tuple[str, str]]],
     moving: Sequence[Excitation],
 ) -> Iterator[BlindSpot]:
-    """Put everything that the recordings cannot tell into sentences, the gravest first."""
+    """Put everything that the recordings cannot reveal into sentences, the gravest first."""
     simulator = bench.simulator
     u = np.concatenate([r.u for r in bench.recordings])
     if still := tuple(n for n, v in zip(simulator.inputs, u.T, strict=True) if not np.ptp(v) > 0):
-        yield BlindSpot("constant-input", still, f"Constant in all recordings: {listed(still)}.")
+        yield BlindSpot("constant-input", still, f"Constant in all recordings: {in_words(still)}.")
     if not parameters:
         text = "The simulator has no free parameter, so a wrong value and a missing law look alike."
         yield BlindSpot("no-free-parameter", (), text)
     sentences = {
         "dead": "No output reacts to {}.",
-        "flat": "The bounds tell more of {} than these recordings.",
-        "start": "{} cannot be told from the unknown state at the first sample; say initial='zero' if it was at rest.",
+        "flat": "These recordings say less about {} than the bounds do.",
+        "start": "{} cannot be distinguished from the unknown initial state; say initial='zero' if it was zero.",
     }
     for kind, sentence in sentences.items():
-        if names := tuple(p.name for p in parameters if p.told == kind):
-            yield BlindSpot(kind, names, sentence.format(listed(names)))
+        if names := tuple(p.name for p in parameters if p.status == kind):
+            yield BlindSpot(kind, names, sentence.format(in_words(names)))
     for tie in ties:
         yield BlindSpot("tied", tie.names, tie.sentence)
     yield from _motion([e for e in moving if e.port.removeprefix("actuator:") not in still])
-    yield from _unseen_ports(laws, [p.name for p in parameters])
+    yield from _undetectable(laws, [p.name for p in parameters])
     yield from _alike_ports(laws, classes)
 
 
@@ -153,46 +152,45 @@ def _motion(moving: Sequence[Excitation]) -> Iterator[BlindSpot]:
     ahead = tuple(e.port for e in moving if e.travel > 0 and e.reversals == 0)
     single = tuple(e.port for e in moving if e.reversals and e.amplitudes == 1)
     if still:
-        yield BlindSpot("no-motion", still, f"Nothing moves at {listed(still)}.")
+        yield BlindSpot("no-motion", still, f"Nothing moves at {in_words(still)}.")
     if ahead:
-        text = (
-            f"No reversal at {listed(ahead)}: hysteresis and friction cannot be told from stiffness and damping there."
-        )
+        text = f"No reversal at {in_words(ahead)}: hysteresis and friction look like stiffness and damping there."
         yield BlindSpot("no-reversal", ahead, text)
     if single:
-        text = f"A single amplitude at {listed(single)}: hysteresis cannot be told from damping and stiffness there."
+        text = f"A single amplitude at {in_words(single)}: hysteresis looks like damping and stiffness there."
         yield BlindSpot("one-amplitude", single, text)
 
 
-def _unseen_ports(laws: Sequence[LawRow], names: Sequence[str]) -> Iterator[BlindSpot]:
-    """Ports at which nothing could be seen, and at the others laws that own parameters follow."""
+def _undetectable(laws: Sequence[LawRow], names: Sequence[str]) -> Iterator[BlindSpot]:
+    """Ports at which nothing is detectable, and at the others laws that own parameters follow."""
     ports = dict.fromkeys(r.port for r in laws)
-    dark = tuple(port for port in ports if not any(r.seen == "yes" for r in laws if r.port == port))
+    dark = tuple(port for port in ports if not any(r.status == "detectable" for r in laws if r.port == port))
     if dark:
-        yield BlindSpot("hidden-port", dark, f"No law of the catalogue could be seen at {listed(dark)}.")
+        yield BlindSpot("hidden-port", dark, f"No law of the catalogue is detectable at {in_words(dark)}.")
     for port in ports:
-        followed = [r for r in laws if r.port == port and r.seen == "followed" and r.law not in LINEAR]
+        followed = [r for r in laws if r.port == port and r.status == "followed" and r.law not in LINEAR]
         for why in dict.fromkeys(r.why for r in followed):
             own = tuple(r.law for r in followed if r.why == why)
             what = f"a change of {why}" if why in names else why
-            text = f"{listed([name.replace('_', ' ') for name in own])} at {port} cannot be told from {what}."
+            names_of = in_words([display_name(name) for name in own])
+            text = f"{names_of[0].upper()}{names_of[1:]} at {port} cannot be distinguished from {what}."
             yield BlindSpot("followed", (port, *own), text)
 
 
 def _alike_ports(laws: Sequence[LawRow], classes: Sequence[Sequence[tuple[str, str]]]) -> Iterator[BlindSpot]:
-    """Ports that could not be told apart by any law that could be seen at both."""
-    seen: dict[str, set[str]] = {}
+    """Ports at which every law that is detectable at both looks the same."""
+    detectable: dict[str, set[str]] = {}
     for r in laws:
-        if r.seen == "yes":
-            seen.setdefault(r.port, set()).add(r.law)
+        if r.status == "detectable":
+            detectable.setdefault(r.port, set()).add(r.law)
     of = {name: i for i, group in enumerate(classes) for name in group}
 
     def one(port: str, other: str) -> bool:
-        shared = seen[port] & seen[other]
+        shared = detectable[port] & detectable[other]
         return bool(shared) and all(of.get((port, n), -1) == of.get((other, n), -2) for n in shared)
 
     groups: list[list[str]] = []
-    for port in seen:
+    for port in detectable:
         group = next((g for g in groups if one(port, g[0])), None)
         if group is None:
             groups.append([port])
@@ -200,19 +198,19 @@ def _alike_ports(laws: Sequence[LawRow], classes: Sequence[Sequence[tuple[str, s
             group.append(port)
     for group in groups:
         if len(group) > 1:
-            text = f"Nothing tells {listed(group)} apart: a law at one looks the same at the other."
+            text = f"A law looks the same at {in_words(group)}."
             yield BlindSpot("alike-ports", tuple(group), text)
 
 
 def helpful_sensors(
-    bench: Workbench, fitted: Fitted, probe: Probe, runs: list[Run], seen: Sensitivity
+    bench: Workbench, fitted: Fitted, probe: Probe, runs: list[Run], response: Sensitivity
 ) -> tuple[str, ...]:
-    """States of which a sensor, as quiet as the present ones, would tell more directions of the parameters."""
+    """Find states whose sensor, as quiet as the present ones, would determine more of the parameters; best first."""
     states, _ = along(bench, fitted)
     moved_by = np.std(states, axis=0)
     y = np.std(np.concatenate([r.y for r in bench.recordings]), axis=0)
     share = float(np.mean(bench.scale / y))
-    count, found = untold(seen.scaled), []
+    count, found = count_undetermined(response.scaled), list[tuple[int, str]]()
     for j, name in enumerate(bench.simulator.states):
         if not moved_by[j] > 0:
             continue
@@ -224,9 +222,9 @@ def helpful_sensors(
             d = np.concatenate([r.d / bench.scale[:, None], np.zeros((len(r.d), 1, r.d.shape[2]))], axis=1)
             return replace(r, c=c, d=d)
 
-        if untold(Sensitivity.of(bench, probe, runs, other).scaled) < count:
-            found.append(name)
-    return tuple(found)
+        left = count_undetermined(Sensitivity.of(bench, probe, runs, other).scaled)
+        found += [(left, name)] if left < count else []
+    return tuple(name for _, name in sorted(found))
 
 
 def next_record(bench: Workbench, blind: Sequence[BlindSpot], ties: Sequence[Tie], sensors: Sequence[str]) -> str:
@@ -236,7 +234,7 @@ def next_record(bench: Workbench, blind: Sequence[BlindSpot], ties: Sequence[Tie
     driven = [n for n, v in zip(bench.simulator.inputs, u.T, strict=True) if np.ptp(v) > 0]
     drive = driven[0] if driven else "the input"
     if "constant-input" in by_kind:
-        return f"One in which {listed(by_kind['constant-input'])} varies."
+        return f"One in which {in_words(by_kind['constant-input'])} varies."
     for inner in (True, False):  # forces inside first, then the signals
         ahead, single = ([p for p in by_kind.get(k, ()) if in_series(p) != inner] for k in MOTION)
         own = [port.removeprefix("actuator:") for port in (*ahead, *single) if port.startswith("actuator:")]
@@ -246,21 +244,21 @@ def next_record(bench: Workbench, blind: Sequence[BlindSpot], ties: Sequence[Tie
         if single:
             return f"A second amplitude of {name}, such as half of it."
     if sensors:
-        names = listed([n for t in ties for n in t.names])
-        return f"One with another sensor, at {' or '.join(sensors)}: it would help to tell {names} apart."
+        names = in_words([n for t in ties for n in t.names])
+        return f"One with another sensor, such as one of {sensors[0]}, to separate {names}."
     if "hidden-port" in by_kind or "dead" in by_kind:
         hidden = (*by_kind.get("hidden-port", ()), *by_kind.get("dead", ()))
-        return f"One with another sensor, which reacts to {listed(hidden)}."
+        return f"One with another sensor, which reacts to {in_words(hidden)}."
     if "alike-ports" in by_kind:
         group = by_kind["alike-ports"]
         inner_ports = [port for port in group if not in_series(port)]
         if inner_ports:
             return f"One that also measures the force at {inner_ports[0]}."
-        return f"One with another sensor between {listed(group)}."
+        return f"One with another sensor between {in_words(group)}."
     if "flat" in by_kind or "followed" in by_kind:
         return f"A longer one, with other amplitudes and rates of {drive}."
     if "start" in by_kind:
         return "One that begins at rest, with initial='zero'."
     if ties:
-        return f"None of these signals helps; measure {ties[0].names[0]} by itself and fix it."
+        return f"No further record of these signals helps: measure {ties[0].names[0]} separately and fix it."
     return "None is pressing; for the test take amplitudes that the training recordings do not have."

@@ -1,7 +1,7 @@
-"""Check before solve: what recordings and sensors can tell, from the simulator alone, before a law is fitted.
+"""Check before solve: what recordings and sensors can reveal, from the simulator alone, before a law is fitted.
 
 The simulator's own parameters are refitted once; everything else follows from the simulator linearised along that run:
-`identifiability` says which parameters are told, `detectability` which laws could be seen at which ports.
+`identifiability` says which parameters are identifiable, `detectability` which laws at which ports are detectable.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import numpy as np
 from .._base import InputError, one_blas_thread
 from ..data import HOLDS, Recording, as_recordings, check_for_identification
 from ..identify import match_channels
-from ..laws import Law
+from ..laws import Law, display_name
 from ..simulators import as_simulator
 from .blind_spots import BlindSpot, Excitation, excitations, find_blind_spots, helpful_sensors, next_record
-from .detectability import LawRow, seen_laws, words
+from .detectability import LawRow, assess_laws, words
 from .floor import Floor, measured_floor, white_part
 from .gates import said_hold
-from .identifiability import ParameterRow, Sensitivity, Tie, told_parameters
+from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters
 from .linearise import linearised
 from .result import LEFT, plain
 from .workbench import Workbench
@@ -34,18 +34,18 @@ FEWEST = 20  # samples, as `diagnose` asks for
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What recordings can tell of a simulator and of what it leaves out.
+    """What recordings can reveal about a simulator and about what it leaves out.
 
     Attributes
     ----------
     blind_spots : tuple of BlindSpot
-        What they cannot tell, the gravest first.
+        What they cannot reveal, the gravest first.
     parameters, ties : tuple of ParameterRow, tuple of Tie
         Free parameters as refitted, and groups that are traded off.
     laws : tuple of LawRow
-        Every law at every port, and from what strength on it could be seen.
+        Every law at every port, and from what strength on it is detectable.
     classes : tuple of tuple of (port, law)
-        What could not be told apart.
+        Laws that look the same.
     excitation : tuple of Excitation
         Motion at each port.
     noise : dict
@@ -99,11 +99,11 @@ class Check:
         return clean
 
     def __str__(self) -> str:
-        lines = ["What these recordings cannot tell:"] if self.blind_spots else ["No blind spot was found."]
+        lines = ["Blind spots of these recordings:"] if self.blind_spots else ["No blind spot was found."]
         lines += [f"- {b.sentence}" for b in self.blind_spots]
         lines += ["", *self._parameter_lines(), "", *self._law_lines()]
         if groups := list(self._group_lines()):
-            lines += ["", "Could not be told apart, one line a group:", *groups]
+            lines += ["", "Laws that look the same, one group a line:", *groups]
         lines += ["", *self._excitation_lines(), "", *self._circumstances(), f"next record: {self.next_record}"]
         return "\n".join([*lines, f"computed in {self.seconds:.1f} s"])
 
@@ -112,9 +112,14 @@ class Check:
             yield "The simulator has no free parameter."
             return
         yield from table(
-            ("parameter", "refitted", "std. error by noise", "told"),
+            ("parameter", "refitted", "std. error (noise only)", "identifiable"),
             [
-                (p.name, f"{p.value:.4g} {p.unit}", "-" if p.std is None else f"{p.std:.2g} {p.unit}", TOLD[p.told])
+                (
+                    p.name,
+                    f"{p.value:.4g} {p.unit}",
+                    "-" if p.std is None else f"{p.std:.2g} {p.unit}",
+                    IDENTIFIABLE[p.status],
+                )
                 for p in self.parameters
             ],
         )
@@ -137,12 +142,12 @@ class Check:
         first = {self._label(name): name for name in reversed(ports)}
         for port, shown in reversed(first.items()):
             own = [r for r in self.laws if r.port == shown]
-            seen = sorted((r for r in own if r.seen == "yes"), key=lambda r: r.share or 0.0)
-            rows += [(port, words_of(r.law), _force(r), _percent(r.share), _strength(r)) for r in seen]
-            for reason, laws in _unseen(own).items():
-                rows.append((port, ", ".join(map(words_of, laws)), reason, "", ""))
-        columns = ("port", "law", "seen from (rms)", "share", "strength")
-        yield from table(columns, rows) if rows else ["No law could be seen at any port."]
+            found = sorted((r for r in own if r.status == "detectable"), key=lambda r: r.share or 0.0)
+            rows += [(port, display_name(r.law), _force(r), _percent(r.share), _strength(r)) for r in found]
+            for reason, laws in _undetectable(own).items():
+                rows.append((port, ", ".join(map(display_name, laws)), reason, "", ""))
+        columns = ("port", "law", "detectable from (rms)", "share", "strength")
+        yield from table(columns, rows) if rows else ["No law is detectable at any port."]
 
     def _excitation_lines(self) -> Iterator[str]:
         rows = [
@@ -165,12 +170,12 @@ class Check:
         yield f"start of each recording: {', '.join(self.starts)}"
 
 
-TOLD = {
-    "yes": "yes",
-    "dead": "dead: no output reacts",
-    "flat": "flat: not told within its bounds",
-    "tied": "traded off, see above",
-    "start": "traded off with the unknown start",
+IDENTIFIABLE = {
+    "identifiable": "yes",
+    "dead": "no: dead, no output reacts",
+    "flat": "no: flat within its bounds",
+    "tied": "no: traded off, see above",
+    "start": "no: traded off with the unknown start",
 }
 HOLD_WORDS = {
     "zero": "held",
@@ -192,7 +197,7 @@ def check(
     laws: Sequence[type[Law]] | None = None,
     engine: str = "auto",
 ) -> Check:
-    """Tell what recordings can and cannot tell of a simulator and of what it leaves out, before a law is fitted.
+    """Find what recordings can reveal about a simulator and about what it leaves out, before a law is fitted.
 
     Parameters
     ----------
@@ -234,11 +239,11 @@ def check(
     noise = np.maximum(floor.deviation, FINEST * bench.scale)
     quiet = replace(bench, scale=noise)  # everything from here on is counted in units of the noise
     probe, runs = linearised(quiet, fitted)
-    seen = Sensitivity.of(quiet, probe, runs)
-    parameters, ties = told_parameters(seen, quiet, fitted)
-    law_rows, classes = seen_laws(quiet, fitted, probe, runs, laws, seen.names)
+    response = Sensitivity.of(quiet, probe, runs)
+    parameters, ties = assess_parameters(response, quiet, fitted)
+    law_rows, classes = assess_laws(quiet, fitted, probe, runs, laws, response.names)
     moving = tuple(excitations(quiet, probe, runs))
-    sensors = helpful_sensors(quiet, fitted, probe, runs, seen) if ties else ()
+    sensors = helpful_sensors(quiet, fitted, probe, runs, response) if ties else ()
     blind = tuple(find_blind_spots(bench, parameters, ties, law_rows, classes, moving))
     by_output = dict(zip(simulator.output_names, zip(noise, noise / bench.scale, strict=True), strict=True))
     return Check(
@@ -266,18 +271,13 @@ def _start(r: Recording) -> str:
     return words[r.begins]
 
 
-def words_of(law: str) -> str:
-    """A law's id in lower case words."""
-    return law.replace("_", " ")
-
-
-def _unseen(rows: Sequence[LawRow]) -> dict[str, list[str]]:
-    """Laws that could not be seen, by the reason in words."""
+def _undetectable(rows: Sequence[LawRow]) -> dict[str, list[str]]:
+    """Laws that are not detectable, by the reason in words."""
     out: dict[str, list[str]] = {}
     for r in rows:
-        if r.seen != "yes":
+        if r.status != "detectable":
             reason = {"followed": f"no: followed by {r.why}", "weak": "no: below the noise", "no data": f"no: {r.why}"}
-            out.setdefault(reason[r.seen], []).append(r.law)
+            out.setdefault(reason[r.status], []).append(r.law)
     return out
 
 

@@ -1,4 +1,4 @@
-"""Which laws at which ports could be seen in recordings, from what strength on, and which could not be told apart.
+"""Which laws at which ports are detectable in recordings, from what strength on, and which look the same.
 
 With φ the outputs' changes by a law's force of unit size and φ' what own parameters and unknown initial states leave of
 them, both in units of the noise (`remainder`), a force of the size 3.29 / |φ'| is detected: 5 % false alarms and 5 % of
@@ -30,18 +30,18 @@ LINEAR = ("linear_stiffness", "viscous_damping")  # what a simulator's own param
 
 @dataclass(frozen=True)
 class LawRow:
-    """A law at a port, and whether it could be seen.
+    """A law at a port, and whether it is detectable.
 
     Attributes
     ----------
-    seen : str
-        "yes", "followed" (own parameters follow it), "weak" (it moves no output by more than the noise), or "no data"
-        (with the reason in `why`).
+    status : str
+        "detectable", "followed" (own parameters follow it), "weak" (it moves no output by more than the noise), or
+        "no data" (with the reason in `why`).
     force : float or None
         Smallest rms force (in series: deviation of the signal) that would be detected, in `unit`.
     share : float or None
         That force over the largest force of the simulator's own at the port, in series over the signal; None where it
-        cannot be told.
+        is unknown.
     strength : tuple or None
         Name, value and unit of the law's strength at that force, for laws of one strength.
     why : str
@@ -50,7 +50,7 @@ class LawRow:
 
     port: str
     law: str
-    seen: str
+    status: str
     force: float | None = None
     unit: str = ""
     share: float | None = None
@@ -69,7 +69,7 @@ class _Response:
 
 
 def plainest_forms(port: Port) -> tuple[type[Law], ...]:
-    """The first form of each law that may stand at a port: its finer forms are seen where this one is."""
+    """The first form of each law that may stand at a port: its finer forms are detectable where this one is."""
     first: dict[str, type[Law]] = {}
     for law in CATALOGUE:
         if port.kinds & set(law.places):
@@ -77,7 +77,7 @@ def plainest_forms(port: Port) -> tuple[type[Law], ...]:
     return tuple(first.values())
 
 
-def seen_laws(
+def assess_laws(
     bench: Workbench,
     fitted: Fitted,
     probe: Probe,
@@ -85,11 +85,12 @@ def seen_laws(
     laws: Sequence[type[Law]] | None,
     names: Sequence[str],
 ) -> tuple[tuple[LawRow, ...], tuple[tuple[tuple[str, str], ...], ...]]:
-    """Every law at every port, and classes of (port, law) that could not be told apart; the bench's scale is the noise.
+    """Every law at every port, and classes of (port, law) that look the same; the bench's scale is the noise.
 
     Without `laws` the plainest form of each law of the catalogue. `names` are those of the free parameters.
     """
-    tried = {port.name: plainest_forms(port) if laws is None else tuple(laws) for port in bench.simulator.all_ports()}
+    ports = [port for port in bench.simulator.all_ports() if port.name not in idle_ports(bench.simulator)]
+    tried = {port.name: plainest_forms(port) if laws is None else tuple(laws) for port in ports}
     rest = Remainder.of(bench, probe, runs, tuple(dict.fromkeys(law for own in tried.values() for law in own)))
     blocks = [moved(bench, r) for r in rest.runs]
     n = runs[0].n_free
@@ -101,6 +102,8 @@ def seen_laws(
     rows: list[LawRow] = []
     responses: list[_Response] = []
     for task in rest.tasks:
+        if task.port.name not in tried:
+            continue
         own = tried[task.port.name]
         task = replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in own])
         found, more = _at_port(rest, task, base, changes[:, :n], levels[task.index], names)
@@ -117,7 +120,7 @@ def seen_laws(
 def _at_port(
     rest: Remainder, task: Task, base: np.ndarray, own: np.ndarray, level: float | None, names: Sequence[str]
 ) -> tuple[list[LawRow], list[_Response]]:
-    """The laws of one port, and the responses of those that could be seen."""
+    """The laws of one port, and the responses of those that are detectable."""
     rows, responses = [], []
     w_unit, z_unit = port_units(task.port, rest.bench.recordings[0])
     size = np.maximum(lengths(own), 1e-300)
@@ -132,15 +135,15 @@ def _at_port(
         raw = dose.phi[:, int(np.argmax(lengths(dose.phi)))]
         force = DETECTED / sizes[middle] if sizes[middle] > 0 else None
         share = None if force is None or not level else force / level
-        row = LawRow(task.port.name, law.id, "yes", force, w_unit, share)
+        row = LawRow(task.port.name, law.id, "detectable", force, w_unit, share)
         most = level or np.inf
         if force is None or force > most:
             if not np.any(raw) or float(np.linalg.norm(raw)) * most < DETECTED:
-                row = replace(row, seen="weak")
+                row = replace(row, status="weak")
             else:
                 cosines = np.abs(raw @ own) / size
                 best = names[int(np.argmax(cosines))] if len(names) and cosines.max() > TENTH else "the unknown start"
-                row = replace(row, seen="followed", why=best)
+                row = replace(row, status="followed", why=best)
         else:
             if len(law.strength) == 1 and dose.phi.shape[1] == 1:
                 unit = readable_unit(law.units[law.strength[0]], w_unit, z_unit)
@@ -154,7 +157,7 @@ def _at_port(
 
 
 def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], ...]:
-    """Groups of which each member could be taken for the one that is seen best, and that for each member."""
+    """Groups in which each member explains the most visible one, and is explained by it, to a tenth."""
     order = sorted(responses, key=lambda r: -r.most)
     if not order:
         return ()
@@ -174,6 +177,12 @@ def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], .
         if len(group) > 1:
             out.append(tuple(order[i].name for i in group))
     return tuple(out)
+
+
+def idle_ports(simulator: Simulator) -> frozenset[str]:
+    """Ports at which nothing can be missing: inputs that no equation reads, and equations that define a speed."""
+    inputs = {f"actuator:{name}" for name in simulator.idle_inputs}
+    return frozenset(inputs | {f"equation:{name}" for name in simulator.kinematic})
 
 
 def port_units(port: Port, recording: Recording) -> tuple[str, str]:

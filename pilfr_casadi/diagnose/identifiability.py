@@ -1,10 +1,10 @@
-"""Which parameters of a simulator the recordings determine, and which they leave dead, flat or traded off.
+"""Which parameters of a simulator are identifiable from recordings, and which are dead, flat or traded off.
 
 With J the outputs' changes by the parameters in units of the noise, initial states projected off, and D the room that
-the bounds leave each parameter, the singular values s of J D say how well each direction is told. Along one with s < 1
+the bounds leave each parameter, the singular values s of J D say how well each direction is determined. Where s < 1
 the standard error is larger than the room: the recordings add nothing to the bounds. Parameters that hold such a
 direction among themselves are traded off. A direction with whole exponents, in logarithms of the parameters, leaves
-only a ratio or a product to be told (Bellman & Åström 1970; Brun, Reichert & Künsch 2001).
+only a ratio or a product identifiable (Bellman & Åström 1970; Brun, Reichert & Künsch 2001).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from .remainder import block_diagonal, lengths, moved, orthonormal
 from .workbench import Fitted, Workbench
 
 LARGEST_GROUP = 4  # parameters of a group that is looked for; above it all combinations are too many
+SHOWN = 8  # names in a sentence
 EXPONENTS = (1, 2, 3)  # denominators of exponents; physical laws have small ones
 STEP = 1.1  # factor of a trial step that tells a product from a sum; they differ by a twentieth of it
 SAME = 0.01  # share of a parameter's own change that a step along a ratio or product leaves; of another curve, more
@@ -28,42 +29,49 @@ SAME = 0.01  # share of a parameter's own change that a step along a ratio or pr
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """A free parameter as refitted, and what the recordings tell of it.
+    """A free parameter as refitted, and whether it is identifiable.
 
     Attributes
     ----------
     std : float or None
-        Standard error by the noise; None where the parameter is not told by itself.
-    told : str
-        "yes", "dead" (no output reacts), "flat" (the standard error is as large as the room of the bounds), "tied"
-        (traded off with others), or "start" (traded off with the unknown initial state).
+        Standard error due to the noise alone; None where the parameter is not identifiable.
+    status : str
+        "identifiable", "dead" (no output reacts), "flat" (the standard error is as large as the room of the bounds),
+        "tied" (traded off with others), or "start" (traded off with the unknown initial state).
     """
 
     name: str
     value: float
     unit: str
     std: float | None
-    told: str
+    status: str
 
 
 @dataclass(frozen=True)
 class Tie:
-    """Parameters that are traded off with each other, and what alone is told of them, such as ("k/m",)."""
+    """Parameters that are traded off, and the only combinations that are identifiable, such as ("k/m",)."""
 
     names: tuple[str, ...]
     only_as: tuple[str, ...]
 
     @property
     def sentence(self) -> str:
-        """What is told, in words."""
-        names = " and ".join([", ".join(self.names[:-1]), self.names[-1]])
+        """The tie in words."""
+        names = in_words(self.names)
         if not self.only_as:
-            return f"{names} are told only together, not one by one."
+            return f"{names} can be identified only together, not separately."
         if len(self.only_as) == 1 and len(self.names) == 2:
             word = "product" if "*" in self.only_as[0] else "sum" if "+" in self.only_as[0] else ""
             if word and "^" not in self.only_as[0]:
-                return f"{names} are told only as their {word} ({self.only_as[0]})."
-        return f"{names} are told only as {' and '.join(self.only_as)}."
+                return f"{names} can be identified only as their {word} ({self.only_as[0]})."
+        return f"{names} can be identified only as {in_words(self.only_as)}."
+
+
+def in_words(names: Sequence[str]) -> str:
+    """Names as a sentence has them; many are cut short."""
+    if len(names) > SHOWN:
+        return f"{', '.join(names[:SHOWN])} and {len(names) - SHOWN} more"
+    return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +113,17 @@ class Sensitivity:
         states = whole[:, len(places) :]
         kept = np.repeat([not r.from_zero and q.begins != "given" for r, q in zip(runs, bench.recordings, strict=True)],
                          states.shape[1] // len(runs))  # fmt: skip
-        values, lower, upper = (v[places] for v in (probe.values, own.lower, own.upper))
+        raw = whole[:, : len(places)]
+        signal = np.concatenate([r.y[skip:] / bench.scale for r, skip in zip(bench.recordings, skips, strict=True)])
+        felt = np.linalg.norm(signal - signal.mean(axis=0)) / np.where(lengths(raw) > 0, lengths(raw), 1.0)
+        values, given, lower, upper = (v[places] for v in (probe.values, own.start, own.lower, own.upper))
         units = [p.unit for p in own.values() for _ in range(p.size)]
         return cls(
             tuple(own.labels[i] for i in places),
             tuple(units[i] for i in places),
             values,
-            room(values, lower, upper),
-            whole[:, : len(places)],
+            room(np.where(given != 0, np.abs(given), felt), lower, upper),
+            raw,
             orthonormal(states[:, kept]),
         )
 
@@ -123,100 +134,110 @@ class Sensitivity:
         return np.asarray(columns - self.start @ (self.start.T @ columns))
 
 
-def room(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+def room(size: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Standard deviation of values of which the bounds alone are known: uniform, in logarithms if of one sign.
 
-    Without bounds the value itself, as nobody knows its sign then.
+    Without bounds it is `size`: the given value, whose sign would be unknown then; of a value given as zero the change
+    that moves the outputs as much as they have moved.
     """
-    out = np.where(values != 0, np.abs(values), 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(np.log(upper / lower)) / np.sqrt(12) * np.abs(values)
+        ratio = np.abs(np.log(upper / lower)) / np.sqrt(12) * size
     linear = (upper - lower) / np.sqrt(12)
-    bounded = np.isfinite(linear)
-    out = np.where(bounded, linear, out)
-    return np.where(bounded & (lower * upper > 0) & (ratio > 0), ratio, np.where(out > 0, out, 1.0))
+    bounded = np.isfinite(linear) & (linear > 0)
+    return np.where(bounded & (lower * upper > 0), ratio, np.where(bounded, linear, size))
 
 
-def untold(scaled: np.ndarray) -> int:
+def count_undetermined(scaled: np.ndarray) -> int:
     """Number of directions along which the standard error is larger than the room."""
-    return int(np.sum(np.linalg.svd(scaled, compute_uv=False) < 1)) if scaled.shape[1] else 0
+    return scaled.shape[1] - int(np.sum(np.linalg.svd(scaled, compute_uv=False) >= 1)) if scaled.shape[1] else 0
 
 
-def told_parameters(
-    seen: Sensitivity, bench: Workbench, fitted: Fitted
+def assess_parameters(
+    response: Sensitivity, bench: Workbench, fitted: Fitted
 ) -> tuple[tuple[ParameterRow, ...], tuple[Tie, ...]]:
     """Each free parameter, and the groups that are traded off."""
-    names, n = seen.names, len(seen.names)
+    names, n = response.names, len(response.names)
     if not n:
         return (), ()
-    small = np.asarray(np.linalg.qr(seen.scaled, mode="r"))  # the same singular values
-    alone, before = lengths(small), lengths(seen.raw * seen.room)
-    told = np.full(n, "yes", dtype=object)
-    told[alone < 1] = "start"
-    told[before < 1] = "flat"
-    told[before == 0] = "dead"
-    rest = [i for i in range(n) if told[i] == "yes"]
+    small = np.asarray(np.linalg.qr(response.scaled, mode="r"))  # the same singular values
+    alone, before = lengths(small), lengths(response.raw * response.room)
+    status = np.full(n, "identifiable", dtype=object)
+    status[alone < 1] = "start"
+    status[before < 1] = "flat"
+    status[before == 0] = "dead"
+    rest = [i for i in range(n) if status[i] == "identifiable"]
     groups = _groups(small, rest)
     for i in {i for g in groups for i in g}:
-        told[i] = "tied"
+        status[i] = "tied"
     _, s, v = np.linalg.svd(small[:, rest])
     weight = np.where(s >= 1, 1 / np.maximum(s, 1.0), 0.0)
-    std = seen.room[rest] * np.sqrt(np.sum((weight[:, None] * v[: len(s)]) ** 2, axis=0)) if rest else np.zeros(0)
+    std = response.room[rest] * np.sqrt(np.sum((weight[:, None] * v[: len(s)]) ** 2, axis=0)) if rest else np.zeros(0)
     by_place = dict(zip(rest, std.tolist(), strict=True))
     rows = []
     for i, name in enumerate(names):
-        own = by_place.get(i) if told[i] == "yes" else None
-        rows.append(ParameterRow(name, float(seen.values[i]), seen.units[i], own, str(told[i])))
-    ties = tuple(Tie(tuple(names[i] for i in g), _only_as(seen, small, g, bench, fitted)) for g in groups)
+        own = by_place.get(i) if status[i] == "identifiable" else None
+        rows.append(ParameterRow(name, float(response.values[i]), response.units[i], own, str(status[i])))
+    ties = tuple(Tie(tuple(names[i] for i in g), _only_as(response, small, g, bench, fitted)) for g in groups)
     return tuple(rows), ties
 
 
 def _groups(small: np.ndarray, rest: list[int]) -> list[list[int]]:
-    """Smallest sets of columns that hold an untold direction; those that share a parameter are one group."""
+    """Smallest sets of columns that hold an undetermined direction; those that share a parameter are one group."""
     found: list[set[int]] = []
+    total = count_undetermined(small[:, rest])
+    share = _share(small, rest)
+    involved = [i for i, part in zip(rest, share, strict=True) if part > SAME]
 
-    def left() -> int:  # untold directions that no group holds
-        return untold(small[:, rest]) - sum(untold(small[:, sorted(g)]) for g in found)
+    def left() -> int:  # undetermined directions that no group holds
+        return total - sum(count_undetermined(small[:, sorted(g)]) for g in found)
 
-    for size in range(2, min(LARGEST_GROUP, len(rest)) + 1):
-        for chosen in combinations(rest, size):
-            if left() <= 0:
-                break
+    for size in range(2, min(LARGEST_GROUP, len(involved)) + 1):
+        if left() <= 0:
+            break
+        for chosen in combinations(involved, size):
             new = set(chosen)
-            if any(new <= g for g in found) or untold(small[:, list(chosen)]) == 0:
+            if any(new <= g for g in found) or count_undetermined(small[:, list(chosen)]) == 0:
                 continue
-            if any(untold(small[:, list(part)]) for part in combinations(chosen, size - 1)):
+            if any(count_undetermined(small[:, list(part)]) for part in combinations(chosen, size - 1)):
                 continue  # a smaller set holds it
             for g in [g for g in found if g & new]:
                 found.remove(g)
                 new |= g
             found.append(new)
+            if left() <= 0:
+                break
     if left() > 0:  # spread over many
-        taken = {i for g in found for i in g}
-        _, s, v = np.linalg.svd(small[:, rest])
-        share = np.abs(v[len(s) - untold(small[:, rest]) :]).max(axis=0)
-        wide = {i for i, part in zip(rest, share, strict=True) if part > 0.1} - taken  # a tenth of the direction
-        if len(wide) > 1:
-            found.append(wide)
+        wide = [i for i in involved if not any(i in g for g in found)]
+        for i in sorted(wide, key=lambda i: share[rest.index(i)]):  # the least involved first
+            others = [j for j in wide if j != i]
+            wide = others if count_undetermined(small[:, others]) == count_undetermined(small[:, wide]) else wide
+        found += [set(wide)] if len(wide) > 1 else []
     return [sorted(g) for g in found]
 
 
+def _share(small: np.ndarray, rest: list[int]) -> np.ndarray:
+    """How much each parameter takes part in the undetermined directions, between 0 and 1."""
+    _, s, v = np.linalg.svd(small[:, rest])
+    s = np.append(s, np.zeros(len(v) - len(s)))
+    return np.asarray(lengths(v[s < 1]))
+
+
 def _only_as(
-    seen: Sensitivity, small: np.ndarray, group: list[int], bench: Workbench, fitted: Fitted
+    response: Sensitivity, small: np.ndarray, group: list[int], bench: Workbench, fitted: Fitted
 ) -> tuple[str, ...]:
-    """What is told of a group: monomials or sums of small whole numbers, or nothing where it is neither."""
-    names, values = [seen.names[i] for i in group], seen.values[group]
+    """What is identifiable of a group: monomials or sums of small whole numbers, or nothing where it is neither."""
+    names, values = [response.names[i] for i in group], response.values[group]
     found = []
     for unit, write in ((values, _monomial), (np.ones(len(group)), _sum)):
-        if np.all(unit != 0) and (rows := _whole(small[:, group], seen.room[group] / unit)) is not None:
-            change = _finite_change(rows, write is _monomial, group, seen, bench, fitted)
+        if np.all(unit != 0) and (rows := _whole(small[:, group], response.room[group] / unit)) is not None:
+            change = _finite_change(rows, write is _monomial, group, response, bench, fitted)
             found.append((change, tuple(write(names, row) for row in rows)))
     change, best = min(found, default=(np.inf, ()))
     return best if change < SAME else ()
 
 
 def _whole(columns: np.ndarray, room: np.ndarray) -> np.ndarray | None:
-    """Rows of small whole numbers that are constant along all untold directions of a group; None where there are none.
+    """Find rows of small whole numbers that are constant along a group's undetermined directions, or None.
 
     `columns` are those of J D, and `room` is D in the coordinates wanted, with their sign.
     """
@@ -281,7 +302,7 @@ def _sum(names: Sequence[str], factors: np.ndarray) -> str:
 
 
 def _finite_change(
-    rows: np.ndarray, logarithmic: bool, group: list[int], seen: Sensitivity, bench: Workbench, fitted: Fitted
+    rows: np.ndarray, logarithmic: bool, group: list[int], response: Sensitivity, bench: Workbench, fitted: Fitted
 ) -> float:
     """Change of the first recording's outputs by a step of a tenth along which the rows are constant.
 
@@ -291,7 +312,7 @@ def _finite_change(
     along = np.linalg.svd(rows)[2][len(rows)]
     along /= np.max(np.abs(along))
     places = np.flatnonzero(ParameterSet(dict(bench.simulator.parameters)).free)[group]
-    value, alone = seen.values[group], np.eye(len(group))[0]
+    value, alone = response.values[group], np.eye(len(group))[0]
     far = (STEP - 1) * np.min(np.abs(value))
     r, model = bench.recordings[0], fitted.model
     drive = model.drive(r)
@@ -307,7 +328,7 @@ def _finite_change(
         changes = np.column_stack([outputs(along) - now, outputs(alone) - now])
     if not np.all(np.isfinite(changes)):
         return np.inf
-    start = seen.start[: len(changes)]
+    start = response.start[: len(changes)]
     if start.shape[1]:
         changes = changes - start @ np.linalg.lstsq(start, changes, rcond=None)[0]
     size = lengths(changes)

@@ -20,11 +20,11 @@ def files(tmp_path):
     return tmp_path
 
 
-def test_it_prints_what_is_told_and_writes_it(capsys, files):
+def test_it_prints_what_is_found_and_writes_it(capsys, files):
     given = ("check", files / "rig.py", files / "rig_train.csv", "--initial", "zero", "--hold", "zero")
     status, out, err = run(capsys, *given, "--out", files / "out")
     assert status == 0 and not err
-    for words in ("parameter", "k2", "seen from (rms)", "ground-m1", "reversals", "noise", "next record: "):
+    for words in ("parameter", "k2", "detectable from (rms)", "ground-m1", "reversals", "noise", "next record: "):
         assert words in out
     found = json.loads((files / "out" / "check.json").read_text(encoding="utf-8"))
     assert found["hold"] == "zero" and found["starts"] == ["at zero"]
