@@ -156,16 +156,23 @@ def pairs(texts: Sequence[str], option: str) -> dict[str, str]:
 
 
 def numbers_of(texts: Sequence[str], option: str) -> dict[str, float]:
-    """Split each `NAME=NUMBER`."""
-    return {name: number(value, f"{option} {name}={value}") for name, value in pairs(texts, option).items()}
+    """Split each `NAME=NUMBER`; refuse an infinite one."""
+    found = {name: number(value, f"{option} {name}={value}") for name, value in pairs(texts, option).items()}
+    for name, value in found.items():
+        if math.isinf(value):
+            raise InputError(f"{option} {name}={value} was given; give a finite number.")
+    return found
 
 
 def number(text: str, given: str) -> float:
-    """Read a number; `given` begins the sentence where it is none."""
+    """Read a number, which may be infinite; `given` begins the sentence where it is none."""
     try:
-        return float(text)
+        value = float(text)
     except ValueError:
-        raise InputError(f"{given} was given, and {text!r} is not a number; write one like 0.5.") from None
+        value = math.nan
+    if math.isnan(value):
+        raise InputError(f"{given} was given, and {text!r} is not a number; write one like 0.5.")
+    return value
 
 
 def check_given_once(paths: Sequence[str]) -> None:

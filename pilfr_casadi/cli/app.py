@@ -36,6 +36,30 @@ COMMANDS = {  # name: (file, help)
 KEYWORDS = ("dt", "time_tolerance", "period", "hold", "initial", "skip", "starts", "seed", "workers", "engine")
 
 
+class PlainCommand(typer.core.TyperCommand):
+    """A command whose help names its arguments as they are written, without braces and Python types."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return what follows the command in the usage line."""
+        names = [p.metavar + "..." * (p.nargs != 1) for p in _arguments(self)]
+        return [self.options_metavar or "", *names]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the tables of arguments and options."""
+        rows = {
+            "Arguments": [(p.metavar, p.help or "") for p in _arguments(self)],
+            "Options": [p.get_help_record(ctx) for p in self.get_params(ctx) if p.param_type_name == "option"],
+        }
+        for title, table in rows.items():
+            if table:
+                with formatter.section(title):
+                    formatter.write_dl(table)
+
+
+def _arguments(command: Any) -> list[Any]:
+    return [p for p in command.params if p.param_type_name == "argument"]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command.
 
@@ -92,7 +116,7 @@ def _program(wanted: str) -> typer.Typer:
         command: Callable[..., Any] = _placeholder
         if name == wanted:
             command = getattr(importlib.import_module(f".{file}", __package__), f"{name}_command")
-        program.command(name, help=f"{text}\n\n\b\n{command.__doc__ or ''}", short_help=text)(command)
+        program.command(name, cls=PlainCommand, help=f"{text}\n\n{command.__doc__ or ''}", short_help=text)(command)
     return program
 
 

@@ -72,7 +72,7 @@ STRUCTURE_NAMES = {"bound": "bounds"}  # options with another name in the struct
 class FitOptions(DataOptions):
     """The options of `pilfr fit`; options of a search have no default, to show which ones were given."""
 
-    train: list[str] = typer.Argument(..., help="Training recordings (.csv, .mat, .npz).", metavar="TRAIN")
+    train: list[str] = typer.Argument(..., metavar="TRAIN", help="Training recordings (.csv, .mat, .npz).")
     inputs: str = option("Names of the inputs.", "NAME[,NAME]", ...)
     outputs: str = option("Names of the outputs.", "NAME[,NAME]", ...)
     test: list[str] = option("Test recording, never fitted (repeatable).", "FILE", [])
@@ -269,9 +269,11 @@ def describe_test_error(result: Fit, recording: Recording) -> str:
 class SimulateOptions(DataOptions):
     """The options of `pilfr simulate`."""
 
-    model: str = typer.Argument(..., help="A saved model, model.json.")
+    model: str = typer.Argument(..., metavar="MODEL", help="A saved model, model.json.")
     data: str = typer.Argument(
-        ..., help="A recording (.csv, .mat, .npz), or several in one array (.npz, .npy: samples, channels, ...)."
+        ...,
+        metavar="DATA",
+        help="A recording (.csv, .mat, .npz), or several in one array (.npz, .npy: samples, channels, ...).",
     )
     out: str = option("CSV file; for several records also .npz or .npy.", "FILE", ...)
 
@@ -409,11 +411,11 @@ def _error_line(fitted: Fit, recording: Recording, y: np.ndarray) -> str:
 class ExportOptions:
     """The options of `pilfr export`."""
 
-    model: str = typer.Argument(..., help="A model.json, or a Python file that sets `simulator`.")
+    model: str = typer.Argument(..., metavar="MODEL", help="A model.json, or a Python file that sets `simulator`.")
     out: str = option("Path of the file; with --c the folder of both files.", "FILE", ...)
     casadi: bool = flag("Write a file for casadi.Function.load, and one with its names (default).", "--casadi")
     c: bool = flag("Write C source and header that need no library.", "--c")
-    name: str = option("Name of the function (default: model).", default="model")
+    name: str = option("Name of the function (default: model).", "NAME", "model")
     smooth: float = option("Width of the rounding of min and max (default: 0, exact).", "EPS", 0.0)
     dt: float | None = option("Duration of a step, needed for a simulator.", "SECONDS")
     hold: Literal["zero", "linear"] | None = option("Course of a simulator's inputs between samples.")

@@ -143,6 +143,9 @@ def test_too_few_samples_for_the_order(capsys, tmp_path):
         (("--bound", "w=2"), "LOW:HIGH"),
         (("--bound", "nothing=0:1"), "nothing"),
         (("--fix", "D_yu=a"), "not a number"),
+        (("--fix", "D_yu=nan"), "--fix D_yu=nan was given, and 'nan' is not a number"),
+        (("--fix", "D_yu=-inf"), "--fix D_yu=-inf was given; give a finite number"),
+        (("--bound", "w=nan:1"), "--bound w=nan:1 was given, and 'nan' is not a number"),
         (("--fix", "Q=0"), "'Q'"),
         (("--nx", "-1"), "--nx -1 was given; give a whole number from 0 to 1000"),
         (("--operators", "-2"), "--operators"),
@@ -278,7 +281,9 @@ def test_version_and_help(capsys):
     assert status == 0 and "pilfr: " not in err
     for name in ("fit", "check", "diagnose", "simulate", "export", "run", "campaign", "demo"):
         assert f"\n  {name} " in out
-        assert run(capsys, name, "--help")[0] == 0
+        status, text, _ = run(capsys, name, "--help")
+        assert status == 0
+        assert not re.search(r"<(list|str|int|float)|TEXT|INTEGER|FLOAT|[{}]", text), text  # types are Python's
 
 
 def test_options_are_not_abbreviated(capsys, tmp_path, train):

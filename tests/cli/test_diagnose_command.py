@@ -222,7 +222,7 @@ def test_files_that_are_missing_or_in_the_wrong_place(capsys, files):
     refused(capsys, *arguments(files)[:-4], "--out", files / "file" / "below", says="--out")
 
 
-@pytest.mark.parametrize("limit", ["force=much", "force", "torque=3", "force=-1"])
+@pytest.mark.parametrize("limit", ["force=much", "force", "torque=3", "force=-1", "force=nan", "force=inf"])
 def test_limits_that_are_none(capsys, files, limit):
     refused(capsys, *arguments(files, "--limit", limit), says=("limit", limit.partition("=")[0]))
 
