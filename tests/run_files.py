@@ -55,6 +55,7 @@ operators = [1, 3]
 start = "plain"
 starts = 1
 """
+ALONE = ("workers = 2", "workers = 1")  # a campaign in this process, without the second that each worker takes to begin
 PYTHON = """
 import pilfr_casadi as pilfr
 run = dict(

@@ -65,6 +65,7 @@ def test_fit_simulate_and_export_run_end_to_end(capsys, tmp_path, fitted):
     assert f.name_in() == ["x", "u"] and f.name_out() == ["x_next", "y"]
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_fit_tells_its_stages_in_plain_lines(capsys, tmp_path, train, monkeypatch):
     """Piped, each line has the stage, what is done of it, the best error so far, which never rises, and the time."""
     for pause in ("NEW_STAGE_LINE", "LINE"):
@@ -84,6 +85,7 @@ def test_fit_tells_its_stages_in_plain_lines(capsys, tmp_path, train, monkeypatc
     assert spent == sorted(spent)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_saved_model_can_be_fitted_further(capsys, tmp_path, train, model):
     names = ("--inputs", "u", "--outputs", "y", "--initial", "zero")
     further = ("fit", train, *names, "--from", model, "--out", tmp_path / "further")
@@ -218,6 +220,7 @@ def test_an_unstable_start_is_refused(capsys, tmp_path, train, model):
     refused(capsys, "fit", train, *names, "--from", wild, "--out", tmp_path / "wild", says="diverges")
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_messages_name_options_of_the_command_line(capsys, tmp_path, train, monkeypatch):
     path = tmp_path / "odd.csv"
     path.write_text(train.read_text().replace("t,u,y", "clock,u,y", 1))
@@ -291,6 +294,7 @@ def test_options_are_not_abbreviated(capsys, tmp_path, train):
     assert status == 2 and "No such option: --start" in err
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_model_is_overwritten_only_when_asked(capsys, tmp_path, train):
     model = tmp_path / "out" / "model.json"
     model.parent.mkdir()
@@ -302,6 +306,7 @@ def test_a_model_is_overwritten_only_when_asked(capsys, tmp_path, train):
     assert json.loads(model.read_text())["format"]
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_fit_says_what_it_works_with(capsys, tmp_path, train, monkeypatch):
     arguments = list(fit_arguments(train, tmp_path, "--operators", 0))
     del arguments[arguments.index("--nx") : arguments.index("--nx") + 2]
@@ -313,6 +318,7 @@ def test_fit_says_what_it_works_with(capsys, tmp_path, train, monkeypatch):
     assert "engine: CasADi's virtual machine, which is slower: no C compiler was found\n" in out
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_compiler_that_fails_is_named(capsys, tmp_path, train, monkeypatch):
     monkeypatch.setattr("pilfr_casadi.engine.compiled.compiler", lambda: "/bin/false")
     status, out, err = run(capsys, *fit_arguments(train, tmp_path, "--operators", 0))
@@ -320,6 +326,7 @@ def test_a_compiler_that_fails_is_named(capsys, tmp_path, train, monkeypatch):
     assert out.count("virtual machine") == 1 and "/bin/false could not build the model" in out
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_time_limit_keeps_the_best_so_far(capsys, tmp_path):
     path = write_csv(tmp_path / "train.csv", m=2000)
     names = ("--inputs", "u", "--outputs", "y", "--nx", 3, "--operators", 20, "--starts", 2000)
@@ -419,6 +426,7 @@ def test_an_interrupted_run_writes_the_best_so_far(tmp_path):
     assert json.loads((tmp_path / "out" / "model.json").read_text())["parameters"]["A"]
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_model_that_misses_its_constraints_is_no_usable_result(capsys, tmp_path):
     """What contradicts itself is bad input (2), what no solver could meet no usable result (1), as in a run."""
     write_csv(tmp_path / "train.csv", seed=0, m=200)

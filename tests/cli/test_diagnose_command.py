@@ -232,6 +232,7 @@ def test_recordings_that_do_not_fit_each_other(capsys, files, truth):
     refused(capsys, *arguments(files), says=("test.csv", "0.01 s", "0.02 s"))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_what_a_simulation_answered_stands_in_for_it(capsys, files):
     write_csv(files / "simulated.csv", *rig(5, m=1200, k=95.0, cubic=0.0))
     status, out, err = run(capsys, *arguments(files, "--hold", "zero", "--initial", "zero", simulator=None))
@@ -312,6 +313,7 @@ def test_a_column_that_the_recordings_have_not_is_told(capsys, files, truth, mon
     assert status == 130 and seen["outputs"] == ("position", "speed"), err
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, monkeypatch):
     """A fitted PI-LFR in place of a simulator file: its matrices are parameters of the simulator."""
     names = ("--inputs", "force", "--outputs", "position", "--nx", 2, "--operators", 0)
@@ -328,6 +330,7 @@ def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, monkeypatch
     assert (files / "out" / "report.html").exists()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_saved_model_is_diagnosed_like_a_simulator(capsys, files, monkeypatch):
     seen = {}
 
@@ -350,6 +353,7 @@ def test_a_saved_model_is_diagnosed_like_a_simulator(capsys, files, monkeypatch)
     refused(capsys, *given, "--column", "u=force", "--column", "y=position", says=("0.05 s", "0.02 s"))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_demonstration_finds_what_its_rig_hides(capsys, tmp_path):
     assert diagnose_rig(tmp_path / "diagnosis", 1) == 0
     assert "Coulomb friction at ground-m2" in capsys.readouterr().out

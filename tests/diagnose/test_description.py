@@ -22,6 +22,7 @@ def diagnosed(true, law, test=True):
     return pilfr.diagnose(rig(430.0, 5.0), recorded(true, 0), test=held_out, laws=(law,), **options)
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(
     ("true", "law"),
     [(STIFF_TOO, PiecewiseStiffness), (HYSTERETIC, ProgressiveStiffness)],

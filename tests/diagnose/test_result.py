@@ -94,6 +94,7 @@ def with_test_errors(before, after, confidence, **more):
     return replace(d, errors=errors, effects=tuple(replace(e, confidence=confidence) for e in d.effects))
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(
     ("confidence", "after", "tone"),
     [(0.03, 0.01, "warning"), (0.03, 2.58, "bad")],
@@ -122,6 +123,7 @@ def test_a_correction_that_diverges_on_the_test_recording_is_worse():
     assert d.outcome == "worse" and "the simulation diverges" in d.summary
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_free_vector_parameter_is_diagnosed_to_the_end(tmp_path):
     """A simulator whose stiffness and damping are the two entries of one parameter."""
     simulator = Simulator(

@@ -195,6 +195,7 @@ def test_limits_that_are_missed_say_so(record, full):
     assert not limit.met and "NOT MET, off by" in str(limit)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_report_has_the_limits(record, tmp_path):
     fit = pilfr.fit(pilfr.hammerstein(1, PLAYS), record, starts=1, constraints=dc_gain(1.1))
     page = pilfr.fit_report(fit, record, (), tmp_path).read_text()

@@ -54,11 +54,13 @@ def test_every_verdict_has_its_files(verdict, tmp_path):
         assert titles[0] == "What the recordings" + "&#39; checks found" and "wrong way round" in reader.text
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_without_test_recordings_it_says_so(tmp_path):
     text = Reader(diagnosis_report(example(test=False), tmp_path).read_text()).text
     assert "no test was given" in text and "none held out" in text and "test (held out)" not in text
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.slow
 def test_it_says_what_makes_the_answer_less_certain(tmp_path):
     d = example()
@@ -68,6 +70,7 @@ def test_it_says_what_makes_the_answer_less_certain(tmp_path):
     assert "The test error is far above the training error" in text
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.slow
 def test_what_is_closed_in_without_a_name_is_said_with_the_error(tmp_path):
     d, note = example(), Gate("ground", "unsure", "creep", "Beside it something more is missing.", False)
@@ -90,6 +93,7 @@ def test_it_is_simulated_in_the_steps_of_the_fits():
         assert not np.array_equal(getattr(found, name), getattr(known, name))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_test_that_gets_worse_a_refit_that_follows_nothing_and_an_interrupt_are_said(tmp_path):
     d = example()
     worse = {role: {**e, "before": 0.97, "after": 1.4} for role, e in d.errors.items()}
@@ -103,6 +107,7 @@ def test_a_test_that_gets_worse_a_refit_that_follows_nothing_and_an_interrupt_ar
     assert all(note in text and note in str(found) for note in found.warnings())
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_old_figures_go_and_other_files_stay(tmp_path):
     (tmp_path / "figures").mkdir()
     old, mine = (tmp_path / "figures" / name for name in ("diagnosis-99-old.png", "mine.png"))

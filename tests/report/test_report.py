@@ -207,6 +207,7 @@ def test_modes_are_eigenvalues():
     assert large.rows[0] == pytest.approx(small.rows[0])
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(
     ("status", "tone"),
     [(Status.MAX_ITERATIONS, "warning"), (Status.INTERRUPTED, "warning"), (Status.INFEASIBLE, "bad")],

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import sentence, write_csv
-from run_files import PYTHON, changed, command, contents, prepared
+from run_files import ALONE, PYTHON, changed, command, contents, prepared
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import Clock, InputError, close_workers, time_limit, workers
@@ -103,7 +103,7 @@ def test_what_a_campaign_tells(folder, capsys):
     long = f"{'long' * 25}.csv"
     (folder / "test.csv").rename(folder / long)
     names = ("test.csv", long)
-    assert main(["campaign", str(changed(folder, few, names))]) == 0
+    assert main(["campaign", str(changed(folder, ALONE, few, names))]) == 0
     said = capsys.readouterr().out
     assert "2 cells x 3 seeds" in said and "6 jobs done now" in said
     assert "chosen on the training recordings" in said  # two structures, and nothing to judge them by
@@ -119,7 +119,7 @@ def test_what_a_campaign_tells(folder, capsys):
         assert len(errors) == 3 and row["failed"] == "0" and float(row["median"]) == np.median(errors)
         assert float(row["upper_quartile"]) == np.percentile(errors, 75)
         assert shown[long, "(test)", n] == f"{np.median(errors):.4f}"  # nothing is cut off, however long the line
-    more = pilfr.campaign(changed(folder, few, names, ("[1, 3]", "[1, 2, 3]")))  # a grid that grows
+    more = pilfr.campaign(changed(folder, ALONE, few, names, ("[1, 3]", "[1, 2, 3]")))  # a grid that grows
     assert len(more.done) == 3 and len(more.skipped) == 6
 
 
@@ -194,7 +194,7 @@ def test_ctrl_c_after_the_jobs_says_that_they_are_done(folder, monkeypatch, caps
         raise KeyboardInterrupt
 
     monkeypatch.setattr(importlib.import_module("pilfr_casadi.studies.execution"), "summarise", interrupted)
-    assert main(["campaign", str(folder / "rig.toml")]) == 130
+    assert main(["campaign", str(changed(folder, ALONE))]) == 130
     assert "8 of 8 jobs are done" in capsys.readouterr().err
     assert len({r["job"] for r in rows(folder / "rig-campaign")}) == 8
 
@@ -244,7 +244,7 @@ def test_a_job_that_hangs_dies_or_fails_does_not_stop_the_others(folder, what, s
 
 def test_more_time_or_another_worker_tries_again(folder):
     few = ("count = 4", "count = 2")
-    first = pilfr.campaign(changed(folder, few))
+    first = pilfr.campaign(changed(folder, ALONE, few))
     manifest = Manifest.read(first.folder)
     entries = manifest.content["jobs"]
     a, b = first.done[:2]
@@ -259,7 +259,11 @@ def test_more_time_or_another_worker_tries_again(folder):
 
 def test_cross_validation_recommends_a_structure(folder):
     path = changed(
-        folder, ("count = 4", "count = 1"), ("report = false", "folds = 2\nreport = false"), ("[1, 3]", "[0, 2, 5]")
+        folder,
+        ALONE,
+        ("count = 4", "count = 1"),
+        ("report = false", "folds = 2\nreport = false"),
+        ("[1, 3]", "[0, 2, 5]"),
     )
     result = pilfr.campaign(path)
     chosen = result.selection
@@ -274,7 +278,7 @@ def test_cross_validation_recommends_a_structure(folder):
 def test_models_that_explain_nothing_count_as_failed(folder, capsys):
     """A constant output is a minimum, which a solver may call converged; of a start it is a failure."""
     shut = ("nx = 1", "nx = 1\nbounds = { w = [0.0, 0.0] }")
-    assert main(["campaign", str(changed(folder, ("count = 4", "count = 2"), shut, ("[1, 3]", "[3]")))]) == 1
+    assert main(["campaign", str(changed(folder, ALONE, ("count = 4", "count = 2"), shut, ("[1, 3]", "[3]")))]) == 1
     out, err = capsys.readouterr()
     assert out.count("The model explains nothing of the training recordings") == 2 and "explains nothing" in err
     result = pilfr.campaign(folder / "rig.toml")
@@ -284,7 +288,9 @@ def test_models_that_explain_nothing_count_as_failed(folder, capsys):
 
 def test_a_validation_recording_recommends_one_too(folder):
     write_csv(folder / "held.csv", seed=7, m=400)
-    result = pilfr.campaign(changed(folder, ('test = "test.csv"', 'validation = "held.csv"'), ("[1, 3]", "[0, 2, 6]")))
+    result = pilfr.campaign(
+        changed(folder, ALONE, ('test = "test.csv"', 'validation = "held.csv"'), ("[1, 3]", "[0, 2, 6]"))
+    )
     assert result.selection.names[result.selection.cell] == "operators 2"
     assert result.chosen.startswith("operators-2")
 

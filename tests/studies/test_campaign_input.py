@@ -7,7 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 from command_line import refused, sentence
-from run_files import changed, prepared
+from run_files import ALONE, changed, prepared
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
@@ -46,7 +46,7 @@ def folder(tmp_path):
     ],
 )
 def test_bad_input_gets_one_sentence(capsys, folder, old, new, says):
-    refused(capsys, "campaign", changed(folder, (old, new), ("workers = 2", "workers = 1")), says=says)
+    refused(capsys, "campaign", changed(folder, (old, new), ALONE), says=says)
 
 
 def test_bad_workers_get_one_sentence(folder):
@@ -71,14 +71,14 @@ def test_bad_folders_and_places_get_one_sentence(capsys, folder, monkeypatch):
 
 
 def test_results_of_another_version_get_one_sentence(capsys, folder):
-    out = pilfr.campaign(changed(folder, ("count = 4", "count = 1"))).folder
+    out = pilfr.campaign(changed(folder, ALONE, ("count = 4", "count = 1"))).folder
     manifest = Manifest.read(out)
     manifest.content["versions"]["pilfr_casadi"] = "0.0.1"
     manifest.write()
     refused(capsys, "campaign", folder / "rig.toml", says=("results of pilfr_casadi 0.0.1", "--overwrite"))
     (out / "manifest.json").write_text('{"format": "pilfr_casadi run", "version": 7}')
     refused(capsys, "campaign", folder / "rig.toml", says=("manifest", "--overwrite"))
-    assert main(["campaign", str(changed(folder, ("count = 4", "count = 1"))), "--overwrite"]) == 0
+    assert main(["campaign", str(changed(folder, ALONE, ("count = 4", "count = 1"))), "--overwrite"]) == 0
 
 
 def test_unfit_workers_get_one_sentence(folder, monkeypatch):
@@ -99,7 +99,7 @@ def test_why_jobs_have_no_model_is_told_once_a_reason(capsys, folder):
     two = ("count = 4", "count = 2")
     gain = "[constraints]\ndc_gain = { value = 1e9, within = 1.0 }\n[grid]"
     bounds = "nx = 1\nbounds = { A = [-0.5, 0.5], w = [0, 1], B_w = [0, 1], C_y = [0, 1], D_yw = [0, 1] }"
-    path = changed(folder, two, ("[grid]\noperators = [1, 3]", gain + "\noperators = [2]"), ("nx = 1", bounds))
+    path = changed(folder, ALONE, two, ("[grid]\noperators = [1, 3]", gain + "\noperators = [2]"), ("nx = 1", bounds))
     for kind in ("run", "campaign"):
         assert main([kind, str(path)]) == 1
         out, err = capsys.readouterr()

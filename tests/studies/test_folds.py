@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from command_line import refused, write_csv
-from run_files import changed, prepared
+from run_files import ALONE, changed, prepared
 
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import InputError
@@ -36,7 +36,7 @@ def test_folds_hold_out_every_sample_once(folder):
 def test_other_folds_are_other_jobs(folder, monkeypatch):
     """How recordings are dealt is no entry of the run file; results of another dealing must not be taken for these."""
     path = changed(
-        folder, ("count = 4", "count = 1"), ("report = false", "folds = 2\nreport = false"), ("[1, 3]", "[0]")
+        folder, ALONE, ("count = 4", "count = 1"), ("report = false", "folds = 2\nreport = false"), ("[1, 3]", "[0]")
     )
     assert set(pilfr.campaign(path).done) == {
         "operators-0_fold-0_seed-0",

@@ -61,6 +61,7 @@ def test_a_run_gives_the_same_bytes_twice_and_skips_what_is_done(folder):
     assert {k: v for k, v in contents(none.folder).items() if k != "manifest.json"} == models
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_what_is_written(done):
     folder = done
     result = pilfr.run(changed(folder, "report = false", "report = true"))
@@ -171,6 +172,7 @@ def test_the_same_content_under_another_key_order_is_the_same_job(folder):
     assert keys[0] == keys[1] and len(set(keys[0])) == 3
 
 
+@pytest.mark.usefixtures("blank_figures")
 @pytest.mark.parametrize(
     "name", ["model.json", "jobs/seed-0/model.json", "results.csv", "manifest.json", "report.html"]
 )
