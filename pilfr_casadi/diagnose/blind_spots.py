@@ -15,6 +15,7 @@ from .linearise import Probe, Run, along
 from .workbench import Fitted, Workbench
 
 SMALLEST_SWING = 0.05  # of a reversal, over the travel; smaller ones are ripple on the way
+HALF = 0.5  # mean square error over the outputs' power, above which the linearisation may be that of another machine
 MOTION = ("no-reversal", "one-amplitude")
 
 
@@ -118,14 +119,22 @@ def _rests(z: np.ndarray, least: float, samples: float) -> int:
 
 def find_blind_spots(
     bench: Workbench,
+    fitted: Fitted,
     parameters: Sequence[ParameterRow],
+    alive: Sequence[str],
     ties: Sequence[Tie],
     laws: Sequence[LawRow],
     classes: Sequence[Sequence[tuple[str, str]]],
     moving: Sequence[Excitation],
 ) -> Iterator[BlindSpot]:
-    """Put everything that the recordings cannot reveal into sentences, the gravest first."""
+    """Put everything that the recordings cannot reveal into sentences, the gravest first.
+
+    `alive` are dead or flat parameters that move the outputs at the given values.
+    """
     simulator = bench.simulator
+    if fitted.cost > HALF:
+        left = f"{100 * fitted.cost**0.5:.3g} % of the outputs' deviation"
+        yield BlindSpot("rough", (), f"The refitted simulator leaves {left}, so all of this is rough.")
     u = np.concatenate([r.u for r in bench.recordings])
     if still := tuple(n for n, v in zip(simulator.inputs, u.T, strict=True) if not np.ptp(v) > 0):
         yield BlindSpot("constant-input", still, f"Constant in all recordings: {in_words(still)}.")
@@ -139,7 +148,10 @@ def find_blind_spots(
     }
     for kind, sentence in sentences.items():
         if names := tuple(p.name for p in parameters if p.status == kind):
-            yield BlindSpot(kind, names, sentence.format(in_words(names)))
+            text = sentence.format(in_words(names))
+            if own := [name for name in names if name in alive]:
+                text += f" At the given values, before the refit, the outputs do react to {in_words(own)}."
+            yield BlindSpot(kind, names, text)
     for tie in ties:
         yield BlindSpot("tied", tie.names, tie.sentence)
     yield from _motion([e for e in moving if e.port.removeprefix("actuator:") not in still])
@@ -230,6 +242,8 @@ def helpful_sensors(
 def next_record(bench: Workbench, blind: Sequence[BlindSpot], ties: Sequence[Tie], sensors: Sequence[str]) -> str:
     """The sentence on what to record next: the gravest blind spot that a record can mend."""
     by_kind = {b.kind: b.names for b in reversed(blind)}
+    if "rough" in by_kind:
+        return "None before the simulator follows these better: check its values and units, the start and the hold."
     u = np.concatenate([r.u for r in bench.recordings])
     driven = [n for n, v in zip(bench.simulator.inputs, u.T, strict=True) if np.ptp(v) > 0]
     drive = driven[0] if driven else "the input"

@@ -24,11 +24,11 @@ from .floor import Floor, measured_floor, white_part
 from .gates import said_hold
 from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters
 from .linearise import linearised
+from .remainder import lengths
 from .result import LEFT, plain
-from .workbench import Workbench
+from .workbench import Fitted, Workbench
 
 FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a sensor of 20 bits
-HALF = 0.5  # of the outputs' power that the refit leaves, from which its linearisation is that of another machine
 FEWEST = 20  # samples, as `diagnose` asks for
 
 
@@ -161,10 +161,8 @@ class Check:
         yield f"noise ({self.noise['source']}): {noise}"
         floor = float(np.mean(list(self.noise["share"].values())))
         times = self.error / max(floor, 1e-300)
-        yield f"refitted: error {_percent(self.error)} of the outputs' deviation, {times:.2g} times the noise"
-        if self.error**2 > HALF:
-            yield "  The simulator explains less than half of the outputs' power: take all of the above as rough."
-        elif times > LEFT:
+        yield f"refitted: error {100 * self.error:.3g} % of the outputs' deviation, {times:.2g} times the noise"
+        if times > LEFT:
             yield "  Something is missing or the noise is slow: the strengths above count the noise alone."
         yield f"inputs between samples: {HOLD_WORDS[self.hold]}"
         yield f"start of each recording: {', '.join(self.starts)}"
@@ -176,6 +174,7 @@ IDENTIFIABLE = {
     "flat": "no: flat within its bounds",
     "tied": "no: traded off, see above",
     "start": "no: traded off with the unknown start",
+    "port": "only with a law at its port",
 }
 HOLD_WORDS = {
     "zero": "held",
@@ -244,7 +243,8 @@ def check(
     law_rows, classes = assess_laws(quiet, fitted, probe, runs, laws, response.names)
     moving = tuple(excitations(quiet, probe, runs))
     sensors = helpful_sensors(quiet, fitted, probe, runs, response) if ties else ()
-    blind = tuple(find_blind_spots(bench, parameters, ties, law_rows, classes, moving))
+    alive = _alive_as_given(quiet, fitted, parameters)
+    blind = tuple(find_blind_spots(bench, fitted, parameters, alive, ties, law_rows, classes, moving))
     by_output = dict(zip(simulator.output_names, zip(noise, noise / bench.scale, strict=True), strict=True))
     return Check(
         blind_spots=blind,
@@ -264,6 +264,18 @@ def check(
         next_record=next_record(bench, blind, ties, sensors),
         seconds=time.perf_counter() - began,
     )
+
+
+def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
+    """Parameters that are dead or flat as refitted and move the outputs at the given values."""
+    doubtful = [p.name for p in parameters if p.status in ("dead", "flat")]
+    values = {k: p.value for k, p in fitted.model.parameters.items()}
+    given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model) if doubtful else fitted
+    if not doubtful or not np.isfinite(given.cost):
+        return ()
+    response = Sensitivity.of(bench, *linearised(bench, given))
+    moved = lengths(response.raw * response.room) >= 1
+    return tuple(name for name, there in zip(response.names, moved, strict=True) if there and name in doubtful)
 
 
 def _start(r: Recording) -> str:

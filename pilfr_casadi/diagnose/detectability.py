@@ -17,7 +17,8 @@ from .._base import one_at_a_time
 from ..data import Recording
 from ..laws import CATALOGUE, Law, display_name, readable_unit
 from ..models import map_points
-from ..simulators import Named, Port, Simulator
+from ..simulators import Port, Simulator
+from .identifiability import Symbols
 from .linearise import Probe, Run, along
 from .remainder import Remainder, Task, block_diagonal, lengths, moved, orthonormal
 from .workbench import Fitted, Workbench
@@ -220,23 +221,18 @@ def local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[floa
 
 def _term_functions(simulator: Simulator) -> dict[str, ca.Function]:
     """For each port in parallel `(x, u, p) -> (slopes (n_targets, n_x + n_u), factors (n_targets, 1))`, at t = 0."""
-    own = simulator.parameter_set
-    vector, t = ca.SX.sym("p", own.size), ca.SX(0)
-    p = Named("parameter", own.symbols(vector))
-    n_x, n_u = len(simulator.states), len(simulator.inputs)
-    xs, us = ca.SX.sym("x", n_x), ca.SX.sym("u", n_u)
-    x = Named("state", {name: xs[i] for i, name in enumerate(simulator.states)})
-    u = Named("input", {name: us[i] for i, name in enumerate(simulator.inputs)})
-    changes = ca.vertsplit(simulator.derivatives(x, u, p, t)) if n_x else []
+    s = Symbols.of(simulator)
+    x, u, p, t = s.x, s.u, s.p, ca.SX(0)
+    changes = ca.vertsplit(simulator.derivatives(x, u, p, t)) if simulator.states else []
     equations = {**simulator.measured(x, u, p, t), **dict(zip(simulator.states, changes, strict=True))}
     out = {}
     for port in simulator.all_ports():
         if not port.series:
             into = simulator.into(port, x, u, p, t)
             right = ca.vertcat(*(equations[name] for name in into))
-            slopes = ca.densify(ca.jacobian(right, ca.vertcat(xs, us)))
+            slopes = ca.densify(ca.jacobian(right, ca.vertcat(s.states, s.inputs)))
             factors = ca.densify(ca.vertcat(*(ca.SX(f) for f in into.values())))
-            out[port.name] = ca.Function("terms", [xs, us, vector], [slopes, factors])
+            out[port.name] = ca.Function("terms", [s.states, s.inputs, s.vector], [slopes, factors])
     return out
 
 

@@ -13,9 +13,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
+import casadi as ca
 import numpy as np
 
 from ..models import ParameterSet
+from ..simulators import Named, Simulator
 from .linearise import Probe, Run, propagate
 from .remainder import block_diagonal, lengths, moved, orthonormal
 from .workbench import Fitted, Workbench
@@ -37,7 +39,8 @@ class ParameterRow:
         Standard error due to the noise alone; None where the parameter is not identifiable.
     status : str
         "identifiable", "dead" (no output reacts), "flat" (the standard error is as large as the room of the bounds),
-        "tied" (traded off with others), or "start" (traded off with the unknown initial state).
+        "tied" (traded off with others), "start" (traded off with the unknown initial state), or "port" (only the
+        ports read it, so it acts with a law alone).
     """
 
     name: str
@@ -65,6 +68,31 @@ class Tie:
             if word and "^" not in self.only_as[0]:
                 return f"{names} can be identified only as their {word} ({self.only_as[0]})."
         return f"{names} can be identified only as {in_words(self.only_as)}."
+
+
+@dataclass(frozen=True, eq=False)
+class Symbols:
+    """Symbols that a simulator's equations are evaluated with: vectors, and by name."""
+
+    states: ca.SX
+    inputs: ca.SX
+    vector: ca.SX
+    x: Named
+    u: Named
+    p: Named
+    t: ca.SX
+
+    @classmethod
+    def of(cls, simulator: Simulator) -> Symbols:
+        """Make new symbols."""
+        own = simulator.parameter_set
+        xs, us, vector = (
+            ca.SX.sym(n, size)
+            for n, size in (("x", len(simulator.states)), ("u", len(simulator.inputs)), ("p", own.size))
+        )
+        x = Named("state", {name: xs[i] for i, name in enumerate(simulator.states)})
+        u = Named("input", {name: us[i] for i, name in enumerate(simulator.inputs)})
+        return cls(xs, us, vector, x, u, Named("parameter", own.symbols(vector)), ca.SX.sym("t"))
 
 
 def in_words(names: Sequence[str]) -> str:
@@ -165,6 +193,7 @@ def assess_parameters(
     status[alone < 1] = "start"
     status[before < 1] = "flat"
     status[before == 0] = "dead"
+    status[_port_parameters(bench.simulator)] = "port"
     rest = [i for i in range(n) if status[i] == "identifiable"]
     groups = _groups(small, rest)
     for i in {i for g in groups for i in g}:
@@ -179,6 +208,19 @@ def assess_parameters(
         rows.append(ParameterRow(name, float(response.values[i]), response.units[i], own, str(status[i])))
     ties = tuple(Tie(tuple(names[i] for i in g), _only_as(response, small, g, bench, fitted)) for g in groups)
     return tuple(rows), ties
+
+
+def _port_parameters(simulator: Simulator) -> np.ndarray:
+    """Which free entries of the parameters only the ports read, shape (n,), bool."""
+    s = Symbols.of(simulator)
+    equations = [simulator.derivatives(s.x, s.u, s.p, s.t), *simulator.measured(s.x, s.u, s.p, s.t).values()]
+    ports = [e for port in simulator.ports for e in simulator.into(port, s.x, s.u, s.p, s.t).values()]
+    read = [
+        np.array(ca.which_depends(ca.vertcat(*map(ca.SX, found)), s.vector), dtype=bool) if found else np.zeros(0, bool)
+        for found in (equations, ports)
+    ]
+    only = ~read[0] & read[1] if ports else np.zeros(s.vector.numel(), bool)
+    return np.asarray(only[simulator.parameter_set.free])
 
 
 def _groups(small: np.ndarray, rest: list[int]) -> list[list[int]]:
