@@ -131,7 +131,8 @@ def _at_port(
             phi[:, lengths(phi) < FOLLOWED * lengths(d.phi)] = 0.0
         loudest = [int(np.argmax(lengths(phi))) for phi in left]
         sizes = np.array([lengths(phi)[j] for phi, j in zip(left, loudest, strict=True)])
-        middle = int(np.argsort(sizes)[len(sizes) // 2])
+        order = np.argsort(sizes)[np.sum(sizes == 0) :] if np.any(sizes) else np.arange(len(sizes))
+        middle = int(order[len(order) // 2])  # of the shapes that own parameters do not follow
         column, dose = loudest[middle], doses[middle]
         raw = dose.phi[:, int(np.argmax(lengths(dose.phi)))]
         force = DETECTED / sizes[middle] if sizes[middle] > 0 else None
