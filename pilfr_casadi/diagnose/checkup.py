@@ -118,7 +118,7 @@ class Check:
                     p.name,
                     f"{p.value:.4g} {p.unit}",
                     "-" if p.std is None else f"{p.std:.2g} {p.unit}",
-                    IDENTIFIABLE[p.status],
+                    IDENTIFIABLE[p.status] + ", at its bound" * p.at_bound,
                 )
                 for p in self.parameters
             ],

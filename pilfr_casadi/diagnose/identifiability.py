@@ -41,6 +41,8 @@ class ParameterRow:
         "identifiable", "dead" (no output reacts), "flat" (the standard error is as large as the room of the bounds),
         "tied" (traded off with others), "start" (traded off with the unknown initial state), or "port" (only the
         ports read it, so it acts with a law alone).
+    at_bound : bool
+        Whether the refit ended at one of its bounds.
     """
 
     name: str
@@ -48,6 +50,7 @@ class ParameterRow:
     unit: str
     std: float | None
     status: str
+    at_bound: bool = False
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,8 @@ class Sensitivity:
         Free entries of the simulator's parameters.
     values, room : array, shape (n,)
         Fitted values, and the standard deviation of a value of which only the bounds are known.
+    at_bound : array, shape (n,), bool
+        Whether the fitted values are at a bound.
     raw : array, shape (R, n)
         Changes of all outputs by a unit change of each parameter.
     start : array, shape (R, k)
@@ -122,6 +127,7 @@ class Sensitivity:
     units: tuple[str, ...]
     values: np.ndarray
     room: np.ndarray
+    at_bound: np.ndarray
     raw: np.ndarray
     start: np.ndarray
 
@@ -151,6 +157,7 @@ class Sensitivity:
             tuple(units[i] for i in places),
             values,
             room(np.where(given != 0, np.abs(given), felt), lower, upper),
+            (values <= lower) | (values >= upper),
             raw,
             orthonormal(states[:, kept]),
         )
@@ -205,7 +212,8 @@ def assess_parameters(
     rows = []
     for i, name in enumerate(names):
         own = by_place.get(i) if status[i] == "identifiable" else None
-        rows.append(ParameterRow(name, float(response.values[i]), response.units[i], own, str(status[i])))
+        value, at_bound = float(response.values[i]), bool(response.at_bound[i])
+        rows.append(ParameterRow(name, value, response.units[i], own, str(status[i]), at_bound))
     ties = tuple(Tie(tuple(names[i] for i in g), _only_as(response, small, g, bench, fitted)) for g in groups)
     return tuple(rows), ties
 

@@ -179,6 +179,13 @@ def test_a_simulator_that_does_not_follow_is_said_to_be_rough():
     assert found.blind_spots[0].kind == "rough" and "check its values and units" in found.next_record
 
 
+def test_a_refit_that_ends_at_a_bound_is_marked():
+    simulator = gained(lambda p: p.g, {"g": WIDE})
+    held = gained(lambda p: p.g, {"g": Parameter(2.0, bounds=(1.0, 2.5))})
+    found = check(held, record(simulator, noise_like(2)))
+    assert [p.name for p in found.parameters if p.at_bound] == ["g"] and "yes, at its bound" in str(found)
+
+
 def test_an_input_that_no_equation_reads_is_no_port():
     simulator = gained(lambda p: p.g, {"g": WIDE})
     idle = Simulator(
