@@ -43,7 +43,7 @@ def recorded(true, seed, samples=700, **more):
     u = (8 * np.sum(tones, axis=0) * (0.4 + 0.6 * t / t[-1]))[:, None] / 2
     blank = Recording(u, np.zeros((samples, len(true.output_names))), DT, ("force",), true.output_names, initial="zero")
     model = Workbench.of(true, [blank.with_(y=rng.standard_normal(blank.y.shape))], "zero").model(true)
-    y = make_engine(model, "vm").simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_x))[0]
+    y = make_engine(model, "vm").simulate(model.drive(blank), model.parameters.start, np.zeros(model.n_state))[0]
     return blank.with_(y=y + NOISE * np.std(y, axis=0) * rng.standard_normal(y.shape), **more)
 
 

@@ -11,7 +11,8 @@ The files by stage:
   `second_effect` and `pairs` go from one effect to the next.
 - Review: `review`, `rivals`, `exchange`, `every_sensor`, `own_shape`, `other_hold`, `held`, `varying`, `undeclared`,
   `tones` and `ringing` look for another reading of what was found.
-- Verdict: `verdict`, `conclusion`, `description` (the corrected simulator where no name is sure).
+- Verdict: `verdict`, `conclusion`; `correction` chooses the simulator to hand back by `cross_validation`, with a
+  `learned` element where names do not reach.
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
 - Before any of it: `checkup` (what the recordings can reveal), by `identifiability`,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from .checkup import BlindSpot as BlindSpot, Check as Check, check as check
     from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
     from .gates import Gate as Gate
+    from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
     from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect, plain as plain
     from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate

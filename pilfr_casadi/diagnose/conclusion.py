@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from .choice import Choice
 from .clipping import clipped_input
-from .description import Description, find_description
+from .correction import Correction, as_named, find_correction
 from .gates import Gate
 from .held import held_value
 from .proof import mean_nrmse
@@ -30,8 +30,8 @@ class Conclusion:
         The effects that are named; others may be closed in.
     let_go : str
         The held parameter that does what a law was named for.
-    description : Description or None
-        The elements of `fitted` that have no sure name, for an unexplained mismatch.
+    correction : Correction
+        What `fitted` consists of beside the refit.
     """
 
     verdict: str
@@ -39,8 +39,8 @@ class Conclusion:
     gates: tuple[Gate, ...]
     fitted: Fitted
     named: list[Choice]
+    correction: Correction
     let_go: str = ""
-    description: Description | None = None
 
 
 def concluded(search: Search, gates: tuple[Gate, ...]) -> Conclusion:
@@ -49,11 +49,14 @@ def concluded(search: Search, gates: tuple[Gate, ...]) -> Conclusion:
     unfinished = search.interrupted  # what comes below only adds to an answer that is there
     held = held_value(search) if verdict in ("missing-physics", "unexplained") and not unfinished else None
     if held is not None:
-        return Conclusion("complete", held.sentence, gates, held.fitted, [], held.name)
+        return Conclusion("complete", held.sentence, gates, held.fitted, [], as_named(search, held.fitted), held.name)
+    refit = as_named(search, search.without)
     if (lost := _lost_input(search, verdict)) is not None:
-        return Conclusion("recording-fault", lost.sentence, (*gates, lost), search.without, [])
+        return Conclusion("recording-fault", lost.sentence, (*gates, lost), search.without, [], refit)
     if verdict == "missing-physics":
-        return Conclusion(verdict, sentence, (*gates, *not_named(search)), search.base, named(search))
+        correction, fitted = find_correction(search, named=True)
+        sentence = f"{sentence} {correction.sentence}" if correction.learned else sentence
+        return Conclusion(verdict, sentence, (*gates, *not_named(search)), fitted, named(search), correction)
     if verdict == "unexplained":
         gates = (*gates, *beyond_the_ports(search), *varying(search))
     if unfinished and verdict != "recording-fault":
@@ -61,11 +64,10 @@ def concluded(search: Search, gates: tuple[Gate, ...]) -> Conclusion:
             "The search was interrupted before it came to an answer; refitted, the simulator is off by "
             f"{mean_nrmse(search.bench, search.without):.3g} of the outputs' deviation."
         )
-    elif verdict == "unexplained" and (found := find_description(search)) is not None:
-        description, fitted = found
-        sentence = f"{sentence} {description.sentence}"
-        return Conclusion(verdict, sentence, gates, fitted, [], description=description)
-    return Conclusion(verdict, sentence, gates, search.without, [])
+    elif verdict == "unexplained":
+        correction, fitted = find_correction(search)
+        return Conclusion(verdict, f"{sentence} {correction.sentence}", gates, fitted, [], correction)
+    return Conclusion(verdict, sentence, gates, search.without, [], refit)
 
 
 def _lost_input(search: Search, verdict: str) -> Gate | None:

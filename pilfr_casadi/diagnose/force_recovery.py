@@ -187,6 +187,13 @@ def hidden_force(
     return HiddenForce(port, r.name, r.t[window][:-1], z, dz, force, std, law_z, law_dz, law_force, instant)
 
 
+def law_signals(bench: Workbench, fitted: Fitted, number: int, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute local coordinate, rate and force, (M,) each, of an element along the fitted run of recording i."""
+    r, n = bench.recordings[i], fitted.model.substeps
+    drive, start = fitted.model.drive(r), np.asarray(fitted.initial[i], dtype=float)
+    return _law_signals(fitted, number, states_along(fitted.model, drive, fitted.vector, start)[::n], r, bench)
+
+
 def _law_signals(
     fitted: Fitted, number: int, states: np.ndarray, r: Recording, bench: Workbench
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -23,10 +23,12 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
     return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
 
 
-def run_free(model: Model, engine: Engine, recording: Recording) -> tuple[np.ndarray, int]:
+def run_free(
+    model: Model, engine: Engine, recording: Recording, starts: Sequence[np.ndarray] = ()
+) -> tuple[np.ndarray, int]:
     """Simulate a model as it stands along a recording.
 
-    An initial state that is to be estimated is fitted to the first part of the recording.
+    An initial state that is to be estimated is fitted to the first part of the recording, from rest and from `starts`.
 
     Returns
     -------
@@ -39,23 +41,32 @@ def run_free(model: Model, engine: Engine, recording: Recording) -> tuple[np.nda
     used = min(samples_for_state(model), len(recording) // 3) if estimated else 0
     with np.errstate(all="ignore"):
         try:
-            state = first_state(model, engine, recording, used or None)
+            state = first_state(model, engine, recording, used or None, starts=starts)
             y = engine.simulate(model.drive(recording), model.parameters.start, state)[0]
         except (RuntimeError, FloatingPointError):  # a quadratic program of huge numbers
             y = np.full(recording.y.shape, np.nan)
     return np.asarray(y), max(recording.skip, used)
 
 
-def errors_of(bench: Workbench, model: Model) -> float:
-    """NRMSE of a model as it stands, averaged over recordings; infinite where the simulation diverges."""
+def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = ()) -> float:
+    """NRMSE of a model as it stands, averaged over recordings; infinite where the simulation diverges.
+
+    `starts` are where unknown initial states are looked for besides rest.
+    """
     engine = make_engine(model, bench.engine)
     errors = []
     for r in bench.recordings:
-        y, skip = run_free(model, engine, r)
+        y, skip = run_free(model, engine, r, starts)
         if not np.all(np.isfinite(y)):
             return np.inf
         errors.append(nrmse(r.y, y, skip=skip))
     return float(np.mean(errors))
+
+
+def starts_of(fitted: Fitted) -> list[np.ndarray]:
+    """Initial states at which a recording may begin where a learned element is unsure at rest, out of its range."""
+    learned = any(e.law.id == "learned" for e in fitted.simulator.elements)
+    return fitted.initial if learned else []
 
 
 def test_errors(
@@ -75,7 +86,9 @@ def test_errors(
         if g.change is not None:
             tests = [g.change(r) for r in tests]
     for name, one in (("before", without), ("after", after)):
-        out[name] = errors_of(bench.on(tests), one.model.with_parameters(one.model.parameters.at(one.vector)))
+        out[name] = errors_of(
+            bench.on(tests), one.model.with_parameters(one.model.parameters.at(one.vector)), starts_of(one)
+        )
     return out
 
 

@@ -90,7 +90,11 @@ class Remainder:
 
         Shapes (R, n) and (n,), the shapes and strengths of one law after those of the other.
         """
-        forces = np.hstack([unit_forces(law, task.part, s).reshape(len(task.part.z), -1) for law, s in task.pairs])
+        forces = [unit_forces(law, task.part, s).reshape(len(task.part.z), -1) for law, s in task.pairs]
+        return self.response(task.index, np.hstack(forces))
+
+    def response(self, port: int, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What forces (M, n) at a port, each made of unit size, change beside the base, and what their sizes were."""
         forces[~(np.abs(forces) < 1e100)] = 0.0
         size = lengths(forces) / np.sqrt(len(forces))
         size = np.where(size > 0, size, 1.0)
@@ -98,7 +102,7 @@ class Remainder:
         blocks, at = [], 0
         for r in self.runs:
             now = slice(at, at + len(r.z))
-            blocks.append(moved(self.bench, r, [(task.index, forces[now])])[:, -len(size) :])
+            blocks.append(moved(self.bench, r, [(port, forces[now])])[:, -len(size) :])
             at = now.stop
         phi = np.concatenate(blocks) if len(blocks) > 1 else blocks[0]
         size_before = lengths(phi)

@@ -19,9 +19,10 @@ from ..identify import match_channels
 from ..laws import display_name
 from ..models import ParameterSet
 from ..simulators import Simulator, discretise, in_series
-from .description import Description
+from .correction import Correction
 from .gates import Gate
-from .proof import run_free
+from .learned import Learned
+from .proof import run_free, starts_of
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
@@ -103,9 +104,9 @@ class Diagnosis:
         Integration steps per sample with which the corrected simulator was fitted.
     let_go : str
         Parameter that was fixed or at a bound and is free in the corrected simulator; see `held`.
-    description : Description or None
-        For an unexplained mismatch: the elements of `corrected`, which follow unseen data better than the refit but
-        have no sure name. They are not effects.
+    correction : Correction or None
+        What `corrected` consists of beside the refit: laws, a learned element, and their shares. Elements that are not
+        among `effects` predict unseen data better than the refit but have no sure name.
     """
 
     verdict: str
@@ -129,7 +130,7 @@ class Diagnosis:
     evidence: Mapping[str, Any] = field(default_factory=dict)
     substeps: int = 1
     let_go: str = ""
-    description: Description | None = None
+    correction: Correction | None = None
 
     @property
     def sure(self) -> bool:
@@ -166,7 +167,7 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of diagnosis.json; numbers that are not finite are None."""
-        raw = {
+        raw: dict[str, Any] = {
             "schema": 1,
             "verdict": self.verdict,
             "sentence": self.summary,
@@ -177,10 +178,12 @@ class Diagnosis:
             "parameters": self.parameters,
             "fit": {**self.errors, "noise_floor": self.floor},
             "next_experiment": self.next_experiment,
-            "description": self.description.to_dict() if self.description else None,
+            "description": self.correction.to_dict() if self.correction else None,
             "notes": self.warnings(),
             "interrupted": self.interrupted,
         }
+        if self.correction:
+            raw |= {"shares": self.shares, "learned": [e.to_dict() for e in self.learned]}
         clean: dict[str, Any] = plain(raw)
         return clean
 
@@ -247,7 +250,22 @@ class Diagnosis:
     @property
     def _changed(self) -> bool:
         """Whether the corrected simulator differs from the refitted one."""
-        return bool(self.effects or self.description or self.let_go)
+        return bool(self.effects or self.nameless or self.let_go)
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Of what the refit leaves above the noise: `named` by laws, followed by a `learned` element, `left`."""
+        return dict(self.correction.shares) if self.correction else {}
+
+    @property
+    def learned(self) -> tuple[Learned, ...]:
+        """The learned elements of `corrected`."""
+        return self.correction.learned if self.correction else ()
+
+    @property
+    def nameless(self) -> Correction | None:
+        """The correction, where it holds elements and no effect is named."""
+        return self.correction if self.correction and self.correction.elements and not self.effects else None
 
     def _run(self, recording: Recording, simulator: Simulator | None = None) -> tuple[Recording, np.ndarray, int]:
         """The recording as corrected, the outputs of a simulator along it, and the first scored sample."""
@@ -261,7 +279,7 @@ class Diagnosis:
         fitted = self.evidence.get("after" if simulator is self.corrected else "without")
         substeps = fitted.model.substeps if fitted is not None else self.substeps
         model = discretise(simulator, dt, self.hold, substeps)
-        y, skip = run_free(model, make_engine(model), r)
+        y, skip = run_free(model, make_engine(model), r, starts_of(fitted) if fitted is not None else ())
         return r, y, skip
 
     def export(self, **options: Any) -> Any:

@@ -145,7 +145,7 @@ def _build_diagnosis(
         evidence={"search": search, "without": without, "after": after},
         substeps=after.model.substeps,
         let_go=found.let_go,
-        description=found.description,
+        correction=found.correction,
     )
 
 

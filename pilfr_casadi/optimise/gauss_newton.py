@@ -23,7 +23,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -578,12 +578,19 @@ def samples_for_state(model: Model) -> int:
 
 
 def first_state(
-    model: Model, engine: Engine, recording: Recording, samples: int | None = None, *, state_prior: bool = False
+    model: Model,
+    engine: Engine,
+    recording: Recording,
+    samples: int | None = None,
+    *,
+    state_prior: bool = False,
+    starts: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
     """Find the state with memory at a recording's first sample, as its `initial` says, at the model's parameters.
 
-    A state that is to be estimated is fitted to the first `samples` outputs alone. With `state_prior` it has a prior
-    around rest, on the scale of the states in a run over all inputs (`state_precision`).
+    A state that is to be estimated is fitted to the first `samples` outputs alone, from rest and from each of `starts`.
+    With `state_prior` it has a prior around rest, on the scale of the states in a run over all inputs
+    (`state_precision`), and is fitted from rest alone.
     """
     n, values, state = model.n_state, model.parameters.start, given_state(model, recording)
     if recording.begins == "periodic":
@@ -601,7 +608,8 @@ def first_state(
     )
     square = state_precision(engine, model.drive(recording), values, model.n_x, model.n_s) if state_prior else None
     if square is None:
-        return solver.solve(problem).theta
+        found = [solver.solve(problem, start) for start in (problem.start, *starts)]
+        return min(found, key=lambda solution: solution.cost).theta
     state, wider = problem.start, 1.0
     for _ in range(STATE_ROUNDS):  # free decay from a large state exceeds the states of forced motion
         problem.penalties = Penalties(fixed, {}, 1.0, problem.residuals, problem.size, [(0, square / wider)])

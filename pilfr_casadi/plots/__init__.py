@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         force_cloud as force_cloud,
         force_remainder as force_remainder,
         force_time as force_time,
+        learned_force as learned_force,
         mismatch_bands as mismatch_bands,
         mismatch_growth as mismatch_growth,
         mismatch_level as mismatch_level,

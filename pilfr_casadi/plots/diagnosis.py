@@ -32,6 +32,7 @@ from .canvas import (
 )
 
 CLOUD_POINTS = 2500  # more cannot be told apart in a figure
+LINE_POINTS = 400  # samples along which laws are drawn over a learned force: a few swings
 
 
 def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
@@ -267,6 +268,28 @@ def _cloud(ax: Axes, x: Signal, y: Signal, **style: Any) -> tuple[float, float, 
     every = max(len(x.values) // CLOUD_POINTS, 1)
     ax.plot(x.values[::every] / sx, y.values[::every] / sy, ".", color=BLUE, markersize=2.6, rasterized=True, **style)
     return sx, sy, across, up
+
+
+def learned_force(x: Signal, force: Signal, laws: Sequence[tuple[str, np.ndarray]], *, title: str = "") -> Axes:
+    """Draw a learned force over a local signal as points, and named laws over the stretch of its largest swings.
+
+    Parameters
+    ----------
+    laws : sequence of (name, force)
+        Forces (K,) along the same signal; samples that are not finite are left out.
+    """
+    ax = axes_or_new(None)
+    sx, sy, across, up = _cloud(ax, x, force, alpha=0.35, label="learned force")
+    known = np.flatnonzero(np.all([np.isfinite(f) for _, f in laws], axis=0)) if laws else np.zeros(0, dtype=int)
+    if len(known):
+        energy = np.cumsum(np.append(0.0, (force.values[known] - np.mean(force.values[known])) ** 2))
+        width = min(LINE_POINTS, len(known))
+        begin = int(np.argmax(energy[width:] - energy[:-width]))
+        part = known[begin : begin + width]
+        for (name, values), colour, style in zip(laws, (VERMILLION, GREEN, INK), ("-", "--", ":"), strict=False):
+            ax.plot(x.values[part] / sx, values[part] / sy, style, color=colour, linewidth=1.2, label=plain(name))
+    ax.set_ylim(*_robust_limits(force.values / sy, np.concatenate([f[known] for _, f in laws]) / sy if laws else None))
+    return finish(ax, across, up, title)
 
 
 def force_time(t: np.ndarray, recovered: Signal, std: np.ndarray, law: np.ndarray, name: str = "law") -> Axes:

@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import plots
 from .._base import InputError, make_folder, write_atomically
-from ..diagnose import Comparison, Diagnosis, Fitted, HiddenForce, Workbench, hidden_force
+from ..diagnose import Comparison, Diagnosis, Fitted, HiddenForce, Learned, Workbench, hidden_force
 from ..laws import display_name
 from ..plots import Signal
 from ..simulators import Port
@@ -123,7 +123,7 @@ def _subtitle(case: _Case) -> str:
 def _result_title(d: Diagnosis) -> str:
     if d.effects:
         return "What is missing" if d.sure and d.outcome in ("better", "") else "What may be missing"
-    return "A description without a certain name" if d.description else "How good the simulator is"
+    return "A correction without a certain name" if d.nameless else "How good the simulator is"
 
 
 def _result(d: Diagnosis) -> list[Block]:
@@ -138,8 +138,9 @@ def _result(d: Diagnosis) -> list[Block]:
         )
     elif d.verdict == "recording-fault":
         out.append(Text("Correct the recordings before you look for missing physics; see the checks above."))
-    if d.description:
-        out.append(Text(d.description.sentence))
+    if d.correction and (d.nameless or d.learned):
+        out.append(Text(d.correction.sentence))
+    out += [Text(learned.sentence) for learned in d.learned]
     return [*out, tables.error_table(d), *map(Text, d.warnings())]
 
 
@@ -176,7 +177,7 @@ def _mismatch(case: _Case) -> list[Block]:
 
 def _hidden_forces(case: _Case) -> list[Block]:
     """Draw the forces of the named effects; without a name, beside the nearest law and at the freest port."""
-    d, out = case.diagnosis, list[Block]()
+    d, out = case.diagnosis, [block for learned in case.diagnosis.learned for block in _learned_force(case, learned)]
     for e in d.effects:
         number = next((i for i, p in enumerate(d.corrected.elements) if (p.port, p.law.id) == (e.port, e.law)), None)
         if number is not None:
@@ -198,6 +199,34 @@ def _hidden_forces(case: _Case) -> list[Block]:
         if nearest is None or freest != nearest.winner.port:
             out += _force_blocks(case, case.before, freest, None, "")
     return out
+
+
+def _learned_force(case: _Case, learned: Learned) -> list[Block]:
+    """Draw a learned force over the local coordinate and its rate, with the nearest named laws."""
+    port = case.bench.simulator.port(learned.port)
+    _, _, channel = learned.port.partition(":")
+    across = channel if port.series and channel else "local coordinate z"
+    force = Signal("learned force w", learned.force, port.unit)
+    laws = [(f"{display_name(n.law)}, off by {100 * n.error:.2g} %", n.force) for n in learned.nearest]
+    text = (
+        f"The blue points are the learned force at {learned.port} along the training recordings. The lines are the "
+        "named laws that come nearest to it, drawn along the stretch where it is strongest."
+    )
+    drawn = [(Signal(across, learned.z, port.across_unit), "its local coordinate")]
+    if np.ptp(learned.dz) > 0:
+        unit = f"{port.across_unit}/s" if port.across_unit else ""
+        drawn.append((Signal(f"rate of {across}", learned.dz, unit), "its rate"))
+    return [
+        Text(text),
+        *(
+            Picture(
+                plots.learned_force(x, force, laws, title=learned.port),
+                f"The learned force at {learned.port} over {name}, with the nearest laws.",
+                f"Learned force at {learned.port} over {name}.",
+            )
+            for x, name in drawn
+        ),
+    ]
 
 
 def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, name: str) -> list[Block]:
@@ -330,11 +359,11 @@ def _next_experiment(d: Diagnosis) -> list[Block]:
 
 
 def _usage_title(d: Diagnosis) -> str:
-    corrected = (d.effects or d.description) and d.outcome != "worse"
+    corrected = (d.effects or d.nameless) and d.outcome != "worse"
     return "How to use the corrected simulator" if corrected else "How to use the result"
 
 
 def _usage(d: Diagnosis) -> list[Block]:
-    kind = "with the law closed in, at the fitted values" if d.effects or d.description else "refitted"
+    kind = "with what was found closed in, at the fitted values" if d.effects or d.nameless else "refitted"
     text = f"In the session that made the diagnosis, diagnosis.corrected is the simulator {kind}. Anywhere else, run:"
     return [Text(text), Code(tables.usage(d))]

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnose import Diagnosis, plain
-from ..laws import display_name
+from ..diagnose import Diagnosis, learned_force, plain
+from ..laws import display_name, scaled
 from ..models import Parameter, ParameterSet
 from .page import Block, Code, Table, Text, number_text, render, uncertain_text
 
@@ -34,10 +34,11 @@ def correction_words(diagnosis: Diagnosis) -> str:
     if diagnosis.effects:
         unsure = [g.finding == "unsure" for g in diagnosis.gates]
         names = [*(display_name(e.law) for e in diagnosis.effects), *(["what is not sure"] if any(unsure) else [])]
+        names += ["a learned force"] if diagnosis.learned else []
         stated = diagnosis.sure and diagnosis.outcome in ("better", "")
         return f"with {' and '.join(names)} {'put back' if stated else 'added'}"
-    if diagnosis.description:
-        return f"with {diagnosis.description.words} added"
+    if diagnosis.nameless:
+        return f"with {diagnosis.nameless.words} added"
     return f"with {diagnosis.let_go} let go" if diagnosis.let_go else ""
 
 
@@ -256,21 +257,32 @@ def usage(diagnosis: Diagnosis) -> str:
     fitted = {k: plain(np.asarray(p.value)) for k, p in simulator.parameter_set.items()}
     modules: dict[str, set[str]] = {}
     for e in simulator.elements:
-        modules.setdefault(_home(type(e.law)), set()).add(type(e.law).__name__)
+        for part in _parts(type(e.law))[0]:
+            modules.setdefault(_home(part), set()).add(part.__name__)
     return render(
         "use_diagnosis.txt",
         diagnosis=diagnosis,
         simulator=simulator,
         modules=modules,
         elements=[
-            (e, e.own(fitted), {k: tuple(map(_literal, v)) for k, v in e.law.limits.items()})
+            (e, _parts(type(e.law))[1], e.own(fitted), {k: tuple(map(_literal, v)) for k, v in e.law.limits.items()})
             for e in simulator.elements
         ],
         values={k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters},
     )
 
 
-def _home(law: type) -> str:
+def _parts(law: Any) -> tuple[tuple[Any, ...], str]:
+    """List what has to be imported to make the class of a law, and write the expression that makes it."""
+    if getattr(law, "factor", ""):
+        return (learned_force,), f"learned_force({law.factor!r})"
+    if law.scaled_by:
+        base = law.__base__
+        return (scaled, base), f"scaled({base.__name__}, {law.scaled_by!r})"
+    return (law,), law.__name__
+
+
+def _home(law: Any) -> str:
     from .. import laws
 
     return laws.__name__ if getattr(laws, law.__name__, None) is law else law.__module__

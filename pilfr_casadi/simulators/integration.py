@@ -96,8 +96,8 @@ class ClosedEquations:
             e, now = simulator.elements[i], Named("input", u)
             have = {"z": z, "dz": dz, "q": q[i], "p": self._own(e), "t": t, "x": x, "u": now}
             if hasattr(e.law, "step"):
-                rate = {"dz": dz} if "dz" in inspect.signature(e.law.step).parameters else {}
-                w, memory[i] = e.law.step(z, s[i], self._own(e), **rate)
+                beside = {k: have[k] for k in ("dz", "u") if k in inspect.signature(e.law.step).parameters}
+                w, memory[i] = e.law.step(z, s[i], self._own(e), **beside)
             else:
                 w = call(e.law.force, f"law {e.law.id!r}", **have)
                 if self.n_q[i]:

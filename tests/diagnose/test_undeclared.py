@@ -9,6 +9,7 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose import conclusion
+from pilfr_casadi.diagnose.correction import Correction
 
 
 @pytest.mark.slow
@@ -28,9 +29,11 @@ def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(monkey
         search.interrupted = True
         return ()
 
+    refit = Correction((), {"named": 0.0, "learned": 0.0, "left": 1.0})
     search = SimpleNamespace(interrupted=unfinished, bench=None, without=None)
     monkeypatch.setattr(conclusion, "judge", lambda *given: ("unexplained", "Something is missing."))
-    monkeypatch.setattr(conclusion, "find_description", lambda search: None)
+    monkeypatch.setattr(conclusion, "find_correction", lambda search: (refit, None))
+    monkeypatch.setattr(conclusion, "as_named", lambda *given: refit)
     monkeypatch.setattr(conclusion, "held_value", lambda search: None)
     monkeypatch.setattr(conclusion, "clipped_input", lambda *given: None)
     monkeypatch.setattr(conclusion, "mean_nrmse", lambda *given: 0.5)

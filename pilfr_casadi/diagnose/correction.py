@@ -1,0 +1,203 @@
+"""A correction always: the simulator that predicts best what it was not fitted to, with or without a name.
+
+Where the named answer is not sure, or leaves something, these compete on held-out blocks of the training recordings
+(`cross_validation`): the refit, the laws that the search has fitted, and a learned element alone or beside them. The
+simplest is taken that the best one does not beat by more than its uncertainty; test recordings are never looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._base import InputError
+from ..laws import CATALOGUE, display_name
+from ..simulators import Placed
+from .cross_validation import HeldOut, held_out_errors
+from .learned import Learned, LearnedForce, candidates, described
+from .verdict import UNSURE, confidence
+from .workbench import Fitted
+
+if TYPE_CHECKING:
+    from .search import Search
+
+# standard errors from which a difference on held-out blocks is one, and ratio of the errors from which it is worth more
+# parameters: model error is alike in all blocks, so that a difference of a few per cent can be many standard errors
+BETTER, GAIN = 2.0, 0.9
+TRIED = 3  # candidates of the first pass that are looked at where the search accepted none
+PORTS = 3  # ports at which an element is learned: those where a flexible force explains most
+JUDGED = 2  # learned elements that are compared on held-out blocks: those that follow all blocks best
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What the corrected simulator consists of beside the refit, and how well it predicts.
+
+    Attributes
+    ----------
+    elements : tuple of (port, law, form)
+        The elements closed in; empty where the refit predicts as well.
+    shares : dict
+        `named`, `learned`, `left`: of the mean square error that the refit leaves above the noise on the training
+        recordings, the share that named laws take away, the one that the learned element takes away beside them, and
+        the rest.
+    learned : tuple of Learned
+        The learned elements.
+    before, after : float
+        Rms error on held-out blocks of the refit and of the corrected simulator, in units of the outputs' deviation;
+        nan where nothing was compared.
+    """
+
+    elements: tuple[tuple[str, str, str], ...]
+    shares: dict[str, float]
+    learned: tuple[Learned, ...] = ()
+    before: float = np.nan
+    after: float = np.nan
+
+    @property
+    def words(self) -> str:
+        """The elements in words, such as "Coulomb friction at seal and a learned force at seal"."""
+        names = []
+        for port, law, form in self.elements:
+            name = "a learned force" if law == LearnedForce.id else display_name(law)
+            names.append(f"{name}{f' ({display_name(form)})' if form else ''} at {port}")
+        return " and ".join(names)
+
+    @property
+    def sentence(self) -> str:
+        """Say what is named, what is learned, what is left, and how much better the simulator predicts."""
+        named, learned, left = (f"{100 * self.shares[k]:.3g} %" for k in ("named", "learned", "left"))
+        shares = f"of what the refit leaves above the noise, named laws explain {named}, a learned force {learned}, "
+        shares += f"and {left} is left."
+        if not self.elements:
+            return (
+                "The corrected simulator is the refitted one: nothing that was tried predicts held-out blocks better "
+                "by more than its uncertainty."
+            )
+        if not np.isfinite(self.after):
+            return shares[0].upper() + shares[1:]
+        return (
+            f"The corrected simulator has {self.words}. On blocks of the training recordings that it was not fitted to "
+            f"its error is {100 * self.after:.2g} % of the outputs' deviation, the refit's {100 * self.before:.2g} %; "
+            f"{shares}"
+        )
+
+    def to_dict(self) -> dict[str, Any] | None:
+        """The key "description" of diagnosis.json; None where nothing was compared or nothing is better."""
+        if not self.elements or not np.isfinite(self.after):
+            return None
+        return {
+            "elements": [{"port": port, "law": law, "form": form} for port, law, form in self.elements],
+            "held_out": {"before": self.before, "after": self.after},
+            "sentence": self.sentence,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    """A fitted simulator, the one without its learned element, and its errors on held-out blocks."""
+
+    fitted: Fitted
+    named: Fitted
+    held_out: HeldOut
+
+    @property
+    def size(self) -> int:
+        """Free parameters, by which simple ones come first."""
+        return int(np.sum(self.fitted.model.parameters.free))
+
+
+def sure_and_complete(search: Search) -> bool:
+    """Whether the named effects are sure and leave nothing that is worth looking for."""
+    sure = [confidence(c, search) > UNSURE for c in search.accepted]
+    return bool(sure) and all(sure) and not search.much()
+
+
+def find_correction(search: Search, named: bool = False) -> tuple[Correction, Fitted]:
+    """Choose the simulator to hand back.
+
+    With `named` the effects of the search have been named and stay: only a learned element beside them is tried.
+    """
+    if named and sure_and_complete(search):
+        return as_named(search, search.base), search.base
+    refit = _judged(search, search.without, search.without)
+    bases = [search.base] if named else _with_laws(search)
+    found = [h for base in bases if (h := _judged(search, base, base)) is not None]
+    roots = [search.base] if named else [search.without, *(h.fitted for h in found[:1])]
+    found += [h for root in roots for h in _with_learned(search, root)]
+    if not named and refit is not None:
+        found.append(refit)
+    if not found:
+        return as_named(search, search.base), search.base
+    best = _simplest(found)
+    if not named and refit is not None and not _clearly_better(best, refit):
+        best = refit
+    shares = _shares(search, best.named, best.fitted)
+    learned: tuple[Learned, ...] = ()
+    if best.fitted is not best.named:
+        learned = (described(search.bench, best.fitted, shares["learned"], dict.fromkeys((*CATALOGUE, *search.laws))),)
+    before = refit.held_out.error if refit is not None else np.inf
+    return Correction(_elements(search, best.fitted), shares, learned, before, best.held_out.error), best.fitted
+
+
+def as_named(search: Search, fitted: Fitted) -> Correction:
+    """Describe a simulator without a learned element, which was compared with nothing."""
+    return Correction(_elements(search, fitted), _shares(search, fitted, fitted))
+
+
+def _simplest(found: Sequence[_Hypothesis]) -> _Hypothesis:
+    """Take the simplest hypothesis that the best one does not beat by more than its uncertainty (Breiman 1984)."""
+    best = min(found, key=lambda h: h.held_out.error)
+    near = (h for h in found if np.isfinite(h.held_out.error) and not _clearly_better(best, h))
+    return min(near, key=lambda h: (h.size, h.held_out.error), default=best)
+
+
+def _clearly_better(one: _Hypothesis, other: _Hypothesis) -> bool:
+    """Whether a hypothesis predicts held-out blocks better by more than the uncertainty, and by a tenth at least."""
+    a, b = one.held_out, other.held_out
+    return a.better_than(b) >= BETTER and a.error <= GAIN * b.error
+
+
+def _judged(search: Search, fitted: Fitted, named: Fitted) -> _Hypothesis | None:
+    """A hypothesis with its errors on held-out blocks; None where it cannot be simulated."""
+    with suppress(InputError):
+        return _Hypothesis(fitted, named, held_out_errors(search.bench, fitted))
+    return None
+
+
+def _with_laws(search: Search) -> list[Fitted]:
+    """The simulators with laws that the search has: what it accepted, else the best candidates of its first pass."""
+    if _elements(search, search.base):
+        return [search.base]
+    tried = sorted(search.passes[0].candidates, key=lambda c: c.tail)[:TRIED] if search.passes else []
+    return [whole.fitted for candidate in tried if (whole := search.polished(candidate)) is not None]
+
+
+def _with_learned(search: Search, base: Fitted) -> list[_Hypothesis]:
+    """Learned elements on top of a fitted simulator, at the ports where a flexible force explains most."""
+    shares = search.open_after if base is search.base else search.open_before
+    ports = sorted(shares, key=lambda name: -shares[name])[:PORTS]
+    with suppress(InputError, np.linalg.LinAlgError):
+        found = candidates(search.bench, base, ports, search.bench.simulator.inputs)
+        return [h for f in found[:JUDGED] if (h := _judged(search, f, base)) is not None]
+    return []
+
+
+def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
+    """Shares of the refit's mean square error above the noise; all of it is left where there is none."""
+    excess = search.without.cost - search.floor2
+    if not excess > 0:
+        return {"named": 0.0, "learned": 0.0, "left": 0.0}
+    after = [float(np.clip((f.cost - search.floor2) / excess, 0.0, 1.0)) for f in (named, whole)]
+    left = min(after)
+    return {"named": 1 - after[0], "learned": after[0] - left, "left": left}
+
+
+def _elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:
+    """Port, law and form of the elements that the diagnosis has put in."""
+    own: Sequence[Placed] = fitted.simulator.elements[len(search.bench.simulator.elements) :]
+    return tuple((e.port, e.law.id, e.law.form) for e in own)

@@ -1,0 +1,380 @@
+"""A learned element: a flexible force of a port's local signals, for physics that no law of the catalogue names.
+
+    w = sum_j (c_j + d_j u~) phi_j(z, dz/dt, stops of z)
+
+The features phi_j are stops of z with fixed thresholds and their powers (loops), low powers of z and |z| (curves), and
+curves of dz/dt (friction), some of them times z. u~ is an input of the simulator, standardised, where one scales the
+force. The force is linear in its weights c and d, which are fitted together with the simulator's own parameters in
+simulation error. They start from the linear solution of the projected sensitivities (`remainder`), with a ridge prior
+on the size of the force whose strength is chosen on held-out blocks. It is the discrepancy of Kennedy & O'Hagan (2001,
+J. R. Statist. Soc. B 63), inside the loop.
+
+Beyond the range of z and dz/dt that the training recordings visit, both signals are saturated: the force goes on a
+little way and then stays as it is. The saturation keeps a slope everywhere, so an unknown initial state can be
+estimated from outside the range.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError
+from ..engine import make_engine
+from ..laws import SCALABLE, Law, Local, display_name, scaled, unit_forces
+from ..models import Parameter, play
+from .force_recovery import law_signals
+from .linearise import linearised
+from .remainder import Remainder, Task, lengths, usable
+from .workbench import QUICK, Fitted, Workbench, started
+
+STOPS = 8
+# over half the range of z: from presliding to a stop that slips in every loud motion, which so forgets how it began
+THRESHOLDS = np.geomspace(0.02, 0.7, STOPS)
+POWERS = 3  # of each stop: odd ones for symmetric loops, the even one for one-sided forces
+KNEES = (0.01, 0.05, 0.25)  # of the curves v / (|v| + knee), over the largest speed: from dry friction to a soft bend
+FEATURES = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)
+ROOM = 0.5  # of half the range, by which the signals go on at most beyond the range seen
+FREE = 5.0  # times the same while it is fitted: the refit's run may be a poor guess of the range
+RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # tried, over the mean square response to a force of unit size
+SHARES = (1.0, 0.3, 0.0)  # of the linear solution that a fit may start from
+FITS = 3  # elements that are fitted at most: the best by the linear solution
+SAME_SIGNAL = 0.99  # correlation of an input with z or dz/dt from which it is that signal and scales nothing
+SHOWN = 3  # nearest laws that are told
+LONGEST = 8000  # samples along which laws are compared with the learned force
+
+
+class LearnedForce(Law):
+    """A force of z, dz/dt and memory, linear in its weights; the scales of its features are held."""
+
+    id = "learned"
+    equation = "w = sum_j c_j phi_j(z, dz/dt, stops of z)"
+    source = "Kennedy & O'Hagan (2001), J. R. Statist. Soc. B 63(3)"
+    sentence = "a learned force of the local coordinate, its rate and its turning points"
+    # weights with their prior deviations; centre, reach and half the range of z, largest speed, mean and deviation of
+    # the input that scales it; ends of the range seen; room beyond them, in z and dz/dt
+    units: ClassVar[Mapping[str, str]] = {
+        "c": "w", "std": "w", "z_0": "z", "z_s": "z", "z_h": "z", "v_s": "z/s", "u_0": "", "u_s": "",
+        "z_low": "z", "z_high": "z", "v_low": "z/s", "v_high": "z/s", "z_room": "z", "v_room": "z/s",
+    }  # fmt: skip
+    strength: ClassVar[tuple[str, ...]] = ("c",)
+    defaults: ClassVar[Mapping[str, Any]] = {"z_0": 0.0, "u_0": 0.0, "z_low": -1.0, "v_low": -1.0}
+    places = ("parallel", "series")
+    factor: ClassVar[str] = ""  # input that scales a part of the force
+    follows = memory = STOPS
+
+    @classmethod
+    def reads(cls) -> set[str]:
+        """It reads z; where dz/dt is always zero its curves of dz/dt are silent."""
+        return {"z"}
+
+    def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0, u: Any = None) -> tuple[Any, Any]:
+        """Force and next memory."""
+        z = _saturated(z, p["z_low"], p["z_high"], p["z_room"])
+        v = _saturated(dz, p["v_low"], p["v_high"], p["v_room"]) / p["v_s"]
+        x = (z - p["z_0"]) / p["z_s"]
+        following = [play(z, s[i], r * p["z_h"]) for i, r in enumerate(THRESHOLDS)]
+        phi = [1.0, x, ca.fabs(x), x**2, x**3]
+        for q, r in zip(following, THRESHOLDS, strict=True):
+            phi += [((z - q) / (r * p["z_h"])) ** power for power in range(1, POWERS + 1)]
+        phi += [v, v * ca.fabs(v), x * v, x**2 * v]
+        for knee in KNEES:
+            curve = v / (ca.fabs(v) + knee)
+            phi += [curve, x * curve]
+        w = sum(p["c"][j] * f for j, f in enumerate(phi))
+        if self.factor and u is not None:
+            scale = (u[self.factor] - p["u_0"]) / p["u_s"]
+            w += scale * sum(p["c"][len(phi) + j] * f for j, f in enumerate(phi))
+        return w, ca.vertcat(*following)
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Weights with their prior, free where the recordings move them, and the scales, fixed."""
+        given = {**dict.fromkeys(self.units, 1.0), **self.defaults, "c": 0.0, **self.values}
+        shape = (FEATURES * (2 if self.factor else 1),)
+        c, std = (np.broadcast_to(np.asarray(given[name], dtype=float), shape) for name in ("c", "std"))
+        felt = std > 0
+        weights = Parameter(np.where(felt, c, 0.0), "w", fixed=~felt, prior=(0.0, np.where(felt, std, 1.0)))
+        held = {
+            k: Parameter(float(given[k]), unit, fixed=True) for k, unit in self.units.items() if k not in ("c", "std")
+        }
+        return {"c": weights, **held}
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        """Generate the scales of the signals along recordings; |z| bends at zero where z is on both sides of it."""
+        both = min(-local.low, local.high) > 0.1 * local.half
+        centre = 0.0 if both else local.middle
+        speed = local.speed if np.any(local.dz) else 1.0
+        scales = {"z_0": centre, "z_s": max(local.high - centre, centre - local.low), "z_h": local.half, "v_s": speed}
+        yield {**scales, **_limits(local.z, local.dz, FREE)}
+
+
+def _saturated(x: Any, low: Any, high: Any, room: Any) -> Any:
+    """Follow x from low to high, and beyond them approach low - room and high + room, with a slope all the way."""
+    above, below = ca.fmax(x - high, 0), ca.fmax(low - x, 0)
+    return ca.fmin(ca.fmax(x, low), high) + room * above / (room + above) - room * below / (room + below)
+
+
+def _limits(z: np.ndarray, dz: np.ndarray, room: float) -> dict[str, float]:
+    """Give the range of both signals, and the room beyond it."""
+    out: dict[str, float] = {}
+    for name, values in (("z", z), ("v", dz)):
+        low, high = float(np.min(values)), float(np.max(values))
+        out |= {f"{name}_low": low, f"{name}_high": high, f"{name}_room": room * (high - low) / 2 or 1.0}
+    return out
+
+
+@functools.cache  # the same class for the same input
+def learned_force(factor: str = "") -> type[LearnedForce]:
+    """Make the class of learned forces, with an input that scales a part of the force where one is named."""
+    if not factor:
+        return LearnedForce
+    own = {
+        "factor": factor,
+        "form": f"scaled by {factor}",
+        "equation": f"w = sum_j (c_j + d_j {factor}~) phi_j(z, dz/dt, stops of z)",
+        "sentence": f"{LearnedForce.sentence}; {factor} scales a part of it",
+        "__doc__": LearnedForce.__doc__,
+    }
+    return type(f"LearnedForceScaledBy_{factor}", (LearnedForce,), own)
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A learned element as the linear problem gives it: the law at its start values, and the share it explains.
+
+    The share is that of the residual's power on blocks that the weights were not fitted to.
+    """
+
+    port: str
+    law: LearnedForce
+    share: float
+
+
+def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str], inputs: Sequence[str]) -> list[Start]:
+    """Solve the linear problem at each port, without and with each input that scales the force, best first."""
+    probe, runs = linearised(bench, base)
+    rest = Remainder.of(bench, probe, runs, (LearnedForce,))
+    samples = sum(len(r) - r.skip for r in bench.recordings) * len(bench.scale)
+    out = []
+    for task in rest.tasks:
+        if task.port.name not in port_names:
+            continue
+        shape = task.pairs[0][1][0]
+        forces = unit_forces(LearnedForce(), task.part, [shape]).reshape(len(task.part.z), -1)
+        for factor in ("", *(name for name in inputs if _scales(task, name))):
+            out.append(_solved(rest, task, forces, shape, factor, samples / len(rest.left)))
+    return sorted(out, key=lambda s: -s.share)
+
+
+def _scales(task: Task, name: str) -> bool:
+    """Whether an input may scale the force at a port: it varies, and is not one of the port's own signals."""
+    u, local = task.local.inputs[name], task.local
+    if task.port.series or not np.ptp(u) > 0:
+        return False
+    own = [v for v in (local.z, local.dz) if np.ptp(v) > 0]
+    return not any(abs(np.corrcoef(u, v)[0, 1]) > SAME_SIGNAL for v in own)
+
+
+def _solved(
+    rest: Remainder, task: Task, forces: np.ndarray, shape: Mapping[str, Any], factor: str, repeated: float
+) -> Start:
+    """Fit the weights to the projected residual by ridge regression, its strength chosen on held-out blocks.
+
+    `repeated` is the number of scored samples for each that is looked at: the prior counts once.
+    """
+    scales, columns = dict(shape), forces.copy()
+    if factor:
+        u, whole = task.part.inputs[factor], task.local.inputs[factor]
+        scales |= {"u_0": float(np.mean(whole)), "u_s": float(np.std(whole))}
+        columns = np.hstack([forces, forces * ((u - scales["u_0"]) / scales["u_s"])[:, None]])
+    phi, size = rest.response(task.index, columns)
+    felt, weights, std = lengths(phi) > 0, np.zeros(len(size)), np.zeros(len(size))
+    if not np.any(felt):
+        return Start(task.port.name, learned_force(factor)({**scales, "std": 0.0}), 0.0)
+    phi, unit = phi[:, felt], float(np.mean(lengths(phi[:, felt]) ** 2))
+    wrong, ridge = min((_error_unseen(phi, rest.left, rest.odd, unit * ridge), ridge) for ridge in RIDGES)
+    weights[felt] = -_ridge(phi, rest.left, unit * ridge) / size[felt]
+    std[felt] = 1 / (size[felt] * np.sqrt(unit * ridge * repeated))
+    law = learned_force(factor)({**scales, "c": weights, "std": std})
+    return Start(task.port.name, law, 1 - wrong / max(float(rest.left @ rest.left), 1e-300))
+
+
+def _ridge(a: np.ndarray, b: np.ndarray, ridge: float) -> np.ndarray:
+    """Solve a x = b in the least squares sense, with the penalty ridge |x|²."""
+    return np.asarray(np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ b))
+
+
+def _error_unseen(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> float:
+    """Sum of squares on every second block by weights fitted to the others, and the other way round."""
+    parts = ((fold, ~fold) for fold in (odd, ~odd))
+    return sum(float(np.sum((left[b] - phi[b] @ _ridge(phi[a], left[a], ridge)) ** 2)) for a, b in parts)
+
+
+def candidates(
+    bench: Workbench, base: Fitted, port_names: Sequence[str], inputs: Sequence[str] = (), most: int = FITS
+) -> list[Fitted]:
+    """Fit a learned element on top of a fitted simulator, which may have elements already, at each of some ports.
+
+    Parameters
+    ----------
+    port_names : sequence of str
+        Ports to try.
+    inputs : sequence of str
+        Inputs that may scale the force, each tried besides the force alone.
+    most : int
+        Elements that are fitted: the best by the linear solution.
+
+    Returns
+    -------
+    list of Fitted
+        The learned element is the last; smallest error first. Fits that diverge are left out.
+    """
+    starts = [s for s in linear_starts(bench, base, port_names, inputs) if s.share > 0]
+    found = [_fitted(bench, base, start) for start in starts[:most]]
+    return sorted((f for f in found if f is not None), key=lambda f: f.cost)
+
+
+def _fitted(bench: Workbench, base: Fitted, start: Start) -> Fitted | None:
+    """Fit a learned element with the simulator's own parameters; None where every start diverges."""
+    placed = base.simulator.with_element(start.port, start.law)
+    model = bench.model(placed)
+    engine = make_engine(model, bench.engine)
+    name = f"{placed.elements[-1].prefix}c"
+    starts = [{**base.values, name: share * np.asarray(start.law.values["c"])} for share in SHARES]
+    first = bench.begun(placed, model, started(model, starts[0]), base.initial)
+
+    def cost(values: Mapping[str, Any]) -> float:
+        found = bench.result(placed, model.parameters.unpack(started(model, values)), first, engine, model).cost
+        return found if np.isfinite(found) else np.inf
+
+    try:
+        best = min(starts, key=cost)
+        fitted = bench.fit(placed, [best], states=base.initial, solver=QUICK, model=model, engine=engine)
+    except InputError:
+        return None
+    z, dz, _ = signals_along(bench, fitted)
+    seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _limits(z, dz, ROOM).items()}
+    return bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
+
+
+def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Local coordinate, rate and force of an element along the fitted runs of all recordings, (M,) each."""
+    number %= len(fitted.simulator.elements)
+    found = [law_signals(bench, fitted, number, i) for i in range(len(bench.recordings))]
+    z, dz, w = (np.concatenate(part) for part in zip(*found, strict=True))
+    return z, dz, w
+
+
+@dataclass(frozen=True, eq=False)
+class NearLaw:
+    """A named law that follows the learned force: its rms error over the force's deviation, and its force (M,)."""
+
+    law: str
+    form: str
+    error: float
+    force: np.ndarray
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in diagnosis.json."""
+        return {"law": self.law, "form": self.form, "error": self.error}
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """A learned element of the corrected simulator.
+
+    Attributes
+    ----------
+    port, factor : str
+        Where it acts, and the input that scales a part of it, if any.
+    share : float
+        Share of what the refit leaves above the noise that it follows beyond the named laws.
+    z, dz, force : array, shape (M,)
+        Local coordinate, rate and force along the training recordings.
+    nearest : tuple of NearLaw
+        Laws of the catalogue that come nearest to the force, best first.
+    """
+
+    port: str
+    factor: str
+    share: float
+    z: np.ndarray
+    dz: np.ndarray
+    force: np.ndarray
+    nearest: tuple[NearLaw, ...] = field(default=())
+
+    @property
+    def sentence(self) -> str:
+        """Say where it acts, on which range it holds, and which laws are near."""
+        by = f", a part of it scaled by {self.factor}" if self.factor else ""
+        names = ", ".join(f"{display_name(n.law)} (off by {100 * n.error:.2g} %)" for n in self.nearest)
+        near = f" The nearest laws are {names}." if names else ""
+        z, dz = (f"{np.min(v):.4g} to {np.max(v):.4g}" for v in (self.z, self.dz))
+        return (
+            f"A learned force acts at {self.port}{by}. It holds where z is from {z} and dz/dt from {dz}, as in the "
+            f"training recordings, and is saturated beyond.{near}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in diagnosis.json."""
+        return {
+            "port": self.port,
+            "factor": self.factor,
+            "share": self.share,
+            "sentence": self.sentence,
+            "nearest": [n.to_dict() for n in self.nearest],
+            "range": {"z": [np.min(self.z), np.max(self.z)], "dz": [np.min(self.dz), np.max(self.dz)]},
+        }
+
+
+def described(bench: Workbench, fitted: Fitted, share: float, laws: Collection[type[Law]]) -> Learned:
+    """Describe the learned element that is the last of a fitted simulator, with the laws that come nearest."""
+    element = fitted.simulator.elements[-1]
+    z, dz, force = signals_along(bench, fitted)
+    inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in bench.recordings]).T, strict=True))
+    lengths_ = tuple(map(len, bench.recordings))
+    local = Local(
+        z, dz, bench.dt, lengths_, inputs=inputs, from_zero=tuple(r.begins == "zero" for r in bench.recordings)
+    )
+    kinds = bench.simulator.port(element.port).kinds
+    factor = element.law.factor
+    tried = [law for law in laws if kinds & set(law.places)]
+    tried += [scaled(law, factor) for law in SCALABLE if factor and law in laws and "parallel" in kinds]
+    return Learned(element.port, factor, share, z, dz, force, nearest_laws(local, force, tried))
+
+
+def nearest_laws(local: Local, force: np.ndarray, laws: Sequence[type[Law]]) -> tuple[NearLaw, ...]:
+    """Find the laws that come nearest to a force along z and dz/dt, linear in strengths, shapes on their grids.
+
+    A constant is free, since offsets are a matter of where z is zero. Of several forms of a law the best one counts.
+    """
+    most = max(LONGEST // len(local.lengths), 1)
+    ends = np.cumsum((0, *local.lengths))
+    kept = np.concatenate([np.arange(a, min(b, a + most)) for a, b in pairwise(ends)])
+    part = Local(
+        local.z[kept], local.dz[kept], local.dt, tuple(min(n, most) for n in local.lengths),
+        inputs={k: v[kept] for k, v in local.inputs.items()}, from_zero=local.from_zero,
+    )  # fmt: skip
+    centred = force[kept] - np.mean(force[kept])
+    deviation = max(float(np.std(force[kept])), 1e-300)
+    best: dict[str, NearLaw] = {}
+    for law in (kind() for kind in laws):
+        shapes = list(law.shapes(local)) if usable(law, local) else []
+        columns = unit_forces(law, part, shapes) if shapes else np.zeros((len(kept), 0, 1))
+        for k in range(columns.shape[1]):
+            a = columns[:, k, :] - columns[:, k, :].mean(axis=0)
+            if not np.all(np.isfinite(a)):
+                continue
+            fit = a @ np.linalg.lstsq(a, centred, rcond=1e-9)[0]
+            error = float(np.sqrt(np.mean((centred - fit) ** 2))) / deviation
+            if error < best.get(law.id, NearLaw("", "", 1.0, fit)).error:
+                whole = np.full(len(force), np.nan)
+                whole[kept] = fit + np.mean(force[kept])
+                best[law.id] = NearLaw(law.id, law.form, error, whole)
+    return tuple(sorted(best.values(), key=lambda n: n.error)[:SHOWN])
