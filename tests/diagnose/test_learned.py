@@ -62,6 +62,7 @@ def test_an_export_gives_the_numbers_of_the_simulation(nameless, tmp_path):
     assert source.stat().st_size > 1000 and header.exists()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_file_and_the_page_show_what_is_learned(nameless, tmp_path):
     path = diagnosis_report(nameless, tmp_path)
     content = json.loads((tmp_path / "diagnosis.json").read_text(), parse_constant=pytest.fail)
