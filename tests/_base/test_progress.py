@@ -1,12 +1,14 @@
 """Progress shows the stage that runs, what is done of it, the smallest error so far, and the time spent."""
 
 import contextlib
+import io
 import os
 import pty
 import re
 import signal
 import subprocess
 import sys
+import time
 from itertools import pairwise
 
 import numpy as np
@@ -136,3 +138,27 @@ def test_an_interrupt_that_was_swallowed_is_raised_again():
             progress("starts", 2, 2, 0.4)
         progress("polish", 1, 1, 0.3)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+class Terminal(io.StringIO):
+    """A stream that says that it is a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def test_a_bar_shows_the_stage_its_count_and_the_smallest_error(monkeypatch):
+    drawn = Terminal()
+    monkeypatch.setattr("sys.stderr", drawn)
+    for name, value in {"COLUMNS": "90", "TERM": "xterm"}.items():
+        monkeypatch.setenv(name, value)
+    with progress_bar() as progress:
+        progress("starts", 0, 0, NAN)
+        time.sleep(0.2)  # the bar is drawn ten times a second
+        assert "starts" in drawn.getvalue() and "NRMSE" not in drawn.getvalue()
+        progress("polish", 5, 9, 0.0123)
+        progress("polish", 6, 9, 0.5)
+        time.sleep(0.2)
+    for words in ("polish", "6/9", "best NRMSE 0.0123"):
+        assert words in drawn.getvalue()
+    assert "0.5000" not in drawn.getvalue()

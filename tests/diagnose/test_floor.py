@@ -1,0 +1,60 @@
+"""The noise floor: measured where something repeats, and what tells noise from a residual that is none."""
+
+import numpy as np
+import pytest
+
+from pilfr_casadi import Recording
+from pilfr_casadi.diagnose.floor import effective_size, measured_floor, swells_with, white_part
+
+N, DEVIATION = 200, (0.02, 0.5)
+
+
+def noisy(count, seed=0, **known):
+    """A recording of some periods, with white noise of its own in each of two outputs."""
+    rng, t = np.random.default_rng(seed), np.arange(N * count) / N
+    y = np.column_stack([np.sin(2 * np.pi * t), np.cos(4 * np.pi * t)]) + rng.standard_normal((len(t), 2)) * DEVIATION
+    return Recording(np.sin(2 * np.pi * t)[:, None], y, 0.01, ("u",), ("a", "b"), **known)
+
+
+def test_periods_show_the_noise_of_each_output():
+    found = measured_floor([noisy(8, seed, initial="periodic", period=N) for seed in range(2)])
+    assert found.source == "periods"
+    assert found.deviation == pytest.approx(DEVIATION, rel=0.05)
+    assert found.nrmse(np.array([0.2, 5.0])) == pytest.approx(0.1, rel=0.05)
+    assert found.beside(np.array([0.02, 0.0])).deviation == pytest.approx((2**0.5 * 0.02, 0.5), rel=0.05)
+
+
+@pytest.mark.parametrize("initial", ["zero", "estimate"])
+def test_recordings_of_the_same_input_show_it_too(initial):
+    found = measured_floor([noisy(4, seed, initial=initial) for seed in range(4)])
+    assert found.source == "repeats"
+    assert found.deviation == pytest.approx(DEVIATION, rel=0.1)
+
+
+def test_one_period_and_one_recording_show_nothing():
+    assert measured_floor([noisy(1, initial="periodic", period=N)]) is None
+    other = noisy(4, initial="zero")
+    assert measured_floor([other, other.with_(u=2 * other.u)]) is None
+
+
+def test_slow_error_does_not_count_as_white_noise():
+    rng, slow = np.random.default_rng(0), np.sin(np.arange(4000) * 0.01)[:, None]
+    assert white_part([slow + 0.01 * rng.standard_normal((4000, 1))]) == pytest.approx([0.01], rel=0.1)
+
+
+def test_samples_that_are_alike_count_less():
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal((4000, 1))
+    alike = np.apply_along_axis(np.convolve, 0, white, np.ones(20), "same")
+    assert effective_size([white]) > 0.6 * 4000 > 5 * effective_size([alike])
+
+
+@pytest.mark.parametrize("kind", ["swells", "steady", "short", "still"])
+def test_an_error_that_swells_with_a_signal_is_no_noise(kind):
+    rng = np.random.default_rng(0)
+    m = 40 if kind == "short" else 4000
+    loud = 0.1 + np.sin(np.arange(m) * 2 * np.pi / m) ** 2
+    signal = np.zeros(m) if kind == "still" else loud * rng.standard_normal(m)
+    error = rng.standard_normal(m) * (1.0 if kind == "steady" else loud)
+    signals = np.column_stack([rng.standard_normal(m), signal])
+    assert swells_with([error[:, None]], [signals]) is (kind == "swells")
