@@ -19,9 +19,11 @@ def interrupted(*_, **__):
 def quick(monkeypatch):
     """Ctrl-C strikes where the model with hysteresis begins; the linear one is fitted."""
     fit = demo.fit
-    monkeypatch.setattr(
-        demo, "fit", lambda model, *given, **options: (interrupted if model.element else fit)(model, *given, **options)
-    )
+
+    def struck(model, *given, **options):
+        return (interrupted if model.element else fit)(model, *given, **options)
+
+    monkeypatch.setattr(demo, "fit", struck)
 
 
 def told(capsys, folder):
