@@ -29,6 +29,7 @@ from ._common import (
     numbers_of,
     option,
     say,
+    seconds,
     takes_options,
     whole,
 )
@@ -56,6 +57,7 @@ class DiagnoseOptions(DataOptions):
     workers: int | None = whole(
         "Number of parallel fits (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
     )
+    time_limit: float | None = seconds("Answer after about this time from what was found (default: no limit).")
     out: str = option("Folder for diagnosis.json and report.html (default: diagnosis).", "DIR", "diagnosis")
     overwrite: bool = flag("Replace an existing diagnosis in that folder.", "--overwrite")
 
@@ -123,6 +125,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
                 limits=numbers_of(options.limit, "--limit"),
                 workers=options.workers,
                 stand_in_error=error,
+                time_limit=options.time_limit,
                 progress=progress,
             )
     except KeyboardInterrupt:

@@ -1,18 +1,19 @@
 """Find the physics that a simulator leaves out: where, what, how sure, and the proof.
 
-The files by stage:
+A hypothesis is the simulator with laws in its ports. All hypotheses are fitted to the same recordings and compared by
+one log evidence; verdict, effects and confidence are sums over their posterior. `pipeline` shows how an answer comes
+about. The files by stage:
 
-- The whole: `run` (the steps in their order), `workbench` (what all steps share), `stages` (progress).
+- The whole: `pipeline` (the steps in their order), `workbench` (what all steps share), `stages` (progress).
 - Preparation: `preparation` calls the checks of recordings `glitches`, `settling`, `stale`, `gates` (sign, unit,
   exchange, hold), `clipping`, `gaps`, `timing` and `offset`; `standing` sets how recordings begin,
   `finer_steps` the integration steps, `floor` the noise.
-- Search: `search_start`, `search`; candidates are found by `linearise`, `screen`, `remainder` and `flexible`, fitted by
-  `candidate` and `explain`, and compared by `choice`, `kinship`, `imitated`, `knees` and `passed_over`; `first_effect`,
-  `second_effect` and `pairs` go from one effect to the next.
-- Review: `review`, `rivals`, `exchange`, `every_sensor`, `own_shape`, `other_hold`, `held`, `varying`, `undeclared`,
-  `tones` and `ringing` look for another reading of what was found.
-- Verdict: `verdict`, `conclusion`; `correction` chooses the simulator to hand back by `cross_validation`, with a
-  `learned` element where names do not reach.
+- Search: `search` moves from hypothesis to hypothesis; `linearise`, `remainder`, `screen`, `pairs` and `relatives` say
+  which are worth a fit, `trials` and `knees` fit them.
+- Evidence: `evidence` (log evidence), `flexible` (what any force could still follow), `cross_validation` (held-out
+  blocks), `posterior`, `verdict`.
+- Correction: `correction` chooses the simulator to hand back, with a `learned` element where names do not reach.
+- Other readings: `held` (a value that is held), `varying`, `undeclared`, `tones`, `ringing`.
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
 - Before any of it: `checkup` (what the recordings can reveal), by `identifiability`,
@@ -56,6 +57,7 @@ def diagnose(
     workers: int | None = None,
     engine: str = "auto",
     stand_in_error: float = 0.0,
+    time_limit: float | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Find what a simulator leaves out, from recordings of the machine.
@@ -83,6 +85,8 @@ def diagnose(
         Generated C or CasADi's virtual machine; by default C where there is a compiler.
     stand_in_error : float
         NRMSE between a surrogate and the simulation that it stands for; it counts as noise.
+    time_limit : float, optional
+        Seconds after which the search ends; the answer then rests on what was fitted until then.
     progress : callable
         Called with (stage, done, total, smallest error so far).
 
@@ -95,9 +99,9 @@ def diagnose(
     InputError
         If simulator and recordings do not fit each other.
     """
-    from .run import run_diagnosis
+    from .pipeline import diagnose_in_steps
 
-    return run_diagnosis(
+    return diagnose_in_steps(
         simulator,
         train,
         test=test,
@@ -108,5 +112,6 @@ def diagnose(
         workers=workers,
         engine=engine,
         stand_in_error=stand_in_error,
+        time_limit=time_limit,
         progress=progress,
     )

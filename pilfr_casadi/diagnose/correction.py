@@ -7,7 +7,7 @@ simplest is taken that the best one does not beat by more than its uncertainty; 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,9 @@ from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
 from .cross_validation import HeldOut, held_out_errors
 from .learned import Learned, LearnedForce, candidates, described
-from .verdict import UNSURE, confidence
+from .posterior import LEFT, Posterior, unfollowed
+from .trials import Trial
+from .verdict import SURE
 from .workbench import Fitted
 
 if TYPE_CHECKING:
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
 # standard errors from which a difference on held-out blocks is one, and ratio of the errors from which it is worth more
 # parameters: model error is alike in all blocks, so that a difference of a few per cent can be many standard errors
 BETTER, GAIN = 2.0, 0.9
-TRIED = 3  # candidates of the first pass that are looked at where the search accepted none
+TRIED = 3  # hypotheses with laws that are looked at where none is named
 PORTS = 3  # ports at which an element is learned: those where a flexible force explains most
 JUDGED = 2  # learned elements that are compared on held-out blocks: those that follow all blocks best
 
@@ -111,30 +113,28 @@ class _Hypothesis:
         return int(np.sum(self.fitted.model.parameters.free))
 
 
-def sure_and_complete(search: Search) -> bool:
-    """Whether the named effects are sure and leave nothing that is worth looking for."""
-    sure = [confidence(c, search) > UNSURE for c in search.accepted]
-    return bool(sure) and all(sure) and not search.much()
-
-
-def find_correction(search: Search, named: bool = False) -> tuple[Correction, Fitted]:
+def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:
     """Choose the simulator to hand back.
 
-    With `named` the effects of the search have been named and stay: only a learned element beside them is tried.
+    With `named` the effects of the answer have been named; where a learned element at another port predicts as well
+    without them, the correction is without them. At their own ports it would only learn what they say.
     """
-    if named and sure_and_complete(search):
-        return as_named(search, search.base), search.base
-    refit = _judged(search, search.without, search.without)
-    bases = [search.base] if named else _with_laws(search)
-    found = [h for base in bases if (h := _judged(search, base, base)) is not None]
-    roots = [search.base] if named else [search.without, *(h.fitted for h in found[:1])]
-    found += [h for root in roots for h in _with_learned(search, root)]
-    if not named and refit is not None:
+    best_laws, root = answer.best, search.root
+    if named and answer.sure > SURE and unfollowed(search, best_laws) < LEFT:
+        return as_named(search, best_laws.fitted), best_laws.fitted
+    refit = _judged(search, root.fitted, root.fitted)
+    trials = _with_laws(search)
+    trials = [best_laws, *(t for t in trials if t.key != best_laws.key)] if named else trials
+    judged = [(t, h) for t in trials if (h := _judged(search, t.fitted, t.fitted)) is not None]
+    taken = {e.port for e in best_laws.laws} if named else set[str]()
+    found = [*(h for _, h in judged), *_with_learned(search, root, taken)]
+    found += [h for t, _ in judged[:1] for h in _with_learned(search, t)]
+    if refit is not None:
         found.append(refit)
     if not found:
-        return as_named(search, search.base), search.base
+        return as_named(search, best_laws.fitted), best_laws.fitted
     best = _simplest(found)
-    if not named and refit is not None and not _clearly_better(best, refit):
+    if refit is not None and not _clearly_better(best, refit):
         best = refit
     shares = _shares(search, best.named, best.fitted)
     learned: tuple[Learned, ...] = ()
@@ -169,27 +169,26 @@ def _judged(search: Search, fitted: Fitted, named: Fitted) -> _Hypothesis | None
     return None
 
 
-def _with_laws(search: Search) -> list[Fitted]:
-    """The simulators with laws that the search has: what it accepted, else the best candidates of its first pass."""
-    if _elements(search, search.base):
-        return [search.base]
-    tried = sorted(search.passes[0].candidates, key=lambda c: c.tail)[:TRIED] if search.passes else []
-    return [whole.fitted for candidate in tried if (whole := search.polished(candidate)) is not None]
+def _with_laws(search: Search) -> list[Trial]:
+    """The most promising hypotheses with laws, fitted to everything."""
+    ranked = sorted((t for t in search.memo.values() if t.laws), key=search.promise, reverse=True)[:TRIED]
+    found = [t if t.thorough else search.fits.polished(t) for t in ranked]
+    return [t for t in found if np.isfinite(t.whole)]
 
 
-def _with_learned(search: Search, base: Fitted) -> list[_Hypothesis]:
-    """Learned elements on top of a fitted simulator, at the ports where a flexible force explains most."""
-    shares = search.open_after if base is search.base else search.open_before
-    ports = sorted(shares, key=lambda name: -shares[name])[:PORTS]
+def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Hypothesis]:
+    """Learned elements on top of a fitted simulator, at the free ports where a flexible force explains most."""
+    shares = search.flexible(base)
+    ports = [name for name in sorted(shares, key=lambda name: -shares[name]) if name not in taken][:PORTS]
     with suppress(InputError, np.linalg.LinAlgError):
-        found = candidates(search.bench, base, ports, search.bench.simulator.inputs)
-        return [h for f in found[:JUDGED] if (h := _judged(search, f, base)) is not None]
+        found = candidates(search.bench, base.fitted, ports, search.bench.simulator.inputs)
+        return [h for f in found[:JUDGED] if (h := _judged(search, f, base.fitted)) is not None]
     return []
 
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
     """Shares of the refit's mean square error above the noise; all of it is left where there is none."""
-    excess = search.without.cost - search.floor2
+    excess = search.root.whole - search.floor2
     if not excess > 0:
         return {"named": 0.0, "learned": 0.0, "left": 0.0}
     after = [float(np.clip((f.cost - search.floor2) / excess, 0.0, 1.0)) for f in (named, whole)]

@@ -174,7 +174,7 @@ def choose_hold(
 def hold_note(simulator: Any, hold: str, ratio: float) -> Gate:
     """That the hold was chosen from the data, the other's error being `ratio` times as large."""
     words = {"zero": "held over each sample", "linear": "interpolated between samples"}
-    why = f"fits better (error {ratio:.3g} times smaller)" if ratio > 1.005 else "gives the surer answer"
+    why = f"fits better (error {ratio:.3g} times smaller)"
     return Gate(
         ", ".join(simulator.inputs),
         "hold",

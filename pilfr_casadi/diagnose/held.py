@@ -8,19 +8,17 @@ value whose bounds are in another unit no law says anything of the machine: it i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .._base import InputError
 from ..laws import display_name
-from .choice import LIKE
-from .verdict import AT_FLOOR, WELL_ABOVE
+from .posterior import Posterior
+from .search import Search
 from .workbench import THOROUGH, Fitted
 
-if TYPE_CHECKING:
-    from .search import Search
-
+LIKE = 0.03  # share by which errors differ that say the same
+AT_FLOOR, WELL_ABOVE = 1.15, 3.0  # times the noise that counts as being at it, and as being far from it
 HELPLESS = 0.5  # error of a refit that says little of a machine: a value may be powers of ten away
 FAR = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)
 LINEAR = ("linear_stiffness", "viscous_damping")
@@ -36,17 +34,17 @@ class Held:
     sentence: str
 
 
-def held_value(search: Search) -> Held | None:
+def held_value(search: Search, answer: Posterior) -> Held | None:
     """The held parameter that, let go, does as well as what was named; None where there is none.
 
     One that is fixed is asked for only by a linear law, which is the same as another value of it.
     """
-    named = [c.winner for c in search.accepted]
+    named = [e.element for e in answer.effects]
     linear = len(named) == 1 and named[0].law.id in LINEAR
-    bench, without = search.bench, search.without
+    bench, without = search.bench, search.root.fitted
     if not linear and without.cost < HELPLESS**2:
         return None
-    as_well = (1 + LIKE) ** 2 * search.base.cost if named else np.inf
+    as_well = (1 + LIKE) ** 2 * answer.best.whole if named else np.inf
     enough = min(as_well, (WELL_ABOVE if named else AT_FLOOR) ** 2 * search.floor2)  # else something is missing
     best: tuple[str, Fitted] | None = None
     for name, p in bench.simulator.parameters.items():

@@ -9,21 +9,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from .._base import InputError
 from .workbench import FINER, THOROUGH, Fitted, Workbench
 
 if TYPE_CHECKING:
-    from .candidate import Candidate
+    from .trials import Trial
 
 NARROW = 0.05  # of the widest that is tried, of a knee that is sharp
 KNEES = (0.25, 4.0)  # times the width of a knee that a law is started from again
-MOVED = 1.2  # times the width, of a knee that is another
 FINEST, SAME = 16, 0.1  # times the sub-steps at most, and the share by which finer ones may change the mean square
 
 
-def knees(candidate: Candidate) -> list[dict[str, Any]]:
+def knees(candidate: Trial) -> list[dict[str, Any]]:
     """Fitted values, also with a sharper and a wider knee where it is sharp."""
     values, knee = candidate.fitted.values, candidate.knee
     if not knee or values[knee] > NARROW * candidate.fitted.model.parameters[knee].bounds[1]:
@@ -54,11 +51,3 @@ def on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
     except InputError:
         return fitted
     return found if found.cost < max(fitted.cost, there.cost) else fitted
-
-
-def moved(before: Candidate, after: Candidate) -> bool:
-    """Whether the knee is another than the one that the first part was fitted with."""
-    if not after.knee:
-        return False
-    ratio = float(after.fitted.values[after.knee] / before.fitted.values[after.knee])
-    return abs(np.log(ratio)) > np.log(MOVED)

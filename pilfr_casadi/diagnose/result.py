@@ -34,6 +34,7 @@ SURE = 0.5  # confidence above which an effect is stated as found; below it is a
 CONSTANT = 0.9  # error from which a refitted simulator is hardly better than a constant
 FAR = 3.0  # ratio of the test error to the training error from which the answer warns
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
+OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits made until then."
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +101,8 @@ class Diagnosis:
         `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs.
     floor : dict
         `nrmse` and `source`.
+    out_of_time : bool
+        Whether the time limit ended the search.
     substeps : int
         Integration steps per sample with which the corrected simulator was fitted.
     let_go : str
@@ -127,6 +130,7 @@ class Diagnosis:
     seconds: float = 0.0
     times: Mapping[str, float] = field(default_factory=dict)
     interrupted: bool = False
+    out_of_time: bool = False
     evidence: Mapping[str, Any] = field(default_factory=dict)
     substeps: int = 1
     let_go: str = ""
@@ -313,7 +317,7 @@ class Diagnosis:
 
     def warnings(self) -> list[str]:
         """List the reasons for doubt: an interrupt, parameters at their bounds, errors that stay large."""
-        out = [INTERRUPTED] if self.interrupted else []
+        out = [INTERRUPTED] * self.interrupted + [OUT_OF_TIME] * self.out_of_time
         at_bounds = self._at_bounds()
         if at_bounds:
             one = len(at_bounds) == 1

@@ -8,8 +8,9 @@ from dataclasses import replace
 from .._base import InputError
 from ..laws import display_name
 from .gates import Gate
+from .posterior import posterior
 from .search import Search
-from .verdict import UNSURE
+from .verdict import SURE
 
 
 def beyond_the_ports(search: Search) -> Sequence[Gate]:
@@ -20,19 +21,19 @@ def beyond_the_ports(search: Search) -> Sequence[Gate]:
     open_ = replace(search.bench.simulator, ports=())
     bench = replace(search.bench, simulator=open_)
     try:
-        without = bench.fit(open_, [search.without.values], states=search.without.begin)
+        without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
         other = Search(bench, without, search.floor, search.laws, search.workers, search.say).run(1)
     except InputError:
         return ()
     except KeyboardInterrupt:
         search.interrupted = True
         return ()
-    search.interrupted, named = other.interrupted, other.accepted
-    if other.certainty() <= UNSURE or not named or not named[0].winner.port.startswith("equation:"):
+    search.interrupted, found = other.interrupted, posterior(other)
+    if found.sure <= SURE or not found.effects[0].name[0].startswith("equation:"):
         return ()
-    state, law = named[0].winner.port.removeprefix("equation:"), named[0].winner.law.id
+    state, law = found.effects[0].name[0].removeprefix("equation:"), found.effects[0].name[1]
     sentence = (
         f"No declared port reaches it: in the equation of {state}, {display_name(law)} explains it (refitted with it, "
-        f"the error is {other.base.cost**0.5:.3g} of the outputs' deviation). Declare the port that it acts through."
+        f"the error is {found.best.error:.3g} of the outputs' deviation). Declare the port that it acts through."
     )
     return (Gate(state, "undeclared", law.replace("_", " "), sentence, False),)

@@ -30,7 +30,7 @@ Group = tuple[str, Sequence[Recording], Sequence[np.ndarray]]  # what it is call
 
 def varying(search: Search) -> tuple[Gate, ...]:
     """A note on what differs between the recordings, or else between the halves of each."""
-    bench, whole = search.bench, search.without
+    bench, whole = search.bench, search.root.fitted
     if search.interrupted or not np.any(whole.model.parameters.free):
         return ()
     try:
@@ -59,7 +59,7 @@ def _halves(bench: Workbench, whole: Fitted) -> list[Group]:
 
 
 def _told(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
-    bench, whole = search.bench, search.without
+    bench, whole = search.bench, search.root.fitted
     fits, benches = list[Fitted](), list[Workbench]()
     for _, recordings, states in groups:
         part = bench.on(recordings)

@@ -164,16 +164,16 @@ def port_law_map(
     without: float | None = None,
     floor: float | None = None,
 ) -> Axes:
-    """Draw the error on held-out data for every port and law; grey where no fit was made.
+    """Draw the error after the fit for every port and law; grey where no fit was made.
 
     Parameters
     ----------
     rows : sequence of (port, law, error)
-        Validation errors; the smallest of several forms of a law is drawn.
+        Errors; the smallest of several forms of a law is drawn.
     best : sequence of (port, law)
         Pairs to frame.
     without, floor : float, optional
-        Ends of the scale: validation error of the simulator without a law, and error of noise alone.
+        Ends of the scale: error of the simulator without a law, and error of noise alone.
     """
     ports = list(dict.fromkeys(p for p, _, _ in rows))
     smallest: dict[tuple[str, str], float] = {}
@@ -208,7 +208,7 @@ def port_law_map(
     for side in ax.spines.values():
         side.set_visible(False)
     bar = figure.colorbar(mesh, ax=ax, pad=0.02)
-    bar.set_label("error on data not fitted [%]", fontsize=FONT - 1)
+    bar.set_label("error after the fit [%]", fontsize=FONT - 1)
     _readable_log(bar.ax.yaxis, low, top)
     bar.ax.tick_params(labelsize=FONT - 1)
     return ax

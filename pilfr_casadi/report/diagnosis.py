@@ -185,10 +185,10 @@ def _hidden_forces(case: _Case) -> list[Block]:
     if d.verdict != "unexplained":
         return out
     search, rows = d.evidence.get("search"), tables.candidates_by_pass(d)
-    nearest = search.passes[0].choice if search is not None and search.passes else None
+    nearest = max(search.steps[0].trials, key=search.evidence) if search is not None and search.steps else None
     if nearest is not None:
-        fitted, port = nearest.winner.fitted, nearest.winner.port
-        number, name = len(fitted.simulator.elements) - 1, f"{display_name(nearest.winner.law.id)} (the nearest law)"
+        fitted, port = nearest.fitted, nearest.port
+        number, name = len(fitted.simulator.elements) - 1, f"{display_name(nearest.law.id)} (the nearest law)"
         out += _force_blocks(case, fitted, port, number, name)
     elif rows:
         out += _force_blocks(case, case.before, rows[0][0]["port"], None, "")
@@ -196,7 +196,7 @@ def _hidden_forces(case: _Case) -> list[Block]:
     if table is not None:
         out.append(table)
         freest = str(table.rows[0][0])
-        if nearest is None or freest != nearest.winner.port:
+        if nearest is None or freest != nearest.port:
             out += _force_blocks(case, case.before, freest, None, "")
     return out
 
@@ -278,15 +278,14 @@ def _candidates(d: Diagnosis) -> list[Block]:
         named = d.effects[k : k + 1] if k else d.effects[: max(len(d.effects), 1)]
         chosen = {(e.port, e.law) for e in named}
         title = "All fitted pairs of port and law"
-        if k:
-            before = " and ".join(f"{display_name(e.law)} at {e.port}" for e in d.effects[:k]) or "the first law"
-            title = f"Second pass, with {before} in place"
-        cells = [(r["port"], display_name(r["law"]), tables.held_out(r)) for r in rows]
+        if before := tables.in_place(d, k):
+            title = f"Fitted beside {before}"
+        cells = [(r["port"], display_name(r["law"]), tables.score(r)) for r in rows]
         framed = [(port, display_name(law)) for port, law in chosen]
-        axes = plots.port_law_map(cells, framed, tables.held_out_before(d, k), d.floor["nrmse"] or None)
+        axes = plots.port_law_map(cells, framed, tables.error_before(d, k), d.floor["nrmse"] or None)
         caption = (
-            f"{title}: the error on the part of the training recordings that was not fitted, in %, by port and law "
-            "(best form). Grey: excluded by the quick test before the fits."
+            f"{title}: the error on the training recordings after the fit, in %, by port and law (best form). "
+            " Grey: excluded by the quick test before the fits."
         )
         wide = len({r["port"] for r in rows}) > WIDE_MAP
         out += [Picture(axes, caption, "Errors by port and law.", wide)]

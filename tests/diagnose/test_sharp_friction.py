@@ -1,23 +1,17 @@
 """Friction that turns round at once, and offsets that it had looked like."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from diagnosis_rig import DT, recordings, rig
+from diagnosis_rig import DT
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.candidate import Candidate
-from pilfr_casadi.diagnose.choice import Choice
 from pilfr_casadi.diagnose.finer_steps import on_steps_as_fine
-from pilfr_casadi.diagnose.first_effect import let_idle_offsets_go
-from pilfr_casadi.diagnose.offset import Offset
-from pilfr_casadi.diagnose.search import Pass
 from pilfr_casadi.diagnose.workbench import FINER, THOROUGH
 from pilfr_casadi.engine import make_engine
-from pilfr_casadi.laws import AsymmetricFriction, CoulombFriction, Delay, Polynomial
+from pilfr_casadi.laws import CoulombFriction, Delay, Polynomial
 from pilfr_casadi.simulators import Simulator, discretise
 
 F_C = 6.0
@@ -135,23 +129,3 @@ def test_a_sharp_knee_gets_finer_steps_whatever_its_sharpness():
         law = CoulombFriction(values={"F_c": F_C, "v_0": v_0})
         counts = bench.model(bench.simulator.with_element("guide", law)).substeps
         assert counts == FINER * bench.substeps or v_0 > 1e-3
-
-
-def test_an_offset_and_what_a_law_holds_against_it_go_together():
-    placed = rig().with_element("actuator:force", Offset())
-    law = AsymmetricFriction().at({"v_0": 0.01}, {"v_0": (1e-4, 1.0), "F_c": (0.0, np.inf)})
-    true = CoulombFriction(values={"F_c": 4.0, "v_0": 0.01})
-    bench = Workbench.of(placed, recordings(true, count=1), "zero")
-    both = placed.with_element("ground-m1", law)
-    start = {"actuator:force.w_0": 2.0, "ground-m1.F_c": 4.0, "ground-m1.F_0": 2.0, "ground-m1.v_0": 0.01}
-    fitted = bench.fit(both, [start])
-    winner = Candidate("ground-m1", law, fitted, fitted.cost, fitted.cost, 3, fitted.cost)
-    choice = Choice(winner, (), 100.0, 0.0, 10.0)
-    found = Pass(choice, (winner,), (), (1.0, 1.0), True)
-    search = SimpleNamespace(bench=bench, base=fitted, passes=[found])
-    let_idle_offsets_go(search)
-    assert (
-        search.base.values["actuator:force.w_0"] == 0 and search.base.simulator.parameters["actuator:force.w_0"].fixed
-    )
-    assert type(search.passes[0].choice.winner.law) is CoulombFriction
-    assert search.base.values["ground-m1.F_c"] == pytest.approx(4.0, rel=0.02)

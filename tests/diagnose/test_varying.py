@@ -8,6 +8,7 @@ from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.stages import Stages
 from pilfr_casadi.diagnose.varying import varying
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
@@ -40,7 +41,8 @@ def told(*recordings):
     """What is said of them where nothing else is found."""
     bench = Workbench.of(cart(), recordings, "zero")
     floor = Floor(np.full(1, 1e-3), "estimated")
-    return varying(Search(bench, bench.fit(bench.simulator), floor, (), 1, lambda *_: None))
+    search = Search(bench, bench.fit(bench.simulator), floor, (), 1, Stages(lambda *_: None))
+    return varying(search.run(0))
 
 
 def test_recordings_that_disagree_are_told_with_the_value_that_differs():

@@ -1,0 +1,155 @@
+"""What a search comes to: the probability of every answer, from the log evidences of all hypotheses that were fitted.
+
+The probability of a hypothesis is its share of the sum of all evidences. A law that is the physics leaves little of
+the mismatch to any other force; so, with s the share of the mismatch that the law leaves and that a flexible force at
+some port would follow, the density of s is
+
+    1 / (s log(1 / s_0))  where the physics has no name (s from s_0 to 1, any size as likely),
+    2 / (π s_0 (1 + (s / s_0)²))  where the law is the physics,
+
+and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. The verdict is the
+likeliest of complete, missing physics and unexplained; the confidence of an effect is the probability that it is in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..simulators import Placed
+from .search import Search
+from .trials import Trial
+
+OUTSIDE = 0.1  # prior probability that missing physics is in no law of the catalogue
+LEFT = 0.003  # s_0: share of a mismatch that a law of the right name may well leave
+DISTURBED = 0.2  # weight of what a law leaves and no force at a port follows
+ALIKE = 3.0  # nats within which two hypotheses are not told apart
+Name = tuple[str, str]  # port and law id
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """An effect of the likeliest hypothesis.
+
+    Attributes
+    ----------
+    confidence : float
+        Probability that it, or the same law where the recordings cannot tell the place, is in.
+    alike : dict
+        Port and law id of other effects in its place that are not told apart -> the hypothesis, the likeliest first.
+    """
+
+    element: Placed
+    confidence: float
+    alike: dict[Name, Trial]
+
+    @property
+    def name(self) -> Name:
+        """Port and law id."""
+        return self.element.port, self.element.law.id
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Probabilities of the answers.
+
+    Attributes
+    ----------
+    best : Trial
+        The likeliest hypothesis.
+    named : float
+        Probability that the laws of the best hypothesis are the physics, given the hypothesis.
+    effects : tuple of Named
+        Its laws, strongest first.
+    nothing : float
+        Probability of the simulator alone.
+    """
+
+    best: Trial
+    named: float
+    effects: tuple[Named, ...]
+    nothing: float
+
+    @property
+    def sure(self) -> float:
+        """Confidence of the least sure effect; zero without effects."""
+        return min((e.confidence for e in self.effects), default=0.0)
+
+    def beside_learned(self, share: float) -> Posterior:
+        """The same where a learned force follows a share of the mismatch beside the named laws."""
+        named = min(self.named, share_named(share))
+        ratio = named / max(self.named, 1e-300)
+        return replace(
+            self, named=named, effects=tuple(replace(e, confidence=ratio * e.confidence) for e in self.effects)
+        )
+
+
+def names(trial: Trial) -> frozenset[Name]:
+    """Ports and law ids of a hypothesis; an offset is a finding about the recording, not an effect."""
+    return frozenset((e.port, e.law.id) for e in trial.laws if e.law.id != "offset")
+
+
+def unfollowed(search: Search, trial: Trial) -> float:
+    """Share s of the mismatch that a hypothesis leaves and that a flexible force would follow.
+
+    What no force at a port follows counts little: it may be a disturbance that acts beside the law.
+    """
+    excess = max(search.root.whole - search.floor2, 1e-300)
+    left = float(np.clip((trial.whole - search.floor2) / excess, 0.0, 1.0))
+    share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
+    return left * (share + DISTURBED * (1 - share))
+
+
+def share_named(s: float) -> float:
+    """Probability that a law which leaves the share s is the physics."""
+    law = (1 - OUTSIDE) * 2 / (np.pi * LEFT * (1 + (s / LEFT) ** 2))
+    other = OUTSIDE / (max(s, LEFT) * np.log(1 / LEFT))
+    return float(law / (law + other))
+
+
+def posterior(search: Search) -> Posterior:
+    """Weigh all hypotheses of a search."""
+    trials = list(search.memo.values())
+    logs = np.array([search.evidence(t) for t in trials])
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    by_names: dict[frozenset[Name], float] = {}
+    for t, w in zip(trials, weights, strict=True):
+        by_names[names(t)] = by_names.get(names(t), 0.0) + float(w)
+    likeliest = max(by_names, key=lambda n: by_names[n])
+    best = max((t for t in trials if names(t) == likeliest), key=search.evidence)
+    effects = [e for e in best.laws if e.law.id != "offset"]
+    named = share_named(unfollowed(search, best)) if effects else 0.0
+    found = []
+    for e in effects:
+        twins = _twins(search, best, e)
+        same = {(e.port, e.law.id), *(n for name in twins if name[1] == e.law.id for n in _each(name))}
+        inside = sum(w for n, w in by_names.items() if n & same)
+        found.append(Named(e, named * inside, twins))
+    return Posterior(best, named, tuple(found), by_names.get(frozenset(), 0.0))
+
+
+def _twins(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:
+    """Hypotheses with another effect in place of one of the best one's, as likely or nearly.
+
+    The same law in every sensor is one effect, at "sensor:a + sensor:b".
+    """
+    own = (element.port, element.law.id)
+    rest, out = names(best) - {own}, dict[Name, Trial]()
+    least = search.evidence(best) - ALIKE
+    every = [f"sensor:{name}" for name in search.bench.simulator.output_names]
+    for t in sorted(search.memo.values(), key=search.evidence, reverse=True):
+        other = names(t) - rest
+        if search.evidence(t) < least or not rest <= names(t) or own in other or not other:
+            continue
+        if len(other) == 1 and len(names(t)) == len(names(best)):
+            out.setdefault(next(iter(other)), t)
+        elif other == {(port, element.law.id) for port in every}:
+            out.setdefault((" + ".join(every), element.law.id), t)
+    return out
+
+
+def _each(name: Name) -> list[Name]:
+    """The single effects of one that is in several places."""
+    return [(port, name[1]) for port in name[0].split(" + ")]
