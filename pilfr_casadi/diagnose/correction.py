@@ -2,7 +2,7 @@
 
 Where the named answer is not sure, or leaves something, these compete on held-out blocks of the training recordings
 (`cross_validation`): the refit, the laws that the search has fitted, and a learned element alone or beside them. The
-simplest is taken that the best one does not beat by more than its uncertainty; test recordings are never looked at.
+simplest is taken of those that do about as well as the best; test recordings are never looked at.
 """
 
 from __future__ import annotations
@@ -27,9 +27,7 @@ from .workbench import Fitted
 if TYPE_CHECKING:
     from .search import Search
 
-# standard errors from which a difference on held-out blocks is one, and ratio of the errors from which it is worth more
-# parameters: model error is alike in all blocks, so that a difference of a few per cent can be many standard errors
-BETTER, GAIN = 2.0, 0.9
+GAIN = 0.9  # ratio of two errors on what was held out, from which the smaller one is worth more parameters
 TRIED = 3  # hypotheses with laws that are looked at where none is named
 PORTS = 3  # ports at which an element is learned: those where a flexible force explains most
 JUDGED = 2  # learned elements that are compared on held-out blocks: those that follow all blocks best
@@ -122,10 +120,10 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     best_laws, root = answer.best, search.root
     if named and answer.sure > SURE and unfollowed(search, best_laws) < LEFT:
         return as_named(search, best_laws.fitted), best_laws.fitted
-    refit = _judged(search, root.fitted, root.fitted)
+    refit = _of_trial(search, root)
     trials = _with_laws(search)
     trials = [best_laws, *(t for t in trials if t.key != best_laws.key)] if named else trials
-    judged = [(t, h) for t in trials if (h := _judged(search, t.fitted, t.fitted)) is not None]
+    judged = [(t, h) for t in trials if (h := _of_trial(search, t)) is not None]
     taken = {e.port for e in best_laws.laws} if named else set[str]()
     found = [*(h for _, h in judged), *_with_learned(search, root, taken)]
     found += [h for t, _ in judged[:1] for h in _with_learned(search, t)]
@@ -134,8 +132,6 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     if not found:
         return as_named(search, best_laws.fitted), best_laws.fitted
     best = _simplest(found)
-    if refit is not None and not _clearly_better(best, refit):
-        best = refit
     shares = _shares(search, best.named, best.fitted)
     learned: tuple[Learned, ...] = ()
     if best.fitted is not best.named:
@@ -150,29 +146,30 @@ def as_named(search: Search, fitted: Fitted) -> Correction:
 
 
 def _simplest(found: Sequence[_Hypothesis]) -> _Hypothesis:
-    """Take the simplest hypothesis that the best one does not beat by more than its uncertainty (Breiman 1984)."""
-    best = min(found, key=lambda h: h.held_out.error)
-    near = (h for h in found if np.isfinite(h.held_out.error) and not _clearly_better(best, h))
-    return min(near, key=lambda h: (h.size, h.held_out.error), default=best)
+    """Take the simplest hypothesis of those that predict about as well as the best."""
+    best = min(h.held_out.error for h in found)
+    near = (h for h in found if GAIN * h.held_out.error <= best)
+    return min(near, key=lambda h: (h.size, h.held_out.error))
 
 
-def _clearly_better(one: _Hypothesis, other: _Hypothesis) -> bool:
-    """Whether a hypothesis predicts held-out blocks better by more than the uncertainty, and by a tenth at least."""
-    a, b = one.held_out, other.held_out
-    return a.better_than(b) >= BETTER and a.error <= GAIN * b.error
+def _of_trial(search: Search, trial: Trial) -> _Hypothesis | None:
+    """A hypothesis of the search with its errors on what it was not fitted to; None where it cannot be simulated."""
+    with suppress(InputError):
+        return _Hypothesis(trial.fitted, trial.fitted, search.predicts(trial))
+    return None
 
 
 def _judged(search: Search, fitted: Fitted, named: Fitted) -> _Hypothesis | None:
-    """A hypothesis with its errors on held-out blocks; None where it cannot be simulated."""
+    """The same of a hypothesis with a learned element."""
     with suppress(InputError):
         return _Hypothesis(fitted, named, held_out_errors(search.bench, fitted))
     return None
 
 
 def _with_laws(search: Search) -> list[Trial]:
-    """The most promising hypotheses with laws, fitted to everything."""
-    ranked = sorted((t for t in search.memo.values() if t.laws), key=search.promise, reverse=True)[:TRIED]
-    found = [t if t.thorough else search.fits.polished(t) for t in ranked]
+    """The most promising hypotheses with laws, fitted to everything, and those that have predicted already."""
+    ranked = sorted((t for t in search.memo.values() if t.laws), key=search.promise, reverse=True)
+    found = [search.thorough(t) for t in ranked[:TRIED]] + [t for t in ranked[TRIED:] if t.key in search.held_out]
     return [t for t in found if np.isfinite(t.whole)]
 
 

@@ -358,12 +358,13 @@ def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] 
 
 def _row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
     """A candidate as in diagnosis.json."""
+    held_out = search.held_out.get(t.key)
     gain = search.evidence(t) - search.evidence(parent)
     return {
         "port": t.port,
         "law": t.law.id,
         "form": t.law.form,
         "nrmse_train": t.error,
-        "nrmse_validation": t.predicted**0.5 if np.isfinite(t.predicted) else None,
+        "nrmse_validation": held_out.error if held_out and np.isfinite(held_out.error) else None,
         "delta_bic": -2 * gain,
     }

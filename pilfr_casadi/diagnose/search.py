@@ -7,7 +7,6 @@ brings a better one. What was fitted stays in the memo and counts in the posteri
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +19,7 @@ from ..data import Recording
 from ..engine import make_engine
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
-from .cross_validation import held_out_errors
+from .cross_validation import HeldOut, held_out_errors
 from .evidence import EXACT, MORE, Sample, information, log_evidence, log_prior
 from .flexible import explainable
 from .floor import Floor, effective_size, white_part
@@ -94,6 +93,7 @@ class Search:
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
     gates: tuple[Gate, ...] = ()
     open: dict[Key, dict[str, float]] = field(default_factory=dict)
+    held_out: dict[Key, HeldOut] = field(default_factory=dict)
     times: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
     out_of_time: bool = False
@@ -140,9 +140,9 @@ class Search:
 
     def evidence(self, trial: Trial) -> float:
         """Log evidence of a hypothesis, from its error on blocks that it was not fitted to where that is known."""
-        root = self.root
-        worse = root.predicted / root.whole if np.isfinite(root.predicted) else 1.0
-        v = trial.whole * worse if np.isnan(trial.predicted) else trial.predicted
+        known, of_root = self.held_out.get(trial.key), self.held_out.get(self.root.key)
+        worse = of_root.mean_square / self.root.whole if of_root else 1.0
+        v = known.mean_square if known else trial.whole * (worse if np.isfinite(worse) else 1.0)
         return self._log_evidence(trial, v, self.samples)
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
@@ -150,20 +150,27 @@ class Search:
         v += self.tolerance
         return log_evidence(v, told, log_prior(trial.laws, self.alternatives, trial.doubtful), n)
 
+    def predicts(self, trial: Trial) -> HeldOut:
+        """Errors of a hypothesis on what it was not fitted to."""
+        if trial.key not in self.held_out:
+            self.held_out[trial.key] = held_out_errors(self.bench, trial.fitted)
+        return self.held_out[trial.key]
+
     def _predict(self) -> None:
-        """Let the likeliest hypotheses predict blocks that they are not fitted to, until the first one has.
+        """Let the likeliest hypotheses predict what they are not fitted to.
 
         Where the error is noise, the fit says the same; where a model is wrong, it may have learned by heart.
         """
         if self.samples > EXACT / WRONG:
             return
         began = self.begin("held-out blocks")
-        for tried in (self.root, *itertools.repeat(None, PREDICTED)):
-            trial = tried or max(self.memo.values(), key=self.evidence)
-            if not np.isnan(trial.predicted) or not self._in_time():
+        self.predicts(self.root)
+        for _ in range(PREDICTED):
+            least = max(map(self.evidence, self.memo.values())) - REACH
+            left = [t for t in self.memo.values() if t.key not in self.held_out and self.evidence(t) > least]
+            if not left or not self._in_time():
                 break
-            found = held_out_errors(self.bench, trial.fitted).error ** 2
-            self.memo[trial.key] = replace(trial, predicted=found if np.isfinite(found) else np.inf)
+            self.predicts(max(left, key=self.evidence))
         self.timed("held-out blocks", began)
 
     def flexible(self, trial: Trial) -> dict[str, float]:
@@ -239,6 +246,7 @@ class Search:
         if known is None or trial.supersedes(known):
             self.memo[trial.key] = trial
             self.open.pop(trial.key, None)
+            self.held_out.pop(trial.key, None)
 
     def add(self, parent: Trial, again: bool = False) -> Step:
         """Fit what the screen lets through beside a hypothesis, a few to look `again`; what may win thoroughly."""
@@ -293,6 +301,12 @@ class Search:
             done = list(pool.map(fits.polished, near))
         for trial in done:
             self.keep(trial)
+
+    def thorough(self, trial: Trial) -> Trial:
+        """The same hypothesis fitted thoroughly and to everything."""
+        if not self.memo[trial.key].thorough:
+            self.keep(self.fits.polished(trial))
+        return self.memo[trial.key]
 
     def _estimate_noise(self) -> None:
         """Take what no force at any port explains of the best hypothesis' residual for noise, unless it was measured.
@@ -396,7 +410,7 @@ class Search:
             self.timed("look back", began)
         if alone.cost > LED_OUT * self.root.whole:
             return False
-        self.without, self.memo, self.open, self.steps = alone, {}, {}, []
+        self.without, self.memo, self.open, self.held_out, self.steps = alone, {}, {}, {}, []
         self.keep(Trial((), alone, alone.cost, alone.cost, True))
         return True
 

@@ -54,8 +54,6 @@ class Trial:
         Whether it was fitted to everything.
     information : array
         See `evidence.information`.
-    predicted : float
-        Mean square error on blocks of the recordings that it was not fitted to; nan where that was not tried.
     """
 
     laws: tuple[Placed, ...]
@@ -64,7 +62,6 @@ class Trial:
     whole: float
     thorough: bool = False
     information: np.ndarray | None = None
-    predicted: float = np.nan
 
     @property
     def key(self) -> Key:
