@@ -106,9 +106,9 @@ class _Hypothesis:
     held_out: HeldOut
 
     @property
-    def size(self) -> int:
-        """Free parameters, by which simple ones come first."""
-        return int(np.sum(self.fitted.model.parameters.free))
+    def size(self) -> tuple[bool, int]:
+        """What simple ones have less of: a learned element, then elements."""
+        return self.fitted is not self.named, len(self.fitted.simulator.elements)
 
 
 def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:

@@ -73,6 +73,8 @@ class Search:
         NRMSE by which the simulator misses what it stands for; the floor holds it too.
     count : float
         Samples of the best residual over its correlation time.
+    seen2 : float
+        Mean square of white noise in the best residual, in units of the outputs' variance.
     until : float
         Time (of `time.perf_counter`) at which the search answers from what it has.
     out_of_time : bool
@@ -98,11 +100,22 @@ class Search:
     interrupted: bool = False
     out_of_time: bool = False
     count: float = FEWEST
+    seen2: float = 0.0
 
     @property
     def fits(self) -> Trials:
         """What fits hypotheses."""
         return Trials(self.bench, self.workers, self.until)
+
+    @property
+    def samples(self) -> float:
+        """Effective samples, which all hypotheses share.
+
+        What is left counts as noise as far as it was measured or is white; the rest may be noise and may be physics.
+        """
+        v = min(t.whole for t in self.memo.values()) + self.tolerance
+        seen2 = self.seen2 if self.floor.source == "estimated" else self.floor2
+        return Sample(seen2 + self.tolerance, self.count).effective(v)
 
     @property
     def floor2(self) -> float:
@@ -128,11 +141,6 @@ class Search:
     def best(self) -> Trial:
         """The most promising hypothesis, from which the search goes on."""
         return max(self.memo.values(), key=self.promise)
-
-    @property
-    def samples(self) -> float:
-        """Effective samples, which all hypotheses share."""
-        return self.sample.effective(min(t.whole for t in self.memo.values()) + self.tolerance)
 
     def promise(self, trial: Trial) -> float:
         """Log evidence of a hypothesis if what is still missing were found beside it: samples count as at the noise."""
@@ -321,8 +329,9 @@ class Search:
         error = np.concatenate([e[r.skip :] for e, r in self._residual(best)])
         share = float(np.clip(1 - max(self.flexible(best).values(), default=0.0), 0.0, 1.0))
         rest = np.minimum(np.sqrt(share * np.mean(error**2, axis=0)), LOUDEST * self.bench.scale)
-        known = self.stand_in_error * self.bench.scale
-        self.floor = Floor(np.hypot(np.maximum(white_part(best.fitted.residual), rest), known), "estimated")
+        known, white = self.stand_in_error * self.bench.scale, white_part(best.fitted.residual)
+        self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
+        self.seen2 = float(np.mean((np.hypot(white, known) / self.bench.scale) ** 2))
 
     def _finer(self, parent: Trial) -> None:
         """The best law of a step in its finer forms."""
