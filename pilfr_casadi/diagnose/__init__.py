@@ -52,7 +52,7 @@ def diagnose(
     test: Recording | Sequence[Recording] | None = None,
     hold: str | None = None,
     laws: Sequence[type[Law]] | None = None,
-    effects: int = 2,
+    effects: int | None = None,
     limits: Mapping[str, float] | None = None,
     workers: int | None = None,
     engine: str = "auto",
@@ -75,8 +75,8 @@ def diagnose(
     laws : sequence of Law classes, optional
         By default the whole catalogue. Inputs that the simulator's equations do not
         read are tried as scales of some of its laws.
-    effects : int
-        Largest number of effects to look for.
+    effects : int, optional
+        Largest number of effects to look for; by default as many as the recordings tell.
     limits : mapping, optional
         Largest amplitude of each input that a next experiment may have; by default what was recorded.
     workers : int, optional

@@ -7,7 +7,8 @@ simplest is taken of those that do about as well as the best; test recordings ar
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import time
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -112,23 +113,19 @@ class _Hypothesis:
 
 
 def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:
-    """Choose the simulator to hand back.
+    """Choose the simulator to hand back, from what there is time to try.
 
     With `named` the effects of the answer have been named; where a learned element at another port predicts as well
     without them, the correction is without them. At their own ports it would only learn what they say.
     """
-    best_laws, root = answer.best, search.root
+    best_laws = answer.best
     if named and answer.sure > SURE and unfollowed(search, best_laws) < LEFT:
         return as_named(search, best_laws.fitted), best_laws.fitted
-    refit = _of_trial(search, root)
-    trials = _with_laws(search)
-    trials = [best_laws, *(t for t in trials if t.key != best_laws.key)] if named else trials
-    judged = [(t, h) for t in trials if (h := _of_trial(search, t)) is not None]
-    taken = {e.port for e in best_laws.laws} if named else set[str]()
-    found = [*(h for _, h in judged), *_with_learned(search, root, taken)]
-    found += [h for t, _ in judged[:1] for h in _with_learned(search, t)]
-    if refit is not None:
-        found.append(refit)
+    found: list[_Hypothesis] = []
+    for hypothesis in _competing(search, best_laws if named else None):
+        found.append(hypothesis)
+        if time.perf_counter() > search.end:
+            break
     if not found:
         return as_named(search, best_laws.fitted), best_laws.fitted
     best = _simplest(found)
@@ -136,8 +133,20 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     learned: tuple[Learned, ...] = ()
     if best.fitted is not best.named:
         learned = (described(search.bench, best.fitted, shares["learned"], dict.fromkeys((*CATALOGUE, *search.laws))),)
-    before = refit.held_out.error if refit is not None else np.inf
-    return Correction(_elements(search, best.fitted), shares, learned, before, best.held_out.error), best.fitted
+    refit = next((h.held_out.error for h in found if h.fitted is search.root.fitted), np.inf)
+    return Correction(_elements(search, best.fitted), shares, learned, refit, best.held_out.error), best.fitted
+
+
+def _competing(search: Search, named: Trial | None) -> Iterator[_Hypothesis]:
+    """Generate what competes: the refit, the named laws or the likeliest, a learned element alone and beside them."""
+    first = named or max(search.memo.values(), key=lambda t: (bool(t.laws), search.promise(t)))
+    yield from _of_trial(search, search.root)
+    if first.laws:
+        yield from _of_trial(search, first)
+    yield from _with_learned(search, search.root, {e.port for e in named.laws} if named else set())
+    if first.laws:
+        yield from _with_learned(search, search.memo[first.key])
+    yield from (h for t in _with_laws(search) if t.key != first.key for h in _of_trial(search, t))
 
 
 def as_named(search: Search, fitted: Fitted) -> Correction:
@@ -152,35 +161,27 @@ def _simplest(found: Sequence[_Hypothesis]) -> _Hypothesis:
     return min(near, key=lambda h: (h.size, h.held_out.error))
 
 
-def _of_trial(search: Search, trial: Trial) -> _Hypothesis | None:
-    """A hypothesis of the search with its errors on what it was not fitted to; None where it cannot be simulated."""
+def _of_trial(search: Search, trial: Trial) -> Iterator[_Hypothesis]:
+    """Generate a hypothesis of the search, with its errors on what it was not fitted to, if it can be simulated."""
     with suppress(InputError):
-        return _Hypothesis(trial.fitted, trial.fitted, search.predicts(trial))
-    return None
-
-
-def _judged(search: Search, fitted: Fitted, named: Fitted) -> _Hypothesis | None:
-    """The same of a hypothesis with a learned element."""
-    with suppress(InputError):
-        return _Hypothesis(fitted, named, held_out_errors(search.bench, fitted))
-    return None
+        trial = search.thorough(trial)
+        yield _Hypothesis(trial.fitted, trial.fitted, search.predicts(trial))
 
 
 def _with_laws(search: Search) -> list[Trial]:
-    """The most promising hypotheses with laws, fitted to everything, and those that have predicted already."""
+    """The most promising hypotheses with laws, and those that have predicted already."""
     ranked = sorted((t for t in search.memo.values() if t.laws), key=search.promise, reverse=True)
-    found = [search.thorough(t) for t in ranked[:TRIED]] + [t for t in ranked[TRIED:] if t.key in search.held_out]
-    return [t for t in found if np.isfinite(t.whole)]
+    return [*ranked[:TRIED], *(t for t in ranked[TRIED:] if t.key in search.held_out)]
 
 
-def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Hypothesis]:
-    """Learned elements on top of a fitted simulator, at the free ports where a flexible force explains most."""
+def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Hypothesis]:
+    """Generate learned elements beside a trial, at the free ports where a flexible force explains most."""
     shares = search.flexible(base)
     ports = [name for name in sorted(shares, key=lambda name: -shares[name]) if name not in taken][:PORTS]
     with suppress(InputError, np.linalg.LinAlgError):
-        found = candidates(search.bench, base.fitted, ports, search.bench.simulator.inputs)
-        return [h for f in found[:JUDGED] if (h := _judged(search, f, base.fitted)) is not None]
-    return []
+        inputs = search.bench.simulator.inputs
+        for fitted in candidates(search.bench, base.fitted, ports, inputs, search.workers)[:JUDGED]:
+            yield _Hypothesis(fitted, base.fitted, held_out_errors(search.bench, fitted, search.workers))
 
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:

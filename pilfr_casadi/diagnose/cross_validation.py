@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, side_by_side
 from ..identify import solve_within_bounds
 from ..optimise import GaussNewton, Problem
 from .workbench import ENDLESS, Fitted, Workbench
@@ -64,15 +64,15 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
     return out
 
 
-def held_out_errors(bench: Workbench, fitted: Fitted) -> HeldOut:
+def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldOut:
     """Fit a simulator again to all but every fold of blocks, and to the first halves; errors on what was left out."""
     blocks = blocks_of(bench)
     folds = [[(b >= 0) & (b % FOLDS == fold) for b in blocks] for fold in range(FOLDS)]
     later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
-    total = sum(_sum_of_squares(bench, fitted, left) for left in folds)
+    *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)
     scored = bench.recordings[0].y.shape[1] * sum(int(np.sum(b >= 0)) for b in blocks)
     ahead = bench.recordings[0].y.shape[1] * sum(int(np.sum(left)) for left in later)
-    return HeldOut(total / max(scored, 1), _sum_of_squares(bench, fitted, later) / max(ahead, 1))
+    return HeldOut(sum(squares) / max(scored, 1), second / max(ahead, 1))
 
 
 def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> float:

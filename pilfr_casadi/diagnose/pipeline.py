@@ -36,6 +36,7 @@ from .verdict import SURE, Verdict, judge
 from .workbench import THOROUGH, Fitted
 
 FURTHER = 0.5  # share of the mean square that is left at most where a channel that seemed early is not
+SEARCHING = 0.7  # of the time that is left, for the search; the rest is for the correction
 MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
 
@@ -49,9 +50,9 @@ class Asked:
     hold: str | None
     engine: str
     workers: int
-    effects: int
+    effects: float
     stand_in_error: float
-    until: float
+    end: float
     say: Stages
 
     @property
@@ -92,7 +93,7 @@ def diagnose_in_steps(
     test: Recording | Sequence[Recording] | None,
     hold: str | None,
     laws: Sequence[type[Law]] | None,
-    effects: int,
+    effects: int | None,
     limits: Mapping[str, float] | None,
     workers: int | None,
     engine: str,
@@ -103,7 +104,7 @@ def diagnose_in_steps(
     """Carry out `diagnose`, whose parameters these are."""
     began = time.perf_counter()
     workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
-    effects = whole(effects, "effects", 0)
+    most = np.inf if effects is None else whole(effects, "effects", 0)
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
     if hold not in HOLDS:
@@ -115,8 +116,8 @@ def diagnose_in_steps(
     _check_tests(recordings, tests)
     _check_limits(simulator, limits)
     tried = _laws(simulator, laws)
-    until = np.inf if time_limit is None else began + float(time_limit)
-    asked = Asked(simulator, recordings, tried, hold, engine, workers, effects, stand_in_error, until, say)
+    end = np.inf if time_limit is None else began + float(time_limit)
+    asked = Asked(simulator, recordings, tried, hold, engine, workers, most, stand_in_error, end, say)
     ready, search = _searched_both_holds(asked)
     ended = search.begin("conclusion")
     found = conclude(search, (*ready.gates, *search.gates))
@@ -206,7 +207,8 @@ def _searched(asked: Asked, early: bool = True) -> tuple[Prepared, Search]:
         asked.workers,
         asked.say,
         stand_in_error=asked.stand_in_error,
-        until=asked.until,
+        until=began + SEARCHING * (asked.end - began),
+        end=asked.end,
         times={CHECKS: time.perf_counter() - began},
     )
     search.run(asked.effects)

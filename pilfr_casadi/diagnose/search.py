@@ -77,6 +77,8 @@ class Search:
         Mean square of white noise in the best residual, in units of the outputs' variance.
     until : float
         Time (of `time.perf_counter`) at which the search answers from what it has.
+    end : float
+        Time at which the diagnosis has to be over.
     out_of_time : bool
         Whether it did.
     """
@@ -90,6 +92,7 @@ class Search:
     hold_said: bool = True
     stand_in_error: float = 0.0
     until: float = np.inf
+    end: float = np.inf
     memo: dict[Key, Trial] = field(default_factory=dict)
     steps: list[Step] = field(default_factory=list)
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
@@ -161,7 +164,7 @@ class Search:
     def predicts(self, trial: Trial) -> HeldOut:
         """Errors of a hypothesis on what it was not fitted to."""
         if trial.key not in self.held_out:
-            self.held_out[trial.key] = held_out_errors(self.bench, trial.fitted)
+            self.held_out[trial.key] = held_out_errors(self.bench, trial.fitted, self.workers)
         return self.held_out[trial.key]
 
     def _predict(self) -> None:
@@ -211,7 +214,7 @@ class Search:
         if self.bench.struck:
             raise KeyboardInterrupt
 
-    def run(self, effects: int) -> Search:
+    def run(self, effects: float) -> Search:
         """Look for up to so many effects; an interrupt ends the search with what there is."""
         self.keep(Trial((), self.without, self.without.cost, self.without.cost, True))
         try:
@@ -223,7 +226,7 @@ class Search:
             self.interrupted = True
         return self
 
-    def _grow(self, effects: int) -> None:
+    def _grow(self, effects: float) -> None:
         while self.room(parent := self.best) and _count(parent) < effects and self._in_time():
             self.add(parent)
             if not parent.laws and self._in_time() and self._led_out():
