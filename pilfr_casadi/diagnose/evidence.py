@@ -73,13 +73,14 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
     laws_at = np.flatnonzero(np.append(own, np.zeros(len(theta) - n_free, dtype=bool)))
     rest = np.setdiff1d(np.arange(len(theta)), laws_at)
     width = _widths(fitted, laws, problem.free, np.diag(hessian)[:n_free])[laws_at]
-    block = hessian[np.ix_(laws_at, laws_at)] * np.outer(width, width)
-    across = hessian[np.ix_(rest, laws_at)] * width
-    size = np.sqrt(np.maximum(np.diag(hessian)[rest], 1e-300))
-    inner = hessian[np.ix_(rest, rest)] / np.outer(size, size)
-    block = block - (across / size[:, None]).T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ (
-        across / size[:, None]
-    )
+    with np.errstate(all="ignore"):
+        block = hessian[np.ix_(laws_at, laws_at)] * np.outer(width, width)
+        size = np.sqrt(np.maximum(np.diag(hessian)[rest], 1e-300))
+        across = hessian[np.ix_(rest, laws_at)] * width / size[:, None]
+        inner = hessian[np.ix_(rest, rest)] / np.outer(size, size)
+        block = block - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
+    if not np.all(np.isfinite(block)):
+        return np.full(int(own.sum()), np.inf)
     return np.maximum(np.linalg.eigvalsh(block), 0.0)
 
 

@@ -33,11 +33,10 @@ from .trials import Trial
 from .undeclared import beyond_the_ports
 from .varying import varying
 from .verdict import SURE, Verdict, judge
-from .workbench import THOROUGH, Fitted
+from .workbench import Fitted
 
 FURTHER = 0.5  # share of the mean square that is left at most where a channel that seemed early is not
 SEARCHING = 0.7  # of the time that is left, for the search; the rest is for the correction
-MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,28 +167,18 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Found:
 def _searched_both_holds(asked: Asked) -> tuple[Prepared, Search]:
     """The search; where nobody said what inputs do between samples and it matters, the likelier of both holds."""
     ready, search = _searched(asked)
-    if asked.hold_said or search.interrupted or search.out_of_time or not _hold_matters(search):
+    if search.interrupted or not search.misheld():
         return ready, search
     hold = search.bench.otherwise_held().hold
     try:
         other, again = _searched(replace(asked, hold=hold, say=asked.say.under("other hold: ")))
     except InputError:  # it cannot be run so
-        return ready, search
+        return ready, search.settled(asked.effects)
     if again.best.whole > search.best.whole or (again.interrupted and len(again.memo) < 2):
         search.interrupted = again.interrupted
-        return ready, search
+        return ready, search.settled(asked.effects)
     ratio = float(np.sqrt(search.best.whole / max(again.best.whole, 1e-300)))
     return replace(other, gates=(*other.gates, hold_note(asked.simulator, hold, ratio))), again
-
-
-def _hold_matters(search: Search) -> bool:
-    """Whether the best hypothesis follows the recordings better with the other hold."""
-    best = search.best.fitted
-    try:
-        other = search.bench.otherwise_held().fit(best.simulator, [best.values], states=best.initial, solver=THOROUGH)
-    except InputError:
-        return False
-    return other.cost * MISHELD**2 < best.cost
 
 
 def _searched(asked: Asked, early: bool = True) -> tuple[Prepared, Search]:
@@ -206,6 +195,7 @@ def _searched(asked: Asked, early: bool = True) -> tuple[Prepared, Search]:
         (*asked.laws, Offset),
         asked.workers,
         asked.say,
+        hold_said=asked.hold_said,
         stand_in_error=asked.stand_in_error,
         until=began + SEARCHING * (asked.end - began),
         end=asked.end,

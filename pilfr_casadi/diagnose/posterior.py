@@ -13,6 +13,7 @@ likeliest of complete, missing physics and unexplained; the confidence of an eff
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from .trials import Trial
 OUTSIDE = 0.1  # prior probability that missing physics is in no law of the catalogue
 LEFT = 0.003  # s_0: share of a mismatch that a law of the right name may well leave
 DISTURBED = 0.2  # weight of what a law leaves and no force at a port follows
+HALF = 0.5  # probability of being in that an effect has to have beside others (Barbieri & Berger 2004)
 ALIKE = 3.0  # nats within which two hypotheses are not told apart
 Name = tuple[str, str]  # port and law id
 
@@ -111,23 +113,50 @@ def share_named(s: float) -> float:
 def posterior(search: Search) -> Posterior:
     """Weigh all hypotheses of a search."""
     trials = list(search.memo.values())
-    logs = np.array([search.evidence(t) for t in trials])
-    weights = np.exp(logs - logs.max())
-    weights /= weights.sum()
+    weights = _weights(search, trials)
     by_names: dict[frozenset[Name], float] = {}
     for t, w in zip(trials, weights, strict=True):
         by_names[names(t)] = by_names.get(names(t), 0.0) + float(w)
-    likeliest = max(by_names, key=lambda n: by_names[n])
-    best = max((t for t in trials if names(t) == likeliest), key=search.evidence)
-    effects = [e for e in best.laws if e.law.id != "offset"]
-    named = share_named(unfollowed(search, best)) if effects else 0.0
-    found = []
-    for e in effects:
-        twins = _twins(search, best, e)
-        same = {(e.port, e.law.id), *(n for name in twins if name[1] == e.law.id for n in _each(name))}
-        inside = sum(w for n, w in by_names.items() if n & same)
-        found.append(Named(e, named * inside, twins))
-    return Posterior(best, named, tuple(found), by_names.get(frozenset(), 0.0))
+    said = max(by_names, key=lambda n: by_names[n])
+    while True:
+        best = max((t for t in trials if names(t) == said), key=search.evidence)
+        if not said:
+            return Posterior(best, 0.0, (), by_names[said])
+        found = [_named(search, best, e, by_names) for e in best.laws if e.law.id != "offset"]
+        least = min(found, key=lambda e: e.confidence)
+        fewer = said - {least.name}
+        if least.confidence > HALF or fewer not in by_names or not fewer:
+            break
+        said = fewer
+    named = share_named(unfollowed(search, best))
+    effects = tuple(replace(e, confidence=named * e.confidence) for e in found)
+    return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
+
+
+def _named(search: Search, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]) -> Named:
+    """An effect of a hypothesis, with the probability that it is in if the physics is in the catalogue."""
+    twins = _twins(search, best, element)
+    same = {
+        (element.port, element.law.id),
+        *(n for name in twins if name[1] == element.law.id for n in _each(name)),
+    }
+    return Named(element, sum(w for n, w in by_names.items() if n & same), twins)
+
+
+def _weights(search: Search, trials: Sequence[Trial]) -> np.ndarray:
+    """Probability of each hypothesis.
+
+    The simulator alone says that all of its error is noise, so that samples count in full against it. Laws only say
+    that they are near the physics, and are weighed by samples that count as far as their error is noise.
+    """
+    full, tempered = (np.array([of(t) for t in trials]) for of in (search.promise, search.evidence))
+    alone = np.array([not t.laws for t in trials])
+    complete = float(np.exp(full[alone].max() - np.logaddexp.reduce(full)))
+    tempered[alone] = -np.inf
+    weights = np.exp(tempered - tempered.max()) if np.any(~alone) else np.zeros(len(trials))
+    weights *= (1 - complete) / max(weights.sum(), 1e-300)
+    weights[alone] = complete
+    return weights
 
 
 def _twins(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:

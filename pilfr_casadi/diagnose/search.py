@@ -43,6 +43,7 @@ FEWEST = 30.0  # samples that recordings are worth at least
 WRONG = 0.2  # share of the error that is no noise, from which models are judged on held-out blocks
 PREDICTED = 6  # hypotheses that are
 LOUDEST = 0.05  # of an output's deviation: slow errors that are larger are no noise of a sensor
+MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
 LED_OUT = 0.8  # share of the mean square that is left at most by a simulator that a law has led out of a dead end
 
 
@@ -219,24 +220,49 @@ class Search:
         self.keep(Trial((), self.without, self.without.cost, self.without.cost, True))
         try:
             self._estimate_noise()
-            self._grow(effects)
-            self._every_sensor()
-            self._predict()
+            if self._grow(effects):
+                self._every_sensor()
+                self._predict()
         except KeyboardInterrupt:
             self.interrupted = True
         return self
 
-    def _grow(self, effects: float) -> None:
-        while self.room(parent := self.best) and _count(parent) < effects and self._in_time():
+    def settled(self, effects: float) -> Search:
+        """Go on where the other hold was no better, unless the search was interrupted."""
+        self.hold_said = True
+        return self if self.interrupted else self.run(effects)
+
+    def _grow(self, effects: float) -> bool:
+        """Add effects while that pays; False as soon as inputs prove to be held in the other way."""
+        while self.room(parent := self.best) and _count(parent) < effects and self._pays(parent) and self._in_time():
             self.add(parent)
             if not parent.laws and self._in_time() and self._led_out():
                 self.add(self.root)
+            if self.misheld():
+                return False
             if _count(self.best) > _count(parent) >= 1:
                 self.exchange()
             if len(self.best.laws) <= len(parent.laws):  # nothing that was added is worth it
                 break
         if effects > 1 and _count(self.best) < 2 and self.room(self.best) and self._in_time():
             self.add_two()
+        return True
+
+    def _pays(self, trial: Trial) -> bool:
+        """Whether the last of several laws was worth it, of which a wrong model can always take one more."""
+        fewer = [t for t in self.memo.values() if t.laws and _count(t) < _count(trial)]
+        return _count(trial) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
+
+    def misheld(self) -> bool:
+        """Whether the best hypothesis follows the recordings better with inputs that do the other thing in between."""
+        best = self.best.fitted
+        if self.hold_said or not self._in_time():
+            return False
+        try:
+            other = self.bench.otherwise_held().fit(best.simulator, [best.values], states=best.initial, solver=THOROUGH)
+        except InputError:
+            return False
+        return other.cost * MISHELD**2 < best.cost
 
     def room(self, trial: Trial) -> bool:
         """Whether a law that left nothing but noise would be worth its prior beside a hypothesis."""

@@ -6,6 +6,7 @@ thoroughly and to everything. A sharp knee, as of dry friction, is fitted on ste
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -110,7 +111,7 @@ class Trial:
         knee = getattr(self.law, "knee", "")
         return f"{self.element.prefix}{knee}" if knee else ""
 
-    @property
+    @functools.cached_property
     def doubtful(self) -> bool:
         """Whether a law at its fitted values is hardly what its name says."""
         return any(e.law.doubtful(e.own(self.fitted.values)) for e in self.laws)

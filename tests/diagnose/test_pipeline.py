@@ -63,6 +63,12 @@ class Searched:
         self.bench = SimpleNamespace(otherwise_held=lambda: SimpleNamespace(hold="linear"))
         self.memo = dict.fromkeys(range(fits))
 
+    def misheld(self):
+        return True
+
+    def settled(self, effects):
+        return self
+
 
 @pytest.mark.parametrize(
     ("again", "taken"),
@@ -84,7 +90,6 @@ def test_the_search_with_the_other_hold_is_taken_where_it_comes_nearer(monkeypat
         return SimpleNamespace(gates=()), again
 
     monkeypatch.setattr(pipeline, "said_hold", lambda *given: given[2])
-    monkeypatch.setattr(pipeline, "_hold_matters", lambda search: True)
     monkeypatch.setattr(pipeline, "_searched", searched)
     monkeypatch.setattr(pipeline, "hold_note", lambda *given: given[1])
     monkeypatch.setattr(pipeline, "replace", lambda of, **more: SimpleNamespace(**{**vars(of), **more}))
