@@ -155,10 +155,10 @@ def as_named(search: Search, fitted: Fitted) -> Correction:
 
 
 def _simplest(found: Sequence[_Hypothesis]) -> _Hypothesis:
-    """Take the simplest hypothesis of those that predict about as well as the best."""
+    """Take the simplest hypothesis of those that predict about as well as the best; of two, the better on average."""
     best = min(h.held_out.error for h in found)
     near = (h for h in found if GAIN * h.held_out.error <= best)
-    return min(near, key=lambda h: (h.size, h.held_out.error))
+    return min(near, key=lambda h: (h.size, h.held_out.blocks + h.held_out.ahead))
 
 
 def _of_trial(search: Search, trial: Trial) -> Iterator[_Hypothesis]:

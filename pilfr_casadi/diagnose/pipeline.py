@@ -250,7 +250,7 @@ def _build_diagnosis(
     proving = time.perf_counter()
     asked.say("proof", 0, 1)
     bench, without, after = search.bench, search.root.fitted, found.fitted
-    if found.effects:
+    if found.effects and not np.isfinite(found.correction.after):  # else it is what has predicted best
         after = without_idle_offsets(bench, after)
     std = deviations(bench, after)
     errors = {

@@ -34,8 +34,8 @@ from .stages import Stages
 from .trials import Key, Trial, Trials
 from .workbench import THOROUGH, Fitted, Workbench, started
 
-POLISHED = 5  # trials of a step fitted thoroughly, besides those within reach
-REACH = 8.0  # nats of log evidence within which a trial may still win
+POLISHED, BEHIND = 5, 1.5  # trials of a step fitted thoroughly at most, and times the best one's error that they have
+REACH = 8.0  # nats of log evidence within which a hypothesis may still win
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
 ROUNDS = 3  # exchanges in turn
 FORMULA = 1e-3  # share of a mismatch that the formula of the right law may leave: 3 % of its force
@@ -332,7 +332,7 @@ class Search:
         """Fit the trials that may win thoroughly."""
         kept = [self.memo[t.key] for t in trials if t.key in self.memo]
         ranked = sorted({t.key: t for t in kept}.values(), key=self.promise, reverse=True)
-        near = [t for t in ranked[:POLISHED] if not t.thorough and self.evidence(t) > self.evidence(ranked[0]) - REACH]
+        near = [t for t in ranked[:POLISHED] if not t.thorough and t.error < BEHIND * ranked[0].error]
         fits = self.fits
         with ThreadPoolExecutor(self.workers) as pool:
             done = list(pool.map(fits.polished, near))
