@@ -4,7 +4,8 @@ A hypothesis is the simulator with laws in its ports. All hypotheses are fitted 
 one log evidence; verdict, effects and confidence are sums over their posterior. `pipeline` shows how an answer comes
 about. The files by stage:
 
-- The whole: `pipeline` (the steps in their order), `workbench` (what all steps share), `stages` (progress).
+- The whole: `pipeline` (the steps in their order), `arguments` (their checks), `workbench` (what all steps share),
+  `stages` (progress).
 - Preparation: `preparation` calls the checks of recordings `glitches`, `settling`, `stale`, `gates` (sign, unit,
   exchange, hold), `clipping`, `gaps`, `timing` and `offset`; `standing` sets how recordings begin,
   `finer_steps` the integration steps, `floor` the noise.

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, one_blas_thread
-from ..data import HOLDS, Recording, as_recordings, check_for_identification
-from ..identify import match_channels
+from .._base import one_blas_thread
+from ..data import Recording
 from ..laws import Law, display_name
-from ..simulators import as_simulator
+from .arguments import check_laws, matched
 from .blind_spots import BlindSpot, Excitation, excitations, find_blind_spots, helpful_sensors, next_record
 from .detectability import LawRow, assess_laws, words
 from .floor import Floor, measured_floor, white_part
@@ -29,7 +28,6 @@ from .result import LEFT, plain
 from .workbench import Fitted, Workbench
 
 FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a sensor of 20 bits
-FEWEST = 20  # samples, as `diagnose` asks for
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,15 +219,8 @@ def check(
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
     began = time.perf_counter()
-    if hold not in HOLDS:
-        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear' or None.")
-    simulator = as_simulator(simulator, as_recordings(train))
-    recordings = check_for_identification(
-        [match_channels(simulator, r) for r in as_recordings(train)], FEWEST, excited=False
-    )
-    for law in laws or ():
-        if not (isinstance(law, type) and issubclass(law, Law)):
-            raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
+    simulator, recordings = matched(simulator, train, hold, excited=False)
+    check_laws(laws)
     stated = said_hold(simulator, recordings, hold)
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
     fitted = bench.fit(simulator)
