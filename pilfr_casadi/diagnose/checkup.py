@@ -1,4 +1,4 @@
-"""Check before solve: what recordings and sensors can reveal, from the simulator alone, before a law is fitted.
+"""Assess recordings before a diagnosis: what they and the sensors can reveal of a simulator, without fitting a law.
 
 The simulator's own parameters are refitted once; everything else follows from the simulator linearised along that run:
 `identifiability` says which parameters are identifiable, `detectability` which laws at which ports are detectable.
@@ -32,12 +32,12 @@ FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What recordings can reveal about a simulator and about what it leaves out.
+    """Answer of `check`: the power of recordings to reveal parameters and missing laws.
 
     Attributes
     ----------
     blind_spots : tuple of BlindSpot
-        What they cannot reveal, the gravest first.
+        Facts that the recordings cannot reveal, the gravest first.
     parameters, ties : tuple of ParameterRow, tuple of Tie
         Free parameters as refitted, and groups that are traded off.
     laws : tuple of LawRow
@@ -71,7 +71,7 @@ class Check:
     seconds: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of check.json; numbers that are not finite are None."""
+        """Return the content of check.json; numbers that are not finite are None."""
         clean: dict[str, Any] = plain(
             {
                 "schema": 1,
@@ -123,12 +123,12 @@ class Check:
         )
 
     def _label(self, port: str) -> str:
-        """The port's name, with those of the ports that look the same."""
+        """Join the names of all ports that look the same as this one."""
         groups = (b.names for b in self.blind_spots if b.kind == "alike-ports")
         return " = ".join(next((names for names in groups if port in names), (port,)))
 
     def _group_lines(self) -> Iterator[str]:
-        """Groups of laws that look the same, beyond those at ports that all look the same."""
+        """List groups of laws that look the same, beyond those at ports that all look the same."""
         for group in self.classes:
             names = dict.fromkeys(words((self._label(port), law)) for port, law in group)
             if len(names) > 1:
@@ -258,7 +258,7 @@ def check(
 
 
 def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
-    """Parameters that are dead or flat as refitted and move the outputs at the given values."""
+    """Find parameters that are dead or flat as refitted and move the outputs at the given values."""
     doubtful = [p.name for p in parameters if p.status in ("dead", "flat")]
     values = {k: p.value for k, p in fitted.model.parameters.items()}
     given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model) if doubtful else fitted
@@ -275,7 +275,7 @@ def _start(r: Recording) -> str:
 
 
 def _undetectable(rows: Sequence[LawRow]) -> dict[str, list[str]]:
-    """Laws that are not detectable, by the reason in words."""
+    """Group the laws that are not detectable by the reason in words."""
     out: dict[str, list[str]] = {}
     for r in rows:
         if r.status != "detectable":
@@ -297,7 +297,7 @@ def _percent(share: float | None) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Rows of text in aligned columns."""
+    """Align rows of text in columns."""
     widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
     for row in (head, *rows):
         yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
