@@ -36,7 +36,7 @@ if TYPE_CHECKING:
         time_limit as time_limit,
         unwrapped_interrupt as unwrapped_interrupt,
     )
-    from .progress import Progress as Progress, progress_bar as progress_bar
+    from .progress import Progress as Progress, Stages as Stages, progress_bar as progress_bar
     from .workers import (
         Reply as Reply,
         check_executor as check_executor,

@@ -117,6 +117,11 @@ def slower_by(factor: float) -> Change:
     return lambda r: r.with_(dt=r.dt * factor)
 
 
+def opened_at_the_start(r: Recording) -> Recording:
+    """Leave the initial state of a periodic recording that is not on its steady cycle to be estimated."""
+    return r.with_(initial="estimate", period=None) if r.begins == "periodic" else r
+
+
 def changed(bench: Workbench, change: Change) -> Workbench:
     """Return the bench with changed recordings, errors in units of their own deviation."""
     recordings = tuple(change(r) for r in bench.recordings)
