@@ -4,16 +4,17 @@ A hypothesis is the simulator with laws in its ports. All hypotheses are fitted 
 one log evidence; verdict, effects and confidence are sums over their posterior. `pipeline` shows how an answer comes
 about. The files by stage:
 
-- The whole: `pipeline` (the steps in their order), `workbench` (what all steps share), `stages` (progress).
-- Preparation: `preparation` calls the checks of recordings `glitches`, `settling`, `stale`, `gates` (sign, unit,
-  exchange, hold), `clipping`, `gaps`, `timing` and `offset`; `standing` sets how recordings begin,
-  `finer_steps` the integration steps, `floor` the noise.
+- The whole: `pipeline` (the steps in their order), `arguments` (their checks), `workbench` (what all steps share).
+- Preparation: `preparation` calls the checks of recordings `recording_faults` (glitches, stale and clipped samples,
+  unsettled periods), `gates` (sign, unit, exchange, hold), `gaps`, `timing` and `offset`; `equilibrium_state` sets the
+  state in which laws begin, `step_refinement` the integration steps, `floor` the noise.
 - Search: `search` moves from hypothesis to hypothesis; `linearise`, `remainder`, `screen`, `pairs` and `relatives` say
-  which are worth a fit, `trials` and `knees` fit them.
-- Evidence: `evidence` (log evidence), `flexible` (what any force could still follow), `cross_validation` (held-out
+  which are worth a fit, `trials` fits them.
+- Evidence: `evidence` (log evidence), `cross_validation` (held-out
   blocks), `posterior`, `verdict`.
 - Correction: `correction` chooses the simulator to hand back, with a `learned` element where names do not reach.
-- Other readings: `held` (a value that is held), `varying`, `undeclared`, `tones`, `ringing`.
+- Other readings: `other_explanations` (a pinned value, an undeclared port, a machine that changed) and
+  `residual_spectrum` (steady tones, ringing modes).
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
 - Before any of it: `checkup` (what the recordings can reveal), by `identifiability`,

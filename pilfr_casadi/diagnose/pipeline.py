@@ -9,29 +9,26 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, Progress, listed, one_blas_thread, processors, whole
-from ..data import HOLDS, Recording, as_recordings, check_for_identification
-from ..identify import match_channels
-from ..laws import CATALOGUE, SCALABLE, Law, readable_unit, scaled
-from ..simulators import Simulator, as_simulator
-from .clipping import clipped_input
+from .._base import InputError, Progress, Stages, one_blas_thread, processors, whole
+from ..data import Recording
+from ..laws import Law, readable_unit
+from ..simulators import Simulator
+from .arguments import check_laws, check_limits, matched, matched_tests, with_scaled
 from .correction import Correction, as_named, find_correction
 from .experiment import next_experiment, placebo
 from .gates import Gate, hold_note, said_hold
-from .held import held_value
 from .mismatch_map import mismatch
 from .offset import Offset, as_it_came_out, offset_gates, without_idle_offsets
+from .other_explanations import beyond_the_ports, held_value, varying
 from .posterior import Named, names, posterior
 from .preparation import CHECKS, Prepared, prepare
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
+from .recording_faults import clipped_input
+from .residual_spectrum import tones
 from .result import Diagnosis, Effect
 from .search import Search
-from .stages import Stages
 from .surrogates import told_of_surrogate
-from .tones import tones
 from .trials import Trial
-from .undeclared import beyond_the_ports
-from .varying import varying
 from .verdict import SURE, Verdict, judge
 from .workbench import Fitted
 
@@ -106,15 +103,11 @@ def diagnose_in_steps(
     most = np.inf if effects is None else whole(effects, "effects", 0)
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
-    if hold not in HOLDS:
-        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear' or None.")
     say = Stages(progress or (lambda stage, done, total, best: None))
-    simulator = as_simulator(simulator, as_recordings(train))
-    recordings = check_for_identification([match_channels(simulator, r) for r in as_recordings(train)], 20)
-    tests = tuple(match_channels(simulator, r) for r in as_recordings(test)) if test is not None else ()
-    _check_tests(recordings, tests)
-    _check_limits(simulator, limits)
-    tried = _laws(simulator, laws)
+    simulator, recordings = matched(simulator, train, hold)
+    tests = matched_tests(simulator, test, recordings)
+    check_limits(simulator, limits)
+    tried = with_scaled(check_laws(laws), simulator)
     end = np.inf if time_limit is None else began + float(time_limit)
     asked = Asked(simulator, recordings, tried, hold, engine, workers, most, stand_in_error, end, say)
     ready, search = _searched_both_holds(asked)
@@ -208,33 +201,6 @@ def _searched(asked: Asked, early: bool = True) -> tuple[Prepared, Search]:
         if other[1].best.whole < FURTHER * search.best.whole:
             return other
     return ready, search
-
-
-def _laws(simulator: Simulator, laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
-    """The laws that are tried, some also scaled by inputs that the equations do not read."""
-    laws = CATALOGUE if laws is None else tuple(laws)
-    for law in laws:
-        if not (isinstance(law, type) and issubclass(law, Law)):
-            raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
-    return (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
-
-
-def _check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:
-    for name, most in (limits or {}).items():
-        if name not in simulator.inputs:
-            raise InputError(
-                f"A limit was given for {name!r}, which is no input; there are {listed(simulator.inputs)}."
-            )
-        if not most > 0:
-            raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")
-
-
-def _check_tests(train: Sequence[Recording], tests: Sequence[Recording]) -> None:
-    for t in tests:
-        if any(len(r) == len(t) and np.array_equal(r.u, t.u) and np.array_equal(r.y, t.y) for r in train):
-            raise InputError("A test recording equals a training recording; give data the fit has not seen.")
-        if abs(t.dt / train[0].dt - 1) > 1e-4:
-            raise InputError(f"The test recording's step is {t.dt:g} s, the training's {train[0].dt:g} s; resample it.")
 
 
 def _build_diagnosis(

@@ -106,7 +106,7 @@ class Diagnosis:
     substeps : int
         Integration steps per sample with which the corrected simulator was fitted.
     let_go : str
-        Parameter that was fixed or at a bound and is free in the corrected simulator; see `held`.
+        Parameter that was fixed or at a bound and is free in the corrected simulator; see `other_explanations`.
     correction : Correction or None
         What `corrected` consists of beside the refit: laws, a learned element, and their shares. Elements that are not
         among `effects` predict unseen data better than the refit but have no sure name.

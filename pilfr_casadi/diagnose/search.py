@@ -14,14 +14,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .._base import InputError, side_by_side
+from .._base import InputError, Stages, side_by_side
 from ..data import Recording
 from ..engine import make_engine
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
 from .cross_validation import HeldOut, held_out_errors
 from .evidence import EXACT, MORE, Sample, information, log_evidence, log_prior
-from .flexible import explainable
 from .floor import Floor, effective_size, white_part
 from .gates import Gate
 from .linearise import linearised
@@ -29,8 +28,7 @@ from .offset import Offset
 from .pairs import fitted_together, promising
 from .relatives import complements, relatives
 from .remainder import Remainder
-from .screen import Scored, screen
-from .stages import Stages
+from .screen import Scored, explainable, screen
 from .trials import Key, Trial, Trials
 from .workbench import THOROUGH, Fitted, Workbench, started
 

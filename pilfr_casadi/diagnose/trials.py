@@ -22,9 +22,9 @@ from ..laws import Law
 from ..models import Model
 from ..optimise import GaussNewton
 from ..simulators import Placed, Simulator
-from .knees import knees, on_finer_steps
+from .gates import opened_at_the_start
 from .screen import Scored
-from .standing import opened_at_the_start
+from .step_refinement import knees, on_finer_steps
 from .workbench import QUICK, THOROUGH, Fitted, Workbench, started
 
 LONG = 8000  # samples that brief fits look at

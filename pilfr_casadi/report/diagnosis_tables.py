@@ -156,17 +156,22 @@ def score(row: Mapping[str, Any]) -> float:
 
 def error_before(diagnosis: Diagnosis, number: int) -> float | None:
     """Return the error of the simulator that the candidates of a pass were put into; None if it is unknown."""
-    search = diagnosis.evidence.get("search")
-    steps = [step for step in search.steps if step.trials] if search is not None else []
-    return float(steps[number].parent.error) if number < len(steps) else None
+    parent = _parent(diagnosis, number)
+    return None if parent is None else float(parent.error)
 
 
 def in_place(diagnosis: Diagnosis, number: int) -> str:
     """Name the laws that were in place in a pass; empty for the simulator alone."""
+    parent = _parent(diagnosis, number)
+    laws = () if parent is None else parent.laws
+    return " and ".join(f"{display_name(e.law.id)} at {e.port}" for e in laws)
+
+
+def _parent(diagnosis: Diagnosis, number: int) -> Any:
+    """Return the hypothesis that the candidates of a pass were put into; None if it is unknown."""
     search = diagnosis.evidence.get("search")
     steps = [step for step in search.steps if step.trials] if search is not None else []
-    laws = steps[number].parent.laws if number < len(steps) else ()
-    return " and ".join(f"{display_name(e.law.id)} at {e.port}" for e in laws)
+    return steps[number].parent if number < len(steps) else None
 
 
 def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, str]], title: str) -> list[Block]:

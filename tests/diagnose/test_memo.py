@@ -6,10 +6,10 @@ import pytest
 from diagnosis_rig import OFF, recordings, rig
 
 from pilfr_casadi import laws
+from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.search import Search
-from pilfr_casadi.diagnose.stages import Stages
 from pilfr_casadi.diagnose.trials import Trials
 
 TRIED = (laws.CoulombFriction, laws.CubicStiffness, laws.QuadraticDrag)

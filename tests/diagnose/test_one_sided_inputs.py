@@ -5,8 +5,8 @@ import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
-from pilfr_casadi.diagnose.clipping import clipped, clipped_input
 from pilfr_casadi.diagnose.preparation import prepare
+from pilfr_casadi.diagnose.recording_faults import clipped, clipped_input
 
 DT = 0.02
 

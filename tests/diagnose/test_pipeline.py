@@ -9,8 +9,8 @@ from test_timing import shaken, spring
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, laws
+from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import pipeline
-from pilfr_casadi.diagnose.stages import Stages
 from pilfr_casadi.diagnose.verdict import Verdict
 
 

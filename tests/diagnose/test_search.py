@@ -6,10 +6,10 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
+from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench, preparation
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.search import Search
-from pilfr_casadi.diagnose.stages import Stages
 from pilfr_casadi.diagnose.trials import Trials
 from pilfr_casadi.optimise import GaussNewton
 

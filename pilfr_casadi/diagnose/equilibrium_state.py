@@ -1,7 +1,7 @@
-"""Where laws begin in a recording of which nobody knows how it began: as if the signals had stood still before.
+"""Equilibrium state of laws at the begin of a recording: as if their signals had stood still before.
 
 From zero, a delay or a lag of a signal about a working point would first have to come there: a transient that no
-recording shows, and that a fit of the law's parameters is bent by before the initial state has followed.
+recording shows, and that bends a fit of the law's parameters before the initial state has followed.
 """
 
 from __future__ import annotations
@@ -12,20 +12,19 @@ import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
-from ..data import Recording
 from ..models import ParameterSet, map_points
 from ..simulators import ClosedEquations, Instant, Simulator, on_grid
 
 
-def stands(simulator: Simulator) -> list[int]:
-    """Which elements have states or memory that come to rest where their signal does."""
+def resting_elements(simulator: Simulator) -> list[int]:
+    """Return the indices of elements whose states or memory come to rest where their signal does."""
     laws = [e.law for e in simulator.elements]
     return [i for i, law in enumerate(laws) if getattr(law, "follows", 0) or getattr(law, "shifts", False)]
 
 
 @one_at_a_time
-def standing(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """State with laws' own states and memory, (n_state,), of a simulator on steps of h seconds.
+def equilibrium_state(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Compute the state with laws' own states and memory at rest, (n_state,), on steps of h seconds.
 
     Parameters
     ----------
@@ -38,7 +37,7 @@ def standing(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, 
     """
     simulator = on_grid(simulator, h)
     p = ca.SX.sym("p", ParameterSet(dict(simulator.parameters)).size)
-    equations, n_x, moved = ClosedEquations(simulator, p), len(simulator.states), stands(simulator)
+    equations, n_x, moved = ClosedEquations(simulator, p), len(simulator.states), resting_elements(simulator)
     n_q, n_s = equations.n_q, equations.n_s
     n_xq = n_x + sum(n_q)
     state = np.append(x[:n_x], np.zeros(sum(n_q) + sum(n_s)))
@@ -51,8 +50,3 @@ def standing(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, 
         for i, value in zip(moved, map_points(z, state[None], u, vector[: p.numel()])[0].ravel(), strict=True):
             state[spans[i]] = simulator.elements[i].law.standing(float(value))
     return state
-
-
-def opened_at_the_start(recording: Recording) -> Recording:
-    """A recording that is not on its steady cycle: the initial state is to be estimated."""
-    return recording.with_(initial="estimate", period=None) if recording.begins == "periodic" else recording

@@ -8,7 +8,7 @@ from diagnosis_rig import DT
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.finer_steps import on_steps_as_fine
+from pilfr_casadi.diagnose.step_refinement import on_steps_as_fine
 from pilfr_casadi.diagnose.workbench import FINER, THOROUGH
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, Delay, Polynomial

@@ -1,7 +1,12 @@
-"""Steady tones in what a fit leaves, which no input holds: mains hum, a fan, an unbalanced motor.
+"""Lines in the spectrum of a residual: steady tones that no input holds, and the simulator's own modes.
 
-A tone is a line of the residual's spectrum far above those around it, whose amplitude and phase stay over the record
-and which is neither in an input nor a harmonic or a mixture of an input's few lines.
+A tone, as from mains hum, a fan or an unbalanced motor, is a line of the residual's spectrum far above those around it.
+Its amplitude and phase stay over the record, and it is neither in an input nor a harmonic or a mixture of an input's
+few lines.
+
+A residual that swings at one of the simulator's own frequencies is no noise. A force that is not recorded, or one that
+depends on more than a port's coordinate and the time, leaves such a residual: no law at any port explains it, and yet
+something is missing.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ import numpy as np
 
 from ..data import Recording
 from .gates import Gate
+from .linearise import linearised
 from .workbench import Fitted, Workbench
 
 FEWEST, SLOWEST = 256, 10  # samples, and periods in the record, that a tone is told from
@@ -23,9 +29,15 @@ STEADY = 0.5  # of the amplitude by which a quarter's may differ
 LINES, STRONG, ORDER = 3, 0.01, 7  # an input that has no more, of that power over its strongest, mixes them
 SPARSE, HARMONICS = 16, 60  # lines of the record that lie between an input's harmonics at least, and their number
 
+LIGHT = 0.15  # damping ratio below which a mode rings
+LOUD = 10.0  # times the spectrum around it
+FINE = 10  # lines of the spectrum up to a mode
+AVERAGED = 4  # half-overlapping segments that its spectrum is averaged over at least
+BESIDE = 1.2, 1.8  # times a mode's frequency, above and below, where the spectrum is compared with
+
 
 def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
-    """A note for each output in whose residual, in every recording, the same tone stands."""
+    """Note each output in whose residual, in every recording, the same tone stands."""
     found = []
     for i, name in enumerate(bench.simulator.output_names):
         pairs = zip(fitted.residual, bench.recordings, strict=True)
@@ -46,7 +58,7 @@ def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
 
 
 def tone(e: np.ndarray, r: Recording) -> tuple[float, float] | None:
-    """Frequency, Hz, and amplitude of the tone in the residual of one output, or None."""
+    """Find frequency, Hz, and amplitude of the tone in the residual of one output; None where there is none."""
     n, e = len(e), e - np.mean(e)
     power = _power(e)
     k = SLOWEST + int(np.argmax(power[SLOWEST:-OWN]))
@@ -66,20 +78,20 @@ def _power(v: np.ndarray) -> np.ndarray:
 
 
 def _around(power: np.ndarray, k: int) -> float:
-    """Median of the lines around line k."""
+    """Return the median of the lines around line k."""
     near = np.arange(max(k - AROUND, 1), min(k + AROUND + 1, len(power)))
     return float(np.median(power[near[np.abs(near - k) > OWN]]))
 
 
 def _wave(e: np.ndarray, f: float, part: slice) -> complex:
-    """Amplitude and phase of the frequency f, a share of the sampling rate, in a part of e, by least squares."""
+    """Fit amplitude and phase of the frequency f, a share of the sampling rate, in a part of e, by least squares."""
     angle = 2 * np.pi * f * np.arange(len(e))[part]
     a, b, _ = np.linalg.lstsq(np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))]), e[part])[0]
     return complex(a, -b)
 
 
 def _refined(e: np.ndarray, k: int) -> float:
-    """The frequency near line k of the strongest wave, as a share of the sampling rate."""
+    """Find the frequency of the strongest wave near line k, as a share of the sampling rate."""
     from scipy.optimize import minimize_scalar
 
     ends = (k - 1) / len(e), (k + 1) / len(e)
@@ -88,7 +100,7 @@ def _refined(e: np.ndarray, k: int) -> float:
 
 
 def _from(u: np.ndarray, f: float, r: Recording) -> bool:
-    """Whether an input holds the frequency, or its few lines or its period make it in something nonlinear."""
+    """Tell whether an input holds the frequency, or its few lines or its period make it in something nonlinear."""
     n, power = len(u), _power(u)
     k = round(f * n)
     if np.max(power[max(k - 1, 0) : k + 2]) > IN_INPUT * _around(power, k):
@@ -105,11 +117,34 @@ def _from(u: np.ndarray, f: float, r: Recording) -> bool:
 
 
 def _mixed(lines: Sequence[float]) -> list[float]:
-    """Mixtures of a few lines."""
+    """Combine a few lines up to the order `ORDER`."""
     orders = [c for c in itertools.product(range(-ORDER, ORDER + 1), repeat=len(lines)) if sum(map(abs, c)) <= ORDER]
     return [abs(sum(a * f for a, f in zip(c, lines, strict=True))) for c in orders]
 
 
 def _folded(f: float) -> float:
-    """Where a frequency above half the sampling rate appears."""
+    """Return the frequency at which one above half the sampling rate appears."""
     return abs(f - round(f))
+
+
+def ringing(bench: Workbench, fitted: Fitted) -> float | None:
+    """Find the frequency, Hz, of a lightly damped mode that stands out of a fit's residual, or None."""
+    a = linearised(bench, fitted)[1][0].mean[0]
+    with np.errstate(divide="ignore"):
+        poles = np.log(np.linalg.eigvals(a).astype(complex)) * fitted.model.substeps / bench.dt
+    modes = [abs(s) / (2 * np.pi) for s in poles if s.imag > 0 and -s.real < LIGHT * abs(s)]
+    rest = [e[r.skip :, i] for e, r in zip(fitted.residual, bench.recordings, strict=True) for i in range(r.n_y)]
+    return next((f for f in sorted(modes) if any(_stands_out(e, f * bench.dt) for e in rest)), None)
+
+
+def _stands_out(e: np.ndarray, f: float) -> bool:
+    """Tell whether the spectrum of e at frequency f, a share of the sampling rate, is far above that around it."""
+    from scipy.signal import welch
+
+    length = int(np.ceil(FINE / f))
+    if BESIDE[1] * f > 0.5 or 2 * len(e) // length - 1 < AVERAGED:
+        return False
+    lines, power = welch(e, nperseg=length)
+    far = np.maximum(lines / f, f / np.maximum(lines, 1e-12))
+    around = power[(far > BESIDE[0]) & (far < BESIDE[1])]
+    return bool(np.max(power[far < 1 + 1.5 / FINE]) > LOUD * np.median(around))
