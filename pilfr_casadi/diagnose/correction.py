@@ -77,7 +77,7 @@ class Correction:
         if not self.elements:
             return (
                 "The corrected simulator is the refitted one: nothing that was tried predicts held-out blocks better "
-                "by more than its uncertainty."
+                "by a tenth."
             )
         if not np.isfinite(self.after):
             return shares[0].upper() + shares[1:]
