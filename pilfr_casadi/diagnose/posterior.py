@@ -150,13 +150,18 @@ def _weights(search: Search, trials: Sequence[Trial]) -> np.ndarray:
     that they are near the physics, and are weighed by samples that count as far as their error is noise.
     """
     full, tempered = (np.array([of(t) for t in trials]) for of in (search.promise, search.evidence))
-    alone = np.array([not t.laws for t in trials])
-    complete = float(np.exp(full[alone].max() - np.logaddexp.reduce(full)))
-    tempered[alone] = -np.inf
-    weights = np.exp(tempered - tempered.max()) if np.any(~alone) else np.zeros(len(trials))
-    weights *= (1 - complete) / max(weights.sum(), 1e-300)
-    weights[alone] = complete
+    alone = np.array([not names(t) for t in trials])
+    nothing = float(np.sum(_shares(full)[alone]))
+    weights = np.empty(len(trials))
+    weights[alone] = nothing * _shares(full[alone])
+    weights[~alone] = (1 - nothing) * _shares(tempered[~alone])
     return weights
+
+
+def _shares(logs: np.ndarray) -> np.ndarray:
+    """Shares of the sum of numbers of which the logarithms are given."""
+    found = np.exp(logs - logs.max(initial=-np.inf)) if len(logs) else logs
+    return np.asarray(found / max(found.sum(), 1e-300))
 
 
 def _twins(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:

@@ -21,8 +21,11 @@ def trial(*laws, left=0.0):
     return Trial(tuple(Placed(port, law, f"{port}.") for port, law in laws), None, whole, whole, True)
 
 
-def searched(told, flexible=0.0):
-    """A search by its trials and their log evidences; of what each leaves, a flexible force follows a share."""
+def searched(told, flexible=0.0, full=1.0):
+    """A search by its trials and their log evidences; of what each leaves, a flexible force follows a share.
+
+    Where all samples count, log evidences are `full` times as large.
+    """
     evidence = {t.key: value for t, value in told}
     return SimpleNamespace(
         memo={t.key: t for t, _ in told},
@@ -30,6 +33,7 @@ def searched(told, flexible=0.0):
         floor2=NOISE,
         bench=SimpleNamespace(simulator=SimpleNamespace(output_names=("x",))),
         evidence=lambda t: evidence[t.key],
+        promise=lambda t: full * evidence[t.key],
         flexible=lambda t: {"a": flexible, "b": 0.0},
     )
 
@@ -69,12 +73,26 @@ def test_two_forms_of_a_law_are_one_answer():
 
 
 def test_an_effect_counts_wherever_it_stands_beside_others():
-    both, cubic = trial(DRY, ("b", CubicStiffness())), trial(DRY, ("b", QuadraticDrag()))
-    found = posterior(searched([(trial(left=1.0), 0.0), (trial(DRY, left=0.1), 30.0), (both, 60.0), (cubic, 60.0)]))
+    both, drag = trial(DRY, ("b", CubicStiffness())), trial(DRY, ("b", QuadraticDrag()))
+    found = posterior(searched([(trial(left=1.0), 0.0), (trial(DRY, left=0.1), 30.0), (both, 60.0), (drag, 59.0)]))
     sure = {e.name: e.confidence for e in found.effects}
     assert sure[("a", "coulomb_friction")] == pytest.approx(SURE)
-    assert min(sure.values()) == pytest.approx(0.5 * SURE)
+    assert min(sure.values()) == pytest.approx(SURE / (1 + np.exp(-1)))
     assert found.sure == min(sure.values())
+
+
+def test_an_effect_that_is_likelier_out_than_in_is_not_said():
+    others = [(trial(DRY, ("b", law())), 60.0) for law in (CubicStiffness, QuadraticDrag, CoulombFriction)]
+    found = posterior(searched([(trial(left=1.0), 0.0), (trial(DRY), 58.0), *others]))
+    assert [e.name for e in found.effects] == [("a", "coulomb_friction")]
+    assert found.best.key == trial(DRY).key and found.sure == pytest.approx(SURE)
+
+
+def test_that_nothing_is_missing_is_weighed_by_all_samples():
+    told = [(trial(left=1.0), 0.0), (trial(DRY), 1.0)]
+    assert posterior(searched(told)).nothing == pytest.approx(1 / (1 + np.e))
+    found = posterior(searched(told, full=20.0))
+    assert found.nothing < 1e-8 and found.sure == pytest.approx(SURE)
 
 
 def test_the_simulator_alone_and_an_offset_are_no_effects():
