@@ -218,13 +218,18 @@ def check(
     InputError
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
-    began = time.perf_counter()
     simulator, recordings = matched(simulator, train, hold, excited=False)
     check_laws(laws)
     stated = said_hold(simulator, recordings, hold)
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
     fitted = bench.fit(simulator)
     bench.check_followed(fitted)
+    return assess(bench, fitted, stated or "", laws)
+
+
+def assess(bench: Workbench, fitted: Fitted, stated: str, laws: Sequence[type[Law]] | None = None) -> Check:
+    """Assess the recordings of a bench along a refitted run; `stated` is the hold that somebody stated, if any."""
+    began, simulator = time.perf_counter(), bench.simulator
     floor = measured_floor(bench.recordings) or Floor(white_part(fitted.residual), "estimated")
     noise = np.maximum(floor.deviation, FINEST * bench.scale)
     quiet = replace(bench, scale=noise)  # everything from here on is counted in units of the noise
@@ -250,7 +255,7 @@ def check(
             "share": {k: float(v[1]) for k, v in by_output.items()},
         },
         error=fitted.cost**0.5,
-        hold=stated or "",
+        hold=stated,
         starts=tuple(_start(r) for r in bench.recordings),
         next_record=next_record(bench, blind, ties, sensors),
         seconds=time.perf_counter() - began,

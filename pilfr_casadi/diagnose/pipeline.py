@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +15,8 @@ from ..data import Recording
 from ..laws import Law, readable_unit
 from ..simulators import Simulator
 from .arguments import check_laws, check_limits, matched, matched_tests, with_scaled
+from .blind_spots import BlindSpot
+from .checkup import assess
 from .correction import Correction, as_named, find_correction
 from .experiment import next_experiment, placebo
 from .gates import Gate, hold_note, said_hold
@@ -265,7 +268,16 @@ def _build_diagnosis(
         substeps=after.model.substeps,
         let_go=found.let_go,
         correction=found.correction,
+        blind_spots=_blind_spots(asked, search),
     )
+
+
+def _blind_spots(asked: Asked, search: Search) -> tuple[BlindSpot, ...]:
+    """What the recordings cannot reveal of the refitted simulator; nothing where that cannot be told."""
+    bench = search.bench
+    with suppress(InputError, np.linalg.LinAlgError):
+        return assess(bench, search.root.fitted, bench.hold if asked.hold_said else "").blind_spots
+    return ()
 
 
 def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
