@@ -11,7 +11,7 @@ import time
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,13 +20,11 @@ from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
 from .cross_validation import HeldOut, held_out_errors
 from .learned import Learned, LearnedForce, candidates, described
-from .posterior import LEFT, Posterior, unfollowed
+from .posterior import Posterior, unfollowed
+from .search import FORMULA, Search
 from .trials import Trial
 from .verdict import SURE
 from .workbench import Fitted
-
-if TYPE_CHECKING:
-    from .search import Search
 
 GAIN = 0.9  # ratio of two errors on what was held out, from which the smaller one is worth more parameters
 TRIED = 3  # hypotheses with laws that are looked at where none is named
@@ -119,7 +117,7 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     without them, the correction is without them. At their own ports it would only learn what they say.
     """
     best_laws = answer.best
-    if named and answer.sure > SURE and unfollowed(search, best_laws) < LEFT:
+    if named and answer.sure > SURE and unfollowed(search, best_laws) < FORMULA:
         return as_named(search, best_laws.fitted), best_laws.fitted
     found: list[_Hypothesis] = []
     for hypothesis in _competing(search, best_laws if named else None):

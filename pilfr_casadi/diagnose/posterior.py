@@ -19,11 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..simulators import Placed
-from .search import Search
+from .search import FORMULA, Search
 from .trials import Trial
 
 OUTSIDE = 0.1  # prior probability that missing physics is in no law of the catalogue
-LEFT = 0.003  # s_0: share of a mismatch that a law of the right name may well leave
 DISTURBED = 0.2  # weight of what a law leaves and no force at a port follows
 HALF = 0.5  # probability of being in that an effect has to have beside others (Barbieri & Berger 2004)
 ALIKE = 3.0  # nats within which two hypotheses are not told apart
@@ -105,8 +104,8 @@ def unfollowed(search: Search, trial: Trial) -> float:
 
 def share_named(s: float) -> float:
     """Probability that a law which leaves the share s is the physics."""
-    law = (1 - OUTSIDE) * 2 / (np.pi * LEFT * (1 + (s / LEFT) ** 2))
-    other = OUTSIDE / (max(s, LEFT) * np.log(1 / LEFT))
+    law = (1 - OUTSIDE) * 2 / (np.pi * FORMULA * (1 + (s / FORMULA) ** 2))
+    other = OUTSIDE / (max(s, FORMULA) * np.log(1 / FORMULA))
     return float(law / (law + other))
 
 
