@@ -72,8 +72,6 @@ class Search:
         NRMSE by which the simulator misses what it stands for; the floor holds it too.
     count : float
         Samples of the best residual over its correlation time.
-    seen2 : float
-        Mean square of white noise in the best residual, in units of the outputs' variance.
     until : float
         Time (of `time.perf_counter`) at which the search answers from what it has.
     end : float
@@ -98,11 +96,11 @@ class Search:
     gates: tuple[Gate, ...] = ()
     open: dict[Key, dict[str, float]] = field(default_factory=dict)
     held_out: dict[Key, HeldOut] = field(default_factory=dict)
+    screens: dict[Key, tuple[list[Scored], np.ndarray | None]] = field(default_factory=dict)
     times: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
     out_of_time: bool = False
     count: float = FEWEST
-    seen2: float = 0.0
 
     @property
     def fits(self) -> Trials:
@@ -111,13 +109,8 @@ class Search:
 
     @property
     def samples(self) -> float:
-        """Effective samples, which all hypotheses share.
-
-        What is left counts as noise as far as it was measured or is white; the rest may be noise and may be physics.
-        """
-        v = min(t.whole for t in self.memo.values()) + self.tolerance
-        seen2 = self.seen2 if self.floor.source == "estimated" else self.floor2
-        return Sample(seen2 + self.tolerance, self.count).effective(v)
+        """Effective samples, which all hypotheses share."""
+        return self.sample.effective(min(t.whole for t in self.memo.values()) + self.tolerance)
 
     @property
     def floor2(self) -> float:
@@ -169,19 +162,26 @@ class Search:
     def _predict(self) -> None:
         """Let the likeliest hypotheses predict what they are not fitted to.
 
-        Where the error is noise, the fit says the same; where a model is wrong, it may have learned by heart.
+        Where one is alone and its error is noise, the fit says the same. Where the model is wrong, it may have learned
+        by heart; and of several that follow the recordings as well, the right one predicts best.
         """
-        if self.samples > EXACT / WRONG:
+        wrong = self.samples < EXACT / WRONG
+        if not wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
             return
         began = self.begin("held-out blocks")
-        self.predicts(self.root)
+        if wrong:
+            self.predicts(self.root)
         for _ in range(PREDICTED):
-            least = max(map(self.evidence, self.memo.values())) - REACH
-            left = [t for t in self.memo.values() if t.key not in self.held_out and self.evidence(t) > least]
+            left = [t for t in self._likeliest() if t.key not in self.held_out]
             if not left or not self._in_time():
                 break
             self.predicts(max(left, key=self.evidence))
         self.timed("held-out blocks", began)
+
+    def _likeliest(self) -> list[Trial]:
+        """Hypotheses that may be the likeliest."""
+        least = max(map(self.evidence, self.memo.values())) - REACH
+        return [t for t in self.memo.values() if self.evidence(t) > least]
 
     def flexible(self, trial: Trial) -> dict[str, float]:
         """Share of a trial's residual that a flexible force explains, by port."""
@@ -282,10 +282,13 @@ class Search:
             self.memo[trial.key] = trial
             self.open.pop(trial.key, None)
             self.held_out.pop(trial.key, None)
+            self.screens.pop(trial.key, None)
 
     def add(self, parent: Trial, again: bool = False) -> Step:
         """Fit what the screen lets through beside a hypothesis, a few to look `again`; what may win thoroughly."""
-        scored, gain = self._screened(parent)
+        scored, gain = self.screened(parent)
+        beside = parent.laws
+        scored = [s for s in scored if all(e.port != s.port or complements(e.law, s.law) for e in beside)]
         enough = float(np.sqrt(self.floor2 + NEARLY * max(parent.whole - self.floor2, 0.0)))
         trials = self._fitted(parent, scored, gain, enough, again)
         more = relatives(self.bench, trials, scored) if self._in_time() else []
@@ -302,16 +305,18 @@ class Search:
         self.timed("choice", began)
         return step
 
-    def _screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
-        began = self.begin("screen")
-        scored, gain = screen(self.bench, parent.fitted, self.laws, self.floor.deviation, self.workers)
-        self.timed("screen", began)
-        for s in scored:
-            known = self.alternatives.setdefault(s.port, ())
-            if not any(type(law) is type(s.law) for law in known):
-                self.alternatives[s.port] = (*known, s.law)
-        beside = parent.laws
-        return [s for s in scored if all(e.port != s.port or complements(e.law, s.law) for e in beside)], gain
+    def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
+        """Score every port and law beside a hypothesis; see `screen`."""
+        if parent.key not in self.screens:
+            began = self.begin("screen")
+            scored, gain = screen(self.bench, parent.fitted, self.laws, self.floor.deviation, self.workers)
+            self.screens[parent.key] = scored, gain
+            for s in scored:
+                known = self.alternatives.setdefault(s.port, ())
+                if not any(type(law) is type(s.law) for law in known):
+                    self.alternatives[s.port] = (*known, s.law)
+            self.timed("screen", began)
+        return self.screens[parent.key]
 
     def _fitted(
         self, parent: Trial, scored: Sequence[Scored], gain: np.ndarray | None, enough: float, again: bool
@@ -344,9 +349,9 @@ class Search:
         return self.memo[trial.key]
 
     def _estimate_noise(self) -> None:
-        """Take what no force at any port explains of the best hypothesis' residual for noise, unless it was measured.
+        """Take what no force and no law at any port explains of the best hypothesis' residual for noise.
 
-        Third differences tell how much is there at least: white noise inside the residual. Samples count as far as that
+        Where the noise was measured, that is it. Third differences tell how much is there at least: white noise inside the residual. Samples count as far as that
         residual is not correlated.
         """
         self.count = max(effective_size([e[r.skip :] for e, r in self._residual(self.best)]), FEWEST)
@@ -354,11 +359,11 @@ class Search:
             return
         best = self.best
         error = np.concatenate([e[r.skip :] for e, r in self._residual(best)])
-        share = float(np.clip(1 - max(self.flexible(best).values(), default=0.0), 0.0, 1.0))
+        followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
+        share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
         rest = np.minimum(np.sqrt(share * np.mean(error**2, axis=0)), LOUDEST * self.bench.scale)
         known, white = self.stand_in_error * self.bench.scale, white_part(best.fitted.residual)
         self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
-        self.seen2 = float(np.mean((np.hypot(white, known) / self.bench.scale) ** 2))
 
     def _finer(self, parent: Trial) -> None:
         """The best law of a step in its finer forms."""
@@ -446,7 +451,7 @@ class Search:
             self.timed("look back", began)
         if alone.cost > LED_OUT * self.root.whole:
             return False
-        self.without, self.memo, self.open, self.held_out, self.steps = alone, {}, {}, {}, []
+        self.without, self.memo, self.open, self.held_out, self.screens, self.steps = alone, {}, {}, {}, {}, []
         self.keep(Trial((), alone, alone.cost, alone.cost, True))
         return True
 
