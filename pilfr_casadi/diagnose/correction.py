@@ -1,8 +1,8 @@
-"""A correction always: the simulator that predicts best what it was not fitted to, with or without a name.
+"""The corrected simulator: the one that predicts best what it was not fitted to, with or without a name.
 
-Where the named answer is not sure, or leaves something, these compete on held-out blocks of the training recordings
-(`cross_validation`): the refit, the laws that the search has fitted, and a learned element alone or beside them. The
-simplest is taken of those that do about as well as the best; test recordings are never looked at.
+Where the named answer is not sure, or leaves error above the noise, these compete on held-out parts of the training
+recordings (`cross_validation`): the refitted simulator, the laws that the search has fitted, and a learned force alone
+or beside them. The simplest is taken of those that do about as well as the best. Test recordings are never looked at.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     found: list[_Hypothesis] = []
     for hypothesis in _competing(search, best_laws if named else None):
         found.append(hypothesis)
-        if time.perf_counter() > search.end:
+        if time.perf_counter() > search.deadline:
             break
     if not found:
         return as_named(search, best_laws.fitted), best_laws.fitted

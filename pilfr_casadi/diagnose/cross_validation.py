@@ -1,14 +1,14 @@
-"""Cross-validation of fitted simulators: the error on stretches of the recordings that a fit does not score.
+"""Cross-validation of fitted simulators: the error on parts of the recordings that are excluded from the fit.
 
 Every recording is cut into blocks, and the blocks are dealt to a few folds in turn. For each fold a simulator is fitted
-again, from its fitted values, to the other folds: it is simulated through the held-out blocks, whose samples are not
-scored. So the state at the beginning of a block needs no estimate, and a block is predicted from its inputs and from
-the time before it, as a recording is that nobody has fitted. Neighbouring samples say the same thing, and so whole
-blocks are held out (Burman, Chow & Nolan 1994, Biometrika 81(2)).
+again to the other folds, starting at its fitted values. It is simulated through the held-out blocks, whose samples are
+not scored. So the state at the beginning of a block needs no estimate: a block is predicted from its inputs and the
+time before it. Neighbouring samples say the same thing, and so whole blocks are held out (Burman, Chow & Nolan 1994,
+Biometrika 81(2)).
 
-What comes after a block still holds a simulation that drifts, as behind a free integrator. So the second half of every
-recording is predicted as well, from a fit to the first half (Tashman 2000, Int. J. Forecasting 16(4)). A simulator has
-to do both: its error is the larger one.
+Samples after a block still constrain a simulation that drifts, as behind a free integrator. So the second half of every
+recording is predicted as well, from a fit to the first half (Tashman 2000, Int. J. Forecasting 16(4)). The larger of
+both errors counts.
 """
 
 from __future__ import annotations

@@ -1,18 +1,19 @@
 """The one scale on which all hypotheses of a diagnosis are compared: log evidence.
 
 With v the mean square error of a fitted hypothesis, in units of the outputs' variance, n effective samples, λ the
-eigenvalues of the information that one sample gives on the parameters of its laws, in units of their prior widths,
-and p its prior probability,
+eigenvalues of the Fisher information of one sample on the laws' parameters, these in units of their prior widths, and p
+the prior probability,
 
     log Z = -n/2 log v - 1/2 Σ log(1 + n λ / v) + log p.
 
-This is Laplace's approximation (MacKay 1992) with unknown noise variance; other parameters and initial states are
-eliminated from the information first. A model of a machine is never exact, so samples do not count in full. With m the
-share of the error that is no noise, and N samples,
+This is Laplace's approximation (MacKay 1992) with unknown noise variance. The simulator's own parameters and the
+initial states are projected out of the information first. A model of a machine is never exact, and its error is not
+independent from sample to sample; so samples do not count in full. With m the share of the error that is model error,
+N samples, and n_0 the samples that a wholly wrong model is worth,
 
     n = n_0 N / (n_0 + m N)
 
-(the coarsened posterior of Miller & Dunson 2019): thousands of samples of a slightly wrong model do not shout.
+(the coarsened posterior of Miller & Dunson 2019).
 """
 
 from __future__ import annotations

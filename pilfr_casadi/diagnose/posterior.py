@@ -1,14 +1,18 @@
-"""What a search comes to: the probability of every answer, from the log evidences of all hypotheses that were fitted.
+"""The probability of every answer, from the log evidences of all hypotheses that were fitted.
 
-The probability of a hypothesis is its share of the sum of all evidences. A law that is the physics leaves little of
-the mismatch to any other force; so, with s the share of the mismatch that the law leaves and that a flexible force at
-some port would follow, the density of s is
+A hypothesis that has laws has the probability of its share of the sum of all evidences. The simulator alone says that
+all of its error is noise; so it is weighed with samples that count in full (`search.Search.promise`).
 
-    1 / (s log(1 / s_0))  where the physics has no name (s from s_0 to 1, any size as likely),
-    2 / (π s_0 (1 + (s / s_0)²))  where the law is the physics,
+The right law leaves little of the mismatch for a flexible force to explain. Let s be the share of the mismatch that the
+law leaves and that a flexible force at some port would follow. The density of s is
 
-and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. The verdict is the
-likeliest of complete, missing physics and unexplained; the confidence of an effect is the probability that it is in.
+    1 / (s log(1 / s_0)) for s from s_0 to 1, where the physics has no name: log-uniform,
+    2 / (π s_0 (1 + (s / s_0)²)), where the law is the physics: half-Cauchy,
+
+and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is what the
+formula of the right law may leave. The verdict is the likeliest of complete, missing physics and unexplained. The
+confidence of an effect is the probability that it is included; an effect beside others is named where that is above
+one half.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """The search over hypotheses: sets of laws in ports, each fitted once and kept, all compared by one log evidence.
 
-Moves lead from one hypothesis to others: *add* a law, beside what is there; *exchange* one of several for another, the
-others in place; *add two* at once, where each hides the other. Moves start from the best hypothesis and end when none
-brings a better one. What was fitted stays in the memo and counts in the posterior.
+Moves lead from one hypothesis to others: *add* a law, beside those that are there; *exchange* one of several for
+another, the others in place; *add two* at once, where neither helps alone. A move starts from the most promising
+hypothesis. The search ends when a move brings no better one, when the error is down at the noise, or at the time limit.
+All fits are kept in a memo and count in the posterior.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ class Search:
         Samples of the best residual over its correlation time.
     until : float
         Time (of `time.perf_counter`) at which the search answers from what it has.
-    end : float
+    deadline : float
         Time at which the diagnosis has to be over.
     out_of_time : bool
         Whether it did.
@@ -89,7 +90,7 @@ class Search:
     hold_said: bool = True
     stand_in_error: float = 0.0
     until: float = np.inf
-    end: float = np.inf
+    deadline: float = np.inf
     memo: dict[Key, Trial] = field(default_factory=dict)
     steps: list[Step] = field(default_factory=list)
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
@@ -351,8 +352,8 @@ class Search:
     def _estimate_noise(self) -> None:
         """Take what no force and no law at any port explains of the best hypothesis' residual for noise.
 
-        Where the noise was measured, that is it. Third differences tell how much is there at least: white noise inside the residual. Samples count as far as that
-        residual is not correlated.
+        Where the noise was measured, that is it. Third differences tell how much is there at least: white noise inside
+        the residual. Samples count as far as that residual is not correlated.
         """
         self.count = max(effective_size([e[r.skip :] for e, r in self._residual(self.best)]), FEWEST)
         if self.floor.source != "estimated":

@@ -1,7 +1,8 @@
 """Fits of hypotheses: a simulator with laws put into its ports, all parameters estimated together.
 
-A pair of port and law is fitted briefly from its best start, the best pairs again from several, and those that may win
-thoroughly and to everything. A sharp knee, as of dry friction, is fitted on steps that are fine enough for it.
+A pair of port and law is fitted briefly from its best initial values. The best pairs are fitted again from several.
+Those that may win are fitted to convergence and to all samples. A sharp knee, as of dry friction, is fitted on steps
+that are fine enough for it.
 """
 
 from __future__ import annotations

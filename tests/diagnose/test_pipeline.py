@@ -14,9 +14,11 @@ from pilfr_casadi.diagnose import pipeline
 from pilfr_casadi.diagnose.verdict import Verdict
 
 
-def asked(hold=None):
+def a_request(hold=None):
     """A diagnosis of two effects, of nothing in particular."""
-    return pipeline.Asked(SimpleNamespace(hold=None), (), (), hold, "auto", 1, 2, 0.0, np.inf, Stages(lambda *_: None))
+    return pipeline.Request(
+        SimpleNamespace(hold=None), (), (), hold, "auto", 1, 2, 0.0, np.inf, Stages(lambda *_: None)
+    )
 
 
 @pytest.mark.parametrize("said", [None, "zero"])
@@ -43,14 +45,14 @@ def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monk
         def room(self, trial):
             return True
 
-    def prepare(*given, **_):
-        early_or_not.append(given[6])
+    def prepare(*given, early, say):
+        early_or_not.append(early)
         bench = SimpleNamespace(scale=np.ones(1))
-        return SimpleNamespace(bench=bench, without=None, floor=None, gates=gates if given[6] else ())
+        return SimpleNamespace(bench=bench, without=None, floor=None, gates=gates if early else ())
 
     monkeypatch.setattr(pipeline, "prepare", prepare)
     monkeypatch.setattr(pipeline, "Search", Unsure)
-    ready, _ = pipeline._searched(asked())
+    ready, _ = pipeline._searched(a_request())
     assert early_or_not == ([True] if interrupted else [True, False])
     assert ready.gates == (() if nearer and not interrupted else gates)
 
@@ -93,7 +95,7 @@ def test_the_search_with_the_other_hold_is_taken_where_it_comes_nearer(monkeypat
     monkeypatch.setattr(pipeline, "_searched", searched)
     monkeypatch.setattr(pipeline, "hold_note", lambda *given: given[1])
     monkeypatch.setattr(pipeline, "replace", lambda of, **more: SimpleNamespace(**{**vars(of), **more}))
-    prepared, search = pipeline._searched_both_holds(asked())
+    prepared, search = pipeline._searched_both_holds(a_request())
     assert search is (again if taken else first)
     assert prepared.gates == (("linear",) if taken else ())
     assert search.interrupted is getattr(again, "interrupted", False)
