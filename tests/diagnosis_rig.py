@@ -53,9 +53,9 @@ def rig(factors=(1.0, 1.0, 1.0, 1.0)):
 OFF = (1.1, 0.8, 0.9, 1.2)
 
 
-def recordings(*laws, port="ground-m1", seed=0, count=2, noise=1e-3, hold="zero"):
-    """Recordings of the rig with laws in a port, from rest."""
-    rng, true = np.random.default_rng(seed), rig()
+def recordings(*laws, port="ground-m1", seed=0, count=2, noise=1e-3, hold="zero", of=None):
+    """Recordings of the rig, or of another, with laws in a port, from rest."""
+    rng, true = np.random.default_rng(seed), of or rig()
     for law in filter(None, laws):
         true = true.with_element(port, law)
     t = np.arange(SAMPLES) * DT

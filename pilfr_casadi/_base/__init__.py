@@ -34,8 +34,9 @@ if TYPE_CHECKING:
         deferred_interrupt as deferred_interrupt,
         terminable as terminable,
         time_limit as time_limit,
+        unwrapped_interrupt as unwrapped_interrupt,
     )
-    from .progress import Progress as Progress, progress_bar as progress_bar
+    from .progress import Progress as Progress, Stages as Stages, progress_bar as progress_bar
     from .workers import (
         Reply as Reply,
         check_executor as check_executor,

@@ -27,6 +27,24 @@ def deferred_interrupt() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def unwrapped_interrupt() -> Iterator[None]:
+    """Raise KeyboardInterrupt where Ctrl-C comes out of an extension module as a SystemError.
+
+    A function in C that goes on with a pending exception ends in `SystemError: ... returned a result with an exception
+    set`, whose cause is the KeyboardInterrupt; casadi's `DM.__array__` does so.
+    """
+    try:
+        yield
+    except SystemError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
+            raise
+        raise KeyboardInterrupt from error
+
+
+@contextlib.contextmanager
 def repeated_interrupt() -> Iterator[Callable[[], None]]:
     """Yield a function that raises the KeyboardInterrupt of Ctrl-C again, once, if one was raised since its last call.
 
@@ -44,7 +62,7 @@ def repeated_interrupt() -> Iterator[Callable[[], None]]:
             raise KeyboardInterrupt
 
     own = _in_main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    with _handler(signal.SIGINT, note) if own else contextlib.nullcontext():
+    with _handler(signal.SIGINT, note) if own else contextlib.nullcontext(), unwrapped_interrupt():
         yield repeat
 
 

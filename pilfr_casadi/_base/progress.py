@@ -22,6 +22,35 @@ NEW_STAGE_LINE = 1.0  # least seconds between plain lines when a new stage begin
 LINE = 10.0  # least seconds between other plain lines, the last step of a stage excepted
 
 
+@dataclass(eq=False)
+class Stages:
+    """A `Progress` that keeps the smallest error over all stages.
+
+    Attributes
+    ----------
+    report : callable
+        Called with (stage, done, total, smallest error so far).
+    prefix : str
+        Stands before each stage's name, as in "other hold: fits".
+    best : list of float
+        The smallest error, shared with the reporters made by `under`.
+    """
+
+    report: Progress
+    prefix: str = ""
+    best: list[float] = field(default_factory=lambda: [math.inf])
+
+    def __call__(self, stage: str, done: int, total: int, best: float = math.inf) -> None:
+        """Report that `done` of `total` parts of a stage are finished; `best` is an error found in it."""
+        if math.isfinite(best):
+            self.best[0] = min(self.best[0], best)
+        self.report(f"{self.prefix}{stage}", done, total, self.best[0])
+
+    def under(self, prefix: str) -> Stages:
+        """Make a reporter for a search inside the search; it shares the smallest error."""
+        return Stages(self.report, f"{prefix}{self.prefix}", self.best)
+
+
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
     """Yield a function (stage, done, total, best error) that shows the progress while the context lasts.

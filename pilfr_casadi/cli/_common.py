@@ -134,6 +134,62 @@ class DataOptions:
         return read(path, inputs, outputs, columns=columns, initial=self.initial or "estimate", **more)
 
 
+def simulator_files(metavar: str) -> Any:
+    """Make the argument that takes a simulator file and recordings."""
+    text = "A Python file that sets `simulator` (or a model.json), then training recordings (.csv, .mat, .npz)."
+    return typer.Argument(..., metavar=metavar, help=text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatorOptions(DataOptions):
+    """Options of commands that compare a simulator with recordings."""
+
+    files: list[str] = simulator_files("SIMULATOR TRAIN")
+
+    @property
+    def source(self) -> str | None:
+        """The simulator file; None where something stands in for it."""
+        return self.files[0]
+
+    @property
+    def train(self) -> list[str]:
+        """The training recordings."""
+        return self.files[1:]
+
+    @property
+    def recordings(self) -> list[str]:
+        """All recordings."""
+        return self.train
+
+    def check_files(self, instead: str = "") -> None:
+        """Refuse files in the wrong place, and names that a simulator file has of its own.
+
+        `instead` is the option that takes a recorded simulation instead of a simulator file, where there is one.
+        """
+        from ..data import TABLE_SUFFIXES
+
+        if self.source is not None and Path(self.source).suffix.lower() in TABLE_SUFFIXES:
+            then = f"or inputs and outputs of the simulation with {instead}" if instead else "then the recordings"
+            raise InputError(f"{self.source} is not a simulator file; give SIMULATOR.py first, {then}.")
+        if scripts := [path for path in self.recordings if Path(path).suffix.lower() == ".py"]:
+            none = f", and none with {instead}" if instead else ""
+            raise InputError(f"{scripts[0]} was given as a recording; give one simulator file, first{none}.")
+        if not self.train:
+            raise InputError("No training recording was given; give the simulator file and at least one recording.")
+        if self.source is not None and (self.inputs or self.outputs):
+            where = f"; they go with {instead}" if instead else ""
+            raise InputError(f"--inputs and --outputs were given, but a simulator file has its own names{where}.")
+        check_given_once(self.recordings)
+
+
+def load_simulator(path: str) -> Any:
+    """Return the `simulator` of a Python file, or the model of a model.json."""
+    from ..identify import load
+    from ..simulators import simulator_variable
+
+    return load(path) if Path(path).suffix.lower() == ".json" else simulator_variable(path)
+
+
 def name_list(text: str, option: str) -> tuple[str, ...]:
     """Split names at commas."""
     names = tuple(part.strip() for part in text.split(",") if part.strip())

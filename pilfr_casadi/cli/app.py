@@ -16,7 +16,7 @@ from typing import Any
 
 import typer
 
-from .._base import InputError, __version__, deferred_interrupt, terminable
+from .._base import InputError, __version__, deferred_interrupt, terminable, unwrapped_interrupt
 from ._common import BAD_INPUT, DONE, INTERRUPTED, NO_RESULT, UsageError, say
 
 COMMANDS = {  # name: (file, help)
@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     with deferred_interrupt():  # an import must not be interrupted
         program = typer.main.get_command(_program(arguments[0] if arguments else ""))
-    with terminable(), warnings.catch_warnings():
+    with terminable(), unwrapped_interrupt(), warnings.catch_warnings():
         warnings.showwarning = _warn
         with program.make_context("pilfr", arguments) as context:
             return int(program.invoke(context) or DONE)

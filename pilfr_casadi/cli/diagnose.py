@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import typer
 
-from .._base import InputError, deferred_interrupt, listed, progress_bar, write_atomically
-from ..data import SAME_STEP, TABLE_SUFFIXES, TIME_NAMES, Recording, column_names
-from ..identify import load
-from ..simulators import Simulator, as_simulator, simulator_variable
+from .._base import InputError, deferred_interrupt, listed, progress_bar
+from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
+from ..simulators import Simulator, as_simulator
 from ..studies import LARGEST_SIZE
 from ._common import (
     DONE,
     INTERRUPTED,
     NO_RESULT,
-    DataOptions,
-    check_given_once,
+    SimulatorOptions,
     describe,
     flag,
+    load_simulator,
     make_folder,
     new_file,
     numbers_of,
     option,
     say,
+    seconds,
+    simulator_files,
     takes_options,
     whole,
 )
@@ -38,14 +37,10 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DiagnoseOptions(DataOptions):
+class DiagnoseOptions(SimulatorOptions):
     """The options of `pilfr diagnose`."""
 
-    files: list[str] = typer.Argument(
-        ...,
-        metavar="[SIMULATOR] TRAIN",
-        help="A Python file that sets `simulator` (or a model.json), then training recordings (.csv, .mat, .npz).",
-    )
+    files: list[str] = simulator_files("[SIMULATOR] TRAIN")
     simulated: str | None = option("Recorded simulation (inputs and outputs), instead of the simulator file.", "SIM")
     test: list[str] = option("Test recording, never fitted (repeatable).", "FILE", [])
     limit: list[str] = option(
@@ -56,6 +51,7 @@ class DiagnoseOptions(DataOptions):
     workers: int | None = whole(
         "Number of parallel fits (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
     )
+    time_limit: float | None = seconds("Answer after about this time from what was found (default: no limit).")
     out: str = option("Folder for diagnosis.json and report.html (default: diagnosis).", "DIR", "diagnosis")
     overwrite: bool = flag("Replace an existing diagnosis in that folder.", "--overwrite")
 
@@ -87,14 +83,13 @@ class DiagnoseOptions(DataOptions):
 @takes_options
 def diagnose_command(options: DiagnoseOptions) -> int:
     """Writes the answer to DIR/diagnosis.json and the report to DIR/report.html."""
-    _check_files(options)
+    options.check_files("--simulated SIM.csv")
     new_file(options.out, "diagnosis.json", options.overwrite)
     given = None
     if options.source is None:
         inputs, outputs = _simulated_names(options)
     else:
-        is_model = Path(options.source).suffix.lower() == ".json"
-        given = load(options.source) if is_model else simulator_variable(options.source)
+        given = load_simulator(options.source)
         simulator = as_simulator(given)
         inputs, outputs = simulator.inputs, simulator.output_names
     train = {path: options.read(path, inputs, outputs) for path in options.train}
@@ -123,6 +118,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
                 limits=numbers_of(options.limit, "--limit"),
                 workers=options.workers,
                 stand_in_error=error,
+                time_limit=options.time_limit,
                 progress=progress,
             )
     except KeyboardInterrupt:
@@ -133,10 +129,9 @@ def diagnose_command(options: DiagnoseOptions) -> int:
 def write_diagnosis(diagnosis: Diagnosis, folder: Path) -> int:
     """Write diagnosis.json, then the page; print the diagnosis and its paths; return the exit status."""
     target = folder / "diagnosis.json"
-    content = json.dumps(diagnosis.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     try:
         with deferred_interrupt():
-            write_atomically(target, content)
+            diagnosis.save(target)
             print(diagnosis, flush=True)
             from ..report import diagnosis_report
         with progress_bar() as progress:
@@ -151,25 +146,6 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path) -> int:
         return say(f"The diagnosis is in {target}, but a report could not be written ({reason}).", NO_RESULT)
     print(f"diagnosis: {target}\nreport: {page}")
     return INTERRUPTED if diagnosis.interrupted else DONE
-
-
-def _check_files(options: DiagnoseOptions) -> None:
-    source = options.source
-    if source is not None and Path(source).suffix.lower() in TABLE_SUFFIXES:
-        raise InputError(
-            f"{source} is not a simulator file; give SIMULATOR.py first, or inputs and outputs of the simulation with "
-            "--simulated SIM.csv."
-        )
-    scripts = [path for path in (*options.train, *options.test) if Path(path).suffix.lower() == ".py"]
-    if scripts:
-        raise InputError(
-            f"{scripts[0]} was given as a recording; give one simulator file, first, and none with --simulated."
-        )
-    if not options.train:
-        raise InputError("No training recording was given; give the simulator file and at least one recording.")
-    if source is not None and (options.inputs or options.outputs):
-        raise InputError("--inputs and --outputs go with --simulated; a simulator file has its own names.")
-    check_given_once(options.recordings)
 
 
 def _check_recordings(train: dict[str, Recording], tests: dict[str, Recording]) -> None:

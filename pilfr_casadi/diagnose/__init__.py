@@ -1,18 +1,20 @@
 """Find the physics that a simulator leaves out: where, what, how sure, and the proof.
 
-The files by stage:
+A hypothesis is the simulator with laws in its ports. All hypotheses are fitted to the same recordings and compared by
+one log evidence; verdict, effects and confidence are sums over their posterior. `pipeline` shows how an answer comes
+about. The files by stage:
 
-- The whole: `run` (the steps in their order), `workbench` (what all steps share), `stages` (progress).
-- Preparation: `preparation` calls the checks of recordings `glitches`, `settling`, `stale`, `gates` (sign, unit,
-  exchange, hold), `clipping`, `gaps`, `timing` and `offset`; `standing` sets how recordings begin,
-  `finer_steps` the integration steps, `floor` the noise.
-- Search: `search_start`, `search`; candidates are found by `linearise`, `screen`, `remainder` and `flexible`, fitted by
-  `candidate` and `explain`, and compared by `choice`, `kinship`, `imitated`, `knees` and `passed_over`; `first_effect`,
-  `second_effect` and `pairs` go from one effect to the next.
-- Review: `review`, `rivals`, `exchange`, `every_sensor`, `own_shape`, `other_hold`, `held`, `varying`, `undeclared`,
-  `tones` and `ringing` look for another reading of what was found.
-- Verdict: `verdict`, `conclusion`; `correction` chooses the simulator to hand back by `cross_validation`, with a
-  `learned` element where names do not reach.
+- The whole: `pipeline` (the steps in their order), `arguments` (their checks), `workbench` (what all steps share).
+- Preparation: `preparation` calls the checks of recordings `recording_faults` (glitches, stale and clipped samples,
+  unsettled periods), `gates` (sign, unit, exchange, hold), `gaps`, `timing` and `offset`; `equilibrium_state` sets the
+  state in which laws begin, `step_refinement` the integration steps, `floor` the noise.
+- Search: `search` moves from hypothesis to hypothesis; `linearise`, `remainder`, `screen`, `pairs` and `relatives` say
+  which are worth a fit, `trials` fits them.
+- Evidence: `evidence` (log evidence), `cross_validation` (held-out
+  blocks), `posterior`, `verdict`.
+- Correction: `correction` chooses the simulator to hand back, with a `learned` element where names do not reach.
+- Other readings: `other_explanations` (a pinned value, an undeclared port, a machine that changed) and
+  `residual_spectrum` (steady tones, ringing modes).
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
 - Before any of it: `checkup` (what the recordings can reveal), by `identifiability`,
@@ -51,11 +53,12 @@ def diagnose(
     test: Recording | Sequence[Recording] | None = None,
     hold: str | None = None,
     laws: Sequence[type[Law]] | None = None,
-    effects: int = 2,
+    effects: int | None = None,
     limits: Mapping[str, float] | None = None,
     workers: int | None = None,
     engine: str = "auto",
     stand_in_error: float = 0.0,
+    time_limit: float | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Find what a simulator leaves out, from recordings of the machine.
@@ -73,8 +76,8 @@ def diagnose(
     laws : sequence of Law classes, optional
         By default the whole catalogue. Inputs that the simulator's equations do not
         read are tried as scales of some of its laws.
-    effects : int
-        Largest number of effects to look for.
+    effects : int, optional
+        Largest number of effects to look for; by default as many as the recordings tell.
     limits : mapping, optional
         Largest amplitude of each input that a next experiment may have; by default what was recorded.
     workers : int, optional
@@ -83,6 +86,8 @@ def diagnose(
         Generated C or CasADi's virtual machine; by default C where there is a compiler.
     stand_in_error : float
         NRMSE between a surrogate and the simulation that it stands for; it counts as noise.
+    time_limit : float, optional
+        Seconds after which the search ends; the answer then rests on what was fitted until then.
     progress : callable
         Called with (stage, done, total, smallest error so far).
 
@@ -95,9 +100,9 @@ def diagnose(
     InputError
         If simulator and recordings do not fit each other.
     """
-    from .run import run_diagnosis
+    from .pipeline import diagnose_in_steps
 
-    return run_diagnosis(
+    return diagnose_in_steps(
         simulator,
         train,
         test=test,
@@ -108,5 +113,6 @@ def diagnose(
         workers=workers,
         engine=engine,
         stand_in_error=stand_in_error,
+        time_limit=time_limit,
         progress=progress,
     )

@@ -1,4 +1,4 @@
-"""How the ports move in recordings, what recordings cannot reveal, and which further record would help most."""
+"""Blind spots of recordings, from the ports' motion and the tables of `check`, and the record that would help most."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOTION = ("no-reversal", "one-amplitude")
 
 @dataclass(frozen=True)
 class Excitation:
-    """How a port's local coordinate moves.
+    """Motion of a port's local coordinate.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class BlindSpot:
 
 
 def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator[Excitation]:
-    """The motion of every port's local coordinate along the refitted run."""
+    """Describe the motion of every port's local coordinate along the refitted run."""
     for j, name in enumerate(probe.ports):
         if name not in idle_ports(bench.simulator):
             unit = port_units(bench.simulator.port(name), bench.recordings[0])[1]
@@ -76,7 +76,7 @@ def excitation(port: str, unit: str, signals: Sequence[np.ndarray]) -> Excitatio
 
 
 def _turning_points(z: np.ndarray, least: float) -> list[int]:
-    """Samples at which z turns round after and before swings of at least `least`, with the first and the last one."""
+    """Find the samples at which z turns round between swings of at least `least`, the first and the last included."""
     step = np.diff(z)
     candidates = [0, *(np.flatnonzero(step[:-1] * step[1:] <= 0) + 1).tolist(), len(z) - 1]
     turns, extreme, way = [0], 0, 0
@@ -93,7 +93,7 @@ def _turning_points(z: np.ndarray, least: float) -> list[int]:
 
 
 def _distinct(swings: np.ndarray) -> int:
-    """Number of sizes, a tenth of the largest apart, that nine tenths of the swings have."""
+    """Count the sizes, a tenth of the largest apart, that nine tenths of the swings have."""
     if not len(swings):
         return 0
     left, counts = np.sort(swings)[::-1], list[int]()
@@ -107,7 +107,7 @@ def _distinct(swings: np.ndarray) -> int:
 
 
 def _rests(z: np.ndarray, least: float, samples: float) -> int:
-    """Number of stretches of more than some samples in which z stays within `least`."""
+    """Count the stretches of more than some samples in which z stays within `least`."""
     count, begin, low, high = 0, 0, z[0], z[0]
     for k, value in enumerate(z):
         low, high = min(low, value), max(high, value)
@@ -174,7 +174,7 @@ def _motion(moving: Sequence[Excitation]) -> Iterator[BlindSpot]:
 
 
 def _undetectable(laws: Sequence[LawRow], names: Sequence[str]) -> Iterator[BlindSpot]:
-    """Ports at which nothing is detectable, and at the others laws that own parameters follow."""
+    """Find ports at which nothing is detectable, and at the others laws that own parameters follow."""
     ports = dict.fromkeys(r.port for r in laws)
     dark = tuple(port for port in ports if not any(r.status == "detectable" for r in laws if r.port == port))
     if dark:
@@ -190,7 +190,7 @@ def _undetectable(laws: Sequence[LawRow], names: Sequence[str]) -> Iterator[Blin
 
 
 def _alike_ports(laws: Sequence[LawRow], classes: Sequence[Sequence[tuple[str, str]]]) -> Iterator[BlindSpot]:
-    """Ports at which every law that is detectable at both looks the same."""
+    """Find ports at which every law that is detectable at both looks the same."""
     detectable: dict[str, set[str]] = {}
     for r in laws:
         if r.status == "detectable":
@@ -240,7 +240,7 @@ def helpful_sensors(
 
 
 def next_record(bench: Workbench, blind: Sequence[BlindSpot], ties: Sequence[Tie], sensors: Sequence[str]) -> str:
-    """The sentence on what to record next: the gravest blind spot that a record can mend."""
+    """Say what to record next, by the gravest blind spot that a record can mend."""
     by_kind = {b.kind: b.names for b in reversed(blind)}
     if "rough" in by_kind:
         return "None before the simulator follows these better: check its values and units, the start and the hold."

@@ -1,4 +1,4 @@
-"""Check before solve: what recordings and sensors can reveal, from the simulator alone, before a law is fitted.
+"""Assess recordings before a diagnosis: what they and the sensors can reveal of a simulator, without fitting a law.
 
 The simulator's own parameters are refitted once; everything else follows from the simulator linearised along that run:
 `identifiability` says which parameters are identifiable, `detectability` which laws at which ports are detectable.
@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, one_blas_thread
-from ..data import HOLDS, Recording, as_recordings, check_for_identification
-from ..identify import match_channels
+from .._base import one_blas_thread
+from ..data import Recording
 from ..laws import Law, display_name
-from ..simulators import as_simulator
+from .arguments import check_laws, matched
 from .blind_spots import BlindSpot, Excitation, excitations, find_blind_spots, helpful_sensors, next_record
 from .detectability import LawRow, assess_laws, words
 from .floor import Floor, measured_floor, white_part
@@ -29,17 +28,16 @@ from .result import LEFT, plain
 from .workbench import Fitted, Workbench
 
 FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a sensor of 20 bits
-FEWEST = 20  # samples, as `diagnose` asks for
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What recordings can reveal about a simulator and about what it leaves out.
+    """Answer of `check`: the power of recordings to reveal parameters and missing laws.
 
     Attributes
     ----------
     blind_spots : tuple of BlindSpot
-        What they cannot reveal, the gravest first.
+        Facts that the recordings cannot reveal, the gravest first.
     parameters, ties : tuple of ParameterRow, tuple of Tie
         Free parameters as refitted, and groups that are traded off.
     laws : tuple of LawRow
@@ -73,7 +71,7 @@ class Check:
     seconds: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of check.json; numbers that are not finite are None."""
+        """Return the content of check.json; numbers that are not finite are None."""
         clean: dict[str, Any] = plain(
             {
                 "schema": 1,
@@ -125,12 +123,12 @@ class Check:
         )
 
     def _label(self, port: str) -> str:
-        """The port's name, with those of the ports that look the same."""
+        """Join the names of all ports that look the same as this one."""
         groups = (b.names for b in self.blind_spots if b.kind == "alike-ports")
         return " = ".join(next((names for names in groups if port in names), (port,)))
 
     def _group_lines(self) -> Iterator[str]:
-        """Groups of laws that look the same, beyond those at ports that all look the same."""
+        """List groups of laws that look the same, beyond those at ports that all look the same."""
         for group in self.classes:
             names = dict.fromkeys(words((self._label(port), law)) for port, law in group)
             if len(names) > 1:
@@ -220,20 +218,18 @@ def check(
     InputError
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
-    began = time.perf_counter()
-    if hold not in HOLDS:
-        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear' or None.")
-    simulator = as_simulator(simulator, as_recordings(train))
-    recordings = check_for_identification(
-        [match_channels(simulator, r) for r in as_recordings(train)], FEWEST, excited=False
-    )
-    for law in laws or ():
-        if not (isinstance(law, type) and issubclass(law, Law)):
-            raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
+    simulator, recordings = matched(simulator, train, hold, excited=False)
+    check_laws(laws)
     stated = said_hold(simulator, recordings, hold)
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
     fitted = bench.fit(simulator)
     bench.check_followed(fitted)
+    return assess(bench, fitted, stated or "", laws)
+
+
+def assess(bench: Workbench, fitted: Fitted, stated: str, laws: Sequence[type[Law]] | None = None) -> Check:
+    """Assess the recordings of a bench along a refitted run; `stated` is the hold that somebody stated, if any."""
+    began, simulator = time.perf_counter(), bench.simulator
     floor = measured_floor(bench.recordings) or Floor(white_part(fitted.residual), "estimated")
     noise = np.maximum(floor.deviation, FINEST * bench.scale)
     quiet = replace(bench, scale=noise)  # everything from here on is counted in units of the noise
@@ -259,7 +255,7 @@ def check(
             "share": {k: float(v[1]) for k, v in by_output.items()},
         },
         error=fitted.cost**0.5,
-        hold=stated or "",
+        hold=stated,
         starts=tuple(_start(r) for r in bench.recordings),
         next_record=next_record(bench, blind, ties, sensors),
         seconds=time.perf_counter() - began,
@@ -267,7 +263,7 @@ def check(
 
 
 def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
-    """Parameters that are dead or flat as refitted and move the outputs at the given values."""
+    """Find parameters that are dead or flat as refitted and move the outputs at the given values."""
     doubtful = [p.name for p in parameters if p.status in ("dead", "flat")]
     values = {k: p.value for k, p in fitted.model.parameters.items()}
     given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model) if doubtful else fitted
@@ -284,7 +280,7 @@ def _start(r: Recording) -> str:
 
 
 def _undetectable(rows: Sequence[LawRow]) -> dict[str, list[str]]:
-    """Laws that are not detectable, by the reason in words."""
+    """Group the laws that are not detectable by the reason in words."""
     out: dict[str, list[str]] = {}
     for r in rows:
         if r.status != "detectable":
@@ -306,7 +302,7 @@ def _percent(share: float | None) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Rows of text in aligned columns."""
+    """Align rows of text in columns."""
     widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
     for row in (head, *rows):
         yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()

@@ -1,16 +1,17 @@
-"""A correction always: the simulator that predicts best what it was not fitted to, with or without a name.
+"""The corrected simulator: the one that predicts best what it was not fitted to, with or without a name.
 
-Where the named answer is not sure, or leaves something, these compete on held-out blocks of the training recordings
-(`cross_validation`): the refit, the laws that the search has fitted, and a learned element alone or beside them. The
-simplest is taken that the best one does not beat by more than its uncertainty; test recordings are never looked at.
+Where the named answer is not sure, or leaves error above the noise, these compete on held-out parts of the training
+recordings (`cross_validation`): the refitted simulator, the laws that the search has fitted, and a learned force alone
+or beside them. The simplest is taken of those that do about as well as the best. Test recordings are never looked at.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,16 +20,14 @@ from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
 from .cross_validation import HeldOut, held_out_errors
 from .learned import Learned, LearnedForce, candidates, described
-from .verdict import UNSURE, confidence
+from .posterior import Posterior, unfollowed
+from .search import FORMULA, Search
+from .trials import Trial
+from .verdict import SURE
 from .workbench import Fitted
 
-if TYPE_CHECKING:
-    from .search import Search
-
-# standard errors from which a difference on held-out blocks is one, and ratio of the errors from which it is worth more
-# parameters: model error is alike in all blocks, so that a difference of a few per cent can be many standard errors
-BETTER, GAIN = 2.0, 0.9
-TRIED = 3  # candidates of the first pass that are looked at where the search accepted none
+GAIN = 0.9  # ratio of two errors on what was held out, from which the smaller one is worth more parameters
+TRIED = 3  # hypotheses with laws that are looked at where none is named
 PORTS = 3  # ports at which an element is learned: those where a flexible force explains most
 JUDGED = 2  # learned elements that are compared on held-out blocks: those that follow all blocks best
 
@@ -76,7 +75,7 @@ class Correction:
         if not self.elements:
             return (
                 "The corrected simulator is the refitted one: nothing that was tried predicts held-out blocks better "
-                "by more than its uncertainty."
+                "by a tenth."
             )
         if not np.isfinite(self.after):
             return shares[0].upper() + shares[1:]
@@ -106,42 +105,46 @@ class _Hypothesis:
     held_out: HeldOut
 
     @property
-    def size(self) -> int:
-        """Free parameters, by which simple ones come first."""
-        return int(np.sum(self.fitted.model.parameters.free))
+    def size(self) -> tuple[bool, int]:
+        """What simple ones have less of: a learned element, then elements."""
+        return self.fitted is not self.named, len(self.fitted.simulator.elements)
 
 
-def sure_and_complete(search: Search) -> bool:
-    """Whether the named effects are sure and leave nothing that is worth looking for."""
-    sure = [confidence(c, search) > UNSURE for c in search.accepted]
-    return bool(sure) and all(sure) and not search.much()
+def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:
+    """Choose the simulator to hand back, from what there is time to try.
 
-
-def find_correction(search: Search, named: bool = False) -> tuple[Correction, Fitted]:
-    """Choose the simulator to hand back.
-
-    With `named` the effects of the search have been named and stay: only a learned element beside them is tried.
+    With `named` the effects of the answer have been named; where a learned element at another port predicts as well
+    without them, the correction is without them. At their own ports it would only learn what they say.
     """
-    if named and sure_and_complete(search):
-        return as_named(search, search.base), search.base
-    refit = _judged(search, search.without, search.without)
-    bases = [search.base] if named else _with_laws(search)
-    found = [h for base in bases if (h := _judged(search, base, base)) is not None]
-    roots = [search.base] if named else [search.without, *(h.fitted for h in found[:1])]
-    found += [h for root in roots for h in _with_learned(search, root)]
-    if not named and refit is not None:
-        found.append(refit)
+    best_laws = answer.best
+    if named and answer.sure > SURE and unfollowed(search, best_laws) < FORMULA:
+        return as_named(search, best_laws.fitted), best_laws.fitted
+    found: list[_Hypothesis] = []
+    for hypothesis in _competing(search, best_laws if named else None):
+        found.append(hypothesis)
+        if time.perf_counter() > search.deadline:
+            break
     if not found:
-        return as_named(search, search.base), search.base
+        return as_named(search, best_laws.fitted), best_laws.fitted
     best = _simplest(found)
-    if not named and refit is not None and not _clearly_better(best, refit):
-        best = refit
     shares = _shares(search, best.named, best.fitted)
     learned: tuple[Learned, ...] = ()
     if best.fitted is not best.named:
         learned = (described(search.bench, best.fitted, shares["learned"], dict.fromkeys((*CATALOGUE, *search.laws))),)
-    before = refit.held_out.error if refit is not None else np.inf
-    return Correction(_elements(search, best.fitted), shares, learned, before, best.held_out.error), best.fitted
+    refit = next((h.held_out.error for h in found if h.fitted is search.root.fitted), np.inf)
+    return Correction(_elements(search, best.fitted), shares, learned, refit, best.held_out.error), best.fitted
+
+
+def _competing(search: Search, named: Trial | None) -> Iterator[_Hypothesis]:
+    """Generate what competes: the refit, the named laws or the likeliest, a learned element alone and beside them."""
+    first = named or max(search.memo.values(), key=lambda t: (bool(t.laws), search.promise(t)))
+    yield from _of_trial(search, search.root)
+    if first.laws:
+        yield from _of_trial(search, first)
+    yield from _with_learned(search, search.root, {e.port for e in named.laws} if named else set())
+    if first.laws:
+        yield from _with_learned(search, search.memo[first.key])
+    yield from (h for t in _with_laws(search) if t.key != first.key for h in _of_trial(search, t))
 
 
 def as_named(search: Search, fitted: Fitted) -> Correction:
@@ -150,46 +153,38 @@ def as_named(search: Search, fitted: Fitted) -> Correction:
 
 
 def _simplest(found: Sequence[_Hypothesis]) -> _Hypothesis:
-    """Take the simplest hypothesis that the best one does not beat by more than its uncertainty (Breiman 1984)."""
-    best = min(found, key=lambda h: h.held_out.error)
-    near = (h for h in found if np.isfinite(h.held_out.error) and not _clearly_better(best, h))
-    return min(near, key=lambda h: (h.size, h.held_out.error), default=best)
+    """Take the simplest hypothesis of those that predict about as well as the best; of two, the better on average."""
+    best = min(h.held_out.error for h in found)
+    near = (h for h in found if GAIN * h.held_out.error <= best)
+    return min(near, key=lambda h: (h.size, h.held_out.blocks + h.held_out.ahead))
 
 
-def _clearly_better(one: _Hypothesis, other: _Hypothesis) -> bool:
-    """Whether a hypothesis predicts held-out blocks better by more than the uncertainty, and by a tenth at least."""
-    a, b = one.held_out, other.held_out
-    return a.better_than(b) >= BETTER and a.error <= GAIN * b.error
-
-
-def _judged(search: Search, fitted: Fitted, named: Fitted) -> _Hypothesis | None:
-    """A hypothesis with its errors on held-out blocks; None where it cannot be simulated."""
+def _of_trial(search: Search, trial: Trial) -> Iterator[_Hypothesis]:
+    """Generate a hypothesis of the search, with its errors on what it was not fitted to, if it can be simulated."""
     with suppress(InputError):
-        return _Hypothesis(fitted, named, held_out_errors(search.bench, fitted))
-    return None
+        trial = search.thorough(trial)
+        yield _Hypothesis(trial.fitted, trial.fitted, search.predicts(trial))
 
 
-def _with_laws(search: Search) -> list[Fitted]:
-    """The simulators with laws that the search has: what it accepted, else the best candidates of its first pass."""
-    if _elements(search, search.base):
-        return [search.base]
-    tried = sorted(search.passes[0].candidates, key=lambda c: c.tail)[:TRIED] if search.passes else []
-    return [whole.fitted for candidate in tried if (whole := search.polished(candidate)) is not None]
+def _with_laws(search: Search) -> list[Trial]:
+    """The most promising hypotheses with laws, and those that have predicted already."""
+    ranked = sorted((t for t in search.memo.values() if t.laws), key=search.promise, reverse=True)
+    return [*ranked[:TRIED], *(t for t in ranked[TRIED:] if t.key in search.held_out)]
 
 
-def _with_learned(search: Search, base: Fitted) -> list[_Hypothesis]:
-    """Learned elements on top of a fitted simulator, at the ports where a flexible force explains most."""
-    shares = search.open_after if base is search.base else search.open_before
-    ports = sorted(shares, key=lambda name: -shares[name])[:PORTS]
+def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Hypothesis]:
+    """Generate learned elements beside a trial, at the free ports where a flexible force explains most."""
+    shares = search.flexible(base)
+    ports = [name for name in sorted(shares, key=lambda name: -shares[name]) if name not in taken][:PORTS]
     with suppress(InputError, np.linalg.LinAlgError):
-        found = candidates(search.bench, base, ports, search.bench.simulator.inputs)
-        return [h for f in found[:JUDGED] if (h := _judged(search, f, base)) is not None]
-    return []
+        inputs = search.bench.simulator.inputs
+        for fitted in candidates(search.bench, base.fitted, ports, inputs, search.workers)[:JUDGED]:
+            yield _Hypothesis(fitted, base.fitted, held_out_errors(search.bench, fitted, search.workers))
 
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
     """Shares of the refit's mean square error above the noise; all of it is left where there is none."""
-    excess = search.without.cost - search.floor2
+    excess = search.root.whole - search.floor2
     if not excess > 0:
         return {"named": 0.0, "learned": 0.0, "left": 0.0}
     after = [float(np.clip((f.cost - search.floor2) / excess, 0.0, 1.0)) for f in (named, whole)]

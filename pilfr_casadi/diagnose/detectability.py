@@ -1,4 +1,4 @@
-"""Which laws at which ports are detectable in recordings, from what strength on, and which look the same.
+"""Detectability of laws at ports: the smallest force that recordings reveal, and the laws that look the same.
 
 With φ the outputs' changes by a law's force of unit size and φ' what own parameters and unknown initial states leave of
 them, both in units of the noise (`remainder`), a force of the size 3.29 / |φ'| is detected: 5 % false alarms and 5 % of
@@ -61,7 +61,7 @@ class LawRow:
 
 @dataclass(frozen=True, eq=False)
 class _Response:
-    """What is left of a law's unit response at a port in its middle shape, and a basis of each of its shapes."""
+    """Rest of a law's unit response at a port in its middle shape, and a basis of each of its shapes."""
 
     name: tuple[str, str]
     left: np.ndarray
@@ -70,7 +70,7 @@ class _Response:
 
 
 def plainest_forms(port: Port) -> tuple[type[Law], ...]:
-    """The first form of each law that may stand at a port: its finer forms are detectable where this one is."""
+    """Return the first form of each law that may stand at a port: its finer forms are detectable where this one is."""
     first: dict[str, type[Law]] = {}
     for law in CATALOGUE:
         if port.kinds & set(law.places):
@@ -86,9 +86,9 @@ def assess_laws(
     laws: Sequence[type[Law]] | None,
     names: Sequence[str],
 ) -> tuple[tuple[LawRow, ...], tuple[tuple[tuple[str, str], ...], ...]]:
-    """Every law at every port, and classes of (port, law) that look the same; the bench's scale is the noise.
+    """Assess every law at every port, and group those that look the same; the bench's scale is the noise.
 
-    Without `laws` the plainest form of each law of the catalogue. `names` are those of the free parameters.
+    Without `laws`, these are the plainest forms of the catalogue's. `names` are those of the free parameters.
     """
     ports = [port for port in bench.simulator.all_ports() if port.name not in idle_ports(bench.simulator)]
     tried = {port.name: plainest_forms(port) if laws is None else tuple(laws) for port in ports}
@@ -121,7 +121,7 @@ def assess_laws(
 def _at_port(
     rest: Remainder, task: Task, base: np.ndarray, own: np.ndarray, level: float | None, names: Sequence[str]
 ) -> tuple[list[LawRow], list[_Response]]:
-    """The laws of one port, and the responses of those that are detectable."""
+    """Assess the laws of one port; return their rows, and the responses of those that are detectable."""
     rows, responses = [], []
     w_unit, z_unit = port_units(task.port, rest.bench.recordings[0])
     size = np.maximum(lengths(own), 1e-300)
@@ -159,7 +159,7 @@ def _at_port(
 
 
 def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], ...]:
-    """Groups in which each member explains the most visible one, and is explained by it, to a tenth."""
+    """Group responses: each member explains the most visible one, and is explained by it, to a tenth."""
     order = sorted(responses, key=lambda r: -r.most)
     if not order:
         return ()
@@ -182,13 +182,13 @@ def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], .
 
 
 def idle_ports(simulator: Simulator) -> frozenset[str]:
-    """Ports at which nothing can be missing: inputs that no equation reads, and equations that define a speed."""
+    """Find ports at which nothing can be missing: inputs that no equation reads, and equations that define a speed."""
     inputs = {f"actuator:{name}" for name in simulator.idle_inputs}
     return frozenset(inputs | {f"equation:{name}" for name in simulator.kinematic})
 
 
 def port_units(port: Port, recording: Recording) -> tuple[str, str]:
-    """Units of a port's force and coordinate, in series those of the signal; empty where nobody says."""
+    """Return the units of a port's force and coordinate, in series those of the signal; empty where unknown."""
     if not port.series:
         return port.unit, port.across_unit
     unit = port.unit or recording.units.get(port.name.partition(":")[2], "")
@@ -197,7 +197,7 @@ def port_units(port: Port, recording: Recording) -> tuple[str, str]:
 
 @one_at_a_time
 def local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[float | None]:
-    """Largest rms force of the simulator's own at each port of `all_ports`: of the terms that make up its equation.
+    """Compute the largest rms of the simulator's own terms in the equation of each port of `all_ports`.
 
     A term is the equation's derivative with respect to a state or input times that signal's swing about its mean. In
     series it is the signal's own deviation. None where nothing moves.
@@ -221,7 +221,7 @@ def local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[floa
 
 
 def _term_functions(simulator: Simulator) -> dict[str, ca.Function]:
-    """For each port in parallel `(x, u, p) -> (slopes (n_targets, n_x + n_u), factors (n_targets, 1))`, at t = 0."""
+    """Make `(x, u, p) -> (slopes (n_targets, n_x + n_u), factors (n_targets, 1))` of each parallel port, at t = 0."""
     s = Symbols.of(simulator)
     x, u, p, t = s.x, s.u, s.p, ca.SX(0)
     changes = ca.vertsplit(simulator.derivatives(x, u, p, t)) if simulator.states else []
@@ -238,5 +238,5 @@ def _term_functions(simulator: Simulator) -> dict[str, ca.Function]:
 
 
 def words(name: tuple[str, str]) -> str:
-    """A law at a port, in words."""
+    """Name a law at a port in words."""
     return f"{display_name(name[1])} at {name[0]}"

@@ -49,9 +49,9 @@ class Jump:
     Attributes
     ----------
     rival : float
-        What a shock nearby, or a step of one force or sensor there, takes away.
+        Share that a shock nearby, or a step of one force or sensor there, takes away.
     beside : float
-        What a jump some samples away does.
+        Share that a jump some samples away takes away.
     size : array, shape (n_x,)
         The jump.
     """
@@ -65,22 +65,22 @@ class Jump:
 
     @property
     def distinct(self) -> bool:
-        """Whether it takes much away, and no rival as much."""
+        """Tell whether it takes much away, and no rival as much."""
         return self.share > SHARE and self.rival < RIVAL * self.share
 
     @property
     def told(self) -> bool:
-        """Whether every rival also leaves far more."""
+        """Tell whether every rival also leaves far more."""
         return self.distinct and 1 - self.rival > WORSE * max(1 - self.share, 0.0)
 
     @property
     def sharp(self) -> bool:
-        """Whether it does so at this very sample, as what drifts does not."""
+        """Tell whether it does so at this very sample only; a drift does so around it too."""
         return 1 - self.beside > SHARP * (1 - self.share)
 
 
 def gaps(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Look for lost samples; returns a bench with recordings cut there, where that cures most of the mismatch.
+    """Look for lost samples; cut the recordings there if that cures most of the mismatch.
 
     The state at the first sample of a later piece is estimated. Recordings in periodic steady state are left alone.
     """
@@ -107,7 +107,7 @@ def gaps(bench: Workbench, plain: Fitted, noise2: float) -> tuple[Workbench, Fit
 
 
 def _confirmed(now: Workbench, found: Fitted, origins: list[Origin], least: float) -> Stage | None:
-    """Each gap once more, now that the others are cut; None where one of them is none."""
+    """Test each gap again, now that the others are cut; return None if one of them is no gap."""
     sharp, origins = True, list(origins)
     for i, (label, begin) in enumerate(origins):
         if not begin:
@@ -122,12 +122,12 @@ def _confirmed(now: Workbench, found: Fitted, origins: list[Origin], least: floa
 
 
 def _named(r: Recording, begin: int) -> Recording:
-    """A piece, by the time that it begins at."""
+    """Name a piece by the time at which it begins."""
     return r.with_(name=f"{r.name} from {begin * r.dt:.6g} s".strip()) if begin else r
 
 
 def _joined(bench: Workbench, fitted: Fitted, i: int) -> tuple[Workbench, Fitted]:
-    """The bench with a piece put back behind the one before, and the run there at the same values."""
+    """Put a piece back behind the one before; return the bench and the run there at the same values."""
     one, other = bench.recordings[i - 1 : i + 1]
     whole = one.with_(u=np.concatenate([one.u, other.u]), y=np.concatenate([one.y, other.y]))
     before = replace(bench, recordings=(*bench.recordings[: i - 1], whole, *bench.recordings[i + 1 :]))
@@ -135,12 +135,12 @@ def _joined(bench: Workbench, fitted: Fitted, i: int) -> tuple[Workbench, Fitted
 
 
 def _same(bench: Workbench, fitted: Fitted, initial: list[np.ndarray]) -> Fitted:
-    """Another bench's fit on this one's recordings, as it stands."""
+    """Run another bench's fit on this one's recordings at its values."""
     return bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
 
 
 def _settled(bench: Workbench, fitted: Fitted) -> tuple[Jump, Workbench, Fitted] | None:
-    """The jump, and the fit to the pieces, in turn until the jump stays: a fit across a gap may have gone astray."""
+    """Repeat jump and fit to the pieces until the jump stays: a fit across a gap may have gone astray."""
     best: tuple[Jump, Workbench, Fitted] | None = None
     along = fitted
     for _ in range(TURNS):
@@ -166,19 +166,19 @@ def _settled(bench: Workbench, fitted: Fitted) -> tuple[Jump, Workbench, Fitted]
 
 
 def _cut(r: Recording, sample: int) -> tuple[Recording, Recording]:
-    """A recording in two, of which the second begins in a state that is to be estimated."""
+    """Cut a recording in two; the second begins in a state that is to be estimated."""
     return r.slice(0, sample), r.slice(sample).with_(initial="estimate", period=None)
 
 
 def _quiet(bench: Workbench, fitted: Fitted) -> float:
-    """Mean square of white noise, from the median of third differences, which a few jumps do not move."""
+    """Estimate the mean square of white noise from the median of third differences, which a few jumps do not move."""
     thirds = np.abs(np.concatenate([np.diff(e, 3, axis=0) for e in fitted.residual]))
     return float(np.mean((1.4826 * np.median(thirds, axis=0) / bench.scale) ** 2) / 20)
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
-    """The jump of the simulator's states that takes most away, to first order; None where gaps cannot be told."""
+    """Find the jump of the simulator's states that takes most away, to first order; None if gaps cannot be told."""
     simulator = bench.simulator
     if not simulator.kinematic:
         return None
@@ -213,7 +213,7 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
 def _taken(
     run: Run, scale: np.ndarray, base: np.ndarray, error: np.ndarray, skip: int, n_x: int, moved: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """At each sample, what the best jump of the state takes away, what its best rival does, and that jump.
+    """Compute the share that the best jump of the state takes away at each sample, its best rival's, and that jump.
 
     Shapes (M,), (M,) and (M, n_x); `moved` are the states that a shock moves.
     """
@@ -233,7 +233,7 @@ def _taken(
 
 
 def _solved(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What jumps along some ways, (n, k) or (K, n, k), take away, and how far along them."""
+    """Compute the shares that jumps along some ways, (n, k) or (K, n, k), take away, and their lengths."""
     across = np.swapaxes(ways, -1, -2)
     size = np.sqrt(np.maximum(np.einsum("...ii->...i", across @ s @ ways), 0.0))
     size = np.where(size > 0, size, 1.0)
@@ -248,7 +248,7 @@ def _solved(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) ->
 def _backwards(
     run: Run, scale: np.ndarray, base: np.ndarray, error: np.ndarray, skip: int
 ) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
-    """S, G and s of states and of forces that stay from a sample on, for some samples at a time, the last first."""
+    """Yield S, G and s of states and of forces that stay from a sample on, some samples at a time, the last first."""
     m, n_y, n = run.c.shape
     forces = run.b.shape[2] - run.n_free
     full, n_b = n + forces, base.shape[1]
@@ -270,14 +270,14 @@ def _backwards(
 
 
 def _begin(fitted: Fitted, r: Recording, jump: Jump) -> np.ndarray:
-    """The simulator's own states after a jump, to first order."""
+    """Compute the simulator's own states after a jump, to first order."""
     model = fitted.model
     states = states_along(model, model.drive(r), fitted.vector, fitted.initial[jump.recording])
     return np.asarray(states[jump.sample * model.substeps, : len(jump.size)] - jump.size)
 
 
 def _gate(bench: Workbench, places: Sequence[Origin], before: float, after: float) -> Gate:
-    """What is told about gaps before some samples."""
+    """Describe the gaps before some samples."""
     ordered = sorted(places)
     dt, several = bench.dt, len({label for label, _ in ordered}) > 1 or len(bench.recordings) > 1
     at = " and ".join(f"t = {k * dt:.6g} s (sample {k}{f' of {label}' if several else ''})" for label, k in ordered)

@@ -1,4 +1,4 @@
-"""The dull causes, looked at first: sign, unit, exchanged channels, time unit, alignment, clock, offset, hold.
+"""Faults of whole channels, looked for first: sign, unit, exchange, unit of time; and the choice of the hold.
 
 Each is a change of the recordings; it counts when the simulator, refitted, follows the changed recordings far better
 than the given ones.
@@ -49,7 +49,7 @@ class Gate:
     left: float = 1.0  # share of the mean square error that is left once it is put right
 
     def to_dict(self) -> dict[str, Any]:
-        """As in diagnosis.json."""
+        """Return the finding as in diagnosis.json."""
         keys = ("channel", "finding", "value", "sentence", "corrected")
         return {k: getattr(self, k) for k in keys}
 
@@ -79,8 +79,8 @@ def exchanged(kind: str, one: int, other: int) -> Change:
 def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, cut: bool = True) -> Change:
     """Read some channels at `t + seconds + rate t`, interpolated.
 
-    What lies before the recording is skipped and what lies behind it cut off, unless `cut` is off: then ends are held.
-    A periodic recording goes round.
+    Samples read from before the recording are skipped, samples from behind it are cut off; without `cut`, the ends are
+    held. A periodic recording goes round.
     """
 
     def change(r: Recording) -> Recording:
@@ -102,7 +102,7 @@ def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, 
 
 
 def _read(t: np.ndarray, v: np.ndarray, at: np.ndarray, end: float | None, smooth: bool) -> np.ndarray:
-    """A signal between its samples: an output along a cubic spline, an input along its chords; ends are held."""
+    """Interpolate a signal: an output along a cubic spline, an input along its chords; ends are held."""
     if not smooth:
         return np.interp(at, t, v, period=end)
     from scipy.interpolate import CubicSpline
@@ -117,8 +117,13 @@ def slower_by(factor: float) -> Change:
     return lambda r: r.with_(dt=r.dt * factor)
 
 
+def opened_at_the_start(r: Recording) -> Recording:
+    """Leave the initial state of a periodic recording that is not on its steady cycle to be estimated."""
+    return r.with_(initial="estimate", period=None) if r.begins == "periodic" else r
+
+
 def changed(bench: Workbench, change: Change) -> Workbench:
-    """The bench with changed recordings, errors in units of their own deviation."""
+    """Return the bench with changed recordings, errors in units of their own deviation."""
     recordings = tuple(change(r) for r in bench.recordings)
     scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
     return replace(bench, recordings=recordings, scale=scale)
@@ -131,9 +136,9 @@ def refit(
     within: float = np.inf,
     same: Fitted | None = None,
 ) -> Fitted | None:
-    """The simulator fitted from the user's values, and from a previous fit; `same` lends its compiled model.
+    """Fit the simulator from the user's values and from a previous fit; `same` lends its compiled model.
 
-    None where it diverges, or does not come within the mean square error `within`.
+    Returns None where it diverges, or does not come within the mean square error `within`.
     """
     starts: list[dict[str, Any]] = [{}]
     if previous is not None:
@@ -148,14 +153,14 @@ def refit(
 
 
 def said_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
-    """What inputs do between samples, where the user, the simulator or a recording says so."""
+    """Return the hold that the user, the simulator or a recording states; None if none does."""
     return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
 
 
 def choose_hold(
     simulator: Any, recordings: tuple[Recording, ...], said: str | None, engine: str
 ) -> tuple[str, list[Gate]]:
-    """What inputs do between samples: as said, else what fits better."""
+    """Choose the hold: as stated, else the one that fits better."""
     known = said_hold(simulator, recordings, said)
     if known is not None:
         return known, []
@@ -172,9 +177,9 @@ def choose_hold(
 
 
 def hold_note(simulator: Any, hold: str, ratio: float) -> Gate:
-    """That the hold was chosen from the data, the other's error being `ratio` times as large."""
+    """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
     words = {"zero": "held over each sample", "linear": "interpolated between samples"}
-    why = f"fits better (error {ratio:.3g} times smaller)" if ratio > 1.005 else "gives the surer answer"
+    why = f"fits better (error {ratio:.3g} times smaller)"
     return Gate(
         ", ".join(simulator.inputs),
         "hold",
@@ -185,7 +190,7 @@ def hold_note(simulator: Any, hold: str, ratio: float) -> Gate:
 
 
 def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:
-    """The bench; where the simulator is too fast for the recordings' step, with the time in another unit.
+    """Make the bench; if the simulator is too fast for the recordings' step, with the time in another unit.
 
     Raises
     ------
@@ -213,9 +218,9 @@ def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine:
 
 
 def slips(bench: Workbench, plain: Fitted, workers: int, beside: str = "") -> tuple[Workbench, Fitted, list[Gate]]:
-    """Sign and unit slips of each channel and of the time, and exchanged channels, `workers` at a time.
+    """Try sign and unit slips of each channel and of the time, and exchanged channels, `workers` at a time.
 
-    Only those of one channel `beside` its offset, where that is in place.
+    With `beside`, only slips of that channel are tried, beside the offset that it has already.
     """
     trials: list[Trial] = []
     # beside an offset there is a working point, which a run from rest would first have to come to
@@ -246,7 +251,7 @@ def slips(bench: Workbench, plain: Fitted, workers: int, beside: str = "") -> tu
 def _best_slip(
     bench: Workbench, plain: Fitted, trials: Sequence[Trial], workers: int, more: str = ""
 ) -> tuple[Workbench, Fitted, list[Gate]]:
-    """The trial after which the simulator follows best, where that is far better than without."""
+    """Take the trial after which the simulator follows best, if that is far better than without."""
     best, found = plain, None
     channels = (*bench.simulator.inputs, *bench.simulator.output_names)
 
@@ -286,14 +291,14 @@ def _best_slip(
 
 
 def _sizes(bench: Workbench, errors: Sequence[np.ndarray]) -> np.ndarray:
-    """Size of each measured output over that of the simulated one, by their differences; nan where it diverges."""
+    """Compute the size of each measured output over the simulated one's; nan where the simulation diverges."""
     with np.errstate(all="ignore"):
         y = [e + r.y for e, r in zip(errors, bench.recordings, strict=True)]
         return np.asarray(bench.scale / np.std(np.concatenate(y), axis=0))
 
 
 def _from_rest(bench: Workbench) -> list[np.ndarray]:
-    """Errors of the simulator at the user's values, run from rest."""
+    """Compute the errors of the simulator at the user's values, run from rest."""
     model = bench.model(bench.simulator)
     engine = make_engine(model, bench.engine)
     start, n = model.parameters.start, model.n_state

@@ -25,7 +25,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, side_by_side
 from ..engine import make_engine
 from ..laws import SCALABLE, Law, Local, display_name, scaled, unit_forces
 from ..models import Parameter, play
@@ -217,7 +217,7 @@ def _error_unseen(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: flo
 
 
 def candidates(
-    bench: Workbench, base: Fitted, port_names: Sequence[str], inputs: Sequence[str] = (), most: int = FITS
+    bench: Workbench, base: Fitted, port_names: Sequence[str], inputs: Sequence[str] = (), workers: int = 1
 ) -> list[Fitted]:
     """Fit a learned element on top of a fitted simulator, which may have elements already, at each of some ports.
 
@@ -227,8 +227,8 @@ def candidates(
         Ports to try.
     inputs : sequence of str
         Inputs that may scale the force, each tried besides the force alone.
-    most : int
-        Elements that are fitted: the best by the linear solution.
+    workers : int
+        Threads; the best few by the linear solution are fitted.
 
     Returns
     -------
@@ -236,7 +236,7 @@ def candidates(
         The learned element is the last; smallest error first. Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names, inputs) if s.share > 0]
-    found = [_fitted(bench, base, start) for start in starts[:most]]
+    found = side_by_side(lambda start: _fitted(bench, base, start), starts[:FITS], workers)
     return sorted((f for f in found if f is not None), key=lambda f: f.cost)
 
 

@@ -1,6 +1,6 @@
-"""Where the residual of the refitted simulator lives: in frequency, amplitude, rate, level and time.
+"""Map of the refitted simulator's residual over frequency, amplitude, rate, level and time.
 
-Residuals are taken in units of each output's deviation. What lies above the noise floor is the *excess*; shares are
+Residuals are taken in units of each output's deviation. Power above the noise floor is the *excess*; shares are
 shares of it. Bands of frequency are half octaves; the amplitude is the envelope of the simulated output. Where the
 input is a multisine that leaves lines out, the residual there is distortion: at even lines from asymmetric laws, at odd
 ones from symmetric laws (Pintelon & Schoukens, System Identification, 2nd ed., 2012, ch. 4).
@@ -30,7 +30,7 @@ def mismatch(
     floor_deviation: np.ndarray,
     scale: np.ndarray,
 ) -> dict[str, Any]:
-    """Describe where residuals live.
+    """Map residuals over frequency, amplitude, rate, level and time.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def mismatch(
 
 
 def _bands(samples: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of the bands in Hz: half octaves up from four swings a recording, all below in the first."""
+    """Choose the edges of the bands in Hz: half octaves up from four swings a recording, all below in the first."""
     top, first = 0.5 / dt, min(4 / (samples * dt), 0.25 / dt)
     count = int(np.clip(np.ceil(2 * np.log2(top / first)), 1, MOST_BANDS - 1))
     edges = np.concatenate([[0.0], first * (top / first) ** (np.arange(count + 1) / count)])
@@ -122,7 +122,7 @@ def _by_frequency(
 
 
 def _envelope(v: np.ndarray) -> np.ndarray:
-    """Size (M,) of a swing: modulus of the analytic signal about the mean, over all columns."""
+    """Compute the size (M,) of a swing: modulus of the analytic signal about the mean, over all columns."""
     centred = v - np.mean(v, axis=0)
     n = len(v)
     spectrum = np.fft.fft(centred, axis=0)
@@ -134,7 +134,7 @@ def _envelope(v: np.ndarray) -> np.ndarray:
 
 
 def _binned(x: np.ndarray, power: np.ndarray, from_zero: bool = False) -> dict[str, Any]:
-    """Rms of the residual in bins of x; its outermost half percents join the outer bins."""
+    """Compute the rms of the residual in bins of x; its outermost half percents join the outer bins."""
     a, b = (0.0 if from_zero else float(np.quantile(x, 0.005))), float(np.quantile(x, 0.995))
     edges = np.linspace(a, b if b > a else a + 1.0, BINS + 1)
     index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
@@ -152,7 +152,7 @@ def _map(
     edges: np.ndarray,
     dt: float,
 ) -> dict[str, Any]:
-    """Rms of the residual, band by band, where the output swings so much; None where it never does."""
+    """Compute the residual's rms by band where the output swings so much; None where it never does."""
     index = np.concatenate([np.clip(np.searchsorted(edges, v, side="right") - 1, 0, BINS - 1) for v in envelope])
     count = np.bincount(index, minlength=BINS)
     spectra = [(np.fft.rfft(v, axis=0), np.fft.rfftfreq(len(v), dt), len(v)) for v in e]
@@ -180,7 +180,7 @@ def _over_time(r: Recording, e: np.ndarray, y: np.ndarray) -> dict[str, Any]:
 
 
 def _thirds(e: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> dict[str, list[float]]:
-    """Rms of residual and output in the first, middle and last third, over all recordings."""
+    """Compute the rms of residual and output in the first, middle and last third, over all recordings."""
     out: dict[str, list[float]] = {"rms": [], "output": []}
     for k in range(3):
         for name, signals in (("rms", e), ("output", [v - np.mean(v, axis=0) for v in y])):
@@ -190,7 +190,7 @@ def _thirds(e: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> dict[str, list[
 
 
 def _distortion(recordings: Sequence[Recording], e: Sequence[np.ndarray]) -> dict[str, float | None] | None:
-    """Rms a line of the residual at lines that the inputs leave out, even and odd, below the highest excited line."""
+    """Compute the residual's rms a line at even and odd lines that the inputs leave out, up to the last excited one."""
     even, odd, driven, noise = [], [], [], []
     for r, v in zip(recordings, e, strict=True):
         n = r.period
@@ -219,7 +219,7 @@ def _distortion(recordings: Sequence[Recording], e: Sequence[np.ndarray]) -> dic
 
 
 def sentence(found: dict[str, Any]) -> str:
-    """What the numbers say, in a sentence or two."""
+    """Say in a sentence or two what stands out in the map."""
     rms, floor = found["rms"], found["floor"]
     if rms < 1.1 * floor:
         return "The residual is at the noise floor; no band, amplitude or stretch of time stands out."
@@ -258,7 +258,7 @@ def sentence(found: dict[str, Any]) -> str:
 
 
 def _where_in_frequency(found: dict[str, Any]) -> str:
-    """The narrowest run of bands with three quarters of the excess."""
+    """Find the narrowest run of bands with three quarters of the excess."""
     share = np.asarray(found["share"])
     total = np.concatenate([[0.0], np.cumsum(share)])
     best: tuple[int, float, int, int] | None = None
@@ -276,7 +276,7 @@ def _where_in_frequency(found: dict[str, Any]) -> str:
 
 
 def _growth(amplitude: dict[str, Any], floor: float) -> float | None:
-    """Exponent of the residual's rms over the amplitude, from bins above the floor; None where there are too few."""
+    """Fit the exponent of the residual's rms over the amplitude in bins above the floor; None if these are too few."""
     edges = np.asarray(amplitude["edges"])
     middle = (edges[1:] + edges[:-1]) / 2
     use = [i for i, (v, n) in enumerate(zip(amplitude["rms"], amplitude["samples"], strict=True)) if v and n > 0.01]
@@ -288,7 +288,7 @@ def _growth(amplitude: dict[str, Any], floor: float) -> float | None:
 
 
 def _ratio(binned: dict[str, Any]) -> float | None:
-    """Rms in the upper half of the bins over that in the lower half."""
+    """Divide the rms in the upper half of the bins by that in the lower half."""
     half, means = BINS // 2, []
     for part in (slice(0, half), slice(half, BINS)):
         weights = np.asarray(binned["samples"][part])

@@ -118,6 +118,18 @@ def _told(port: str, value: float) -> str:
     return f"The {where} {name} has a constant offset of about {value:.3g}{load}"
 
 
+def offset_gates(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Gate]:
+    """Findings for the offsets among fitted laws."""
+    out = []
+    for e in elements:
+        if isinstance(e.law, Offset):
+            parameter = f"{e.prefix}w_0"
+            value = float(values[parameter])
+            sentence = f"{_told(e.port, value)}; it is a parameter of the corrected simulator."
+            out.append(Gate(e.port.split(":", 1)[1], "offset", value, sentence, True, parameter=parameter))
+    return out
+
+
 def another_zero(
     bench: Workbench, plain: Fitted, found: tuple[Workbench, Fitted, list[Gate]], workers: int
 ) -> tuple[Workbench, Fitted, list[Gate]]:

@@ -5,39 +5,26 @@ of what small doses of the two change (`remainder`) and e' what is left of the e
 
     |Q_aᵀ e'|² + rᵀ (I - W Wᵀ)⁻¹ r,    r = Q_bᵀ e' - W Q_aᵀ e',    W = Q_bᵀ Q_a
 
-The best pairs are fitted together; then each law of the best is put up against every other, the other one in place.
+The best pairs are fitted together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from .._base import side_by_side
-from ..engine import make_engine
-from .candidate import Candidate, attempt
-from .explain import BRIEF, closed
-from .kinship import handicap
-from .linearise import linearised
 from .remainder import Dose, Remainder, held_out, orthonormal
-from .review import one_does_alone
 from .screen import Scored, start_values
-from .workbench import Fitted, started
-
-if TYPE_CHECKING:
-    from .search import Pass, Search
+from .trials import BRIEF, Trial, Trials, put_in
+from .workbench import Fitted
 
 SHAPES = 5  # of each law at each port, the best alone
 PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each
 LOOKED_AT = 60  # pairs of laws whose share is cross-validated
 RIDGE = 1e-4
-AS_FAR = 1.25  # times the error so far of a pair that is worth putting its laws up against all others
-WORTH = 0.8  # times the error so far that a pair has to come to
-PROMISING = 0.9  # of the mean square so far that a pair leaves at most after the first round
-ROUNDS = 3  # times that one law is put up against all others
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +70,8 @@ def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
     if len(blocks) < 2:
         return []
     left = 1 - together([orthonormal(b.dose.phi) for b in blocks], rest.left)
-    ports, factor = np.array([b.scored.port for b in blocks]), np.array([handicap(b.scored.law) for b in blocks])
-    worth = np.maximum(left, 0.0) * np.outer(factor, factor) ** 2
+    ports = np.array([b.scored.port for b in blocks])
+    worth = np.maximum(left, 0.0)
     worth[ports[:, None] == ports] = np.inf
     seen: dict[tuple[Any, ...], tuple[float, tuple[_Block, _Block]]] = {}
     for flat in np.argsort(worth, axis=None):
@@ -95,7 +82,7 @@ def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
         key = tuple((b.scored.port, type(b.scored.law)) for b in pair)
         if key not in seen and _opposes(pair, rest.left):
             kept = 1 - held_out(np.hstack([b.dose.phi for b in pair]), rest.left, rest.odd)
-            seen[key] = (kept * (factor[i] * factor[j]) ** 2, pair)
+            seen[key] = (kept, pair)
     chosen: dict[tuple[str, str], list[tuple[_Block, _Block]]] = {}
     for _, pair in sorted(seen.values(), key=lambda s: s[0]):
         place = pair[0].scored.port, pair[1].scored.port
@@ -119,76 +106,13 @@ def _opposes(pair: tuple[_Block, _Block], left: np.ndarray) -> bool:
     return True
 
 
-def _fitted_together(search: Search, rest: Remainder, pair: tuple[_Block, _Block]) -> Candidate | None:
-    """A pair fitted from what the screen says of it, and the simulator's parameters as refitted and as given."""
-    simulator, named = search.without.simulator, dict[str, Any]()
+def fitted_together(trials: Trials, root: Fitted, rest: Remainder, pair: tuple[_Block, _Block]) -> Trial | None:
+    """Fit a pair from what the screen says of it, and the simulator's parameters as refitted and as given."""
+    simulator, named = root.simulator, dict[str, Any]()
     for block, strength in zip(pair, _strengths(pair, rest.left), strict=True):
         start = start_values(block.scored.law, block.dose.shape, strength)
-        simulator, own = closed(simulator, block.scored, start)
+        simulator, own = put_in(simulator, block.scored, start)
         named |= own
-    nominal = {k: p.value for k, p in search.without.simulator.parameters.items()}
-    starts = [{**search.without.values, **named}, {**nominal, **named}]
-    return attempt(search.bench, simulator, starts, states=search.without.begin, solver=BRIEF)
-
-
-def _beside(search: Search, joint: Fitted, kept: Any) -> Fitted:
-    """The simulator with one law of a pair, at the values that it has beside the other."""
-    simulator = search.bench.simulator.with_element(kept.port, kept.law)
-    model = search.bench.model(simulator)
-    known = {k: v for k, v in joint.values.items() if k in model.parameters}
-    initial = search.bench.begun(simulator, model, started(model, known), joint.begin)
-    return search.bench.result(simulator, known, initial, make_engine(model, search.bench.engine), model)
-
-
-def two_at_once(search: Search) -> None:
-    """Look for two effects together; the search goes over to them where they explain what it has not."""
-    before, better = (search.base, list(search.passes), search.open_after, search.floor), False
-    certainty = search.certainty()
-    try:
-        found = _two(search)
-        better = found is not None and _better(search, found, before[0].cost)
-        if better and one_does_alone(search):
-            search.open_after = search.flexible(search.base)
-        better = better and search.certainty() > certainty
-    finally:  # an interrupt leaves what there was
-        if not better:
-            search.base, search.passes, search.open_after, search.floor = before
-
-
-def _better(search: Search, found: tuple[Fitted, list[Pass]], cost: float) -> bool:
-    search.base, search.passes = found
-    search.open_after = search.flexible(search.base)
-    return len(search.passes) == 2 and search.base.cost < WORTH**2 * cost
-
-
-def _two(search: Search) -> tuple[Fitted, list[Pass]] | None:
-    """Both laws fitted, and the pass that put each up against all others."""
-    began, bench = search.begin("two at once"), search.bench
-    rest = Remainder.of(bench, *linearised(bench, search.without), search.laws)
-    pairs = promising(rest)
-    fits = side_by_side(lambda pair: _fitted_together(search, rest, pair), pairs, search.workers)
-    best = min((c for c in fits if c is not None), key=lambda c: c.error, default=None)
-    best = search.polished(best) if best is not None else None
-    search.timed("two at once", began)
-    if best is None or best.full > AS_FAR**2 * search.base.cost:
-        return None
-    joint, passes, before = best.fitted, dict[str, Any](), search.base.cost
-    elements = list(joint.simulator.elements[-2:])
-    for k in range(ROUNDS):
-        kept, other = elements
-        search.base = _beside(search, joint, kept)
-        step = search.pass_(1, search.screened())
-        if step.choice is None:
-            return None
-        joint = step.choice.winner.fitted
-        if joint.cost > PROMISING * before:
-            return None
-        new = joint.simulator.elements[-1]
-        same = (new.port, type(new.law)) == (other.port, type(other.law))
-        passes = {kept.port: passes.get(kept.port), new.port: replace(step, accepted=True)}
-        elements = [new, joint.simulator.elements[-2]]
-        if k and same:
-            break
-    steps = [p for p in passes.values() if p is not None]
-    # strongest first: the one without which the other is further off
-    return joint, sorted(steps, key=lambda p: -p.before[0])
+    nominal = {k: p.value for k, p in root.simulator.parameters.items()}
+    starts = [{**root.values, **named}, {**nominal, **named}]
+    return trials.fitted(simulator, starts, 2, states=root.begin, solver=BRIEF)

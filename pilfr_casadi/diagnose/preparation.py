@@ -8,21 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, Stages
 from ..data import Recording
 from ..simulators import Simulator
-from .clipping import unclip
-from .finer_steps import on_steps_as_fine
 from .floor import Floor, measured_floor, white_part
 from .gaps import gaps
 from .gates import CURED, STRAINED, Gate, choose_hold, hold_note, opened, said_hold, slips
-from .glitches import without_glitches
 from .linearise import along, linearised, observer_gain
 from .offset import another_zero, offsets
 from .proof import errors_of
-from .settling import without_transients
-from .stages import Stages
-from .stale import stale_samples
+from .recording_faults import stale_samples, unclip, without_glitches, without_transients
+from .step_refinement import on_steps_as_fine
 from .timing import FAR, as_given, in_steps, timing
 from .workbench import THOROUGH, Fitted, Workbench
 

@@ -103,10 +103,10 @@ def _by_name(fitted: Fitted, where: np.ndarray, matrix: np.ndarray) -> dict[str,
     return fitted.model.parameters.unpack(full)
 
 
-def covariance(bench: Workbench, fitted: Fitted, held: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
+def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
     """Free parameters inside their bounds, as places in the vector (k,), and the covariance of their estimates (k, k).
 
-    Initial states are estimated with them; `held` are places in the vector whose values are given.
+    Initial states are estimated with them.
     """
     free = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
     problem = bench.problem(free, fitted.engine)
@@ -116,7 +116,6 @@ def covariance(bench: Workbench, fitted: Fitted, held: Sequence[int] = ()) -> tu
     theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
     _, _, hessian = problem.normal(theta)
     inside = (theta > problem.lower) & (theta < problem.upper)
-    inside[:n_free] &= ~np.isin(np.flatnonzero(problem.free), held)
     keep = np.flatnonzero(inside & (np.diag(hessian) > 0))
     size = np.sqrt(np.maximum(np.diag(hessian)[keep], 1e-300))
     scaled = hessian[np.ix_(keep, keep)] / np.outer(size, size)
@@ -124,27 +123,6 @@ def covariance(bench: Workbench, fitted: Fitted, held: Sequence[int] = ()) -> tu
     n = max(effective_size(fitted.residual), 10.0)
     own = keep < n_free
     return np.flatnonzero(problem.free)[keep[own]], matrix[np.ix_(own, own)] * fitted.cost / n
-
-
-def shown(bench: Workbench, fitted: Fitted) -> float:
-    """How many standard errors the strengths of the last element are from zero, together; infinite without any.
-
-    Its other parameters are held: at no strength they mean nothing, and beside one that they can be traded for (a
-    relaxation of double the stiffness and double the time) a strength looks uncertain that is plain to see.
-    """
-    element, parameters = fitted.simulator.elements[-1], fitted.model.parameters
-    strengths, shapes = list[int](), list[int]()
-    for name in element.law.parameters():
-        span = parameters.position(f"{element.prefix}{name}")
-        (strengths if name in element.law.strength else shapes).extend(range(span.start, span.stop))
-    where, matrix = covariance(bench, fitted, shapes)
-    own = np.isin(where, strengths)
-    if not np.any(own):  # at a bound, which is zero where there is nothing of it
-        return np.inf if not strengths or np.any(fitted.vector[strengths]) else 0.0
-    deviation = np.sqrt(np.maximum(np.diag(matrix)[own], 1e-300))
-    value = fitted.vector[where[own]] / deviation
-    together = np.linalg.pinv(matrix[np.ix_(own, own)] / np.outer(deviation, deviation), rcond=1e-9, hermitian=True)
-    return float(np.sqrt(max(value @ together @ value, 0.0)))
 
 
 def parameter_table(

@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from ..identify import match_channels
 from ..laws import display_name
 from ..models import ParameterSet
 from ..simulators import Simulator, discretise, in_series
+from .blind_spots import BlindSpot
 from .correction import Correction
 from .gates import Gate
 from .learned import Learned
@@ -34,6 +35,7 @@ SURE = 0.5  # confidence above which an effect is stated as found; below it is a
 CONSTANT = 0.9  # error from which a refitted simulator is hardly better than a constant
 FAR = 3.0  # ratio of the test error to the training error from which the answer warns
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
+OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits made until then."
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,13 +102,17 @@ class Diagnosis:
         `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs.
     floor : dict
         `nrmse` and `source`.
+    out_of_time : bool
+        Whether the time limit ended the search.
     substeps : int
         Integration steps per sample with which the corrected simulator was fitted.
     let_go : str
-        Parameter that was fixed or at a bound and is free in the corrected simulator; see `held`.
+        Parameter that was fixed or at a bound and is free in the corrected simulator; see `other_explanations`.
     correction : Correction or None
         What `corrected` consists of beside the refit: laws, a learned element, and their shares. Elements that are not
         among `effects` predict unseen data better than the refit but have no sure name.
+    blind_spots : tuple of BlindSpot
+        Facts that the recordings cannot reveal, the gravest first, as `check` finds them.
     """
 
     verdict: str
@@ -127,10 +133,12 @@ class Diagnosis:
     seconds: float = 0.0
     times: Mapping[str, float] = field(default_factory=dict)
     interrupted: bool = False
+    out_of_time: bool = False
     evidence: Mapping[str, Any] = field(default_factory=dict)
     substeps: int = 1
     let_go: str = ""
     correction: Correction | None = None
+    blind_spots: tuple[BlindSpot, ...] = ()
 
     @property
     def sure(self) -> bool:
@@ -184,6 +192,7 @@ class Diagnosis:
         }
         if self.correction:
             raw |= {"shares": self.shares, "learned": [e.to_dict() for e in self.learned]}
+        raw["blind_spots"] = [asdict(b) for b in self.blind_spots]
         clean: dict[str, Any] = plain(raw)
         return clean
 
@@ -313,7 +322,7 @@ class Diagnosis:
 
     def warnings(self) -> list[str]:
         """List the reasons for doubt: an interrupt, parameters at their bounds, errors that stay large."""
-        out = [INTERRUPTED] if self.interrupted else []
+        out = [INTERRUPTED] * self.interrupted + [OUT_OF_TIME] * self.out_of_time
         at_bounds = self._at_bounds()
         if at_bounds:
             one = len(at_bounds) == 1
@@ -358,7 +367,7 @@ class Diagnosis:
         lines = [self.summary]
         for e in self.effects:
             lines += _effect_lines(e)
-        lines += [*self._own(), *self._error_lines()]
+        lines += [*self._own(), *self._error_lines(), *self._blind_lines()]
         lines += [f"note: {text}" for text in (*(g.sentence for g in self.gates), *self.warnings())]
         if self.next_experiment:
             lines.append(f"next experiment: {self.next_experiment['sentence']}")
@@ -376,6 +385,12 @@ class Diagnosis:
                 shown = (f"{errors[k]:.4f}" if np.isfinite(errors[k]) else "diverges" for k in STEPS)
                 lines.append(f"  {kind:<10}" + "".join(f"{text:>11}" for text in shown))
         return [*lines, f"  noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})"]
+
+    def _blind_lines(self) -> list[str]:
+        """List the gravest blind spots of the recordings."""
+        told = [f"  {b.sentence}" for b in self.blind_spots[:MOST]]
+        more = [f"  and {len(self.blind_spots) - MOST} more, see pilfr check"] if len(self.blind_spots) > MOST else []
+        return ["blind spots of these recordings:", *told, *more] if told else []
 
     def _own(self) -> list[str]:
         """The simulator's own estimated values, those that moved most first."""

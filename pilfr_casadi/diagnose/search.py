@@ -1,64 +1,58 @@
-"""From a refitted simulator to the effects it lacks: one pass for each, then a look back at the first.
+"""The search over hypotheses: sets of laws in ports, each fitted once and kept, all compared by one log evidence.
 
-A second effect is looked for where the first leaves more than a few per cent of the excess and a flexible force could
-explain it. It is accepted at another port when it removes most of what is left; friction and a curve of position may
-share a port, when the second removes nearly all. What was accepted is looked at again (`review`).
+Moves lead from one hypothesis to others: *add* a law, beside those that are there; *exchange* one of several for
+another, the others in place; *add two* at once, where neither helps alone. A move starts from the most promising
+hypothesis. The search ends when a move brings no better one, when the error is down at the noise, or at the time limit.
+All fits are kept in a memo and count in the posterior.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..laws import Law
-from ..simulators import Placed
-from .candidate import Candidate, heads, judged, polish
-from .choice import Choice, choose
-from .every_sensor import every_sensor
-from .exchange import exchange
-from .explain import explain
-from .first_effect import led_out, offset_beside, wrongly_held
-from .flexible import explainable
+from .._base import InputError, Stages, side_by_side
+from ..data import Recording
+from ..engine import make_engine
+from ..laws import FINER, Law
+from ..simulators import Placed, Simulator
+from .cross_validation import HeldOut, held_out_errors
+from .evidence import EXACT, MORE, Sample, information, log_evidence, log_prior
 from .floor import Floor, effective_size, white_part
 from .gates import Gate
-from .imitated import imitated
-from .kinship import complements
 from .linearise import linearised
-from .pairs import two_at_once
-from .passed_over import passed_over
-from .review import look_back, prefer_what_leaves_nothing, put_more_finely
-from .screen import Scored, screen
-from .second_effect import believed, mends
-from .stages import Stages
-from .verdict import HINT, LITTLE, MAINLY, UNSURE, confidence, explains, left_open
-from .workbench import THOROUGH, Fitted, Workbench
+from .offset import Offset
+from .pairs import fitted_together, promising
+from .relatives import complements, relatives
+from .remainder import Remainder
+from .screen import Scored, explainable, screen
+from .trials import Key, Trial, Trials
+from .workbench import THOROUGH, Fitted, Workbench, started
 
-ROOM = 12.0  # nats by which a law has to improve on the refit to be believed
-FEWEST = 100.0  # effective samples that a comparison is made on at least
-MORE, LOUD = 0.03, 3.0  # share of the excess, or times the noise, that has to be left to look for a second effect
-SEEN = 2.5e-5  # mean square error below which what is more than noise is not worth a second effect
+POLISHED, BEHIND = 5, 1.5  # trials of a step fitted thoroughly at most, and times the best one's error that they have
+REACH = 8.0  # nats of log evidence within which a hypothesis may still win
 NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
-POLISHED = 4  # candidates fitted to everything before one is chosen
-NEAR, NEAR_KNEE = 1.5, 3.0  # times the best error of those
-NOTHING = 0.01  # below this share nothing is explained
-
-Seen = tuple[list[Scored], np.ndarray | None]
+ROUNDS = 3  # exchanges in turn
+FORMULA = 1e-3  # share of a mismatch that the formula of the right law may leave: 3 % of its force
+FEWEST = 30.0  # samples that recordings are worth at least
+WRONG = 0.2  # share of the error that is no noise, from which models are judged on held-out blocks
+PREDICTED = 6  # hypotheses that are
+LOUDEST = 0.05  # of an output's deviation: slow errors that are larger are no noise of a sensor
+MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
+LED_OUT = 0.8  # share of the mean square that is left at most by a simulator that a law has led out of a dead end
 
 
 @dataclass(frozen=True, eq=False)
-class Pass:
-    """One search for an effect."""
+class Step:
+    """What was tried beside a hypothesis: its parent, the screen's scores, and the trials, best first."""
 
-    choice: Choice | None
-    candidates: tuple[Candidate, ...]
+    parent: Trial
     scored: tuple[Scored, ...]
-    before: tuple[float, float]
-    accepted: bool
-    samples: float = FEWEST
+    trials: tuple[Trial, ...]
 
 
 @dataclass(eq=False)
@@ -67,22 +61,24 @@ class Search:
 
     Attributes
     ----------
-    base : Fitted
-        The simulator with the effects accepted so far.
-    open_before, open_after : dict
-        Share of the residual that a flexible force explains, by port, without and with the effects.
+    without : Fitted
+        The simulator refitted, with no law.
+    memo : dict
+        Every hypothesis that was fitted, its best trial by key.
+    steps : list of Step
+        In the order in which they were made.
     hold_said : bool
-        Whether somebody said what inputs do between samples; else each effect is a new chance to tell.
+        Whether somebody said what inputs do between samples.
     stand_in_error : float
         NRMSE by which the simulator misses what it stands for; the floor holds it too.
-    may_be_led : bool
-        Whether the refit may have stayed in a local minimum that a law leads out of.
-    led_to : dict
-        Values that the simulator alone is far better at, where a law has led there; the search has ended then.
-    gates : tuple of Gate
-        What was found of the recordings on the way.
-    misheld : float
-        By how much the error falls, with the effects in place, where inputs do the other thing between samples.
+    count : float
+        Samples of the best residual over its correlation time.
+    until : float
+        Time (of `time.perf_counter`) at which the search answers from what it has.
+    deadline : float
+        Time at which the diagnosis has to be over.
+    out_of_time : bool
+        Whether it did.
     """
 
     bench: Workbench
@@ -92,17 +88,30 @@ class Search:
     workers: int
     say: Stages
     hold_said: bool = True
-    misheld: float = 1.0
     stand_in_error: float = 0.0
-    may_be_led: bool = True
-    led_to: Mapping[str, np.ndarray] = field(default_factory=dict)
-    base: Fitted = field(init=False)
+    until: float = np.inf
+    deadline: float = np.inf
+    memo: dict[Key, Trial] = field(default_factory=dict)
+    steps: list[Step] = field(default_factory=list)
+    alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
     gates: tuple[Gate, ...] = ()
-    passes: list[Pass] = field(default_factory=list)
-    open_before: dict[str, float] = field(default_factory=dict)
-    open_after: dict[str, float] = field(default_factory=dict)
+    open: dict[Key, dict[str, float]] = field(default_factory=dict)
+    held_out: dict[Key, HeldOut] = field(default_factory=dict)
+    screens: dict[Key, tuple[list[Scored], np.ndarray | None]] = field(default_factory=dict)
     times: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
+    out_of_time: bool = False
+    count: float = FEWEST
+
+    @property
+    def fits(self) -> Trials:
+        """What fits hypotheses."""
+        return Trials(self.bench, self.workers, self.until)
+
+    @property
+    def samples(self) -> float:
+        """Effective samples, which all hypotheses share."""
+        return self.sample.effective(min(t.whole for t in self.memo.values()) + self.tolerance)
 
     @property
     def floor2(self) -> float:
@@ -110,17 +119,90 @@ class Search:
         return float(np.mean((self.floor.deviation / self.bench.scale) ** 2))
 
     @property
-    def accepted(self) -> list[Choice]:
-        """The effects accepted so far."""
-        return [p.choice for p in self.passes if p.accepted and p.choice is not None]
+    def tolerance(self) -> float:
+        """Mean square error that the formulas of laws leave of any mismatch, because no machine follows one exactly."""
+        return FORMULA * max(self.root.whole - self.floor2, 0.0)
+
+    @property
+    def sample(self) -> Sample:
+        """What the recordings are worth."""
+        return Sample(self.floor2 + self.tolerance, self.count)
+
+    @property
+    def root(self) -> Trial:
+        """The simulator alone."""
+        return self.memo[frozenset()]
+
+    @property
+    def best(self) -> Trial:
+        """The most promising hypothesis, from which the search goes on."""
+        return max(self.memo.values(), key=self.promise)
+
+    def promise(self, trial: Trial) -> float:
+        """Log evidence of a hypothesis if what is still missing were found beside it: samples count as at the noise."""
+        return self._log_evidence(trial, trial.whole, self.sample.effective(0.0))
+
+    def evidence(self, trial: Trial) -> float:
+        """Log evidence of a hypothesis, from its error on blocks that it was not fitted to where that is known."""
+        known, of_root = self.held_out.get(trial.key), self.held_out.get(self.root.key)
+        worse = of_root.mean_square / self.root.whole if of_root else 1.0
+        v = known.mean_square if known else trial.whole * (worse if np.isfinite(worse) else 1.0)
+        return self._log_evidence(trial, v, self.samples)
+
+    def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
+        told = trial.information if trial.information is not None else np.zeros(0)
+        v += self.tolerance
+        return log_evidence(v, told, log_prior(trial.laws, self.alternatives, trial.doubtful), n)
+
+    def predicts(self, trial: Trial) -> HeldOut:
+        """Errors of a hypothesis on what it was not fitted to."""
+        if trial.key not in self.held_out:
+            self.held_out[trial.key] = held_out_errors(self.bench, trial.fitted, self.workers)
+        return self.held_out[trial.key]
+
+    def _predict(self) -> None:
+        """Let the likeliest hypotheses predict what they are not fitted to.
+
+        Where one is alone and its error is noise, the fit says the same. Where the model is wrong, it may have learned
+        by heart; and of several that follow the recordings as well, the right one predicts best.
+        """
+        wrong = self.samples < EXACT / WRONG
+        if not wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
+            return
+        began = self.begin("held-out blocks")
+        if wrong:
+            self.predicts(self.root)
+        for _ in range(PREDICTED):
+            left = [t for t in self._likeliest() if t.key not in self.held_out]
+            if not left or not self._in_time():
+                break
+            self.predicts(max(left, key=self.evidence))
+        self.timed("held-out blocks", began)
+
+    def _likeliest(self) -> list[Trial]:
+        """Hypotheses that may be the likeliest."""
+        least = max(map(self.evidence, self.memo.values())) - REACH
+        return [t for t in self.memo.values() if self.evidence(t) > least]
+
+    def flexible(self, trial: Trial) -> dict[str, float]:
+        """Share of a trial's residual that a flexible force explains, by port."""
+        if trial.key not in self.open:
+            began = self.begin("flexible")
+            self.open[trial.key] = explainable(self.bench, trial.fitted)
+            self.timed("flexible", began)
+        return self.open[trial.key]
+
+    def _residual(self, trial: Trial) -> list[tuple[np.ndarray, Recording]]:
+        """Residual of each recording, and the recording."""
+        return list(zip(trial.fitted.residual, self.bench.recordings, strict=True))
 
     def begin(self, stage: str) -> float:
         """Report that a stage begins; return the time in s, for `timed`."""
-        self.say(stage, 0, 1, self.base.cost**0.5)
+        self.say(stage, 0, 1, self.without.cost**0.5)
         return time.perf_counter()
 
-    def timed(self, stage: str, began: float, told: bool = False) -> None:
-        """Report that a stage is done and add the seconds since `began` to it; end the search if a fit was interrupted.
+    def timed(self, stage: str, began: float) -> None:
+        """Report that a stage is done and add its seconds; end the search if a fit was interrupted.
 
         Raises
         ------
@@ -128,170 +210,269 @@ class Search:
             If a fit was interrupted, which returns its best so far and goes no further with that.
         """
         self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - began
-        if not told:  # the stage has not reported its own end
-            self.say(stage, 1, 1, self.base.cost**0.5)
+        self.say(stage, 1, 1, self.best.error)
         if self.bench.struck:
             raise KeyboardInterrupt
 
-    def flexible(self, fitted: Fitted) -> dict[str, float]:
-        """Share of a fit's residual that a flexible force explains, by port."""
-        began = self.begin("flexible")
-        found = explainable(self.bench, fitted)
-        self.timed("flexible", began)
-        return found
-
-    def run(self, effects: int) -> Search:
-        """Look for effects, one after the other; an interrupt ends the search with what there is."""
-        self.base = self.without
+    def run(self, effects: float) -> Search:
+        """Look for up to so many effects; an interrupt ends the search with what there is."""
+        self.keep(Trial((), self.without, self.without.cost, self.without.cost, True))
         try:
-            self._run(effects)
-            every_sensor(self)
+            self._estimate_noise()
+            if self._grow(effects):
+                self._every_sensor()
+                self._predict()
         except KeyboardInterrupt:
             self.interrupted = True
         return self
 
-    def _run(self, effects: int) -> None:
-        linearised(self.bench, self.without)  # what both of the next look at
-        with ThreadPoolExecutor(1) as other:
-            looked = other.submit(self.screened)
-            self.open_before = self.open_after = self.flexible(self.without)
-            seen = looked.result()
-        for number in range(effects):
-            if number:
-                if not self.much():
-                    break
-                seen = self.screened()
-                if max([*self.open_after.values(), *(s.share for s in seen[0])], default=0.0) < HINT:
-                    break
-            found = self.pass_(number, seen)
-            self.passes.append(found)
-            if not found.accepted:
+    def settled(self, effects: float) -> Search:
+        """Go on where the other hold was no better, unless the search was interrupted."""
+        self.hold_said = True
+        return self if self.interrupted else self.run(effects)
+
+    def _grow(self, effects: float) -> bool:
+        """Add effects while that pays; False as soon as inputs prove to be held in the other way."""
+        while self.room(parent := self.best) and _count(parent) < effects and self._pays(parent) and self._in_time():
+            self.add(parent)
+            if not parent.laws and self._in_time() and self._led_out():
+                self.add(self.root)
+            if self.misheld():
+                return False
+            if _count(self.best) > _count(parent) >= 1:
+                self.exchange()
+            if len(self.best.laws) <= len(parent.laws):  # nothing that was added is worth it
                 break
-            assert found.choice is not None
-            before, passes = self.base, self.passes[:-1]
-            self.base = found.choice.winner.fitted
-            if not number and led_out(self):
-                return
-            prefer_what_leaves_nothing(self)
-            put_more_finely(self)
-            if number:
-                look_back(self)
-                exchange(self)
-                if mends(self, before):
-                    self.base, self.passes = before, [*passes, replace(found, accepted=False)]
-                    break
-            if wrongly_held(self):
-                return
-            if not number:
-                offset_beside(self)
-            self.open_after = self.flexible(self.base)
-        if effects > 1 and self.unsure():
-            two_at_once(self)
+        if effects > 1 and _count(self.best) < 2 and self.room(self.best) and self._in_time():
+            self.add_two()
+        return True
 
-    def unsure(self) -> bool:
-        """Whether something is left that a force explains, and what is named does not explain it or is not sure."""
-        if self.certainty() > UNSURE or not self.much():
+    def _pays(self, trial: Trial) -> bool:
+        """Whether the last of several laws was worth it, of which a wrong model can always take one more."""
+        fewer = [t for t in self.memo.values() if t.laws and _count(t) < _count(trial)]
+        return _count(trial) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
+
+    def misheld(self) -> bool:
+        """Whether the best hypothesis follows the recordings better with inputs that do the other thing in between."""
+        best = self.best.fitted
+        if self.hold_said or not self._in_time():
             return False
-        return max(self.open_after.values(), default=0.0) > HINT
+        try:
+            other = self.bench.otherwise_held().fit(best.simulator, [best.values], states=best.initial, solver=THOROUGH)
+        except InputError:
+            return False
+        return other.cost * MISHELD**2 < best.cost
 
-    def certainty(self) -> float:
-        """Confidence of the least sure name; nothing where nothing is named, or what is named does not explain."""
-        if not self.accepted or not explains(self.accepted, *left_open(self)):
-            return 0.0
-        return min(confidence(c, self) for c in self.accepted)
+    def room(self, trial: Trial) -> bool:
+        """Whether a law that left nothing but noise would be worth its prior beside a hypothesis."""
+        left, noise = (v + self.tolerance for v in (trial.whole, self.floor2))
+        most = 0.5 * self.sample.effective(0.0) * np.log(max(left / noise, 1.0))
+        return bool(most > np.log(max(len(self.alternatives), 1)) - MORE)
 
-    def much(self) -> bool:
-        """Whether enough is left to look further."""
-        excess, still = left_open(self)
-        much = excess > MORE or self.base.cost > max(LOUD**2 * self.floor2, SEEN)
-        return much or (excess > LITTLE and still > MAINLY)
+    def _in_time(self) -> bool:
+        """Whether there is time for more; said in the result where there is none."""
+        self.out_of_time = self.out_of_time or time.perf_counter() > self.until
+        return not self.out_of_time
 
-    def screened(self) -> Seen:
-        """Every law at every port beside the effects so far, scored."""
-        began = self.begin("screen")
-        seen = screen(self.bench, self.base, self.laws, self.floor.deviation, self.workers)
-        self.timed("screen", began)
-        return seen
+    def keep(self, trial: Trial) -> None:
+        """Put a trial into the memo, unless the same hypothesis fits better there."""
+        if trial.information is None:
+            trial = replace(trial, information=information(self.bench, trial.fitted, trial.laws))
+        known = self.memo.get(trial.key)
+        if known is None or trial.supersedes(known):
+            self.memo[trial.key] = trial
+            self.open.pop(trial.key, None)
+            self.held_out.pop(trial.key, None)
+            self.screens.pop(trial.key, None)
 
-    def pass_(self, number: int, seen: Seen) -> Pass:
-        """Fit what the screen lets through, and choose; `number` effects were accepted before."""
-        scored, gain = seen
-        scored = [s for s in scored if all(e.port != s.port or complements(e.law, s.law) for e in self.found())]
-        most = max((s.share for s in scored), default=0.0)
-        nothing = max(most, max(self.open_after.values(), default=0.0)) < NOTHING and self.base.cost < 0.0025
-        before = (self.base.cost, self.base.cost)
-        if nothing or not scored:
-            return Pass(None, (), tuple(scored), before, False)
-        began = time.perf_counter()
-        candidates = self._explained(number, scored, gain)
-        self.say("imitations", 0, 1)
-        missed = [*passed_over(candidates, scored), *imitated(self.bench, candidates, scored)]
-        self.say("imitations", 1, 1)
-        if missed:
-            more = self._explained(number, missed, gain, "more fits")
-            candidates = sorted([*candidates, *more], key=lambda c: c.error)
-        self.timed("fits", began, told=True)
+    def add(self, parent: Trial, again: bool = False) -> Step:
+        """Fit what the screen lets through beside a hypothesis, a few to look `again`; what may win thoroughly."""
+        scored, gain = self.screened(parent)
+        beside = parent.laws
+        scored = [s for s in scored if all(e.port != s.port or complements(e.law, s.law) for e in beside)]
+        enough = float(np.sqrt(self.floor2 + NEARLY * max(parent.whole - self.floor2, 0.0)))
+        trials = self._fitted(parent, scored, gain, enough, again)
+        more = relatives(self.bench, trials, scored) if self._in_time() else []
+        if more:
+            trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
         began = self.begin("choice")
-        best = candidates[0].error
-        # what coarse steps, and knees that steps are too coarse for, cost is not to decide
-        near = [
-            c
-            for c in candidates[:POLISHED]
-            if c.error < (NEAR_KNEE if c.knee else NEAR) * best or self.bench.too_coarse(c.fitted)
-        ]
-        with ThreadPoolExecutor(self.workers) as pool:
-            bare = pool.submit(self.errors_on_parts, self.base)
-            kept = [*pool.map(lambda c: polish(self.bench, c), near), *(c for c in candidates if c not in near)]
-            before = bare.result()
-        self._lower_floor([c.fitted for c in candidates[:5]])
-        # a law may have become the one that it refines
-        kept = list({(c.port, type(c.law)): c for c in sorted(kept, key=lambda c: -c.error)}.values())[::-1]
-        samples = self.effective_samples(kept)
-        choice = choose(kept, before, self.floor2, samples)
-        while choice is not None and not np.isfinite(choice.winner.full):  # what does not hold on everything is out
-            done = polish(self.bench, choice.winner)
-            kept = sorted((done if c is choice.winner else c for c in kept), key=lambda c: c.error)
-            choice = choose(kept, before, self.floor2, samples)
-        accepted = choice is not None and choice.gain > ROOM
-        if accepted and number:  # what is not fitted has to improve as well
-            assert choice is not None
-            accepted = believed(self, choice, before[1], number)
+        for trial in trials:
+            self.keep(trial)
+        self._polish(trials)
+        step = Step(parent, tuple(scored), tuple(trials))
+        self.steps.append(step)
+        self._finer(parent)
+        self._estimate_noise()
         self.timed("choice", began)
-        return Pass(choice, tuple(kept), tuple(scored), before, accepted, samples)
+        return step
 
-    def found(self) -> Sequence[Placed]:
-        """What stands in the ports so far."""
-        return self.base.simulator.elements[len(self.bench.simulator.elements) :]
+    def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
+        """Score every port and law beside a hypothesis; see `screen`."""
+        if parent.key not in self.screens:
+            began = self.begin("screen")
+            scored, gain = screen(self.bench, parent.fitted, self.laws, self.floor.deviation, self.workers)
+            self.screens[parent.key] = scored, gain
+            for s in scored:
+                known = self.alternatives.setdefault(s.port, ())
+                if not any(type(law) is type(s.law) for law in known):
+                    self.alternatives[s.port] = (*known, s.law)
+            self.timed("screen", began)
+        return self.screens[parent.key]
 
-    def _explained(
-        self, number: int, scored: Sequence[Scored], gain: np.ndarray | None, stage: str = "fits"
-    ) -> list[Candidate]:
-        """Full fits, smallest error first."""
-        enough = float(np.sqrt(self.floor2 + NEARLY * max(self.base.cost - self.floor2, 0.0)))
-        stage += ", second effect" if number else ""
-        return explain(
-            self.bench, scored, self.base, gain, self.workers, enough, lambda i, n, e: self.say(stage, i, n, e)
+    def _fitted(
+        self, parent: Trial, scored: Sequence[Scored], gain: np.ndarray | None, enough: float, again: bool
+    ) -> list[Trial]:
+        began = time.perf_counter()
+        stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
+        trials = self.fits.beside(
+            parent, scored, gain, enough, lambda done, total, error: self.say(stage, done, total, error), again
+        )
+        self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
+        if self.bench.struck:
+            raise KeyboardInterrupt
+        return trials
+
+    def _polish(self, trials: Sequence[Trial]) -> None:
+        """Fit the trials that may win thoroughly."""
+        kept = [self.memo[t.key] for t in trials if t.key in self.memo]
+        ranked = sorted({t.key: t for t in kept}.values(), key=self.promise, reverse=True)
+        near = [t for t in ranked[:POLISHED] if not t.thorough and t.error < BEHIND * ranked[0].error]
+        fits = self.fits
+        with ThreadPoolExecutor(self.workers) as pool:
+            done = list(pool.map(fits.polished, near))
+        for trial in done:
+            self.keep(trial)
+
+    def thorough(self, trial: Trial) -> Trial:
+        """The same hypothesis fitted thoroughly and to everything."""
+        if not self.memo[trial.key].thorough:
+            self.keep(self.fits.polished(trial))
+        return self.memo[trial.key]
+
+    def _estimate_noise(self) -> None:
+        """Take what no force and no law at any port explains of the best hypothesis' residual for noise.
+
+        Where the noise was measured, that is it. Third differences tell how much is there at least: white noise inside
+        the residual. Samples count as far as that residual is not correlated.
+        """
+        self.count = max(effective_size([e[r.skip :] for e, r in self._residual(self.best)]), FEWEST)
+        if self.floor.source != "estimated":
+            return
+        best = self.best
+        error = np.concatenate([e[r.skip :] for e, r in self._residual(best)])
+        followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
+        share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
+        rest = np.minimum(np.sqrt(share * np.mean(error**2, axis=0)), LOUDEST * self.bench.scale)
+        known, white = self.stand_in_error * self.bench.scale, white_part(best.fitted.residual)
+        self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
+
+    def _finer(self, parent: Trial) -> None:
+        """The best law of a step in its finer forms."""
+        best = self.best
+        if len(best.laws) != len(parent.laws) + 1:
+            return
+        element, base = best.element, best.fitted
+        bare = base.simulator.without_last_element()
+        local = next((s.local for step in self.steps for s in step.scored if s.port == best.port), None)
+        for kind in FINER.get(type(element.law), ()) if local is not None else ():
+            shapes = list(kind.finer_starts(best.own, local))
+            law = kind().at(shapes[0], kind().bounds(local))
+            placed = bare.with_element(element.port, law)
+            starts = [{**base.values, **element.named(shape)} for shape in shapes]
+            found = self.fits.fitted(placed, starts, len(best.laws), states=base.begin)
+            if found is not None:
+                self.keep(found)
+                self._polish([found])
+
+    def exchange(self) -> None:
+        """Put each of several laws up against all others, the rest in place, until none gives way."""
+        for _ in range(ROUNDS):
+            best = self.best
+            for element in (e for e in best.laws if not isinstance(e.law, Offset)):
+                if not self._in_time():
+                    return
+                rest = self._beside([e for e in best.laws if e is not element], best)
+                if any(step.parent.key == rest.key for step in self.steps):  # its children are known
+                    continue
+                self.keep(rest)
+                self.add(rest, again=True)
+            if self.best.key == best.key:
+                return
+
+    def add_two(self) -> None:
+        """Two laws at once beside the simulator alone: one after the other, each may hide the other."""
+        began = self.begin("two at once")
+        rest = Remainder.of(self.bench, *linearised(self.bench, self.root.fitted), self.laws)
+        fits, before = self.fits, self.best
+        found = side_by_side(
+            lambda pair: fitted_together(fits, self.root.fitted, rest, pair), promising(rest), self.workers
+        )
+        tried = [t for t in found if t is not None]
+        for trial in tried:
+            self.keep(trial)
+        self._polish(tried)
+        self.timed("two at once", began)
+        if self.best is not before:
+            self.exchange()
+
+    def _every_sensor(self) -> None:
+        """Put a filter that the best hypothesis has at an actuator into every sensor instead, as loggers have them.
+
+        What is linear and time-invariant commutes (Oppenheim & Willsky 1997, Signals and Systems, sec. 2.3).
+        """
+        best, names = self.best, self.bench.simulator.output_names
+        filters = [e for e in best.laws if e.port.startswith("actuator:") and (e.law.order or e.law.shifts)]
+        if len(names) < 2 or len(filters) != 1 or not self._in_time():
+            return
+        began, (source,) = self.begin("every sensor"), filters
+        joint = self._beside([e for e in best.laws if e is not source], best)
+        simulator, named = joint.fitted.simulator, dict[str, object](joint.fitted.values)
+        for name in names:
+            simulator = simulator.with_element(f"sensor:{name}", source.law)
+            named |= simulator.elements[-1].named(source.own(best.fitted.values))
+        found = self.fits.fitted(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
+        if found is not None:
+            self.keep(self.fits.polished(found))
+        self.timed("every sensor", began)
+
+    def _led_out(self) -> bool:
+        """Whether the simulator alone is far better from where the best law has led its parameters; then all is anew.
+
+        The refit had stayed in a local minimum, and that is what the law has made up for.
+        """
+        best = self.best
+        began = self.begin("look back")
+        try:
+            alone = self.bench.fit(
+                self.bench.simulator, [best.fitted.values], states=best.fitted.begin, solver=THOROUGH
+            )
+        except InputError:
+            return False
+        finally:
+            self.timed("look back", began)
+        if alone.cost > LED_OUT * self.root.whole:
+            return False
+        self.without, self.memo, self.open, self.held_out, self.screens, self.steps = alone, {}, {}, {}, {}, []
+        self.keep(Trial((), alone, alone.cost, alone.cost, True))
+        return True
+
+    def _beside(self, laws: Sequence[Placed], joint: Trial) -> Trial:
+        """Some laws of a hypothesis at the values that they have beside the others."""
+        simulator: Simulator = self.bench.simulator
+        named: dict[str, object] = {k: joint.fitted.values[k] for k in simulator.parameters}
+        for e in laws:
+            simulator = simulator.with_element(e.port, e.law)
+            named |= simulator.elements[-1].named(e.own(joint.fitted.values))
+        model = self.bench.model(simulator)
+        engine = make_engine(model, self.bench.engine)
+        vector = started(model, named)
+        initial = self.bench.begun(simulator, model, vector, joint.fitted.begin)
+        fitted = self.bench.result(simulator, model.parameters.unpack(vector), initial, engine, model)
+        return Trial(
+            simulator.elements[len(simulator.elements) - len(laws) :] if laws else (), fitted, fitted.cost, fitted.cost
         )
 
-    def effective_samples(self, candidates: Sequence[Candidate]) -> float:
-        """Effective samples of the best candidate's residual."""
-        best = min(candidates, key=lambda c: c.error, default=None)
-        return max(effective_size(best.fitted.residual if best else self.base.residual), FEWEST)
 
-    def errors_on_parts(self, fitted: Fitted) -> tuple[float, float]:
-        """Fit a simulator to the first parts only; mean square errors on those parts and on the rest."""
-        part = self.bench.on(heads(self.bench.recordings))
-        return judged(
-            self.bench, part.fit(fitted.simulator, [fitted.values, {}], states=fitted.initial, solver=THOROUGH)
-        )
-
-    def _lower_floor(self, fits: Sequence[Fitted]) -> None:
-        if self.floor.source == "estimated":
-            known = self.stand_in_error * self.bench.scale
-            found = [self.floor.deviation, *(np.hypot(white_part(f.residual), known) for f in fits)]
-            self.floor = Floor(np.min(found, axis=0), "estimated")
-
-    def polished(self, candidate: Candidate) -> Candidate | None:
-        """A candidate fitted to everything; None where it does not hold there."""
-        done = candidate if np.isfinite(candidate.full) else polish(self.bench, candidate)
-        return done if np.isfinite(done.full) else None
+def _count(trial: Trial) -> int:
+    """Number of a hypothesis' effects; an offset is none."""
+    return sum(not isinstance(e.law, Offset) for e in trial.laws)

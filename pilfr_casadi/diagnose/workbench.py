@@ -26,7 +26,7 @@ from ..simulators import (
     needed_substeps,
     rate_at_start,
 )
-from .standing import standing, stands
+from .equilibrium_state import equilibrium_state, resting_elements
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 HUGE, ENDLESS = 1e6, 1e20  # times the largest measured value, and mean square error, of what grows without end
@@ -293,8 +293,8 @@ class Workbench:
         for r, given in zip(self.recordings, states, strict=True):
             state = np.asarray(given, dtype=float)[:n]
             full = np.zeros(n)
-            if r.begins == "estimate" and len(state) < n and stands(simulator):
-                full = standing(simulator, self.dt / model.substeps, vector, state, r.u[0])
+            if r.begins == "estimate" and len(state) < n and resting_elements(simulator):
+                full = equilibrium_state(simulator, self.dt / model.substeps, vector, state, r.u[0])
             out.append(np.append(state, full[len(state) :]))
         return out
 

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, one_blas_thread
+from .._base import InputError, one_blas_thread, unwrapped_interrupt
 from ..engine import Engine, make_engine
 from ..models import (
     PILFR,
@@ -341,13 +341,14 @@ def run_tasks(
             ) from None
     futures = [executor.submit(function, *task) for task in tasks] if executor is not None else None
     try:
-        report(results, len(tasks))
-        for i, task in enumerate(tasks):
-            candidate = futures[i].result() if futures else function(*task)
-            results.append(candidate)
+        with unwrapped_interrupt():
             report(results, len(tasks))
-            if candidate.solution.status is Status.INTERRUPTED:
-                return results, True
+            for i, task in enumerate(tasks):
+                candidate = futures[i].result() if futures else function(*task)
+                results.append(candidate)
+                report(results, len(tasks))
+                if candidate.solution.status is Status.INTERRUPTED:
+                    return results, True
     except KeyboardInterrupt:
         for future in futures or ():
             future.cancel()

@@ -31,7 +31,7 @@ from typing import Protocol
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, unwrapped_interrupt
 from ..data import Recording
 from ..engine import Engine
 from ..models import Model, Neighbours
@@ -401,7 +401,7 @@ class _Run:
         if not np.isfinite(self.cost):
             return self._finish(Status.DIVERGED_START)
         try:
-            with handled_interrupt(self._interrupt):
+            with handled_interrupt(self._interrupt), unwrapped_interrupt():
                 status = self._iterate()
                 for k in range(MOST_RETURNS):
                     if status in ENDED and self.penalty.shrink_units(self.theta):

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         compared_residuals as compared_residuals,
         compared_spectra as compared_spectra,
         compared_traces as compared_traces,
+        compares_linear as compares_linear,
         linear_simulation as linear_simulation,
         output_over_input as output_over_input,
         plot_comparison as plot_comparison,

@@ -154,6 +154,12 @@ def limit_depth(ax: Axes, *curves: np.ndarray) -> None:
         ax.set_ylim(np.max(values) - DEPTH, np.max(values) + 0.05 * DEPTH)
 
 
+def noise_band(ax: Axes, deviation: float, label: str) -> None:
+    """Draw a deviation above and below zero, if it is known, as dashed lines."""
+    for side in (deviation, -deviation) if deviation > 0 else ():
+        ax.axhline(side, color=GREEN, linestyle="--", linewidth=1.3, label=label if side > 0 else None)
+
+
 def noise_line(ax: Axes, level: float, label: str = "noise floor") -> None:
     """Draw the noise level, if it is known, as a dashed line."""
     if level > 0:

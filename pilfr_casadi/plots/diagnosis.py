@@ -25,6 +25,7 @@ from .canvas import (
     finish,
     line,
     new_figure,
+    noise_band,
     noise_line,
     plain,
     scale_axis,
@@ -46,10 +47,7 @@ def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
     y[0] = y[0] or y[1] / np.sqrt(2)
     shown = np.ma.masked_invalid(np.maximum(rms[rows], 1e-300))
     mesh = ax.pcolormesh(edges, y, shown, norm=LogNorm(top / 100, top), cmap=SHADES, rasterized=True)
-    bar = ax.figure.colorbar(mesh, ax=ax, pad=0.02, extend="min")
-    bar.set_label("residual [% of the output's deviation]", fontsize=FONT - 1)
-    _readable_log(bar.ax.yaxis, top / 100, top)
-    bar.ax.tick_params(labelsize=FONT - 1)
+    _colour_bar(ax, mesh, "residual [% of the output's deviation]", extend="min")
     ax.set_yscale("log")
     ax.set_facecolor(PALE_GREY)
     finish(ax, label, "frequency [Hz]", "residual by frequency and amplitude")
@@ -164,16 +162,16 @@ def port_law_map(
     without: float | None = None,
     floor: float | None = None,
 ) -> Axes:
-    """Draw the error on held-out data for every port and law; grey where no fit was made.
+    """Draw the error after the fit for every port and law; grey where no fit was made.
 
     Parameters
     ----------
     rows : sequence of (port, law, error)
-        Validation errors; the smallest of several forms of a law is drawn.
+        Errors; the smallest of several forms of a law is drawn.
     best : sequence of (port, law)
         Pairs to frame.
     without, floor : float, optional
-        Ends of the scale: validation error of the simulator without a law, and error of noise alone.
+        Ends of the scale: error of the simulator without a law, and error of noise alone.
     """
     ports = list(dict.fromkeys(p for p, _, _ in rows))
     smallest: dict[tuple[str, str], float] = {}
@@ -207,10 +205,7 @@ def port_law_map(
     ax.set_facecolor(PALE_GREY)
     for side in ax.spines.values():
         side.set_visible(False)
-    bar = figure.colorbar(mesh, ax=ax, pad=0.02)
-    bar.set_label("error on data not fitted [%]", fontsize=FONT - 1)
-    _readable_log(bar.ax.yaxis, low, top)
-    bar.ax.tick_params(labelsize=FONT - 1)
+    _colour_bar(ax, mesh, "error after the fit [%]")
     return ax
 
 
@@ -223,6 +218,14 @@ def _wrap(name: str, most: int = 12, lines: int = 3) -> str:
         rows[-1] += piece
     short = [row if len(row) <= most else row[: most - 1] + "…" for row in rows if row]
     return plain("\n".join([*short[: lines - 1], "…"] if len(short) > lines else short))
+
+
+def _colour_bar(ax: Axes, mesh: Any, label: str, **style: Any) -> None:
+    """Draw the logarithmic scale of a map's colours beside it."""
+    bar = ax.figure.colorbar(mesh, ax=ax, pad=0.02, **style)
+    bar.set_label(label, fontsize=FONT - 1)
+    _readable_log(bar.ax.yaxis, mesh.norm.vmin, mesh.norm.vmax)
+    bar.ax.tick_params(labelsize=FONT - 1)
 
 
 def _readable_log(axis: Any, low: float, high: float) -> None:
@@ -321,9 +324,7 @@ def force_remainder(x: Signal, left: Signal, std: np.ndarray) -> Axes:
     mean = np.bincount(index, left.values, minlength=20)[known] / count[known]
     middle = np.bincount(index, x.values, minlength=20)[known] / count[known]
     ax.plot(middle / sx, mean / sy, "o-", color=INK, linewidth=1.6, markersize=3.5, label="mean")
-    for side in (1, -1):
-        ax.axhline(side * float(np.median(std)) / sy, color=GREEN, linestyle="--", linewidth=1.3,
-                   label="± one standard deviation" if side > 0 else None)  # fmt: skip
+    noise_band(ax, float(np.median(std)) / sy, "± one standard deviation")
     ax.set_ylim(*_robust_limits(left.values / sy))
     return finish(ax, across, up, "recovered − law")
 

@@ -34,6 +34,7 @@ from .canvas import (
     line,
     mask_divergence,
     new_figure,
+    noise_band,
     plain,
     scale_axis,
     with_unit,
@@ -120,7 +121,7 @@ def traces(
     size, label = scale_axis(recording.outputs[output], y[part], plain_unit)
     line(ax, recording.t[part], y[part] / size, "measured", BLUE, linewidth=3.2, alpha=0.55)
     models = [("this model", fit.simulate(recording), INK)]
-    if _compares(fit):
+    if compares_linear(fit):
         models.insert(0, ("linear model", linear_simulation(fit, recording), VERMILLION))
     for model, simulated, colour in models:
         error, note = _without_offset(mask_divergence((simulated[:, output] - y), np.ptp(y)), np.ptp(y), plain_unit)
@@ -185,20 +186,34 @@ def spectrum(
     input, one for each realization; by default from `recording` itself, if it is periodic. The noise level is estimated
     from several periods, the total distortion (noise and nonlinear distortion) from several realizations.
     """
-    ax, y = axes_or_new(ax), _column(recording.y, output, "output")
-    name = recording.outputs[output]
+    y = _column(recording.y, output, "output")
+    signals = [("measured output", y, BLUE), *_residuals(fit, recording, output)]
+    periodic = steady if steady is not None else [recording] if recording.period else []
+    unit = _unit(fit, recording, recording.outputs[output])
+    return _draw_densities(recording, output, unit, signals, _levels(periodic, output), ax)
+
+
+def _draw_densities(
+    recording: Recording,
+    output: int,
+    unit: str,
+    signals: Sequence[tuple[str, np.ndarray, Any]],
+    levels: Sequence[tuple[str, np.ndarray, np.ndarray, str]],
+    ax: Axes | None,
+) -> Axes:
+    """Draw amplitude densities of signals (label, (M,), colour) and levels (label, frequency, density, colour)."""
+    ax = axes_or_new(ax)
     curves: list[np.ndarray] = []
-    for label, signal, colour in [("measured output", y, BLUE), *_residuals(fit, recording, output)]:
+    for label, signal, colour in signals:
         f, power = amplitude_density(signal, recording)
         curves.append(decibel(power))
         line(ax, f, curves[-1], label, colour, linewidth=1.1)
-    periodic = steady if steady is not None else [recording] if recording.period else []
-    for label, f_level, level, colour in _levels(periodic, output):
+    for label, f, level, colour in levels:
         curves.append(decibel(level))
-        line(ax, f_level, curves[-1], label, colour, linewidth=1.4, linestyle="--" if colour == GREEN else ":")
+        line(ax, f, curves[-1], label, colour, linewidth=1.4, linestyle="--" if colour == GREEN else ":")
     ax.set_xscale("log")
     limit_depth(ax, *curves)
-    unit = _unit(fit, recording, name)
+    name = recording.outputs[output]
     return finish(ax, "frequency [Hz]", f"{name} [dB re {unit or '1'}/√Hz]", recording.name)
 
 
@@ -278,7 +293,7 @@ def _without_offset(error: np.ndarray, span: float, unit: str) -> tuple[np.ndarr
     return error - np.mean(known), f", less {np.mean(known):.3g} {unit}".rstrip()
 
 
-def _compares(fit: PlottedFit) -> bool:
+def compares_linear(fit: PlottedFit) -> bool:
     """Tell whether there is a linear model to compare with."""
     return fit.linear is not None and fit.model.n_w > 0
 
@@ -293,7 +308,7 @@ def _column(values: np.ndarray, index: int, role: str) -> np.ndarray:
 def _residuals(fit: PlottedFit, recording: Recording, output: int) -> list[tuple[str, np.ndarray, str]]:
     """List (label, residual, colour) of the linear model, where the fit has one, and of the fit."""
     out = [(*_labelled_residual("this model", recording, fit.simulate(recording), output), INK)]
-    if _compares(fit):
+    if compares_linear(fit):
         out.insert(0, (*_labelled_residual("linear", recording, linear_simulation(fit, recording), output), VERMILLION))
     return out
 
@@ -372,30 +387,18 @@ def compared_residuals(
     size, up = scale_axis(f"simulated − measured {r.outputs[output]}", np.nan_to_num(kept[0][1]) if kept else y, unit)
     for label, e, colour in kept:
         line(ax, r.t, e / size, label, colour, linewidth=0.8)
-    if floor > 0:
-        for side in (2 * floor, -2 * floor):
-            ax.axhline(side / size, color=GREEN, linewidth=1.2, linestyle="--", label="± 2 noise" if side > 0 else None)
+    noise_band(ax, 2 * floor / size, "± 2 noise")
     ax.margins(x=0.01)
     return finish(ax, "time [s]", up, r.name, 3)
 
 
 def compared_spectra(r: Recording, simulated: Simulated, output: int, unit: str, floor: float) -> Axes:
     """Draw amplitude densities of the output, of each residual, and of white noise of deviation `floor`."""
-    ax = axes_or_new(None)
-    y, curves = r.y[:, output], []
+    y = r.y[:, output]
     signals = [("measured", y, BLUE)]
     for (label, v), colour in zip(simulated, SIMULATED_COLOURS, strict=False):
         if v is not None:
             signals.append((f"left {label}", v[:, output] - y, colour))
-    f = np.array([0.1, 1.0])
-    for label, signal, colour in signals:
-        f, power = amplitude_density(signal, r)
-        curves.append(decibel(power))
-        line(ax, f, curves[-1], label, colour, linewidth=1.2)
-    if floor > 0:
-        level = np.full(2, 10 * np.log10(2 * r.dt * floor**2))
-        curves.append(level)
-        line(ax, f[[0, -1]], level, "noise floor (white)", GREEN, linestyle="--", linewidth=1.5)
-    ax.set_xscale("log")
-    limit_depth(ax, *curves)
-    return finish(ax, "frequency [Hz]", f"{r.outputs[output]} [dB re {unit or '1'}/√Hz]", r.name)
+    ends = amplitude_density(y, r)[0][[0, -1]]
+    white = [("noise floor (white)", ends, np.full(2, 2 * r.dt * floor**2), GREEN)] if floor > 0 else []
+    return _draw_densities(r, output, unit, signals, white, None)

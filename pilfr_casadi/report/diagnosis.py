@@ -19,7 +19,7 @@ from ..laws import display_name
 from ..plots import Signal
 from ..simulators import Port
 from . import diagnosis_tables as tables
-from .page import Block, Code, Page, Picture, Section, Text
+from .page import Block, Code, Page, Picture, Section, Text, numbered
 
 MOST_DRAWN = 3  # outputs and recordings that are drawn; the tables have all of them
 WIDE_MAP = 6  # ports from which the map of ports and laws fills the page
@@ -185,10 +185,10 @@ def _hidden_forces(case: _Case) -> list[Block]:
     if d.verdict != "unexplained":
         return out
     search, rows = d.evidence.get("search"), tables.candidates_by_pass(d)
-    nearest = search.passes[0].choice if search is not None and search.passes else None
+    nearest = max(search.steps[0].trials, key=search.evidence) if search is not None and search.steps else None
     if nearest is not None:
-        fitted, port = nearest.winner.fitted, nearest.winner.port
-        number, name = len(fitted.simulator.elements) - 1, f"{display_name(nearest.winner.law.id)} (the nearest law)"
+        fitted, port = nearest.fitted, nearest.port
+        number, name = len(fitted.simulator.elements) - 1, f"{display_name(nearest.law.id)} (the nearest law)"
         out += _force_blocks(case, fitted, port, number, name)
     elif rows:
         out += _force_blocks(case, case.before, rows[0][0]["port"], None, "")
@@ -196,7 +196,7 @@ def _hidden_forces(case: _Case) -> list[Block]:
     if table is not None:
         out.append(table)
         freest = str(table.rows[0][0])
-        if nearest is None or freest != nearest.winner.port:
+        if nearest is None or freest != nearest.port:
             out += _force_blocks(case, case.before, freest, None, "")
     return out
 
@@ -204,18 +204,14 @@ def _hidden_forces(case: _Case) -> list[Block]:
 def _learned_force(case: _Case, learned: Learned) -> list[Block]:
     """Draw a learned force over the local coordinate and its rate, with the nearest named laws."""
     port = case.bench.simulator.port(learned.port)
-    _, _, channel = learned.port.partition(":")
-    across = channel if port.series and channel else "local coordinate z"
     force = Signal("learned force w", learned.force, port.unit)
     laws = [(f"{display_name(n.law)}, off by {100 * n.error:.2g} %", n.force) for n in learned.nearest]
     text = (
         f"The blue points are the learned force at {learned.port} along the training recordings. The lines are the "
         "named laws that come nearest to it, drawn along the stretch where it is strongest."
     )
-    drawn = [(Signal(across, learned.z, port.across_unit), "its local coordinate")]
-    if np.ptp(learned.dz) > 0:
-        unit = f"{port.across_unit}/s" if port.across_unit else ""
-        drawn.append((Signal(f"rate of {across}", learned.dz, unit), "its rate"))
+    coordinate, rate = _local_signals(port, learned.z, learned.dz)
+    drawn = [(coordinate, "its local coordinate"), *([(rate, "its rate")] if rate else [])]
     return [
         Text(text),
         *(
@@ -227,6 +223,14 @@ def _learned_force(case: _Case, learned: Learned) -> list[Block]:
             for x, name in drawn
         ),
     ]
+
+
+def _local_signals(port: Port, z: np.ndarray, dz: np.ndarray) -> tuple[Signal, Signal | None]:
+    """Label a port's local coordinate and its rate; no rate where it is zero throughout."""
+    channel = port.name.partition(":")[2]
+    across, unit = channel if port.series and channel else "local coordinate z", port.across_unit
+    rate = Signal(f"rate of {across}", dz, f"{unit}/s" if unit else "") if np.ptp(dz) > 0 else None
+    return Signal(across, z, unit), rate
 
 
 def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, name: str) -> list[Block]:
@@ -250,17 +254,15 @@ def _force_blocks(case: _Case, fitted: Fitted, port: str, number: int | None, na
 
 def _force_pictures(h: HiddenForce, port: Port, name: str) -> list[Block]:
     """Draw a force over its local coordinate, rate and time, and the rest after subtracting the law."""
-    kind, _, channel = h.port.partition(":")
+    kind = h.port.partition(":")[0]
     label = {"actuator": "added to the input", "sensor": "added to the output"}.get(kind, "force w")
-    across, alt = channel if port.series and channel else "local coordinate z", f"Recovered force at {h.port}"
-    x, force = Signal(across, h.z, port.across_unit), Signal(label, h.force, port.unit)
-    cloud = functools.partial(plots.force_cloud, title=h.port, name=name)
-    drawn = [(cloud(x, force, h.law_z, h.law), f"{h.port}, over {across}.", f"{alt} over its local coordinate.")]
-    if np.ptp(h.dz) > 0:
-        rate = Signal(f"rate of {across}", h.dz, f"{port.across_unit}/s" if port.across_unit else "")
+    (x, rate), force = _local_signals(port, h.z, h.dz), Signal(label, h.force, port.unit)
+    alt, cloud = f"Recovered force at {h.port}", functools.partial(plots.force_cloud, title=h.port, name=name)
+    drawn = [(cloud(x, force, h.law_z, h.law), f"{h.port}, over {x.name}.", f"{alt} over its local coordinate.")]
+    if rate:
         drawn.append((cloud(rate, force, h.law_dz, h.law), "The same force over the rate.", f"{alt} over its rate."))
     elif port.series and len(h.law):  # a law in series: its output over its input
-        acting = Signal(f"{across} as it acts", h.z + h.force, port.across_unit)
+        acting = Signal(f"{x.name} as it acts", h.z + h.force, port.across_unit)
         caption = "The output of the law over its input."
         drawn.append((cloud(x, acting, h.law_z, h.law_z + h.law), caption, f"{alt}: output over input."))
     caption = "The same force over time, around its largest value. The band is the uncertainty due to noise."
@@ -278,15 +280,14 @@ def _candidates(d: Diagnosis) -> list[Block]:
         named = d.effects[k : k + 1] if k else d.effects[: max(len(d.effects), 1)]
         chosen = {(e.port, e.law) for e in named}
         title = "All fitted pairs of port and law"
-        if k:
-            before = " and ".join(f"{display_name(e.law)} at {e.port}" for e in d.effects[:k]) or "the first law"
-            title = f"Second pass, with {before} in place"
-        cells = [(r["port"], display_name(r["law"]), tables.held_out(r)) for r in rows]
+        if before := tables.in_place(d, k):
+            title = f"Fitted beside {before}"
+        cells = [(r["port"], display_name(r["law"]), tables.score(r)) for r in rows]
         framed = [(port, display_name(law)) for port, law in chosen]
-        axes = plots.port_law_map(cells, framed, tables.held_out_before(d, k), d.floor["nrmse"] or None)
+        axes = plots.port_law_map(cells, framed, tables.error_before(d, k), d.floor["nrmse"] or None)
         caption = (
-            f"{title}: the error on the part of the training recordings that was not fitted, in %, by port and law "
-            "(best form). Grey: excluded by the quick test before the fits."
+            f"{title}: the error on the training recordings after the fit, in %, by port and law (best form). "
+            " Grey: excluded by the quick test before the fits."
         )
         wide = len({r["port"] for r in rows}) > WIDE_MAP
         out += [Picture(axes, caption, "Errors by port and law.", wide)]
@@ -305,7 +306,7 @@ def _proof(case: _Case) -> list[Block]:
         )
     role, recordings = ("test", d.test) if d.test else ("training", d.train)
     for k, r in enumerate(recordings[:MOST_DRAWN]):
-        label = r.name or (role if len(recordings) == 1 else f"{role} {k + 1}")
+        label = r.name or numbered(role, k, len(recordings))
         compared = d.compare(r)
         compared = replace(compared, recording=compared.recording.with_(name=label))
         for i in range(min(r.n_y, MOST_DRAWN)):

@@ -139,7 +139,7 @@ def _array(value: Any) -> np.ndarray:
 def candidates_by_pass(diagnosis: Diagnosis) -> list[list[dict[str, Any]]]:
     """Return the candidates of each pass, best first; in the second pass the first effect is in place."""
     search = diagnosis.evidence.get("search")
-    sizes = [len(p.candidates) for p in search.passes] if search is not None else []
+    sizes = [len(step.trials) for step in search.steps] if search is not None else []
     rows = list(diagnosis.candidates)
     if sum(sizes) != len(rows):
         sizes = [len(rows)]
@@ -149,24 +149,29 @@ def candidates_by_pass(diagnosis: Diagnosis) -> list[list[dict[str, Any]]]:
 
 
 def score(row: Mapping[str, Any]) -> float:
-    """Rank a candidate: geometric mean of its errors on the fitted part and on the rest."""
-    a, b = (np.inf if row.get(k) is None else float(row[k]) for k in ("nrmse_train", "nrmse_validation"))
-    return float(np.sqrt(a) * np.sqrt(b)) if np.isfinite(a * b) else np.inf
-
-
-def held_out(row: Mapping[str, Any]) -> float:
-    """Return a candidate's error on the held-out part of the training recordings."""
-    value = row.get("nrmse_validation")
+    """Rank a candidate: its error after the fit."""
+    value = row.get("nrmse_train")
     return np.inf if value is None else float(value)
 
 
-def held_out_before(diagnosis: Diagnosis, number: int) -> float | None:
-    """Return this error of the simulator before a pass; None if it is unknown."""
+def error_before(diagnosis: Diagnosis, number: int) -> float | None:
+    """Return the error of the simulator that the candidates of a pass were put into; None if it is unknown."""
+    parent = _parent(diagnosis, number)
+    return None if parent is None else float(parent.error)
+
+
+def in_place(diagnosis: Diagnosis, number: int) -> str:
+    """Name the laws that were in place in a pass; empty for the simulator alone."""
+    parent = _parent(diagnosis, number)
+    laws = () if parent is None else parent.laws
+    return " and ".join(f"{display_name(e.law.id)} at {e.port}" for e in laws)
+
+
+def _parent(diagnosis: Diagnosis, number: int) -> Any:
+    """Return the hypothesis that the candidates of a pass were put into; None if it is unknown."""
     search = diagnosis.evidence.get("search")
-    passes = [p for p in search.passes if p.candidates] if search is not None else []
-    if number >= len(passes) or not np.isfinite(passes[number].before[1]):
-        return None
-    return float(np.sqrt(passes[number].before[1]))
+    steps = [step for step in search.steps if step.trials] if search is not None else []
+    return steps[number].parent if number < len(steps) else None
 
 
 def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, str]], title: str) -> list[Block]:
@@ -189,11 +194,11 @@ def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, s
             ]
         )
     emphasis = [] if winner is None else [winner]
-    columns = ["law", "port", "error, fitted part", "error, other part", "margin", "ΔBIC"]
+    columns = ["law", "port", "error of the fit", "error, held-out blocks", "margin", "ΔBIC"]
     note = (
-        "Each law is fitted together with the simulator's own parameters to the first part of the recordings and "
-        "judged on the other part. Margin: error (geometric mean of both parts) divided by the winner's. ΔBIC: below "
-        "zero is better than no law."
+        "Each law is fitted together with the simulator's own parameters. Where a model is wrong, the likeliest also "
+        "predict blocks that they are not fitted to. Margin: error of the fit divided by the winner's. ΔBIC: twice the "
+        "log evidence lost; below zero is better than no law."
     )
     out: list[Block] = [
         Table(columns, cells[:RANKED], caption=title, note=note, emphasis=[i for i in emphasis if i < RANKED])
@@ -208,9 +213,10 @@ def candidate_tables(rows: Sequence[Mapping[str, Any]], chosen: set[tuple[str, s
 def flexible_table(diagnosis: Diagnosis) -> Table | None:
     """Tabulate the share of the mismatch that a flexible force at each port could explain."""
     search = diagnosis.evidence.get("search")
-    if search is None or not search.open_before:
+    opened = search.flexible(search.root) if search is not None else {}
+    if not opened:
         return None
-    rows = [[port, percent(share)] for port, share in sorted(search.open_before.items(), key=lambda item: -item[1])]
+    rows = [[port, percent(share)] for port, share in sorted(opened.items(), key=lambda item: -item[1])]
     note = (
         "The flexible force is a smooth function of the local coordinate and its rate, not a law of the catalogue. "
         "With few outputs, several ports can explain the mismatch: look in the pictures for the port where the force "

@@ -26,7 +26,7 @@ from .fit_sections import (
     output_pictures,
     parameter_blocks,
 )
-from .page import Block, Code, Page, Picture, Section, Table, Text, render
+from .page import Block, Code, Page, Picture, Section, Table, Text, numbered, render
 
 Records = Recording | Sequence[Recording]
 RUNAWAY = 1e3  # NRMSE above which the page reports that the simulation diverges
@@ -58,8 +58,8 @@ def fit_page(
 ) -> Page:
     """Fill the page of a fit; see `fit_report`."""
     used, judged = as_recordings(train), as_recordings(tests) if isinstance(tests, Recording) or len(tests) else ()
-    named = [(r.with_(name=r.name or _number("training", i, used)), "training") for i, r in enumerate(used)]
-    named += [(r.with_(name=r.name or _number("test", i, judged)), "test") for i, r in enumerate(judged)]
+    named = [(r.with_(name=r.name or numbered("training", i, len(used))), "training") for i, r in enumerate(used)]
+    named += [(r.with_(name=r.name or numbered("test", i, len(judged))), "test") for i, r in enumerate(judged)]
     rows = [row for recording, role in named for row in _errors(fit, recording, role)]
     shown = [recording for recording, role in named if role == "test"] or [named[0][0]]
     sections = [
@@ -83,20 +83,15 @@ def fit_page(
     )
 
 
-def _number(word: str, i: int, recordings: Sequence[Recording]) -> str:
-    return word if len(recordings) == 1 else f"{word} {i + 1}"
-
-
 def _errors(fit: Fit, recording: Recording, role: str) -> list[dict[str, Any]]:
     """Compute the errors of one recording, output by output, over the scored samples (`Fit.scored_from`)."""
     recording = plots.as_scored(fit, recording)
     y, y_hat = recording.y, fit.simulate(recording)
     scored = y[recording.skip :]
     rms, sigma, extent = rmse_per_output(y, y_hat, recording.skip), np.std(scored, axis=0), np.ptp(scored, axis=0)
-    compared = fit.linear is not None and fit.model.n_w > 0
     linear = (
         rmse_per_output(y, plots.linear_simulation(fit, recording), recording.skip)
-        if compared
+        if plots.compares_linear(fit)
         else np.full(len(rms), np.nan)
     )
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -46,6 +46,11 @@ def uncertain_text(value: float, error: float) -> str:
     return "\u00a0±\u00a0".join(texts)
 
 
+def numbered(word: str, i: int, count: int) -> str:
+    """Name the i-th of some recordings without a name: "test 2", or "test" if it is the only one."""
+    return word if count == 1 else f"{word} {i + 1}"
+
+
 @dataclass(frozen=True)
 class Text:
     """A paragraph."""

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import pilfr_casadi
-from pilfr_casadi._base import Clock, deferred_interrupt, time_limit, worker_pool
+from pilfr_casadi._base import Clock, deferred_interrupt, time_limit, unwrapped_interrupt, worker_pool
 
 TRAIN = Path(pilfr_casadi.__file__).parent / "cli" / "demo_data" / "train.csv"
 PILFR = [sys.executable, "-c", "import sys; from pilfr_casadi.cli import main; sys.exit(main(sys.argv[1:]))"]
@@ -27,6 +27,13 @@ def test_an_interrupt_is_deferred():
         steps.append("went on")
     assert steps == ["went on"]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_only_interrupts_are_unwrapped():
+    with pytest.raises(KeyboardInterrupt), unwrapped_interrupt():
+        raise SystemError("of an extension") from KeyboardInterrupt()
+    with pytest.raises(SystemError, match="another"), unwrapped_interrupt():
+        raise SystemError("another") from ValueError()
 
 
 def test_a_time_limit_interrupts_only_what_it_limits():

@@ -43,7 +43,7 @@ def test_it_writes_nothing_unless_asked(capsys, files):
 def test_wrong_files_get_a_sentence(capsys, files):
     rig, train = files / "rig.py", files / "rig_train.csv"
     refused(capsys, "check", train, rig, says="is not a simulator file")
-    refused(capsys, "check", rig, says="No recording was given")
+    refused(capsys, "check", rig, says="No training recording was given")
     refused(capsys, "check", rig, rig, says="given as a recording")
     refused(capsys, "check", rig, train, train, says="given twice")
     refused(capsys, "check", rig, train, "--inputs", "force", says="its own names")

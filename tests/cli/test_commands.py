@@ -19,6 +19,7 @@ from command_line import fit_arguments, refused, run, sentence, write_csv
 import pilfr_casadi as pilfr
 from pilfr_casadi._base import ordered_digest
 from pilfr_casadi.cli import main, name_options
+from pilfr_casadi.identify import multistart
 
 
 @pytest.fixture
@@ -424,6 +425,32 @@ def test_an_interrupted_run_writes_the_best_so_far(tmp_path):
     assert process.returncode == 130
     assert "interrupted" in out
     assert json.loads((tmp_path / "out" / "model.json").read_text())["parameters"]["A"]
+
+
+def wrapped_interrupt(*_, **__):
+    """As from `DM.__array__`, which goes on with the KeyboardInterrupt of Ctrl-C pending."""
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt as cause:
+        raise SystemError("<method 'full'> returned a result with an exception set") from cause
+
+
+@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.parametrize("done", [0, 1])
+def test_an_interrupt_that_casadi_wraps_is_one_still(capsys, tmp_path, train, monkeypatch, done):
+    """In the first start there is only the linear model to write, in the second one that of the first."""
+    starts = [multistart.explore] * done
+    monkeypatch.setattr(multistart, "explore", lambda *task: (starts.pop() if starts else wrapped_interrupt)(*task))
+    status, out, _ = run(capsys, *fit_arguments(train, tmp_path, "--operators", 2, "--starts", 3))
+    assert status == 130 and "interrupted" in out
+    model = json.loads((tmp_path / "out" / "model.json").read_text())
+    assert ("r" in model["parameters"]) == bool(done)
+
+
+def test_a_wrapped_interrupt_before_any_work_is_one_still(capsys, tmp_path, train, monkeypatch):
+    monkeypatch.setattr("pilfr_casadi.cli.models.make_folder", wrapped_interrupt)
+    status, _, err = run(capsys, *fit_arguments(train, tmp_path))
+    assert status == 130 and "Interrupted" in err
 
 
 @pytest.mark.usefixtures("blank_figures")

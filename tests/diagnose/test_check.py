@@ -47,6 +47,14 @@ def test_every_answer_prints_and_is_standard_json(checked):
             assert spot.sentence in str(found) and spot.sentence[0].strip() and spot.sentence.endswith("."), rig.name
 
 
+def test_a_diagnosis_tells_the_same_blind_spots(checked):
+    rig, found = checked["free scale"]
+    diagnosis = pilfr.diagnose(rig.simulator, rig.train, laws=(), workers=1)
+    assert [b.sentence for b in diagnosis.blind_spots] == [b.sentence for b in found.blind_spots]
+    assert all(b.sentence in str(diagnosis) for b in found.blind_spots)
+    assert json.loads(json.dumps(diagnosis.to_dict()))["blind_spots"][0]["kind"] == found.blind_spots[0].kind
+
+
 def test_a_further_record_is_named_by_the_gravest_blind_spot(checked):
     says = {
         "one amplitude": "A second amplitude of force",

@@ -1,8 +1,5 @@
 """Physics lost on one side or in one direction: friction that depends on it, a tank that spills; and the verdict."""
 
-from dataclasses import replace
-from types import SimpleNamespace
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -10,19 +7,14 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.candidate import Candidate, simpler
 from pilfr_casadi.diagnose.linearise import Probe, locals_of, run
 from pilfr_casadi.diagnose.screen import _gain
-from pilfr_casadi.diagnose.second_effect import not_named
-from pilfr_casadi.diagnose.verdict import _gone, judge
 from pilfr_casadi.laws import (
     CubicStiffness,
     DirectionalFriction,
     HertzContact,
     Local,
     PiecewiseStiffness,
-    PreslidingFriction,
-    PreslidingStribeckFriction,
     QuinticStiffness,
 )
 from pilfr_casadi.optimise import GaussNewton
@@ -163,98 +155,3 @@ def test_a_fit_goes_on_from_given_states():
     glance = GaussNewton(max_iterations=1)
     away = [np.array([80.0, 80.0])]
     assert bench.fit(held, states=away, solver=glance).cost > 2 * bench.fit(held, states=one.begin, solver=glance).cost
-
-
-@pytest.mark.parametrize(("margin", "verdict"), [(2.0, "missing-physics"), (1.2, "unexplained")])
-def test_a_clear_margin_carries_a_name_that_leaves_much(margin, verdict):
-    judged = {"error": 0.4, "head": 0.16, "tail": 0.16, "held_back": False, "doubtful": False}
-    winner = SimpleNamespace(port="guide", law=SimpleNamespace(id="coulomb_friction"), **judged)
-    choice = SimpleNamespace(winner=winner, margin=margin, alike=(), common=None, readings=1)
-    search = SimpleNamespace(
-        accepted=[choice],
-        passes=[SimpleNamespace(choice=choice, before=(1.0, 1.0))],
-        floor2=1e-6,
-        stand_in_error=0.0,
-        floor=SimpleNamespace(source="estimated"),
-        base=SimpleNamespace(cost=0.1, simulator=SimpleNamespace(parameters={}, elements=())),
-        bench=SimpleNamespace(simulator=SimpleNamespace(parameters={}, elements=())),
-        without=SimpleNamespace(cost=1.0),
-        open_before={"guide": 0.9},
-        open_after={"guide": 0.2},
-    )
-    assert judge(search, [])[0] == verdict
-    search.open_after = {"guide": 0.8}  # what is left is a force at the port: the law is another
-    assert judge(search, [])[0] == "unexplained"
-    search.open_after = {"guide": 0.0}
-    search.base.cost = 0.5  # half of the excess is left: no margin carries that
-    assert judge(search, [])[0] == "unexplained"
-
-
-@pytest.mark.parametrize(
-    ("sure", "margin", "doubtful", "verdict", "told"),
-    [
-        ((0.07, 0.05), 1.2, False, "unexplained", ()),
-        ((0.07, 0.05), 1.5, False, "missing-physics", ("delay at a",)),
-        ((0.07, 0.05), 1.5, True, "unexplained", ()),
-        ((0.3, 0.05), 1.2, False, "missing-physics", ("delay at a",)),
-        ((0.3, 0.7), 1.2, False, "missing-physics", ("delay at a", "delay at b")),
-    ],
-)
-def test_two_names_that_are_hardly_sure_are_no_answer_and_a_second_is_named_where_it_is_sure(
-    sure, margin, doubtful, verdict, told, monkeypatch
-):
-    law = SimpleNamespace(id="delay")
-    choices = [
-        SimpleNamespace(
-            winner=SimpleNamespace(port=p, law=law, name=(p, law.id), doubtful=doubtful),
-            margin=margin,
-            common=None,
-            sure=c,
-        )
-        for p, c in zip(("a", "b"), sure, strict=True)
-    ]
-    monkeypatch.setitem(judge.__globals__, "confidence", lambda choice, search: choice.sure)
-    search = SimpleNamespace(
-        accepted=choices,
-        floor2=1e-6,
-        stand_in_error=0.0,
-        floor=SimpleNamespace(source="repeats"),
-        base=SimpleNamespace(cost=0.01),
-        bench=SimpleNamespace(simulator=SimpleNamespace(parameters={}, elements=())),
-        without=SimpleNamespace(cost=1.0),
-        open_before={"a": 0.9},
-        open_after={"a": 0.0},
-    )
-    found, sentence = judge(search, [])
-    assert found == verdict
-    if told:
-        assert f"most likely leaves out {' and '.join(told)};" in sentence
-        assert ("Something more is missing" in sentence) is (len(told) == 1)
-    monkeypatch.setitem(not_named.__globals__, "mean_nrmse", lambda bench, fitted: 0.1)
-    notes = not_named(search)
-    assert [g.channel for g in notes] == ([] if len(told) == 2 else ["b"])
-    assert all("delay at b brings the error to 0.1" in g.sentence for g in notes)
-
-
-def test_only_what_is_the_users_own_is_told_to_come_out_as_zero():
-    """An offset that was looked for is none of it."""
-    offset = SimpleNamespace(prefix="actuator:u.", law=SimpleNamespace(id="offset"))
-    drag = SimpleNamespace(prefix="guide.", law=SimpleNamespace(id="coulomb_friction"))
-    own = SimpleNamespace(parameters=dict.fromkeys(("d", "actuator:u.w_0", "guide.F_c")), elements=(offset, drag))
-    fits = [SimpleNamespace(values=dict.fromkeys(own.parameters, v)) for v in (1.0, 0.0)]
-    search = SimpleNamespace(bench=SimpleNamespace(simulator=own), without=fits[0], base=fits[1])
-    assert _gone(search, 1) == " Beside it, d and guide.F_c come out as zero."
-
-
-def test_a_refinement_that_comes_out_as_zero_is_the_law_that_it_refines():
-    """Stribeck's curve without its rise is plain dry friction."""
-    bench = Workbench.of(axis(), [moved(0)], "zero")
-    law = PreslidingStribeckFriction().at({"k_t": 800.0, "k_e": 0.0, "r": 1e-3, "v_s": 0.1}, {"k_e": (0.0, np.inf)})
-    placed = bench.simulator.with_element("guide", law.at({}, {"k_t": (0.0, np.inf), "r": (1e-5, 0.1)}))
-    own = bench.fit(placed, solver=GaussNewton(max_iterations=1))
-    held = {k: v if "k_e" not in k else 0 * v for k, v in own.values.items()}
-    candidate = Candidate("guide", law, replace(own, values=held), 1.0, 1.0, 4)
-    found = simpler(bench, candidate)
-    assert type(found.law) is PreslidingFriction
-    assert found.size == 2
-    assert found.fitted.cost < own.cost

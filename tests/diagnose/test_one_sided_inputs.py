@@ -1,15 +1,12 @@
 """A valve that only opens: dead zones seen from one side, offsets that are none, inputs that the recorder clipped."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
-from pilfr_casadi.diagnose import conclusion
-from pilfr_casadi.diagnose.clipping import clipped, clipped_input
 from pilfr_casadi.diagnose.preparation import prepare
+from pilfr_casadi.diagnose.recording_faults import clipped, clipped_input
 
 DT = 0.02
 
@@ -97,17 +94,6 @@ def test_what_lies_beyond_a_limit_is_told_from_what_is_felt():
     gate = clipped_input(bench, ready, 1.0)
     assert gate is not None and gate.channel == "drive" and "explains 9" in gate.sentence
     assert clipped_input(bench, ready, 0.001) is None  # a law leaves less
-
-
-@pytest.mark.parametrize(("verdict", "most"), [("unexplained", 1.0), ("missing-physics", 0.07), ("complete", None)])
-def test_laws_that_explain_nothing_do_not_stand_against_a_lost_input(monkeypatch, verdict, most):
-    asked = []
-    monkeypatch.setattr(conclusion, "confidence", lambda *_: 0.1)
-    monkeypatch.setattr(conclusion, "left_open", lambda *_: (0.07, 0.9))
-    monkeypatch.setattr(conclusion, "clipped_input", lambda bench, without, remains: asked.append(remains))
-    search = SimpleNamespace(accepted=["a law"], bench=None, without=None)
-    conclusion._lost_input(search, verdict)
-    assert asked == ([] if most is None else [most])
 
 
 def _prepared(u, y):

@@ -76,7 +76,7 @@ def test_progress_tells_each_stage_and_the_best_never_rises(diagnosed):
 
 
 def test_a_search_with_the_other_hold_is_named_in_the_progress():
-    from pilfr_casadi.diagnose.stages import Stages
+    from pilfr_casadi._base import Stages
 
     seen = []
     first = Stages(lambda *given: seen.append(given))

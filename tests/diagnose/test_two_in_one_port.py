@@ -5,7 +5,7 @@ from diagnosis_rig import OFF, recordings, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.diagnose.kinship import complements
+from pilfr_casadi.diagnose.relatives import complements
 
 FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
 RIPPLE = laws.PeriodicForce(values={"a": 5.0, "b": 3.0, "L": 0.02})

@@ -254,10 +254,13 @@ def test_a_cost_of_nothing_is_converged():
     assert found.status is Status.CONVERGED and found.iterations == 0
 
 
-def test_interrupted_between_two_iterations(case):
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_interrupted_between_two_iterations(case, wrapped):
     model, record, _ = case
 
     def strike(entry):
+        if entry.number == 2 and wrapped:
+            raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
         if entry.number == 2:
             raise KeyboardInterrupt
 

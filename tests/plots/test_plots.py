@@ -417,5 +417,5 @@ def test_the_map_of_ports_and_laws_shows_the_errors_it_is_given():
         ("ground", "drift"): 25.0,
     }
     assert [key for key, t in shown.items() if t.get_fontweight() == "bold"] == [("ground", "hysteresis")]
-    assert ax.figure.axes[1].get_ylabel() == "error on data not fitted [%]"
+    assert ax.figure.axes[1].get_ylabel() == "error after the fit [%]"
     pixels(ax.figure)

@@ -1,0 +1,73 @@
+"""Check the arguments of `diagnose` and `check` where they enter, before any long work."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, listed
+from ..data import HOLDS, SAME_STEP, Recording, as_recordings, check_for_identification
+from ..identify import match_channels
+from ..laws import CATALOGUE, SCALABLE, Law, scaled
+from ..simulators import Simulator, as_simulator
+
+FEWEST_SAMPLES = 20  # of all training recordings together
+
+
+def matched(
+    simulator: Any, train: Recording | Sequence[Recording], hold: str | None, excited: bool = True
+) -> tuple[Simulator, tuple[Recording, ...]]:
+    """Return the simulator, and the recordings with its channels in its order.
+
+    With `excited`, recordings in which no input ever changes are refused.
+
+    Raises
+    ------
+    InputError
+        If the hold is unknown, or simulator and recordings do not fit each other.
+    """
+    if hold not in HOLDS:
+        raise InputError(f"hold={hold!r} was given; use 'zero', 'linear' or None.")
+    given = as_recordings(train)
+    simulator = as_simulator(simulator, given)
+    recordings = [match_channels(simulator, r) for r in given]
+    return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited)
+
+
+def matched_tests(
+    simulator: Simulator, test: Recording | Sequence[Recording] | None, train: Sequence[Recording]
+) -> tuple[Recording, ...]:
+    """Return the test recordings with the simulator's channels; refuse training data and other steps."""
+    tests = tuple(match_channels(simulator, r) for r in as_recordings(test)) if test is not None else ()
+    for t in tests:
+        if any(len(r) == len(t) and np.array_equal(r.u, t.u) and np.array_equal(r.y, t.y) for r in train):
+            raise InputError("A test recording equals a training recording; give data the fit has not seen.")
+        if abs(t.dt / train[0].dt - 1) > SAME_STEP:
+            raise InputError(f"The test recording's step is {t.dt:g} s, the training's {train[0].dt:g} s; resample it.")
+    return tests
+
+
+def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
+    """Return the laws as a tuple, by default the catalogue; refuse what is no class of laws."""
+    for law in laws or ():
+        if not (isinstance(law, type) and issubclass(law, Law)):
+            raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
+    return CATALOGUE if laws is None else tuple(laws)
+
+
+def with_scaled(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
+    """Return the laws, and some of them scaled by each input that the equations do not read."""
+    return (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
+
+
+def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:
+    """Refuse a largest amplitude of something that is no input, and one that is not positive."""
+    for name, most in (limits or {}).items():
+        if name not in simulator.inputs:
+            raise InputError(
+                f"A limit was given for {name!r}, which is no input; there are {listed(simulator.inputs)}."
+            )
+        if not most > 0:
+            raise InputError(f"The limit of {name} is {most!r}; give the largest amplitude allowed, a positive number.")

@@ -1,0 +1,207 @@
+"""Explanations other than a law at a declared port: a pinned parameter, an undeclared port, a machine that changed.
+
+- A spring or a damper in a port where the simulator has one is the same as another value of that one. It comes out as
+  missing only where the value is fixed, or its bounds do not let it go there; then that is what has to be said. With a
+  value whose bounds are in another unit no law says anything of the machine: it is looked for powers of ten away.
+- A mismatch that no declared port explains may have a sure name in the equation of a state.
+- One set of values for every recording is put up against one for each, or one for the first halves and one for the
+  second. Where these follow far better, what differs is said; why, only the engineer knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .._base import InputError
+from ..data import Recording
+from ..laws import display_name
+from ..simulators import states_along
+from .floor import effective_size
+from .gates import Gate, opened_at_the_start
+from .posterior import Posterior, posterior
+from .proof import deviations
+from .search import Search
+from .verdict import SURE
+from .workbench import THOROUGH, Fitted, Workbench
+
+LIKE = 0.03  # share by which errors differ that say the same
+AT_FLOOR, WELL_ABOVE = 1.15, 3.0  # times the noise that counts as being at it, and as being far from it
+HELPLESS = 0.5  # error of a refit that says little of a machine: a value may be powers of ten away
+FAR = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)
+LINEAR = ("linear_stiffness", "viscous_damping")
+
+SHARE = 0.25  # of the mean square that values of their own leave at most
+ROOM = 12.0  # nats that they have to gain beyond what their number costs
+CLEARLY = 5.0  # standard errors by which a value differs
+NAMED = 3  # values told
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """A parameter, the value it would take, the simulator fitted with it, and what is said of it."""
+
+    name: str
+    value: float
+    fitted: Fitted
+    sentence: str
+
+
+def held_value(search: Search, answer: Posterior) -> Held | None:
+    """Find the held parameter that, let go, does as well as what was named; None where there is none.
+
+    One that is fixed is asked for only by a linear law, which is the same as another value of it.
+    """
+    named = [e.element for e in answer.effects]
+    linear = len(named) == 1 and named[0].law.id in LINEAR
+    bench, without = search.bench, search.root.fitted
+    if not linear and without.cost < HELPLESS**2:
+        return None
+    as_well = (1 + LIKE) ** 2 * answer.best.whole if named else np.inf
+    enough = min(as_well, (WELL_ABOVE if named else AT_FLOOR) ** 2 * search.floor2)  # else something is missing
+    best: tuple[str, Fitted] | None = None
+    for name, p in bench.simulator.parameters.items():
+        stays = bool((linear and np.all(p.fixed)) or np.all(without.at_bound(name)))
+        if p.size != 1 or not stays or float(p.value) == 0:  # what is nothing is not there
+            continue
+        free = replace(p, fixed=False, bounds=(0.0 if float(p.value) > 0 else -np.inf, np.inf))
+        simulator = bench.simulator.with_parameters({**bench.simulator.parameters, name: free})
+        far = () if linear else FAR
+        starts = [without.values, *({**without.values, name: p.value * by} for by in far)]
+        try:
+            found = bench.fit(simulator, starts, states=without.initial, solver=THOROUGH)
+        except InputError:
+            continue
+        except KeyboardInterrupt:
+            search.interrupted = True
+            return None
+        if bench.struck:
+            search.interrupted = True
+            return None
+        (low, high), value = p.bounds, float(found.values[name])
+        beyond = bool(np.all(p.fixed)) or not np.all((low <= value) & (value <= high))
+        if beyond and (best is None or found.cost < best[1].cost):
+            best = name, found
+    if best is None or best[1].cost > enough:
+        return None
+    name, found = best
+    p, value = bench.simulator.parameters[name], float(found.values[name])
+    unit = f" {p.unit}" if p.unit else ""
+    kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
+    words = " and ".join(f"the {display_name(c.law.id)} at {c.port}" for c in named)
+    like = f", no further off than with {words}" if named else ""
+    sentence = (
+        f"Nothing is missing but a value: with {name} = {value:.5g}{unit}, which is {kept} "
+        f"{float(without.values[name]):.4g}{unit}, the refitted simulator's error falls from {without.cost**0.5:.3g} "
+        f"to {found.cost**0.5:.3g} of the outputs' deviation{like}; let it go there, or say what takes its place."
+    )
+    return Held(name, value, found, sentence)
+
+
+def beyond_the_ports(search: Search) -> Sequence[Gate]:
+    """Note a mismatch that no declared port explains and that has a sure name in the equation of a state."""
+    ports = search.bench.simulator.ports
+    if not ports or search.interrupted:
+        return ()
+    open_ = replace(search.bench.simulator, ports=())
+    bench = replace(search.bench, simulator=open_)
+    try:
+        without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
+        other = Search(bench, without, search.floor, search.laws, search.workers, search.say).run(1)
+    except InputError:
+        return ()
+    except KeyboardInterrupt:
+        search.interrupted = True
+        return ()
+    search.interrupted, found = other.interrupted, posterior(other)
+    if found.sure <= SURE or not found.effects[0].name[0].startswith("equation:"):
+        return ()
+    state, law = found.effects[0].name[0].removeprefix("equation:"), found.effects[0].name[1]
+    sentence = (
+        f"No declared port reaches it: in the equation of {state}, {display_name(law)} explains it (refitted with it, "
+        f"the error is {found.best.error:.3g} of the outputs' deviation). Declare the port that it acts through."
+    )
+    return (Gate(state, "undeclared", law.replace("_", " "), sentence, False),)
+
+
+Group = tuple[str, Sequence[Recording], Sequence[np.ndarray]]  # what it is called, recordings, and first states
+
+
+def varying(search: Search) -> tuple[Gate, ...]:
+    """Note values that differ between the recordings, or else between the halves of each."""
+    bench, whole = search.bench, search.root.fitted
+    if search.interrupted or not np.any(whole.model.parameters.free):
+        return ()
+    try:
+        for groups, where in ((_each(bench, whole), "the recordings"), (_halves(bench, whole), "the halves")):
+            found = _told(search, groups, where) if len(groups) > 1 else None
+            if found is not None:
+                return (found,)
+    except KeyboardInterrupt:
+        search.interrupted = True
+    return ()
+
+
+def _each(bench: Workbench, whole: Fitted) -> list[Group]:
+    names = [r.name or f"recording {i + 1}" for i, r in enumerate(bench.recordings)]
+    return [(n, (r,), (x,)) for n, r, x in zip(names, bench.recordings, whole.initial, strict=True)]
+
+
+def _halves(bench: Workbench, whole: Fitted) -> list[Group]:
+    first, second, middle = list[Recording](), list[Recording](), list[np.ndarray]()
+    for r, x in zip(bench.recordings, whole.initial, strict=True):
+        cut = (r.skip + len(r)) // 2
+        first.append(opened_at_the_start(r.slice(0, cut)))
+        second.append(opened_at_the_start(r.slice(cut)))
+        middle.append(states_along(whole.model, whole.model.drive(r), whole.vector, x)[cut * whole.model.substeps])
+    return [("first", first, whole.initial), ("second", second, middle)]
+
+
+def _told(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
+    bench, whole = search.bench, search.root.fitted
+    fits, benches = list[Fitted](), list[Workbench]()
+    for _, recordings, states in groups:
+        part = bench.on(recordings)
+        try:
+            fitted = part.fit(whole.simulator, [whole.values], states=states, model=whole.model, engine=whole.engine)
+        except InputError:
+            return None
+        fits.append(fitted)
+        benches.append(part)
+    sizes = [sum(len(r) - r.skip for r in part.recordings) for part in benches]
+    cost = float(np.average([f.cost for f in fits], weights=sizes))
+    begun = sum(len(part.recordings) for part in benches) - len(bench.recordings)
+    more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * begun
+    n = effective_size([e for f in fits for e in f.residual])
+    gained = 0.5 * n * np.log(whole.cost / max(cost, search.floor2)) - 0.5 * more * np.log(max(n, 2.0))
+    if cost > SHARE * whole.cost or gained < ROOM:
+        return None
+    values = _apart(whole, fits, benches)
+    if not values:
+        return None
+    listed = "; ".join(f"{name}: {' / '.join(f'{v:.4g}' for v in found)}" for name, found in values)
+    called = " / ".join(name for name, *_ in groups)
+    sentence = (
+        f"With values of their own, {where} ({called}) are followed to {cost**0.5:.3g} of the outputs' deviation "
+        f"instead of {whole.cost**0.5:.3g} ({listed}): something differs between them, such as a setting, a "
+        "temperature or a level that the simulator does not know."
+    )
+    return Gate(", ".join(name for name, _ in values), "varying", [v for _, v in values], sentence, False)
+
+
+def _apart(whole: Fitted, fits: Sequence[Fitted], benches: Sequence[Workbench]) -> list[tuple[str, list[float]]]:
+    """List the parameters whose values differ most clearly, the clearest first."""
+    spreads = [deviations(part, f) for part, f in zip(benches, fits, strict=True)]
+    out = list[tuple[float, str, list[float]]]()
+    for name, p in whole.simulator.parameters.items():
+        if np.size(p.value) != 1 or np.all(p.fixed):
+            continue
+        values = [float(np.ravel(f.values[name])[0]) for f in fits]
+        errors = [float(np.ravel(s[name])[0]) for s in spreads]
+        error = np.sqrt(np.nanmean(np.square(errors))) if np.any(np.isfinite(errors)) else np.inf
+        clear = np.ptp(values) / max(error, 1e-300)
+        if clear > CLEARLY:
+            out.append((clear, name, values))
+    return [(name, values) for _, name, values in sorted(out, reverse=True)[:NAMED]]

@@ -1,0 +1,384 @@
+"""The diagnosis, step by step: how an answer comes about."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .._base import InputError, Progress, Stages, one_blas_thread, processors, whole
+from ..data import Recording
+from ..laws import Law, readable_unit
+from ..simulators import Simulator
+from .arguments import check_laws, check_limits, matched, matched_tests, with_scaled
+from .blind_spots import BlindSpot
+from .checkup import assess
+from .correction import Correction, as_named, find_correction
+from .experiment import next_experiment, placebo
+from .gates import Gate, hold_note, said_hold
+from .mismatch_map import mismatch
+from .offset import Offset, as_it_came_out, offset_gates, without_idle_offsets
+from .other_explanations import beyond_the_ports, held_value, varying
+from .posterior import Named, Posterior, names, posterior
+from .preparation import CHECKS, Prepared, prepare
+from .proof import deviations, mean_nrmse, parameter_table, test_errors
+from .recording_faults import clipped_input
+from .residual_spectrum import tones
+from .result import Diagnosis, Effect
+from .search import Search
+from .surrogates import told_of_surrogate
+from .trials import Trial
+from .verdict import SURE, Verdict, judge
+from .workbench import Fitted
+
+AS_GIVEN = 0.5  # ratio of mean squares from which a search on channels that were not shifted replaces the first one
+SEARCHING = 0.7  # share of the remaining time for the search; the rest is for the correction
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What is diagnosed, and how; see `diagnose`."""
+
+    simulator: Simulator
+    recordings: Sequence[Recording]
+    laws: Sequence[type[Law]]
+    hold: str | None
+    engine: str
+    workers: int
+    most_effects: float
+    stand_in_error: float
+    deadline: float
+    say: Stages
+
+    @property
+    def hold_said(self) -> bool:
+        """Whether somebody said what inputs do between samples."""
+        return said_hold(self.simulator, self.recordings, self.hold) is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Conclusion:
+    """What a search came to.
+
+    Attributes
+    ----------
+    fitted : Fitted
+        The corrected simulator; the refitted one where there is nothing to correct.
+    correction : Correction
+        What `fitted` has beside the refitted simulator.
+    effects : tuple of Named
+        The effects that are named.
+    let_go : str
+        The fixed parameter whose other value explains what a law was named for.
+    """
+
+    verdict: Verdict
+    gates: tuple[Gate, ...]
+    fitted: Fitted
+    correction: Correction
+    effects: tuple[Named, ...] = ()
+    let_go: str = ""
+
+
+@one_blas_thread
+def diagnose_in_steps(
+    simulator: Any,
+    train: Recording | Sequence[Recording],
+    *,
+    test: Recording | Sequence[Recording] | None,
+    hold: str | None,
+    laws: Sequence[type[Law]] | None,
+    effects: int | None,
+    limits: Mapping[str, float] | None,
+    workers: int | None,
+    engine: str,
+    stand_in_error: float,
+    time_limit: float | None,
+    progress: Progress | None,
+) -> Diagnosis:
+    """Carry out `diagnose`, whose parameters these are.
+
+    1. The arguments are checked, and channels are matched by name.
+    2. The recordings are checked for faults, the simulator is refitted, and the noise is measured (`preparation`).
+    3. The search fits hypotheses, sets of laws in ports, and keeps all of them (`search`).
+    4. All hypotheses are weighed; verdict, effects and corrected simulator are chosen (`conclude`).
+    5. Test recordings, placebos and standard errors are the proof (`proof`); they change nothing above.
+    """
+    began = time.perf_counter()
+    workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
+    most_effects = np.inf if effects is None else whole(effects, "effects", 0)
+    if time_limit is not None and not time_limit > 0:
+        raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
+    say = Stages(progress or (lambda stage, done, total, best: None))
+    simulator, recordings = matched(simulator, train, hold)
+    tests = matched_tests(simulator, test, recordings)
+    check_limits(simulator, limits)
+    tried = with_scaled(check_laws(laws), simulator)
+    deadline = np.inf if time_limit is None else began + float(time_limit)
+    request = Request(simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say)
+    ready, search = _searched_both_holds(request)
+    concluding = search.begin("conclusion")
+    found = conclude(search, (*ready.gates, *search.gates))
+    search.timed("conclusion", concluding)
+    return _build_diagnosis(request, ready, search, found, tests, limits, began)
+
+
+def _searched_both_holds(request: Request) -> tuple[Prepared, Search]:
+    """Search; where nobody said what inputs do between samples and it matters, take the hold with the smaller error."""
+    ready, search = _searched(request)
+    if search.interrupted or not search.misheld():
+        return ready, search
+    hold = search.bench.otherwise_held().hold
+    try:
+        other, again = _searched(replace(request, hold=hold, say=request.say.under("other hold: ")))
+    except InputError:  # it cannot be run so
+        return ready, search.settled(request.most_effects)
+    only_refitted = again.interrupted and len(again.memo) < 2
+    if again.best.whole > search.best.whole or only_refitted:
+        search.interrupted = again.interrupted
+        return ready, search.settled(request.most_effects)
+    ratio = float(np.sqrt(search.best.whole / max(again.best.whole, 1e-300)))
+    return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
+
+
+def _searched(request: Request) -> tuple[Prepared, Search]:
+    """Prepare and search; once more without shifting channels that seemed early, where that leaves far less."""
+    ready, search = _searched_once(request, shift_early=True)
+    seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
+    if not seemed_early or search.interrupted or search.out_of_time or not search.room(search.best):
+        return ready, search
+    other, again = _searched_once(request, shift_early=False)
+    if again.best.whole < AS_GIVEN * search.best.whole:
+        return other, again
+    search.interrupted = again.interrupted
+    return ready, search
+
+
+def _searched_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
+    """Check and correct the recordings, refit the simulator, measure the noise, and search from there."""
+    began = time.perf_counter()
+    ready = prepare(
+        request.simulator,
+        request.recordings,
+        request.hold,
+        request.engine,
+        request.workers,
+        early=shift_early,
+        say=request.say,
+    )
+    floor = ready.floor
+    search = Search(
+        ready.bench,
+        ready.without,
+        floor.beside(request.stand_in_error * ready.bench.scale) if request.stand_in_error else floor,
+        (*request.laws, Offset),
+        request.workers,
+        request.say,
+        hold_said=request.hold_said,
+        stand_in_error=request.stand_in_error,
+        until=began + SEARCHING * (request.deadline - began),
+        deadline=request.deadline,
+        times={CHECKS: time.perf_counter() - began},
+    )
+    return ready, search.run(request.most_effects)
+
+
+def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
+    """Draw the conclusion from a search.
+
+    1. The posterior gives a verdict.
+    2. A parameter that is fixed at a wrong value, or an input that was clipped, may explain as much as a law.
+    3. Named laws compete with a learned force on held-out data. Where the force predicts better, the name is refuted.
+    4. For what has no name, undeclared ports and varying values are looked at, and the best predictor is handed back.
+
+    After Ctrl-C and at the time limit 2 and the first half of 4 are left out; after Ctrl-C a name that was found stays,
+    and else the refitted simulator is handed back.
+    """
+    answer, interrupted = posterior(search), search.interrupted
+    finished = not (interrupted or search.out_of_time)
+    gates = (*gates, *tones(search.bench, answer.best.fitted))
+    verdict = judge(search, answer, gates)
+    if verdict.kind in ("missing-physics", "unexplained") and finished:
+        found = _without_a_law(search, answer, verdict, gates)
+        if found is not None:
+            return found
+    corrected: tuple[Correction, Fitted] | None = None
+    if verdict.kind == "missing-physics":
+        correction, fitted = corrected = find_correction(search, answer, named=True)
+        kept = {(e.port, e.law.id, e.law.form) for e in answer.best.laws} <= set(correction.elements)
+        answer = answer.beside_learned(correction.shares["learned"] if kept else 1.0)
+        verdict = judge(search, answer, gates)
+        if verdict.kind == "missing-physics":
+            said = f"{verdict.sentence} {correction.sentence}" if correction.learned else verdict.sentence
+            zeros = offset_gates(answer.best.laws, answer.best.fitted.values)
+            return Conclusion(Verdict(verdict.kind, said), (*gates, *zeros), fitted, correction, answer.effects)
+    if verdict.kind == "unexplained" and finished:
+        gates = (*gates, *beyond_the_ports(search), *varying(search))
+    refitted = search.root.fitted
+    if interrupted and verdict.kind != "recording-fault":
+        sentence = (
+            "The search was interrupted before it came to an answer; refitted, the simulator is off by "
+            f"{mean_nrmse(search.bench, refitted):.3g} of the outputs' deviation."
+        )
+        verdict = Verdict(verdict.kind, sentence)
+    elif verdict.kind == "unexplained" and not search.interrupted:
+        correction, fitted = corrected or find_correction(search, answer)
+        verdict = Verdict(verdict.kind, f"{verdict.sentence} {correction.sentence}")
+        return Conclusion(verdict, gates, fitted, correction)
+    return Conclusion(verdict, gates, refitted, as_named(search, refitted))
+
+
+def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: Sequence[Gate]) -> Conclusion | None:
+    """A parameter held at a wrong value, or an input that was clipped, where that explains as much as laws do."""
+    held = held_value(search, answer)
+    if held is not None:
+        corrected = as_named(search, held.fitted)
+        return Conclusion(Verdict("complete", held.sentence), tuple(gates), held.fitted, corrected, (), held.name)
+    named = verdict.kind == "missing-physics"
+    if named and answer.sure >= SURE:
+        return None
+    refitted = search.root.fitted
+    left = answer.best.whole / search.root.whole if named else 1.0
+    clipping = clipped_input(search.bench, refitted, left)
+    if clipping is None:
+        return None
+    fault = Verdict("recording-fault", clipping.sentence)
+    return Conclusion(fault, (*gates, clipping), refitted, as_named(search, refitted))
+
+
+def _build_diagnosis(
+    request: Request,
+    ready: Prepared,
+    search: Search,
+    found: Conclusion,
+    tests: tuple[Recording, ...],
+    limits: Mapping[str, float] | None,
+    began: float,
+) -> Diagnosis:
+    """Put the search's conclusion and its proof into a Diagnosis."""
+    proving = time.perf_counter()
+    request.say("proof", 0, 1)
+    bench, without, after = search.bench, search.root.fitted, found.fitted
+    if found.effects and not np.isfinite(found.correction.after):  # what was compared is handed back as it is
+        after = without_idle_offsets(bench, after)
+    std = deviations(bench, after)
+    errors = {
+        "train": {"nominal": ready.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
+        "test": test_errors(bench, tests, found.gates, request.simulator, without, after) if tests else None,
+    }
+    effects = tuple(_effect(search, e, after, std) for e in found.effects)
+    settled = found.verdict.kind in ("complete", "recording-fault") or (
+        min((e.confidence for e in effects), default=0) > SURE
+    )
+    experiment = _next(search, found.effects, limits)
+    request.say("proof", 1, 1)
+    now = time.perf_counter()
+    return Diagnosis(
+        verdict=found.verdict.kind,
+        sentence=found.verdict.sentence,
+        effects=effects,
+        candidates=tuple(
+            _row(search, search.memo.get(t.key, t), step.parent) for step in search.steps for t in step.trials
+        ),
+        gates=(
+            *told_of_surrogate(request.stand_in_error),
+            *as_it_came_out(found.gates, after, std, bool(effects), settled),
+        ),
+        mismatch=mismatch(
+            bench.recordings,
+            without.residual,
+            [e + r.y for e, r in zip(without.residual, bench.recordings, strict=True)],
+            search.floor.deviation,
+            bench.scale,
+        ),
+        parameters=parameter_table(request.simulator, without, after, std),
+        errors=errors,
+        floor={"nrmse": search.floor.nrmse(bench.scale), "source": search.floor.source},
+        corrected=after.corrected(),
+        refitted=without.corrected(),
+        hold=bench.hold,
+        train=bench.recordings,
+        test=tests,
+        next_experiment=experiment,
+        seconds=now - began,
+        times={**search.times, "proof": now - proving},
+        interrupted=search.interrupted,
+        out_of_time=search.out_of_time,
+        evidence={"search": search, "without": without, "after": after},
+        substeps=after.model.substeps,
+        let_go=found.let_go,
+        correction=found.correction,
+        blind_spots=_blind_spots(request, search),
+    )
+
+
+def _blind_spots(request: Request, search: Search) -> tuple[BlindSpot, ...]:
+    """What the recordings cannot reveal of the refitted simulator; nothing where that cannot be told."""
+    bench = search.bench
+    with suppress(InputError, np.linalg.LinAlgError):
+        return assess(bench, search.root.fitted, bench.hold if request.hold_said else "").blind_spots
+    return ()
+
+
+def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
+    bench, law = search.bench, named.element.law
+    own, unrelated = placebo(bench, search.root.fitted, named.element.port, law)
+    element = next(e for e in fitted.simulator.elements if e.port == named.element.port and type(e.law) is type(law))
+    port = bench.simulator.port(element.port)
+    w_unit, z_unit = port.unit, port.across_unit
+    if port.series:  # what it is in series with
+        channel = port.name.partition(":")[2]
+        w_unit = z_unit = bench.recordings[0].units.get(channel) or f"[{channel}]"
+    values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
+    shown: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        unit = readable_unit(element.law.units[name.removeprefix(element.prefix)], w_unit, z_unit)
+        flat = np.ravel(value)
+        for i, v in enumerate(flat):
+            label = name.removeprefix(element.prefix) + (f"[{i}]" if len(flat) > 1 else "")
+            error = float(np.ravel(std[name])[i])
+            shown[label] = {"value": float(v), "std": error if np.isfinite(error) else None, "unit": unit}
+    return Effect(
+        port=element.port,
+        law=law.id,
+        confidence=named.confidence,
+        sentence=law.sentence,
+        equation=law.equation,
+        parameters=shown,
+        indistinguishable=tuple(named.alike),
+        form=law.form,
+        placebo={"own": own, "unrelated": unrelated},
+    )
+
+
+def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
+    """The experiment that would separate the first tie, where there is one."""
+    for effect in effects:
+        if effect.alike:
+            name, other = next(iter(effect.alike.items()))
+            one = max((t for t in search.memo.values() if effect.name in names(t)), key=search.evidence)
+            best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits)
+            tied = [list(effect.name), list(name)]
+            if best is not None:
+                return {"between": tied, **best}
+            sentence = "No sine or triangle within the allowed amplitude separates them beyond the noise."
+            return {"between": tied, "sentence": sentence}
+    return None
+
+
+def _row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
+    """A candidate as in diagnosis.json."""
+    held_out = search.held_out.get(t.key)
+    gain = search.evidence(t) - search.evidence(parent)
+    return {
+        "port": t.port,
+        "law": t.law.id,
+        "form": t.law.form,
+        "nrmse_train": t.error,
+        "nrmse_validation": held_out.error if held_out and np.isfinite(held_out.error) else None,
+        "delta_bic": -2 * gain,
+    }

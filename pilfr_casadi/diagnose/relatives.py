@@ -1,0 +1,212 @@
+"""Further hypotheses that what came out best asks for, and that the screen did not let through.
+
+Each is a pair of port and law with start values of its own:
+
+- a special case of the best law, and a law that the best one refines;
+- a law with one more term than one that came near, from its values;
+- a resonance whose frequency is known: as a mass carried along at another port, or in place of a delay or a lag;
+- a law of a signal that takes time, at the other end of a simulator that is nearly linear;
+- a simple law whose force is most like the one that a flexible law makes along its port's own signal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..laws import Attached, Delay, Lag, Law, Local, Resonance, unit_forces
+from ..models import map_points
+from ..simulators import in_series, signals, states_along
+from .evidence import FLEXIBLE
+from .screen import Scored, start_values
+from .trials import Trial
+from .workbench import Fitted, Workbench
+
+AHEAD = 1.5  # times the best error beyond which a relative is worth another start
+BEHIND = 3.0  # times the best error of a delay or a lag that may stand for a resonance
+DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in its place
+LIKEST = 3  # simple laws whose force is like that of a flexible one
+SEEN = 4000  # samples that forces are compared on, about
+HUGE = 1e60  # signals that a simulation which diverges comes to
+# a law -> laws that are special cases of it
+CONTAINS = {
+    "hysteresis": ("backlash", "coulomb_friction", "linear_stiffness"),
+    "stribeck_friction": ("coulomb_friction",),
+    "clearance": ("piecewise_stiffness", "linear_stiffness"),
+    "piecewise_stiffness": ("linear_stiffness",),
+    "creep": ("linear_stiffness", "viscous_damping"),
+    "extra_mode": ("linear_stiffness", "viscous_damping"),
+}
+
+
+def complements(one: Law, other: Law) -> bool:
+    """Whether two laws of a port are different physics: one opposes motion, the other is a curve of position.
+
+    A constant offset may stand beside any other law.
+    """
+    if "offset" in (one.id, other.id):
+        return one.id != other.id
+    rubs, springs = sorted((one, other), key=lambda law: not law.dissipative)
+    apart = rubs.dissipative and not springs.dissipative and springs.reads() == {"z"} and not hasattr(springs, "step")
+    return apart and springs.order == 0 and rubs.id not in ("creep", "extra_mode")
+
+
+def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Pairs of port and law to be fitted as well; trials and what was scored are best first."""
+    if not trials:
+        return []
+    found = [
+        entry for some in (_special, _carried, _late, _other_end, _refined, _plainer) for entry in some(trials, scored)
+    ]
+    return [*found, *_imitated(bench, trials, scored)]
+
+
+def _near(trials: Sequence[Trial]) -> set[tuple[str, type[Law]]]:
+    """Pairs that came near."""
+    return {(t.port, type(t.law)) for t in trials if t.error < AHEAD * trials[0].error}
+
+
+def _special(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Special cases of the best law at its port, which may have been left where a few steps led."""
+    best, near = trials[0], _near(trials)
+    cases = CONTAINS.get(best.law.id, ())
+    return [s for s in scored if s.port == best.port and s.law.id in cases and (s.port, type(s.law)) not in near]
+
+
+def _carried(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Carried masses at every port where none came near, from the frequency and damping of the best resonance."""
+    best, near = trials[0], _near(trials)
+    if not {"W", "D"} <= set(best.law.units) or isinstance(best.law, Attached):
+        return []
+    found = {k: float(np.ravel(best.own[k])[0]) for k in ("W", "D")}
+    return _started((s for s in scored if isinstance(s.law, Attached) and (s.port, type(s.law)) not in near), [found])
+
+
+def _late(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Damped resonances where a delay or a lag of T came near: at low frequencies they are 2 D / W late."""
+    late: dict[str, float] = {}
+    for t in trials:
+        if isinstance(t.law, Delay | Lag) and t.error < BEHIND * trials[0].error and t.port not in late:
+            late[t.port] = float(np.ravel(t.own["T"])[0])
+    out = []
+    for port, time in late.items():
+        starts = [{"W": 2 * damping / time, "D": damping} for damping in DAMPED]
+        out += _started((s for s in scored if isinstance(s.law, Resonance) and s.port == port), starts)
+    return out
+
+
+def _other_end(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """The best law of a signal that takes time, at every actuator and sensor where it did not come near."""
+    best, near = trials[0], _near(trials)
+    if not in_series(best.port) or not (best.law.order or best.law.shifts):
+        return []
+    times = {k: best.own[k] for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")}
+    same = (s for s in scored if type(s.law) is type(best.law) and in_series(s.port))
+    return _started((s for s in same if (s.port, type(s.law)) not in near), [times])
+
+
+def _started(entries: Iterator[Scored], starts: Sequence[dict[str, Any]]) -> list[Scored]:
+    """The first entry of each pair, started at some values besides its own."""
+    out: dict[tuple[str, type], Scored] = {}
+    for s in entries:
+        more = [{**own, **start} for own in s.starts for start in starts]
+        out.setdefault((s.port, type(s.law)), replace(s, starts=(*more, *s.starts)))
+    return list(out.values())
+
+
+def _refined(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Laws that came near with one more term, where that came out worse or was not tried: from their values."""
+    least = {(t.port, type(t.law)): t.error for t in reversed(trials)}
+    out: dict[tuple[str, type], Scored] = {}
+    for t in trials:
+        if t.error > AHEAD * trials[0].error:
+            continue
+        for s in scored:
+            key = s.port, type(s.law)
+            wider = s.port == t.port and isinstance(s.law, type(t.law)) and type(s.law) is not type(t.law)
+            if wider and least.get(key, np.inf) > t.error and key not in out:
+                start = s.law.starts_as(t.law, t.own)
+                out |= {key: replace(s, starts=(start,))} if start else {}
+    return list(out.values())
+
+
+def _plainer(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """The law that one which came near refines, where that was not tried or came out far worse: from its values."""
+    near, out = _near(trials), dict[tuple[str, type], Scored]()
+    for t in trials:
+        plain: Any = type(t.law).__base__
+        key = t.port, plain
+        if key in near or t.error > AHEAD * trials[0].error or not getattr(plain, "units", {}):
+            continue
+        if set(plain.units) <= set(t.law.units) and key not in out:
+            own = {k: t.own[k] for k in plain.units}
+            for s in scored:
+                if (s.port, type(s.law)) == key:
+                    out[key] = replace(s, starts=(own,))
+                    break
+    return list(out.values())
+
+
+def _imitated(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Simple laws at the best one's port whose force is most like its, started there; none where it is simple."""
+    best, near = trials[0], _near(trials)
+    if best.law.id not in FLEXIBLE:
+        return []
+    entries: dict[type[Law], Scored] = {}
+    for s in scored:
+        if s.port == best.port and s.law.id not in FLEXIBLE and (s.port, type(s.law)) not in near:
+            entries.setdefault(type(s.law), s)
+    local = felt(bench, best.fitted, best.port)
+    if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):  # nor nan, as of a root below zero
+        return []
+    values, law = best.own, best.law
+    shape = {k: v for k, v in values.items() if k not in law.strength}
+    strengths = np.concatenate([np.ravel(values[k]) for k in law.strength]) if law.strength else np.ones(1)
+    force = unit_forces(law.at(values), local, [shape])[:, 0] @ strengths
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = [(*_likest(s.law, local, force), s) for s in entries.values()]
+    ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:LIKEST]
+    return [replace(s, starts=(start, *s.starts)) for _, start, s in ranked]
+
+
+def felt(bench: Workbench, fitted: Fitted, port: str) -> Local:
+    """What a port feels along the fitted runs of all recordings."""
+    simulator, model = fitted.simulator, fitted.model
+    index = [p.name for p in simulator.all_ports()].index(port)
+    own, parts = signals(simulator), []
+    for r, state in zip(bench.recordings, fitted.initial, strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):
+            x = states_along(model, model.drive(r), fitted.vector, state)[:: model.substeps, : len(simulator.states)]
+            slope = np.gradient(r.u, r.dt, axis=0) if bench.hold == "linear" and len(r) > 2 else np.zeros_like(r.u)
+            z, dz, *_ = map_points(own, x, r.u, slope, r.dt * np.arange(len(r))[:, None], fitted.vector)
+        parts.append((z[:, index, 0], dz[:, index, 0]))
+    lengths = tuple(len(z) for z, _ in parts)
+    z, dz = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    inputs = dict(zip(simulator.inputs, np.concatenate([r.u for r in bench.recordings]).T, strict=True))
+    rest = tuple(r.begins == "zero" for r in bench.recordings)
+    return Local(z, dz, bench.dt, lengths, inputs=inputs, from_zero=rest)
+
+
+def _likest(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:
+    """Share of a force that a law leaves, beside what gains of the signal and its rate follow, and its start values."""
+    shapes = list(law.shapes(local))
+    every = max(len(force) // SEEN, 1)
+    base = np.column_stack([np.ones_like(local.z), local.z, local.dz])[::every]
+    q = np.linalg.svd(base / np.maximum(np.linalg.norm(base, axis=0), 1e-300), full_matrices=False)[0]
+    target = force[::every] - q @ (q.T @ force[::every])
+    total, best, start = float(target @ target), np.inf, dict[str, Any]()
+    made = unit_forces(law, local, shapes)[::every]
+    for k, shape in enumerate(shapes):
+        columns = made[:, k] - q @ (q.T @ made[:, k])
+        if not np.all(np.isfinite(columns)):
+            continue
+        found = np.linalg.lstsq(columns, target, rcond=1e-9)[0]
+        if not law.strength and found[0] <= 0:  # the simulator's gain may scale it, not turn it round
+            continue
+        left = float(np.sum((target - columns @ found) ** 2)) / max(total, 1e-300)
+        if left < best:
+            best, start = left, start_values(law, shape, found)
+    return best, start

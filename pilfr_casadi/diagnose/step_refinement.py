@@ -1,0 +1,94 @@
+"""Finer integration steps where the answer depends on them, and the width over which a friction turns round.
+
+Steps are chosen from where a recording begins. A force that turns round at once, as friction that is in the simulator
+already, asks for finer ones later; what coarse steps make of it would look like missing physics.
+
+The knee of a friction is as sharp as the data say, not as the steps of the simulation would. A simulation that is stuck
+chatters on steps too long for its knee, and where it passes quickly each passage falls between two steps. Its error
+has minima of its own there, which no other term of a law is to make up for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._base import InputError
+from ..simulators import MOST_SUBSTEPS
+from .floor import white_part
+from .workbench import FINER, THOROUGH, Fitted, Workbench
+
+if TYPE_CHECKING:
+    from .trials import Trial
+
+DEPENDS = 0.3  # of the noise: as much as finer steps may change at least, to be taken
+QUIET = 3e-4  # of the outputs' deviation: noise below which nothing is to be seen for steps either
+NARROW = 0.05  # of the widest that is tried, of a knee that is sharp
+KNEES = (0.25, 4.0)  # times the width of a knee that a law is started from again
+FINEST, SAME = 16, 0.1  # times the sub-steps at most, and the share by which finer ones may change the mean square
+
+
+def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
+    """Refine the steps until their error is less than the noise; return the bench and the fit there."""
+    noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), QUIET**2)
+    most, steps = min(FINEST * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
+    while FINER * steps <= most and not fitted.simulator.discrete:
+        steps = FINER * steps
+        tried = replace(bench, substeps=steps)
+        try:
+            there = tried.rerun(fitted)
+            if _apart2(bench, there, fitted) < DEPENDS**2 * noise2:
+                break
+            fitted = tried.fit(
+                fitted.simulator,
+                [fitted.values, {}],
+                states=fitted.begin,
+                solver=THOROUGH,
+                model=there.model,
+                engine=there.engine,
+            )
+        except InputError:
+            break
+        bench = tried
+    return bench, fitted
+
+
+def _apart2(bench: Workbench, one: Fitted, other: Fitted) -> float:
+    """Compute the mean square of the difference of two runs."""
+    both = zip(one.residual, other.residual, bench.recordings, strict=True)
+    return float(np.mean(np.concatenate([((a - b) / bench.scale)[r.skip :] for a, b, r in both]) ** 2))
+
+
+def knees(candidate: Trial) -> list[dict[str, Any]]:
+    """Return the fitted values, also with a sharper and a wider knee where it is sharp."""
+    values, knee = candidate.fitted.values, candidate.knee
+    if not knee or values[knee] > NARROW * candidate.fitted.model.parameters[knee].bounds[1]:
+        return [values]
+    return [values, *({**values, knee: times * values[knee]} for times in KNEES)]
+
+
+def on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
+    """Fit again on finer steps if the simulation depends on them or the present ones hold a sharper knee back.
+
+    The knee may be sharper there, as far as these steps can follow it at rest.
+    """
+    given = fitted.simulator.parameters[knee]
+    low, high = given.bounds
+    if fitted.model.substeps * FINER > FINEST * bench.chosen:
+        return fitted
+    finer, placed = replace(bench, at_least=FINER * fitted.model.substeps), fitted.corrected()
+    sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER, high))
+    placed = placed.with_parameters({**placed.parameters, knee: sharper})
+    there = finer.rerun(fitted, placed)
+    held = fitted.values[knee] <= low
+    if not held and abs(there.cost / fitted.cost - 1) < SAME:
+        return fitted
+    starts = [fitted.values, *([{**fitted.values, knee: low / 2}] if held else [])]
+    states, model, engine = fitted.begin, there.model, there.engine
+    try:
+        found = finer.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
+    except InputError:
+        return fitted
+    return found if found.cost < max(fitted.cost, there.cost) else fitted

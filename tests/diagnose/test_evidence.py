@@ -1,0 +1,76 @@
+"""The one scale of all hypotheses: log evidence, and what a posterior makes of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_rig import OFF, recordings, rig
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import laws
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.evidence import EXACT, Sample, information, log_evidence, log_prior
+from pilfr_casadi.diagnose.posterior import share_named
+
+NONE = np.zeros(0)
+
+
+def test_samples_of_noise_count_and_those_of_a_wrong_model_do_not_shout():
+    few, many = (Sample(1e-4, count) for count in (500, 50_000))
+    assert many.effective(1.0) == pytest.approx(few.effective(1.0), rel=0.02) == pytest.approx(EXACT, rel=0.02)
+    assert few.effective(1e-4) > 10 * few.effective(1.0)
+    assert few.effective(1e-4) < 500
+
+
+@pytest.mark.parametrize("n", [8.0, 150.0])
+def test_a_parameter_has_to_pay_for_itself(n):
+    """One that the data determine well costs half the logarithm of its information; a dead one costs nothing."""
+    alone = log_evidence(0.01, NONE, 0.0, n)
+    assert log_evidence(0.01, np.array([0.0]), 0.0, n) == alone
+    dear, dearer = (alone - log_evidence(0.01, np.array([size]), 0.0, n) for size in (1.0, 4.0))
+    assert dearer - dear == pytest.approx(0.5 * np.log(4), rel=0.05)
+    assert log_evidence(0.01 * np.exp(-2.6 * dear / n), np.array([1.0]), 0.0, n) > alone
+
+
+def test_what_diverges_has_no_evidence():
+    assert log_evidence(np.inf, NONE, 0.0, 8.0) == -np.inf
+
+
+def test_the_prior_is_shared_by_ports_laws_and_forms():
+    placed = rig().with_element("ground-m1", laws.CubicStiffness()).elements
+    one = {"ground-m1": (laws.CubicStiffness(), laws.ViscousDamping())}
+    two = {**one, "m1-m2": one["ground-m1"]}
+    forms = {"ground-m1": (*one["ground-m1"], laws.QuinticStiffness())}
+    assert log_prior((), one) == 0
+    assert log_prior(placed, one) - log_prior(placed, two) == pytest.approx(np.log(2))
+    assert log_prior(placed, one) - log_prior(placed, forms) == pytest.approx(np.log(2))
+    assert log_prior(placed, one, doubtful=True) < log_prior(placed, one)
+
+
+def test_a_parameters_unit_does_not_change_its_information():
+    train = recordings(laws.CubicStiffness(values={"k_3": 3e5}), count=1)
+    bench = Workbench.of(rig(OFF), train, "zero")
+    fitted = bench.fit(rig(OFF).with_element("ground-m1", laws.CubicStiffness()))
+    (told,) = information(bench, fitted, fitted.simulator.elements)
+    assert 0 < told <= 1  # its prior width moves the outputs by their deviation, the simulator's own follow a part
+    softer = replace(bench, scale=2 * bench.scale)
+    assert information(softer, fitted, fitted.simulator.elements)[0] == pytest.approx(told, rel=1e-6)
+    assert information(bench, fitted, ()).size == 0
+
+
+def test_the_more_a_force_would_follow_of_the_rest_the_less_the_name_is_believed():
+    shares = [share_named(s) for s in (0.0, 0.003, 0.03, 0.3, 1.0)]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] > 0.95 and shares[-1] < 0.2
+
+
+def test_the_same_law_at_two_ports_that_cannot_be_told_apart_is_sure_all_the_same():
+    """Two dampers in series positions of one body: between the same two points."""
+    simulator = rig(OFF)
+    first = simulator.port("ground-m1")
+    twin = replace(simulator, ports=(*simulator.ports, replace(first, name="twin")))
+    train = recordings(laws.CubicStiffness(values={"k_3": 3e5}), count=1)
+    found = pilfr.diagnose(twin, train, laws=(laws.CubicStiffness, laws.QuadraticDrag))
+    (effect,) = found.effects
+    assert effect.law == "cubic_stiffness" and effect.confidence > 0.9
+    assert {effect.port, *(port for port, _ in effect.indistinguishable)} == {"ground-m1", "twin"}

@@ -1,0 +1,75 @@
+"""Every hypothesis is fitted once: beside the same laws no law is begun again, and none is polished twice."""
+
+from collections import Counter
+
+import pytest
+from diagnosis_rig import OFF, recordings, rig
+
+from pilfr_casadi import laws
+from pilfr_casadi._base import Stages
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.trials import Trials
+
+TRIED = (laws.CoulombFriction, laws.CubicStiffness, laws.QuadraticDrag)
+CUBIC, DRY = laws.CubicStiffness(values={"k_3": 4e5}), laws.CoulombFriction(values={"F_c": 4.0, "v_0": 0.01})
+
+
+@pytest.fixture
+def fits(monkeypatch):
+    """How often each law was begun beside its parent's, and each hypothesis fitted thoroughly."""
+    begun, polished, found = Counter(), Counter(), {"begun": Trials._begun, "polished": Trials.polished}
+
+    def begin(self, parent, entries, gain):
+        begun[parent.key, (entries[0].port, type(entries[0].law))] += 1
+        return found["begun"](self, parent, entries, gain)
+
+    def polish(self, trial):
+        polished[trial.key] += 1
+        return found["polished"](self, trial)
+
+    monkeypatch.setattr(Trials, "_begun", begin)
+    monkeypatch.setattr(Trials, "polished", polish)
+    return begun, polished
+
+
+def searched(train, effects):
+    bench = Workbench.of(rig(OFF), train, "zero")
+    floor = Floor(1e-3 * bench.scale, "repeats")
+    return Search(bench, bench.fit(bench.simulator), floor, TRIED, 1, Stages(lambda *_: None)).run(effects)
+
+
+def test_one_effect_needs_each_hypothesis_once(fits):
+    begun, polished = fits
+    found = searched(recordings(CUBIC, count=1), 1)
+    assert [(e.port, e.law.id) for e in found.best.laws] == [("ground-m1", "cubic_stiffness")]
+    assert set(begun.values()) == {1} and set(polished.values()) == {1}
+    assert set(polished) <= set(found.memo)
+
+
+def test_what_two_effects_are_exchanged_for_is_not_fitted_twice(fits):
+    begun, polished = fits
+    true = rig().with_element("ground-m1", CUBIC)
+    found = searched(recordings(DRY, port="m1-m2", count=1, of=true), 2)
+    assert {(e.port, e.law.id) for e in found.best.laws} == {
+        ("ground-m1", "cubic_stiffness"),
+        ("m1-m2", "coulomb_friction"),
+    }
+    assert set(polished.values()) == {1}
+    assert set(begun.values()) == {1}, [pair for pair, times in begun.items() if times > 1]
+
+
+def test_an_interrupt_of_a_fit_keeps_what_there_is(monkeypatch):
+    seen, whole = [], Trials.judged
+
+    def struck(self, found, count):
+        seen.append(count)
+        if len(seen) > 4:
+            raise KeyboardInterrupt
+        return whole(self, found, count)
+
+    monkeypatch.setattr(Trials, "judged", struck)
+    found = searched(recordings(CUBIC, count=1), 2)
+    assert found.interrupted and found.root.key in found.memo
+    assert found.best is found.root

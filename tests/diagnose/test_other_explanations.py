@@ -1,0 +1,143 @@
+"""Answers other than a law at a declared port: a held value, an undeclared port, a machine that changed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_rig import OFF, recordings, rig
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import Parameter, Recording, Simulator, laws
+from pilfr_casadi._base import Stages
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.other_explanations import varying
+from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.report.diagnosis_tables import headline
+from pilfr_casadi.simulators import discretise
+
+# on the smallest rigs that have them
+
+
+def short(*hidden, **options):
+    (r,) = recordings(*hidden, count=1, **options)
+    return r.slice(0, 1200)
+
+
+@pytest.mark.parametrize("known", [{"fixed": True}, {"value": 1.0, "bounds": (0.3, 5.0)}], ids=["fixed", "far"])
+def test_a_value_that_cannot_go_where_it_should_is_told(known):
+    simulator = rig(OFF)
+    p = simulator.parameters
+    held = simulator.with_parameters({**p, "k1": replace(p["k1"], **known)})
+    found = pilfr.diagnose(held, short(), laws=(laws.LinearStiffness,), effects=1, workers=1)
+    assert (found.verdict, found.effects, found.let_go) == ("complete", (), "k1"), str(found)
+    assert found.parameters["k1"]["refit_with"] == pytest.approx(1100, rel=0.03)
+
+
+def test_friction_where_no_port_is_declared_is_told_where_it_acts():
+    friction = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
+    full = rig(OFF)
+    hidden = short(friction, port="ground-m1")
+    found = pilfr.diagnose(
+        replace(full, ports=full.ports[1:]), hidden, laws=(laws.CoulombFriction,), effects=1, workers=1
+    )
+    assert found.verdict == "unexplained" and "no law of the catalogue explains it" in found.sentence
+    (note,) = [g for g in found.gates if g.finding == "undeclared"]
+    assert (note.channel, note.value, note.corrected) == ("v1", "coulomb friction", False)
+
+
+# values that are held where a linear law would let them go
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("held", "words"), [({"fixed": True}, "held at"), ({"bounds": (1200, 9000)}, "by its bounds")])
+def test_a_value_that_is_held_is_told_in_place_of_a_spring(held, words):
+    simulator = rig(OFF)
+    p = simulator.parameters
+    found = pilfr.diagnose(simulator.with_parameters({**p, "k1": replace(p["k1"], **held)}), recordings())
+    assert (found.verdict, found.effects) == ("complete", ())
+    assert "with k1 = 1" in found.sentence and words in found.sentence
+    assert found.let_go == "k1" and "% with k1 let go" in headline(found).replace("\u00a0", " ")
+    assert found.parameters["k1"]["refit_with"] == pytest.approx(1100, rel=0.02)
+    assert found.errors["train"]["after"] < 0.01 < found.errors["train"]["before"]
+
+
+@pytest.mark.slow
+def test_a_value_whose_bounds_are_powers_of_ten_away_is_told_and_no_law_is_named_for_it():
+    """As a stiffness in N/mm where the equations take N/m: what is seen cancels the simulator's own outputs."""
+    simulator = rig(OFF)
+    p = simulator.parameters
+    far = replace(p["k1"], value=1.0, bounds=(0.3, 5.0))
+    found = pilfr.diagnose(simulator.with_parameters({**p, "k1": far}), recordings())
+    assert (found.verdict, found.effects, found.let_go) == ("complete", (), "k1"), str(found)
+    assert "by its bounds at 5" in found.sentence
+    assert found.parameters["k1"]["refit_with"] == pytest.approx(1100, rel=0.02)
+
+
+# physics that acts where no port is declared
+
+
+@pytest.mark.slow
+def test_a_law_that_no_declared_port_reaches_is_told_where_it_acts():
+    friction = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
+    full = rig(OFF)
+    found = pilfr.diagnose(replace(full, ports=full.ports[1:]), recordings(friction, port="ground-m1", count=1))
+    assert found.verdict == "unexplained"
+    (note,) = [g for g in found.gates if g.finding == "undeclared"]
+    assert (note.channel, note.value, note.corrected) == ("v1", "coulomb friction", False)
+    assert "No declared port reaches it" in str(found)
+
+
+# a machine that changed, between recordings or in the time of one
+
+
+DT, M = 0.05, 1200
+
+
+def cart():
+    """A mass on a spring and a damper."""
+    return Simulator(
+        lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
+        lambda x: {"pos": x.pos},
+        states=("pos", "vel"),
+        inputs=("force",),
+        parameters={"k": Parameter(22.0, bounds=(5, 100)), "d": Parameter(0.9, bounds=(0, 5))},
+    )
+
+
+def recorded(k, seed, state=(0.0, 0.0), initial="zero"):
+    """A recording with a spring of stiffness k."""
+    rng, model = np.random.default_rng(seed), discretise(cart(), DT)
+    u = pilfr.multisine(M, f_max=2.0, fs=1 / DT, rng=rng)
+    r = Recording(u, np.zeros(M), DT, ("force",), ("pos",), initial=initial, hold="zero", name=f"run{seed}")
+    theta = model.parameters.pack({"k": k, "d": 0.8})
+    y, after = make_engine(model).simulate(model.drive(r), theta, np.array(state))
+    return r.with_(y=y + 1e-3 * rng.standard_normal(y.shape)), after
+
+
+def told(*recordings):
+    """What is said of them where nothing else is found."""
+    bench = Workbench.of(cart(), recordings, "zero")
+    floor = Floor(np.full(1, 1e-3), "estimated")
+    search = Search(bench, bench.fit(bench.simulator), floor, (), 1, Stages(lambda *_: None))
+    return varying(search.run(0))
+
+
+def test_recordings_that_disagree_are_told_with_the_value_that_differs():
+    (gate,) = told(recorded(20.0, 0)[0], recorded(26.0, 1)[0])
+    assert gate.finding == "varying" and gate.channel == "k" and "the recordings (run0 / run1)" in gate.sentence
+    assert gate.value == [pytest.approx([20.0, 26.0], rel=0.02)]
+
+
+def test_a_value_that_changes_within_a_recording_is_told_by_its_halves():
+    first, after = recorded(20.0, 0)
+    second, _ = recorded(26.0, 1, after)
+    whole = first.with_(u=np.vstack([first.u, second.u]), y=np.vstack([first.y, second.y]))
+    (gate,) = told(whole)
+    assert gate.channel == "k" and "the halves (first / second)" in gate.sentence
+    assert gate.value == [pytest.approx([20.0, 26.0], rel=0.02)]
+
+
+def test_recordings_that_agree_are_not():
+    assert told(recorded(20.0, 0)[0], recorded(20.0, 1)[0]) == ()

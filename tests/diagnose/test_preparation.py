@@ -1,0 +1,59 @@
+"""Dull faults beside an unsaid hold, and constants: what the search starts from is right again."""
+
+import numpy as np
+import pytest
+from diagnosis_rig import OFF, recordings, rig
+from test_slips import DT, recorded, tanks
+
+from pilfr_casadi import Recording
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.offset import as_it_came_out, offset_gates, offsets
+from pilfr_casadi.diagnose.preparation import prepare, refitted
+
+
+def unsaid(r, u, y, initial="zero"):
+    """A recording of other samples, of which nobody says what inputs do between them."""
+    return Recording(u, y, r.dt, r.inputs, r.outputs, initial=initial)
+
+
+def test_a_shift_and_the_hold_are_told_apart():
+    """Half a sample more or less, and inputs held or interpolated: the one may look like the other."""
+    (r,) = recordings(count=1, hold="linear")
+    found = prepare(rig(OFF), [unsaid(r, r.u[:1500], r.y[9:1509], "estimate")], None, "auto")
+    (shift,) = [g for g in found.gates if g.finding == "alignment"]
+    assert shift.value == pytest.approx(-9 * r.dt, abs=1e-9)
+    assert found.bench.hold == "linear" and found.without.cost < 0.003**2
+
+
+def test_across_a_gap_the_hold_is_chosen_again():
+    (r,) = recordings(count=1, hold="linear")
+    keep = np.r_[0:700, 725:1600]
+    found = prepare(rig(OFF), [unsaid(r, r.u[keep], r.y[keep])], None, "auto")
+    (gap,) = [g for g in found.gates if g.finding == "gap"]
+    assert gap.value == [pytest.approx(700 * r.dt)] and [len(p) for p in found.bench.recordings] == [700, 875]
+    assert found.bench.hold == "linear" and found.without.cost < 0.003**2
+
+
+def of_tanks(y):
+    return Recording(recorded()[0], y, DT, ("q1", "q2"), ("upper", "lower"), initial="zero", hold="zero")
+
+
+def test_a_wrong_sign_beside_another_zero_is_told():
+    y = recorded()[1] * [-1, 1] + [3.0, 0]
+    found = prepare(tanks(1.15), [of_tanks(y)], "zero", "auto")
+    assert [(g.channel, g.finding) for g in found.gates] == [("upper", "sign"), ("upper", "offset")]
+    assert found.without.values["sensor:upper.w_0"] == pytest.approx(-3.0, rel=0.01)
+    assert found.without.cost < 0.01**2
+
+
+def test_a_constant_of_a_sensor_is_found_and_kept():
+    bench = Workbench.of(tanks(1.15), [of_tanks(recorded()[1] + [0, 0.3])], "zero")
+    _, fitted, gates = offsets(bench, refitted(bench))
+    (gate,) = gates
+    assert (gate.channel, gate.finding, gate.fault) == ("lower", "offset", True)
+    assert gate.value == pytest.approx(0.3, rel=0.02)
+    (again,) = offset_gates(fitted.simulator.elements, fitted.values)
+    assert again.value == gate.value and "parameter of the corrected simulator" in again.sentence
+    (told,) = as_it_came_out(gates, fitted, {gate.parameter: np.array(0.03)}, False, False)
+    assert "may be a part of that" in told.sentence
+    assert not as_it_came_out(gates, fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none

@@ -1,0 +1,165 @@
+"""Glitches, stale samples, and periods that have not settled."""
+
+import numpy as np
+import pytest
+from diagnosis_rig import OFF, recordings, rig
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import laws
+from pilfr_casadi.diagnose.floor import measured_floor
+from pilfr_casadi.diagnose.recording_faults import glitches, mended, stale_samples, without_glitches, without_transients
+
+# single samples far off their neighbours
+
+
+PLACES = [100, 108, 900, 1500]
+
+
+def spoilt(r, places=PLACES, size=3.0):
+    """The recording with some samples off by a few deviations."""
+    y = np.array(r.y)
+    y[places, 0] += size * np.std(y) * np.resize([1, -1], len(places))
+    return r.with_(y=y)
+
+
+def test_glitches_are_found_replaced_and_told():
+    (r,) = recordings(count=1)
+    (clean,), (gate,) = without_glitches([spoilt(r)])
+    assert (gate.channel, gate.finding, gate.value, gate.corrected, gate.fault) == ("x2", "glitch", 4, True, True)
+    assert "the first at t = 0.2 s" in gate.sentence
+    np.testing.assert_array_equal(np.flatnonzero(clean.y != spoilt(r).y), PLACES)
+    assert np.max(np.abs(clean.y - r.y)) < 0.01 * np.std(r.y)
+    np.testing.assert_array_equal(mended(r).y, r.y)
+
+
+@pytest.mark.parametrize("kind", ["noise", "step", "pulse", "shock", "coarse", "short"])
+def test_what_lasts_longer_than_a_sample_is_no_glitch(kind):
+    rng = np.random.default_rng(3)
+    y = np.sin(np.arange(4000) / 40) + 1e-3 * rng.standard_normal(4000)
+    if kind == "noise":
+        y = rng.standard_normal(4000)
+    if kind == "step":
+        y[2000:] += 3
+    if kind == "pulse":
+        y[2000:2003] += 3
+    if kind == "shock":
+        y[2000:] += 3 * np.exp(-np.arange(2000) / 4) * np.cos(np.arange(2000))
+    if kind == "coarse":
+        y = np.round(y, 1)
+    if kind == "short":
+        y = y[:40]
+        y[20] += 3
+    assert not len(glitches(y)[0])
+
+
+@pytest.mark.slow
+def test_friction_is_named_beside_glitches():
+    train = [spoilt(r) for r in recordings(laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01}))]
+    found = pilfr.diagnose(rig(OFF), train)
+    assert [(e.port, e.law) for e in found.effects] == [("ground-m1", "coulomb_friction")]
+    assert "glitch" in [g.finding for g in found.gates]
+
+
+# samples that repeat the one before, among those that never do
+
+
+def lost(r, share, seed=0):
+    """The recording with some samples that repeat the one before."""
+    y = np.array(r.y)
+    for k in np.flatnonzero(np.random.default_rng(seed).random(len(y)) < share):
+        y[k] = y[max(k - 1, 0)]
+    return r.with_(y=y)
+
+
+@pytest.mark.slow
+def test_stale_samples_are_told_and_where():
+    (r,) = recordings(count=1)
+    (gate,) = stale_samples([lost(r, 0.1)])
+    assert (gate.channel, gate.finding, gate.corrected, gate.fault) == ("x2", "stale", False, False)
+    assert gate.value == pytest.approx(0.1, abs=0.02)
+    found = pilfr.diagnose(rig(OFF), lost(r, 0.1))
+    assert found.verdict == "complete" and "stale" in [g.finding for g in found.gates]
+
+
+@pytest.mark.parametrize("kind", ["clean", "coarse", "resting", "clipped", "encoder"])
+def test_a_converter_and_a_rest_are_not_stale(kind):
+    (r,) = recordings(count=1)
+    y = np.array(r.y)
+    if kind == "coarse":
+        y = np.round(y / np.std(y), 1) * np.std(y)
+    if kind == "resting":
+        y[:400] = y[400]
+    if kind == "clipped":
+        y = np.clip(y, *np.quantile(y, [0.05, 0.95]))
+    if kind == "encoder":  # more levels than half of the samples, and slow ways between them
+        y = np.round(np.linspace(0, 1, len(y))[:, None] ** 4 + 0.01 * y / np.std(y), 3)
+    assert not stale_samples([r.with_(y=y)])
+
+
+# periodic recordings whose periods still differ by what dies away
+
+
+def periodic(decay, noise=1e-3, seed=0):
+    """Four periods of a rig's answer, with something on top that dies away."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(2000) / 500
+    u = np.tile(pilfr.multisine(500, f_max=20.0, fs=500.0, rng=rng), 4)
+    y = np.tile(rng.standard_normal(500), 4) + decay * np.exp(-t) * np.sin(9 * t)
+    return pilfr.Recording(
+        u, y + noise * rng.standard_normal(2000), 1 / 500, period=500, initial="periodic", hold="zero", name="first"
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_is_no_transient(seed):
+    kept, gates = without_transients([periodic(0.0, 0.05, seed), periodic(0.0, 1e-3, seed + 50)])
+    assert not gates
+    assert all(r.initial == "periodic" and r.period == 500 for r in kept)
+
+
+def test_what_dies_away_is_said_and_the_initial_state_estimated():
+    whole, dying = periodic(0.0), periodic(0.1)
+    kept, (gate,) = without_transients([whole, dying])
+    assert all(r.initial == "estimate" and r.period is None for r in kept)
+    assert (gate.finding, gate.channel, gate.corrected, gate.fault) == ("transient", "y", True, False)
+    assert "has not settled in first" in gate.sentence
+    assert gate.change(dying).initial == "estimate"
+
+
+@pytest.mark.slow
+def test_a_diagnosis_of_recordings_that_have_not_settled_finds_nothing_missing():
+    """From rest, the rig takes some periods to settle; said to be periodic, it is not yet."""
+    (one,) = recordings(count=1, seed=3)
+    force = np.tile(one.u[:625], (4, 1))
+    from pilfr_casadi.engine import make_engine
+    from pilfr_casadi.simulators import discretise
+
+    model = discretise(rig(), one.dt, "zero", 8)
+    r = one.with_(u=force, y=np.zeros((2500, 1)))
+    y = make_engine(model).simulate(model.drive(r), model.parameters.start, np.zeros(model.n_state))[0]
+    noise = 1e-3 * np.std(y) * np.random.default_rng(1).standard_normal(y.shape)
+    found = pilfr.diagnose(rig(OFF), r.with_(y=y + noise, initial="periodic", period=625))
+    assert found.verdict == "complete"
+    assert [g.finding for g in found.gates] == ["transient"]
+
+
+def test_a_given_state_is_neither_periodic_nor_in_the_way():
+    """What a recording begins with may be numbers, though it has a period."""
+    r = periodic(0.1).with_(initial=np.array([1.0, 2.0]))
+    assert r.begins == "given"
+    kept, gates = without_transients([r])
+    assert not gates and kept[0] is r
+    assert measured_floor([r, r.with_(y=r.y + 1e-3)]).source == "repeats"
+
+
+def test_repeats_that_began_in_other_states_are_compared_late():
+    """The way from another state is no noise; recordings may leave out different numbers of samples at the begin."""
+    rng, t = np.random.default_rng(0), np.arange(4000)
+    u = rng.standard_normal((4000, 1))
+    one, other = (
+        pilfr.Recording(u, (a * np.exp(-t / 100.0) + 0.01 * rng.standard_normal(4000))[:, None], 1e-3, skip=skip)
+        for a, skip in ((1.0, 0), (-1.0, 50))
+    )
+    assert measured_floor([one, other]).deviation[0] == pytest.approx(0.01, rel=0.1)
+    at_rest = measured_floor([r.with_(initial="zero") for r in (one, other)])
+    assert at_rest.deviation[0] > 0.05

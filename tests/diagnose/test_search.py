@@ -1,0 +1,85 @@
+"""The search over hypotheses: when it stops, what it keeps, and what an interrupt and a time limit leave."""
+
+import numpy as np
+import pytest
+from diagnosis_rig import OFF, recordings, rig
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import laws
+from pilfr_casadi._base import Stages
+from pilfr_casadi.diagnose import Workbench, preparation
+from pilfr_casadi.diagnose.floor import Floor
+from pilfr_casadi.diagnose.search import Search
+from pilfr_casadi.diagnose.trials import Trials
+from pilfr_casadi.optimise import GaussNewton
+
+FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
+TRIED = (laws.CoulombFriction, laws.CubicStiffness, laws.ViscousDamping)
+
+
+def searching(train, simulator=None, until=np.inf):
+    """A search on recordings, not yet begun."""
+    bench = Workbench.of(simulator or rig(OFF), train, "zero")
+    floor = Floor(np.full(len(bench.scale), 1e-4), "estimated")
+    return Search(bench, bench.fit(bench.simulator), floor, TRIED, 1, Stages(lambda *_: None), until=until)
+
+
+def test_where_nothing_is_missing_nothing_is_fitted():
+    found = searching(recordings(None, count=1)).run(2)
+    assert list(found.memo) == [frozenset()] and not found.steps
+
+
+def test_a_law_is_found_and_no_hypothesis_is_kept_twice():
+    found = searching(recordings(FRICTION, count=1)).run(2)
+    assert [(e.port, e.law.id) for e in found.best.laws] == [("ground-m1", "coulomb_friction")]
+    assert len(found.memo) == len({t.key for t in found.memo.values()}) > 1
+    assert found.best.thorough and not found.interrupted
+    assert found.evidence(found.best) > found.evidence(found.root) + 10
+
+
+def test_an_interrupt_leaves_what_there_is(monkeypatch):
+    def interrupted(self, trial):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Trials, "polished", interrupted)
+    found = searching(recordings(FRICTION, count=1)).run(2)
+    assert found.interrupted and len(found.memo) > 1
+
+
+def test_at_the_time_limit_the_search_answers_from_what_it_has():
+    found = searching(recordings(FRICTION, count=1), until=0.0).run(2)
+    assert found.out_of_time and list(found.memo) == [frozenset()]
+    diagnosis = pilfr.diagnose(rig(OFF), recordings(FRICTION, count=1), laws=TRIED, time_limit=1e-3)
+    assert "The time limit ended the search" in str(diagnosis)
+    with pytest.raises(pilfr.InputError, match="time_limit=0 was given"):
+        pilfr.diagnose(rig(OFF), recordings(FRICTION, count=1), time_limit=0)
+
+
+def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
+    train = recordings(None, count=1)
+    search = searching(train, rig((3.0, 1.0, 1.0, 1.0)))
+    stuck = search.bench.fit(search.bench.simulator, solver=GaussNewton(max_iterations=1))
+    search.without = stuck
+    found = search.run(1)
+    assert found.best is found.root
+    assert found.root.whole < 1e-3 * stuck.cost
+
+
+@pytest.fixture
+def stuck_refit(monkeypatch):
+    """Recordings that lack nothing, of a simulator whose refit stays in a local minimum."""
+    refit = preparation.refitted
+
+    def stuck(bench, starts=()):
+        if starts:
+            return refit(bench, starts)
+        return bench.fit(bench.simulator, solver=GaussNewton(max_iterations=1))
+
+    monkeypatch.setattr(preparation, "refitted", stuck)
+    return recordings(None, count=1)
+
+
+@pytest.mark.slow
+def test_a_shift_that_only_led_out_of_a_dead_end_is_no_fault(stuck_refit):
+    found = pilfr.diagnose(rig((1.4, 0.8, 0.8, 1.2)), stuck_refit)
+    assert (found.verdict, found.gates) == ("complete", ()), str(found)

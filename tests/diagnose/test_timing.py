@@ -1,0 +1,71 @@
+"""When a channel is early, late or of another clock, and how inputs are held."""
+
+import numpy as np
+import pytest
+
+from pilfr_casadi.data import Recording
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.gates import Gate, hold_note
+from pilfr_casadi.diagnose.timing import timing
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.laws import Creep, CubicStiffness, PeriodicForce, Relaxation, TwoStageCreep, TwoStageRelaxation
+from pilfr_casadi.models import Parameter
+from pilfr_casadi.simulators import Port, Simulator
+
+
+def spring():
+    """A mass on a spring, measured at position and velocity."""
+    return Simulator(
+        lambda x, u, p: {"pos": x.vel, "vel": u.force - p.k * x.pos - p.d * x.vel},
+        lambda x: {"pos": x.pos, "vel": x.vel},
+        states=("pos", "vel"),
+        inputs=("force",),
+        parameters={"k": Parameter(120.0, bounds=(20, 500)), "d": Parameter(1.0, bounds=(0, 20))},
+        ports=(Port("ground", {"vel": -1.0}, lambda x: x.pos, lambda x: x.vel),),
+    )
+
+
+def shaken(hold, clock=0.0, m=3000, dt=0.02, law=None, early=0):
+    """The spring recorded; `clock`: by how much each of the outputs' samples takes longer, `early`: how many early."""
+    rng = np.random.default_rng(3)
+    u = np.convolve(rng.standard_normal(m), np.ones(4) / 2, "same")
+    true = spring().with_parameters({"k": Parameter(100.0), "d": Parameter(1.4)})
+    true = true.with_element("ground", law) if law else true
+    blank = Recording(u, rng.standard_normal((m, 2)), dt, ("force",), ("pos", "vel"), initial="zero")
+    model = Workbench.of(true, [blank], hold).model(true)
+    y = make_engine(model).simulate(model.drive(blank), model.parameters.start, np.zeros(2))[0]
+    u, y = u[: m - early], y[early:]
+    if clock:
+        at = np.arange(m) * (1 + clock)
+        u, y = u[at < m - 1], np.stack([np.interp(at[at < m - 1], np.arange(m), c) for c in y.T], axis=1)
+    y = y + 1e-4 * y.std(axis=0) * rng.standard_normal(y.shape)
+    return Recording(u, y, dt, ("force",), ("pos", "vel"), initial="zero")
+
+
+def test_a_clock_between_the_rates_looked_at_is_found_and_is_that_of_both_outputs():
+    bench = Workbench.of(spring(), [shaken("zero", 3.36e-3)], "zero")
+    _, found, gates = timing(bench, bench.fit(bench.simulator), 1e-8)
+    assert [(g.channel, g.finding) for g in gates] == [("pos, vel", "clock")] and isinstance(gates[0], Gate)
+    assert gates[0].value == pytest.approx(-3.36e-3, rel=0.02)
+    assert found.cost**0.5 < 0.02
+
+
+@pytest.mark.parametrize("stiffening", [0.0, 1e4])
+def test_what_seems_early_while_more_is_wrong_may_be_no_fault(stiffening):
+    law = CubicStiffness(values={"k_3": stiffening})
+    bench = Workbench.of(spring(), [shaken("zero", law=law, early=6)], "zero")
+    plain = bench.fit(spring())
+    for early in (True, False):
+        gates = timing(bench, plain, 1e-8, early=early)[2]
+        assert [g.finding for g in gates] == (["alignment"] if early or not stiffening else [])
+
+
+def test_why_a_hold_was_chosen_is_said():
+    assert "fits better (error 1.3 times smaller)" in hold_note(spring(), "linear", 1.3).sentence
+
+
+@pytest.mark.parametrize(("one", "two", "name"), [(Relaxation, TwoStageRelaxation, "k"), (Creep, TwoStageCreep, "c")])
+def test_creep_in_two_stages_goes_on_from_one(one, two, name):
+    own = {next(iter(one.units)): 8.0, "T": 0.5}
+    assert two().starts_as(one(), own) == {f"{name}_1": 4.0, f"{name}_2": 4.0, "T_1": 0.25, "T_2": 1.0}
+    assert two().starts_as(PeriodicForce(), {"a": 1.0, "b": 0.0, "L": 1.0}) == {}
