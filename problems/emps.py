@@ -87,11 +87,14 @@ def simulator() -> Simulator:
 
 
 def in_closed_loop(axis: Simulator) -> Simulator | None:
-    """The axis under its position controller, driven by the reference; None with more than an offset at the drive.
+    """The axis under its position controller, driven by the reference; None where it needs the recorded voltage.
 
+    An offset at the drive acts in the loop as well; other elements there, and forces that the voltage scales, do not.
     A drift at the encoder is that of a free run, which the controller takes away.
     """
-    inside = tuple(e for e in axis.elements if e.port == "axis")
+    inside = tuple(
+        e for e in axis.elements if e.port == "axis" and not e.law.scaled_by and not getattr(e.law, "factor", "")
+    )
     biases = [f"{e.prefix}w_0" for e in axis.elements if e.port == "actuator:u_vir_V" and e.law.id == "offset"]
     drifts = [e for e in axis.elements if e.port == "sensor:y_qm_m" and e.law.id == "drift"]
     if len(inside) + len(biases) + len(drifts) < len(axis.elements):

@@ -15,9 +15,8 @@ import numpy as np
 
 import pilfr_casadi as pilfr
 
-from .. import accuracy, bank, concealed, emps, masing_diagnosis, piezo_diagnosis, silverbox, speed, table2, tanks, zoo
+from .. import accuracy, bank, concealed, masing_diagnosis, real_machines, speed, table2, zoo
 from ..masing_data import benchmark
-from ..measured_data import measured
 
 DIGITS = 10  # of exported steps
 SHORT_TABLE = ["--rows", "LTI", "N=5, paper", "nx=5, n=5", "--starts", "2", "--network-starts", "1", "--workers", "1"]
@@ -64,40 +63,9 @@ def _case(key: str) -> Answer:
     return {"name": hidden.name, "least": hidden.floor, **diagnosed(diagnosis), "score": marks}
 
 
-def from_files(folder: Path) -> Any:
-    """Diagnose a folder with simulator.py, train_*.csv and test.csv, as `pilfr diagnose` does."""
-    simulator = load_simulator(folder / "simulator.py")
-    names: dict[str, Any] = {"inputs": simulator.inputs, "outputs": simulator.output_names}
-    train = [pilfr.read_csv(path, **names) for path in sorted(folder.glob("train_*.csv"))]
-    return pilfr.diagnose(simulator, train, test=pilfr.read_csv(folder / "test.csv", **names), workers=1)
-
-
-def load_simulator(path: Path) -> Any:
-    """The simulator that a file defines."""
-    from pilfr_casadi.simulators import load_simulator as load
-
-    return load(path)
-
-
-MACHINES: dict[str, tuple[str, Callable[[Path], Any]]] = {
-    "emps": ("emps", lambda folder: emps.run(folder, workers=1)[0]),
-    "silverbox": ("silverbox", lambda folder: silverbox.run(folder, workers=1)[0]),
-    "tanks-linear": ("cascaded_tanks", lambda folder: tanks.run(folder, False, workers=1)[0]),
-    "tanks-root": ("cascaded_tanks", lambda folder: tanks.run(folder, True, workers=1)[0]),
-    "piezo": ("piezo_dbo", lambda folder: piezo_diagnosis.run(folder, workers=1)[0]),
-    "ced": ("ced", from_files),
-    "mr_damper": ("mr_damper", from_files),
-    "pendulum": ("dfki_pendulum", from_files),
-    "seal": ("pneumatic_seal", from_files),
-}
-
-
 def _machine(key: str) -> Answer | None:
-    if key == "masing":
-        return diagnosed(masing_diagnosis.run(0, workers=1)[0])
-    name, run = MACHINES[key]
-    folder = measured(name)
-    return None if folder is None else diagnosed(run(folder))
+    found = real_machines.machine(key)
+    return None if found is None else diagnosed(found.diagnose(workers=1))
 
 
 def _table(key: str) -> Answer:
@@ -165,7 +133,7 @@ SUITES: dict[str, tuple[tuple[str, ...], Callable[[str], Answer | None]]] = {
     "table2": (("101",), _table),
     "accuracy": (tuple(f"{n}-{seed}" for n, seed in ACCURACY), _accuracy),
     "exports": (EXPORTS, _export),
-    "machines": (("masing", *MACHINES), _machine),
+    "machines": (real_machines.NAMES, _machine),
     "cases": (tuple(map(str, SEEDS)), _case),
     "bank": (tuple(map(str, bank.SEEDS)), _case),
     "speed": (("quick",), _speed),
