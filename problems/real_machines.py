@@ -111,7 +111,7 @@ def row(name: str, diagnosis: Diagnosis, seconds: float) -> dict[str, Any]:
         "best": MACHINES[name][2] if name in MACHINES else None,
         "noise": found["fit"]["noise_floor"]["nrmse"],
         "named": [f"{e['law']} at {e['port']} ({e['confidence']:.2f})" for e in found["effects"]],
-        "learned": (found["learned"] or {}).get("port"),
+        "learned": [e["port"] for e in found["learned"]],
         "shares": found["shares"],
         "seconds": round(seconds, 1),
     }
@@ -120,7 +120,7 @@ def row(name: str, diagnosis: Diagnosis, seconds: float) -> dict[str, Any]:
 def line(r: Mapping[str, Any]) -> str:
     """One line of the table."""
     figures = [r[k] for k in ("naive", "refitted", "corrected", "best", "noise")]
-    words = "; ".join([*r["named"], *([f"learned force at {r['learned']}"] if r["learned"] else [])])
+    words = "; ".join([*r["named"], *(f"learned force at {port}" for port in r["learned"])])
     numbers = "".join(f"{'-' if v is None else format(v, '.3g'):>11}" for v in figures)
     return f"{r['machine']:14}{numbers}{r['seconds']:8.0f} s  {r['verdict']:16} {words or 'nothing named'}"
 
