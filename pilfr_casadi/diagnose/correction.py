@@ -2,7 +2,9 @@
 
 Where the named answer is not sure, or leaves error above the noise, these compete on held-out parts of the training
 recordings (`cross_validation`): the refitted simulator, the laws that the search has fitted, and a learned force alone
-or beside them. The simplest is taken of those that do about as well as the best. Test recordings are never looked at.
+or beside them. To the error on what was held out comes the spread of predictions for other inputs (`evidence.spread`),
+which is large where many parameters are hardly determined. The smallest sum is taken. Test recordings are never looked
+at.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy as np
 from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
-from .cross_validation import HeldOut, held_out_errors
+from .cross_validation import HeldOut
 from .learned import Learned, LearnedForce, candidates, described
 from .posterior import Posterior, unfollowed
 from .search import FORMULA, Search
@@ -26,7 +28,6 @@ from .trials import Trial
 from .verdict import SURE
 from .workbench import Fitted
 
-GAIN = 0.9  # ratio of two errors on what was held out, from which the smaller one is worth more parameters
 TRIED = 3  # hypotheses with laws that are looked at where none is named
 PORTS = 3  # ports at which an element is learned: those where a flexible force explains most
 JUDGED = 2  # learned elements that are compared on held-out blocks: those that follow all blocks best
@@ -74,8 +75,8 @@ class Correction:
         shares += f"and {left} is left."
         if not self.elements:
             return (
-                "The corrected simulator is the refitted one: nothing that was tried predicts held-out blocks better "
-                "by a tenth."
+                "The corrected simulator is the refitted one: nothing that was tried is expected to predict other "
+                "recordings better."
             )
         if not np.isfinite(self.after):
             return shares[0].upper() + shares[1:]
@@ -104,11 +105,6 @@ class _Hypothesis:
     named: Fitted
     held_out: HeldOut
 
-    @property
-    def size(self) -> tuple[bool, int]:
-        """What simple ones have less of: a learned element, then elements."""
-        return self.fitted is not self.named, len(self.fitted.simulator.elements)
-
 
 def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:
     """Choose the simulator to hand back, from what there is time to try.
@@ -126,7 +122,7 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
             break
     if not found:
         return as_named(search, best_laws.fitted), best_laws.fitted
-    best = _simplest(found)
+    best = min(found, key=lambda h: h.held_out.expected)
     shares = _shares(search, best.named, best.fitted)
     learned: tuple[Learned, ...] = ()
     if best.fitted is not best.named:
@@ -152,13 +148,6 @@ def as_named(search: Search, fitted: Fitted) -> Correction:
     return Correction(_elements(search, fitted), _shares(search, fitted, fitted))
 
 
-def _simplest(found: Sequence[_Hypothesis]) -> _Hypothesis:
-    """Take the simplest hypothesis of those that predict about as well as the best; of two, the better on average."""
-    best = min(h.held_out.error for h in found)
-    near = (h for h in found if GAIN * h.held_out.error <= best)
-    return min(near, key=lambda h: (h.size, h.held_out.blocks + h.held_out.ahead))
-
-
 def _of_trial(search: Search, trial: Trial) -> Iterator[_Hypothesis]:
     """Generate a hypothesis of the search, with its errors on what it was not fitted to, if it can be simulated."""
     with suppress(InputError):
@@ -179,7 +168,7 @@ def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> I
     with suppress(InputError, np.linalg.LinAlgError):
         inputs = search.bench.simulator.inputs
         for fitted in candidates(search.bench, base.fitted, ports, inputs, search.workers)[:JUDGED]:
-            yield _Hypothesis(fitted, base.fitted, held_out_errors(search.bench, fitted, search.workers))
+            yield _Hypothesis(fitted, base.fitted, search.predict(fitted, _own_elements(search, fitted)))
 
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
@@ -194,5 +183,9 @@ def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
 
 def _elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:
     """Port, law and form of the elements that the diagnosis has put in."""
-    own: Sequence[Placed] = fitted.simulator.elements[len(search.bench.simulator.elements) :]
-    return tuple((e.port, e.law.id, e.law.form) for e in own)
+    return tuple((e.port, e.law.id, e.law.form) for e in _own_elements(search, fitted))
+
+
+def _own_elements(search: Search, fitted: Fitted) -> Sequence[Placed]:
+    """Give the elements that the diagnosis has put in."""
+    return fitted.simulator.elements[len(search.bench.simulator.elements) :]

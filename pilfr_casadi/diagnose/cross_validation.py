@@ -37,20 +37,28 @@ class HeldOut:
     ----------
     blocks, ahead : float
         On blocks of the recordings, and on their second halves; infinite where the simulation diverges.
+    spread : float
+        Mean square by which predictions for other inputs are uncertain; see `evidence.spread`.
     """
 
     blocks: float
     ahead: float
+    spread: float = 0.0
 
     @property
     def mean_square(self) -> float:
-        """The larger of the two."""
-        return max(self.blocks, self.ahead)
+        """The larger error of the two, and what other inputs add to it."""
+        return max(self.blocks, self.ahead) + self.spread
+
+    @property
+    def expected(self) -> float:
+        """Root of the mean square."""
+        return float(np.sqrt(self.mean_square))
 
     @property
     def error(self) -> float:
-        """Root of the mean square."""
-        return float(np.sqrt(self.mean_square))
+        """Root of the larger error of the two."""
+        return float(np.sqrt(max(self.blocks, self.ahead)))
 
 
 def blocks_of(bench: Workbench) -> list[np.ndarray]:

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..laws import Law
+from ..optimise import Problem
 from ..simulators import Placed
 from .workbench import Fitted, Workbench
 
@@ -32,6 +33,8 @@ LEAST_WRONG = 0.05  # share of the error that is never taken for noise
 MORE = np.log(0.5)  # log prior probability of one effect more
 FLEXIBLE = ("hysteresis", "static_curve", "extra_mode", "stribeck_friction", "periodic_force", "drift")
 IMITATES = np.log(0.2)  # log prior probability of a flexible law, which can imitate others, beside that of another
+NEARER = 0.7  # factor on the inputs for which the spread of predictions is computed: well inside what was recorded
+ALMOST_NOTHING = 1e-9  # precision of the prior of initial states, over what a sample tells of them
 DOUBTFUL = np.log(0.01)  # log prior probability of values at which a law is hardly what its name says
 
 
@@ -49,31 +52,17 @@ class Sample:
 
 
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
-    """Compute the eigenvalues λ of what a sample tells of the laws' parameters, in units of their prior widths.
-
-    The prior width of a strength is what moves the outputs by their deviation; that of a shape parameter comes from its
-    bounds, logarithmic where these span more than a decade.
-    """
-    parameters = fitted.model.parameters
-    own = np.zeros(parameters.size, dtype=bool)
-    for e in laws:
-        for name in e.law.parameters():
-            own[parameters.position(f"{e.prefix}{name}")] = True
-    model = fitted.model.with_parameters(parameters.at(fitted.vector))
-    problem = bench.problem(model, fitted.engine)
+    """Compute the eigenvalues λ of what a sample tells of the laws' parameters, in units of their prior widths."""
+    own = _of_laws(fitted, laws)
+    problem, hessian = _hessian(bench, fitted)
     own = own[problem.free]
     if not own.any():
         return np.zeros(0)
-    theta, n_free = problem.start.copy(), problem.n_free
-    states = [s for p, s in zip(problem._placed, fitted.initial, strict=True) if p.first is not None]
-    theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
-    with np.errstate(all="ignore"):
-        hessian = np.nan_to_num(problem.normal(theta)[2], nan=np.inf)
     if not np.all(np.isfinite(hessian)):  # a run at the edge of divergence has no derivatives
         return np.full(int(own.sum()), np.inf)
-    laws_at = np.flatnonzero(np.append(own, np.zeros(len(theta) - n_free, dtype=bool)))
-    rest = np.setdiff1d(np.arange(len(theta)), laws_at)
-    width = _widths(fitted, laws, problem.free, np.diag(hessian)[:n_free])[laws_at]
+    laws_at = np.flatnonzero(np.append(own, np.zeros(len(hessian) - len(own), dtype=bool)))
+    rest = np.setdiff1d(np.arange(len(hessian)), laws_at)
+    width = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(own)])[laws_at]
     with np.errstate(all="ignore"):
         block = hessian[np.ix_(laws_at, laws_at)] * np.outer(width, width)
         size = np.sqrt(np.maximum(np.diag(hessian)[rest], 1e-300))
@@ -85,8 +74,60 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
     return np.maximum(np.linalg.eigvalsh(block), 0.0)
 
 
+def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
+    """Compute the mean square by which predictions for other inputs are uncertain, in units of the outputs' variance.
+
+    The other inputs are the recorded ones, brought nearer to their mean over all recordings. The parameters have the
+    covariance (n H / v + P)^-1 of Laplace's approximation, with H the Fisher information of a sample and P the
+    precision of the prior; with H' the information of a sample for the other inputs, it is tr(H' (n H / v + P)^-1).
+    Parameters that the recordings hardly determine show here, and nowhere in a cross-validation on the same recordings:
+    a curve of a pressure that had two levels, say.
+    """
+    mean = np.mean(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    nearer = bench.on([r.with_(u=mean + NEARER * (r.u - mean)) for r in bench.recordings])
+    problem, told = _hessian(bench, fitted)
+    _, asked = _hessian(nearer, fitted)
+    free = int(problem.free.sum())
+    if not free:
+        return 0.0
+    if not (np.all(np.isfinite(told)) and np.all(np.isfinite(asked))):
+        return np.inf
+    own = _widths(fitted, laws, problem.free, np.diag(told)[:free])
+    width = np.concatenate([own, 1 / np.sqrt(np.maximum(np.diag(told)[free:], 1e-300))])
+    prior = np.concatenate([np.ones(free), np.full(len(width) - free, ALMOST_NOTHING)])
+    precision = n / v * told * np.outer(width, width) + np.diag(prior)
+    covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)[:free, :free]
+    found = float(np.sum(covariance * asked[:free, :free] * np.outer(own, own)))
+    return found if np.isfinite(found) else np.inf
+
+
+def _of_laws(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
+    """Tell which parameters belong to the laws."""
+    parameters = fitted.model.parameters
+    own = np.zeros(parameters.size, dtype=bool)
+    for e in laws:
+        for name in e.law.parameters():
+            own[parameters.position(f"{e.prefix}{name}")] = True
+    return own
+
+
+def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray]:
+    """Compute the Fisher information of one sample on free parameters and initial states; it may be infinite."""
+    model = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
+    problem = bench.problem(model, fitted.engine)
+    theta, n_free = problem.start.copy(), problem.n_free
+    states = [s for r, s in zip(bench.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
+    theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
+    with np.errstate(all="ignore"):
+        return problem, np.nan_to_num(problem.normal(theta)[2], nan=np.inf)
+
+
 def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np.ndarray) -> np.ndarray:
-    """Prior width of each free parameter; that of parameters of the simulator is not used."""
+    """Compute the prior width of each free parameter.
+
+    The width of a strength is its own prior's, or else what moves the outputs by their deviation; that of other
+    parameters comes from their bounds, logarithmic where these span more than a decade.
+    """
     parameters, values = fitted.model.parameters, fitted.vector
     low, high = parameters.lower, parameters.upper
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -98,7 +139,8 @@ def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np
     for e in laws:
         for name in e.law.strength:
             where = parameters.position(f"{e.prefix}{name}")
-            width[where] = of_unit[where]
+            own = e.law.parameters()[name].prior
+            width[where] = of_unit[where] if own is None else np.ravel(own[1])
     return np.asarray(width[free])
 
 

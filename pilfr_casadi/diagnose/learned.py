@@ -9,7 +9,7 @@ simulation error. They start from the linear solution of the projected sensitivi
 on the size of the force whose strength is chosen on held-out blocks. It is the discrepancy of Kennedy & O'Hagan (2001,
 J. R. Statist. Soc. B 63), inside the loop.
 
-Beyond the range of z and dz/dt that the training recordings visit, both signals are saturated: the force goes on a
+Beyond the range of z, dz/dt and u that the training recordings visit, the signals are saturated: the force goes on a
 little way and then stays as it is. The saturation keeps a slope everywhere, so an unknown initial state can be
 estimated from outside the range.
 """
@@ -58,13 +58,14 @@ class LearnedForce(Law):
     source = "Kennedy & O'Hagan (2001), J. R. Statist. Soc. B 63(3)"
     sentence = "a learned force of the local coordinate, its rate and its turning points"
     # weights with their prior deviations; centre, reach and half the range of z, largest speed, mean and deviation of
-    # the input that scales it; ends of the range seen; room beyond them, in z and dz/dt
+    # the input that scales it; ends of the ranges seen, and the room beyond them
     units: ClassVar[Mapping[str, str]] = {
         "c": "w", "std": "w", "z_0": "z", "z_s": "z", "z_h": "z", "v_s": "z/s", "u_0": "", "u_s": "",
-        "z_low": "z", "z_high": "z", "v_low": "z/s", "v_high": "z/s", "z_room": "z", "v_room": "z/s",
+        "z_low": "z", "z_high": "z", "v_low": "z/s", "v_high": "z/s", "u_low": "", "u_high": "",
+        "z_room": "z", "v_room": "z/s", "u_room": "",
     }  # fmt: skip
     strength: ClassVar[tuple[str, ...]] = ("c",)
-    defaults: ClassVar[Mapping[str, Any]] = {"z_0": 0.0, "u_0": 0.0, "z_low": -1.0, "v_low": -1.0}
+    defaults: ClassVar[Mapping[str, Any]] = {"z_0": 0.0, "u_0": 0.0, "z_low": -1.0, "v_low": -1.0, "u_low": -1.0}
     places = ("parallel", "series")
     factor: ClassVar[str] = ""  # input that scales a part of the force
     follows = memory = STOPS
@@ -89,7 +90,7 @@ class LearnedForce(Law):
             phi += [curve, x * curve]
         w = sum(p["c"][j] * f for j, f in enumerate(phi))
         if self.factor and u is not None:
-            scale = (u[self.factor] - p["u_0"]) / p["u_s"]
+            scale = (_saturated(u[self.factor], p["u_low"], p["u_high"], p["u_room"]) - p["u_0"]) / p["u_s"]
             w += scale * sum(p["c"][len(phi) + j] * f for j, f in enumerate(phi))
         return w, ca.vertcat(*following)
 
@@ -111,7 +112,7 @@ class LearnedForce(Law):
         centre = 0.0 if both else local.middle
         speed = local.speed if np.any(local.dz) else 1.0
         scales = {"z_0": centre, "z_s": max(local.high - centre, centre - local.low), "z_h": local.half, "v_s": speed}
-        yield {**scales, **_limits(local.z, local.dz, FREE)}
+        yield {**scales, **_limits(FREE, z=local.z, v=local.dz)}
 
 
 def _saturated(x: Any, low: Any, high: Any, room: Any) -> Any:
@@ -120,10 +121,10 @@ def _saturated(x: Any, low: Any, high: Any, room: Any) -> Any:
     return ca.fmin(ca.fmax(x, low), high) + room * above / (room + above) - room * below / (room + below)
 
 
-def _limits(z: np.ndarray, dz: np.ndarray, room: float) -> dict[str, float]:
-    """Give the range of both signals, and the room beyond it."""
+def _limits(room: float, **signals: np.ndarray) -> dict[str, float]:
+    """Give the range of each signal, and the room beyond it."""
     out: dict[str, float] = {}
-    for name, values in (("z", z), ("v", dz)):
+    for name, values in signals.items():
         low, high = float(np.min(values)), float(np.max(values))
         out |= {f"{name}_low": low, f"{name}_high": high, f"{name}_room": room * (high - low) / 2 or 1.0}
     return out
@@ -191,7 +192,7 @@ def _solved(
     scales, columns = dict(shape), forces.copy()
     if factor:
         u, whole = task.part.inputs[factor], task.local.inputs[factor]
-        scales |= {"u_0": float(np.mean(whole)), "u_s": float(np.std(whole))}
+        scales |= {"u_0": float(np.mean(whole)), "u_s": float(np.std(whole)), **_limits(ROOM, u=whole)}
         columns = np.hstack([forces, forces * ((u - scales["u_0"]) / scales["u_s"])[:, None]])
     phi, size = rest.response(task.index, columns)
     felt, weights, std = lengths(phi) > 0, np.zeros(len(size)), np.zeros(len(size))
@@ -259,7 +260,7 @@ def _fitted(bench: Workbench, base: Fitted, start: Start) -> Fitted | None:
     except InputError:
         return None
     z, dz, _ = signals_along(bench, fitted)
-    seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _limits(z, dz, ROOM).items()}
+    seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _limits(ROOM, z=z, v=dz).items()}
     return bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
 
 

@@ -209,7 +209,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     corrected: tuple[Correction, Fitted] | None = None
     if verdict.kind == "missing-physics":
         correction, fitted = corrected = find_correction(search, answer, named=True)
-        kept = {(e.port, e.law.id, e.law.form) for e in answer.best.laws} <= set(correction.elements)
+        kept = {e.name for e in answer.effects} <= {(port, law) for port, law, _ in correction.elements}
         answer = answer.beside_learned(correction.shares["learned"] if kept else 1.0)
         verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics":

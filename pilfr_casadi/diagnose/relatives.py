@@ -3,6 +3,7 @@
 Each is a pair of port and law with start values of its own:
 
 - a special case of the best law, and a law that the best one refines;
+- another form of a law that came near;
 - a law with one more term than one that came near, from its values;
 - a resonance whose frequency is known: as a mass carried along at another port, or in place of a delay or a lag;
 - a law of a signal that takes time, at the other end of a simulator that is nearly linear;
@@ -59,7 +60,9 @@ def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored
     if not trials:
         return []
     found = [
-        entry for some in (_special, _carried, _late, _other_end, _refined, _plainer) for entry in some(trials, scored)
+        entry
+        for some in (_special, _forms, _carried, _late, _other_end, _refined, _plainer)
+        for entry in some(trials, scored)
     ]
     return [*found, *_imitated(bench, trials, scored)]
 
@@ -74,6 +77,17 @@ def _special(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     best, near = trials[0], _near(trials)
     cases = CONTAINS.get(best.law.id, ())
     return [s for s in scored if s.port == best.port and s.law.id in cases and (s.port, type(s.law)) not in near]
+
+
+def _forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Other forms of the laws that came near, where they were not tried."""
+    tried = {(t.port, type(t.law)) for t in trials}
+    ids = {(t.port, t.law.id) for t in trials if t.error < AHEAD * trials[0].error}
+    out: dict[tuple[str, type[Law]], Scored] = {}
+    for s in scored:
+        if (s.port, s.law.id) in ids and (s.port, type(s.law)) not in tried:
+            out.setdefault((s.port, type(s.law)), s)
+    return list(out.values())
 
 
 def _carried(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:

@@ -21,7 +21,7 @@ from ..engine import make_engine
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
 from .cross_validation import HeldOut, held_out_errors
-from .evidence import EXACT, MORE, Sample, information, log_evidence, log_prior
+from .evidence import EXACT, MORE, Sample, information, log_evidence, log_prior, spread
 from .floor import Floor, effective_size, white_part
 from .gates import Gate
 from .linearise import linearised
@@ -157,8 +157,16 @@ class Search:
     def predicts(self, trial: Trial) -> HeldOut:
         """Errors of a hypothesis on what it was not fitted to."""
         if trial.key not in self.held_out:
-            self.held_out[trial.key] = held_out_errors(self.bench, trial.fitted, self.workers)
+            self.held_out[trial.key] = self.predict(trial.fitted, trial.laws)
         return self.held_out[trial.key]
+
+    def predict(self, fitted: Fitted, laws: Sequence[Placed]) -> HeldOut:
+        """Errors of a fitted simulator with some laws on what it was not fitted to."""
+        found = held_out_errors(self.bench, fitted, self.workers)
+        if not np.isfinite(found.mean_square):
+            return found
+        v = found.mean_square + self.tolerance
+        return replace(found, spread=spread(self.bench, fitted, laws, v, self.sample.effective(0.0)))
 
     def _predict(self) -> None:
         """Let the likeliest hypotheses predict what they are not fitted to.

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         Power as Power,
         PowerWithGain as PowerWithGain,
         Quadratic as Quadratic,
+        Rectified as Rectified,
         Root as Root,
         Saturation as Saturation,
         SkewSaturation as SkewSaturation,

@@ -68,6 +68,24 @@ class Magnitude(Polynomial):
         return p.a * ca.fabs(z)
 
 
+class Rectified(Polynomial):
+    """A sensor that does not see the sign of its signal, such as a pulse counter, with a power and a zero."""
+
+    form = "rectified"
+    equation = "w = |z|^n + b - z"
+    source = "Wigren & Schoukens (2017), Uppsala University, Tech. Rep. 2017-024"
+    sentence = "a memoryless curve: the sensor does not see the sign of its signal"
+    units = {"n": "", "b": "z"}
+    strength = ()
+    starts = {"n": ("", 1.0, 1.5), "b": ("", 0.0)}
+    ranges = {"n": ("", 0.3, 3.0), "b": ("reach", -0.5, 0.5)}
+    places = ("sensor",)
+    two_sided = True  # on one side alone it is a power
+
+    def force(self, z: Any, p: Any) -> Any:
+        return (ca.fabs(z) + 1e-12) ** p.n + p.b - z
+
+
 class Power(Polynomial):
     """A signed power, such as the square root of a flow under its own head (Torricelli)."""
 
