@@ -10,7 +10,7 @@ at.
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -31,6 +31,7 @@ from .workbench import Fitted
 TRIED = 3  # hypotheses with laws that are looked at where none is named
 PORTS = 3  # ports at which an element is learned: those where a flexible force explains most
 JUDGED = 2  # learned elements that are compared on held-out blocks: those that follow all blocks best
+_Competitor = tuple[Fitted, Fitted, Callable[[], HeldOut]]  # as in `_Hypothesis`, the errors still to be computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +117,10 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     if named and answer.sure > SURE and unfollowed(search, best_laws) < FORMULA:
         return as_named(search, best_laws.fitted), best_laws.fitted
     found: list[_Hypothesis] = []
-    for hypothesis in _competing(search, best_laws if named else None):
-        found.append(hypothesis)
+    for fitted, named_only, predict in _competing(search, best_laws if named else None):
+        least = min((h.held_out.mean_square for h in found), default=np.inf)
+        if fitted.cost < least:  # nothing is predicted better than what it is fitted to
+            found.append(_Hypothesis(fitted, named_only, predict()))
         if time.perf_counter() > search.deadline:
             break
     if not found:
@@ -131,16 +134,14 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     return Correction(_elements(search, best.fitted), shares, learned, refit, best.held_out.error), best.fitted
 
 
-def _competing(search: Search, named: Trial | None) -> Iterator[_Hypothesis]:
-    """Generate what competes: the refit, the named laws or the likeliest, a learned element alone and beside them."""
+def _competing(search: Search, named: Trial | None) -> Iterator[_Competitor]:
+    """Generate what competes: the refit, the named laws or the likeliest, other laws, and a learned element."""
     first = named or max(search.memo.values(), key=lambda t: (bool(t.laws), search.promise(t)))
-    yield from _of_trial(search, search.root)
-    if first.laws:
-        yield from _of_trial(search, first)
-    yield from _with_learned(search, search.root, {e.port for e in named.laws} if named else set())
+    for trial in {t.key: t for t in (search.root, first, *_with_laws(search))}.values():
+        yield from _of_trial(search, trial)
     if first.laws:
         yield from _with_learned(search, search.memo[first.key])
-    yield from (h for t in _with_laws(search) if t.key != first.key for h in _of_trial(search, t))
+    yield from _with_learned(search, search.root, {e.port for e in named.laws} if named else set())
 
 
 def as_named(search: Search, fitted: Fitted) -> Correction:
@@ -148,11 +149,11 @@ def as_named(search: Search, fitted: Fitted) -> Correction:
     return Correction(_elements(search, fitted), _shares(search, fitted, fitted))
 
 
-def _of_trial(search: Search, trial: Trial) -> Iterator[_Hypothesis]:
-    """Generate a hypothesis of the search, with its errors on what it was not fitted to, if it can be simulated."""
+def _of_trial(search: Search, trial: Trial) -> Iterator[_Competitor]:
+    """Generate a hypothesis of the search, if it can be simulated."""
     with suppress(InputError):
         trial = search.thorough(trial)
-        yield _Hypothesis(trial.fitted, trial.fitted, search.predicts(trial))
+        yield trial.fitted, trial.fitted, lambda: search.predicts(trial)
 
 
 def _with_laws(search: Search) -> list[Trial]:
@@ -161,14 +162,14 @@ def _with_laws(search: Search) -> list[Trial]:
     return [*ranked[:TRIED], *(t for t in ranked[TRIED:] if t.key in search.held_out)]
 
 
-def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Hypothesis]:
+def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Competitor]:
     """Generate learned elements beside a trial, at the free ports where a flexible force explains most."""
     shares = search.flexible(base)
     ports = [name for name in sorted(shares, key=lambda name: -shares[name]) if name not in taken][:PORTS]
     with suppress(InputError, np.linalg.LinAlgError):
-        inputs = search.bench.simulator.inputs
-        for fitted in candidates(search.bench, base.fitted, ports, inputs, search.workers)[:JUDGED]:
-            yield _Hypothesis(fitted, base.fitted, search.predict(fitted, _own_elements(search, fitted)))
+        inputs, part = search.bench.simulator.inputs, search.fits.part
+        for fitted in candidates(search.bench, part, base.fitted, ports, inputs, search.workers)[:JUDGED]:
+            yield fitted, base.fitted, lambda one=fitted: search.predict(one, _own_elements(search, one))
 
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:

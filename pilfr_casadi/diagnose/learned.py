@@ -218,12 +218,19 @@ def _error_unseen(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: flo
 
 
 def candidates(
-    bench: Workbench, base: Fitted, port_names: Sequence[str], inputs: Sequence[str] = (), workers: int = 1
+    bench: Workbench,
+    part: Workbench,
+    base: Fitted,
+    port_names: Sequence[str],
+    inputs: Sequence[str] = (),
+    workers: int = 1,
 ) -> list[Fitted]:
     """Fit a learned element on top of a fitted simulator, which may have elements already, at each of some ports.
 
     Parameters
     ----------
+    part : Workbench
+        The bench with as much of the recordings as is enough to choose by; the chosen elements are fitted to all.
     port_names : sequence of str
         Ports to try.
     inputs : sequence of str
@@ -237,11 +244,11 @@ def candidates(
         The learned element is the last; smallest error first. Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names, inputs) if s.share > 0]
-    found = side_by_side(lambda start: _fitted(bench, base, start), starts[:FITS], workers)
+    found = side_by_side(lambda start: _fitted(bench, part, base, start), starts[:FITS], workers)
     return sorted((f for f in found if f is not None), key=lambda f: f.cost)
 
 
-def _fitted(bench: Workbench, base: Fitted, start: Start) -> Fitted | None:
+def _fitted(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fitted | None:
     """Fit a learned element with the simulator's own parameters; None where every start diverges."""
     placed = base.simulator.with_element(start.port, start.law)
     model = bench.model(placed)
@@ -255,8 +262,10 @@ def _fitted(bench: Workbench, base: Fitted, start: Start) -> Fitted | None:
         return found if np.isfinite(found) else np.inf
 
     try:
-        best = min(starts, key=cost)
-        fitted = bench.fit(placed, [best], states=base.initial, solver=QUICK, model=model, engine=engine)
+        best, states = min(starts, key=cost), base.initial
+        for some in {id(b): b for b in (part, bench)}.values():
+            fitted = some.fit(placed, [best], states=states, solver=QUICK, model=model, engine=engine)
+            best, states = fitted.values, fitted.initial
     except InputError:
         return None
     z, dz, _ = signals_along(bench, fitted)
