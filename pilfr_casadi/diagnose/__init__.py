@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
-    from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect, plain as plain
+    from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect
     from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate
     from .workbench import Fitted as Fitted, Workbench as Workbench
 else:

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .._base import in_words
 from ..laws import display_name
 from ..simulators import in_series
 from .detectability import LINEAR, TENTH, LawRow, idle_ports, port_units
-from .identifiability import ParameterRow, Sensitivity, Tie, count_undetermined, in_words
+from .identifiability import ParameterRow, Sensitivity, Tie, count_undetermined
 from .linearise import Probe, Run, along
 from .workbench import Fitted, Workbench
 

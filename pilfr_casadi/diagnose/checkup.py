@@ -13,18 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from .._base import one_blas_thread
+from .._base import one_blas_thread, to_json
 from ..data import Recording
 from ..laws import Law, display_name
 from .arguments import check_laws, matched
 from .blind_spots import BlindSpot, Excitation, excitations, find_blind_spots, helpful_sensors, next_record
 from .detectability import LawRow, assess_laws, words
-from .floor import Floor, measured_floor, white_part
+from .floor import ABOVE_NOISE, noise_floor
 from .gates import said_hold
 from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters
 from .linearise import linearised
 from .remainder import lengths
-from .result import LEFT, plain
 from .workbench import Fitted, Workbench
 
 FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a sensor of 20 bits
@@ -72,7 +71,7 @@ class Check:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of check.json; numbers that are not finite are None."""
-        clean: dict[str, Any] = plain(
+        clean: dict[str, Any] = to_json(
             {
                 "schema": 1,
                 "blind_spots": [asdict(b) for b in self.blind_spots],
@@ -160,7 +159,7 @@ class Check:
         floor = float(np.mean(list(self.noise["share"].values())))
         times = self.error / max(floor, 1e-300)
         yield f"refitted: error {100 * self.error:.3g} % of the outputs' deviation, {times:.2g} times the noise"
-        if times > LEFT:
+        if times > ABOVE_NOISE:
             yield "  Something is missing or the noise is slow: the strengths above count the noise alone."
         yield f"inputs between samples: {HOLD_WORDS[self.hold]}"
         yield f"start of each recording: {', '.join(self.starts)}"
@@ -230,7 +229,7 @@ def check(
 def assess(bench: Workbench, fitted: Fitted, stated: str, laws: Sequence[type[Law]] | None = None) -> Check:
     """Assess the recordings of a bench along a refitted run; `stated` is the hold that somebody stated, if any."""
     began, simulator = time.perf_counter(), bench.simulator
-    floor = measured_floor(bench.recordings) or Floor(white_part(fitted.residual), "estimated")
+    floor = noise_floor(bench.recordings, fitted.residual)
     noise = np.maximum(floor.deviation, FINEST * bench.scale)
     quiet = replace(bench, scale=noise)  # everything from here on is counted in units of the noise
     probe, runs = linearised(quiet, fitted)

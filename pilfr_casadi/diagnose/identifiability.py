@@ -16,6 +16,7 @@ from itertools import combinations
 import casadi as ca
 import numpy as np
 
+from .._base import in_words
 from ..models import ParameterSet
 from ..simulators import Named, Simulator
 from .linearise import Probe, Run, propagate
@@ -23,7 +24,6 @@ from .remainder import block_diagonal, lengths, moved, orthonormal
 from .workbench import Fitted, Workbench
 
 LARGEST_GROUP = 4  # parameters of a group that is looked for; above it all combinations are too many
-SHOWN = 8  # names in a sentence
 EXPONENTS = (1, 2, 3)  # denominators of exponents; physical laws have small ones
 STEP = 1.1  # factor of a trial step that tells a product from a sum; they differ by a twentieth of it
 SAME = 0.01  # share of a parameter's own change that a step along a ratio or product leaves; of another curve, more
@@ -96,13 +96,6 @@ class Symbols:
         x = Named("state", {name: xs[i] for i, name in enumerate(simulator.states)})
         u = Named("input", {name: us[i] for i, name in enumerate(simulator.inputs)})
         return cls(xs, us, vector, x, u, Named("parameter", own.symbols(vector)), ca.SX.sym("t"))
-
-
-def in_words(names: Sequence[str]) -> str:
-    """Names as a sentence has them; many are cut short."""
-    if len(names) > SHOWN:
-        return f"{', '.join(names[:SHOWN])} and {len(names) - SHOWN} more"
-    return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
 
 
 @dataclass(frozen=True, eq=False)
