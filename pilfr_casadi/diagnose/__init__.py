@@ -17,8 +17,8 @@ about. The files by stage:
   `residual_spectrum` (steady tones, ringing modes).
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
-- Before any of it: `checkup` (what the recordings can reveal), by `identifiability`,
-  `detectability` and `blind_spots`.
+- Before any of it: `checkup` (what the recordings can reveal), by `identifiability` (of parameters) and
+  `detectability` (of laws).
 - In place of a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
 """
 
