@@ -38,6 +38,15 @@ IDENTIFIABLE = {
     "start": "no: traded off with the unknown start",
     "port": "only with a law at its port",
 }
+UNIDENTIFIABLE = {
+    "dead": "No output reacts to {}.",
+    "flat": "These recordings say less about {} than the bounds do.",
+    "start": "{} cannot be distinguished from the unknown initial state; say initial='zero' if it was zero.",
+}
+MOTION = {  # the record that mends the blind spot
+    "no-reversal": "A slow triangle of {} with reversals, at two amplitudes.",
+    "one-amplitude": "A second amplitude of {}, such as half of it.",
+}
 HOLD_WORDS = {
     "zero": "held",
     "linear": "interpolated",
@@ -100,6 +109,11 @@ class Check:
     next_record: str = ""
     seconds: float = 0.0
 
+    @property
+    def detectable(self) -> tuple[LawRow, ...]:
+        """Laws that are detectable."""
+        return tuple(r for r in self.laws if r.status == "detectable")
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of check.json; numbers that are not finite are None."""
         out: dict[str, Any] = {"schema": 1, **asdict(self), "hold": self.hold or None}
@@ -144,12 +158,11 @@ class Check:
         for r in self.laws:
             shown.setdefault(self._label(r.port), r.port)
         for label, port in shown.items():
-            own = [r for r in self.laws if r.port == port]
-            for r in sorted((r for r in own if r.status == "detectable"), key=lambda r: r.share or 0.0):
+            for r in sorted((r for r in self.detectable if r.port == port), key=lambda r: r.share or 0.0):
                 share = "" if r.share is None else f"{100 * r.share:.2g} %"
                 strength = "{} = {:.2g} {}".format(*r.strength).rstrip() if r.strength else ""
                 rows.append((label, display_name(r.law), f"{r.force:.2g} {r.unit}".rstrip(), share, strength))
-            hidden = [r for r in own if r.status != "detectable"]
+            hidden = [r for r in self.laws if r.port == port and r.status != "detectable"]
             for why in dict.fromkeys(map(_why, hidden)):
                 names = ", ".join(display_name(r.law) for r in hidden if _why(r) == why)
                 rows.append((label, names, f"no: {why}", "", ""))
@@ -237,7 +250,7 @@ def check(
 
 def assess(bench: Workbench, fitted: Fitted, stated: str, laws: Sequence[type[Law]] | None = None) -> Check:
     """Assess the recordings of a bench along a refitted run; `stated` is the hold that somebody stated, if any."""
-    began, outputs = time.perf_counter(), bench.simulator.output_names
+    began, inputs, outputs = time.perf_counter(), bench.simulator.inputs, bench.simulator.output_names
     floor = noise_floor(bench.recordings, fitted.residual)
     noise = np.maximum(floor.deviation, FINEST * bench.scale)
     quiet = replace(bench, scale=noise)  # everything from here on is counted in units of the noise
@@ -261,17 +274,13 @@ def assess(bench: Workbench, fitted: Fitted, stated: str, laws: Sequence[type[La
         hold=stated,
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
     )
-    still = tuple(n for n, swing in _swings(bench).items() if not swing > 0)
-    blind = tuple(_find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters)))
+    swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    still = [name for name, swing in zip(inputs, swings, strict=True) if not swing > 0]
+    found = replace(
+        found, blind_spots=tuple(_find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters)))
+    )
     sensors = helpful_sensors(quiet, fitted, runs, response) if ties else ()
-    record = _next_record(bench, replace(found, blind_spots=blind), sensors)
-    return replace(found, blind_spots=blind, next_record=record, seconds=time.perf_counter() - began)
-
-
-def _swings(bench: Workbench) -> dict[str, float]:
-    """Largest minus smallest value of each input over all recordings."""
-    u = np.concatenate([r.u for r in bench.recordings])
-    return dict(zip(bench.simulator.inputs, np.ptp(u, axis=0).tolist(), strict=True))
+    return replace(found, next_record=_next_record(found, inputs, sensors), seconds=time.perf_counter() - began)
 
 
 def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
@@ -288,115 +297,96 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
     return tuple(name for name in doubtful if reach[name] >= 1)
 
 
-def _find_blind_spots(found: Check, still: tuple[str, ...], alive: Sequence[str]) -> Iterator[BlindSpot]:
+def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) -> Iterator[BlindSpot]:
     """Put everything that the recordings cannot reveal into sentences, the gravest first.
 
     `still` are inputs that never change, `alive` dead or flat parameters that move the outputs at the given values.
     """
+
+    def spot(kind: str, names: Sequence[str], sentence: str) -> Iterator[BlindSpot]:
+        if names:
+            yield BlindSpot(kind, tuple(names), sentence.format(in_words(names)))
+
     if found.error**2 > HALF:
         left = f"{100 * found.error:.3g} % of the outputs' deviation"
         yield BlindSpot("rough", (), f"The refitted simulator leaves {left}, so all of this is rough.")
-    if still:
-        yield BlindSpot("constant-input", still, f"Constant in all recordings: {in_words(still)}.")
+    yield from spot("constant-input", still, "Constant in all recordings: {}.")
     if not found.parameters:
         text = "The simulator has no free parameter, so a wrong value and a missing law look alike."
         yield BlindSpot("no-free-parameter", (), text)
-    sentences = {
-        "dead": "No output reacts to {}.",
-        "flat": "These recordings say less about {} than the bounds do.",
-        "start": "{} cannot be distinguished from the unknown initial state; say initial='zero' if it was zero.",
-    }
-    for kind, sentence in sentences.items():
-        if names := tuple(p.name for p in found.parameters if p.status == kind):
-            text = sentence.format(in_words(names))
-            if own := [name for name in names if name in alive]:
-                text += f" At the given values, before the refit, the outputs do react to {in_words(own)}."
-            yield BlindSpot(kind, names, text)
+    for status, sentence in UNIDENTIFIABLE.items():
+        names = [p.name for p in found.parameters if p.status == status]
+        own = in_words([name for name in names if name in alive])
+        more = f" At the given values, before the refit, the outputs do react to {own}." if own else ""
+        yield from spot(status, names, sentence + more)
     for tie in found.ties:
         yield BlindSpot("tied", tie.names, tie.sentence)
     moving = [e for e in found.excitation if e.port.removeprefix("actuator:") not in still]
-    motions = {
-        "no-motion": ("Nothing moves at {}.", [e for e in moving if e.travel == 0]),
-        "no-reversal": (
-            "No reversal at {}: hysteresis and friction look like stiffness and damping there.",
-            [e for e in moving if e.travel > 0 and e.reversals == 0],
-        ),
-        "one-amplitude": (
-            "A single amplitude at {}: hysteresis looks like damping and stiffness there.",
-            [e for e in moving if e.reversals and e.amplitudes == 1],
-        ),
-    }
-    for kind, (sentence, places) in motions.items():
-        if ports := tuple(e.port for e in places):
-            yield BlindSpot(kind, ports, sentence.format(in_words(ports)))
-    yield from _hidden_laws(found)
-    for group in _alike_ports(found):
-        yield BlindSpot("alike-ports", group, f"A law looks the same at {in_words(group)}.")
-
-
-def _hidden_laws(found: Check) -> Iterator[BlindSpot]:
-    """Find ports at which nothing is detectable, and at the others laws that own parameters follow."""
-    ports = tuple(dict.fromkeys(r.port for r in found.laws))
-    seen = {r.port for r in found.laws if r.status == "detectable"}
-    if dark := tuple(port for port in ports if port not in seen):
-        yield BlindSpot("hidden-port", dark, f"No law of the catalogue is detectable at {in_words(dark)}.")
+    yield from spot("no-motion", [e.port for e in moving if e.travel == 0], "Nothing moves at {}.")
+    text = "No reversal at {}: hysteresis and friction look like stiffness and damping there."
+    yield from spot("no-reversal", [e.port for e in moving if e.travel > 0 and e.reversals == 0], text)
+    text = "A single amplitude at {}: hysteresis looks like damping and stiffness there."
+    yield from spot("one-amplitude", [e.port for e in moving if e.reversals and e.amplitudes == 1], text)
+    ports, seen = (dict.fromkeys(r.port for r in rows) for rows in (found.laws, found.detectable))
+    dark = [port for port in ports if port not in seen]
+    yield from spot("hidden-port", dark, "No law of the catalogue is detectable at {}.")
     for port in ports:
-        followed = [r for r in found.laws if r.port == port and r.status == "followed" and r.law not in LINEAR]
-        for why in dict.fromkeys(r.why for r in followed):
-            own = tuple(r.law for r in followed if r.why == why)
-            what = f"a change of {why}" if any(why == p.name for p in found.parameters) else why
-            names = in_words([display_name(name) for name in own])
-            text = f"{names[0].upper()}{names[1:]} at {port} cannot be distinguished from {what}."
-            yield BlindSpot("followed", (port, *own), text)
+        yield from _followed_laws(found, port)
+    for group in _alike_ports(found):
+        yield from spot("alike-ports", group, "A law looks the same at {}.")
 
 
-def _alike_ports(found: Check) -> Iterator[tuple[str, ...]]:
+def _followed_laws(found: Check, port: str) -> Iterator[BlindSpot]:
+    """Find the laws of a port that own parameters follow, by the parameter that does."""
+    followed = [r for r in found.laws if r.port == port and r.status == "followed" and r.law not in LINEAR]
+    for why in dict.fromkeys(r.why for r in followed):
+        own = tuple(r.law for r in followed if r.why == why)
+        what = f"a change of {why}" if any(why == p.name for p in found.parameters) else why
+        names = in_words([display_name(name) for name in own])
+        text = f"{names[0].upper()}{names[1:]} at {port} cannot be distinguished from {what}."
+        yield BlindSpot("followed", (port, *own), text)
+
+
+def _alike_ports(found: Check) -> list[list[str]]:
     """Find groups of ports at which every law that is detectable at both looks the same."""
-    detectable = {(r.port, r.law) for r in found.laws if r.status == "detectable"}
-    number = {name: i for i, group in enumerate(found.classes) for name in group}
+    laws: dict[str, set[str]] = {}
+    for r in found.detectable:
+        laws.setdefault(r.port, set()).add(r.law)
+    same = {(one, other) for group in found.classes for one in group for other in group}
 
     def alike(one: str, other: str) -> bool:
-        shared = [law for port, law in detectable if port == one and (other, law) in detectable]
-        pairs = [(number.get((one, law), -1), number.get((other, law), -2)) for law in shared]
-        return bool(pairs) and all(a == b for a, b in pairs)
+        shared = laws[one] & laws[other]
+        return bool(shared) and all(((one, law), (other, law)) in same for law in shared)
 
-    ports = dict.fromkeys(r.port for r in found.laws if r.status == "detectable")
-    for group in group_alike(ports, alike):
-        if len(group) > 1:
-            yield tuple(group)
+    return [group for group in group_alike(laws, alike) if len(group) > 1]
 
 
-def _next_record(bench: Workbench, found: Check, sensors: Sequence[str]) -> str:
+def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) -> str:
     """Say what to record next, by the gravest blind spot that a record can mend."""
-    by_kind = {b.kind: b.names for b in reversed(found.blind_spots)}
-    if "rough" in by_kind:
+    names = {b.kind: b.names for b in reversed(found.blind_spots)}
+    if "rough" in names:
         return "None before the simulator follows these better: check its values and units, the start and the hold."
-    if "constant-input" in by_kind:
-        return f"One in which {in_words(by_kind['constant-input'])} varies."
-    drive = next(iter(bench.simulator.inputs), "the input")
-    for inner in (True, False):  # forces inside first, then the signals
-        ahead, single = (
-            [p for p in by_kind.get(k, ()) if in_series(p) != inner] for k in ("no-reversal", "one-amplitude")
-        )
-        own = [port.removeprefix("actuator:") for port in (*ahead, *single) if port.startswith("actuator:")]
-        name = drive if inner or not own else own[0]
-        if ahead:
-            return f"A slow triangle of {name} with reversals, at two amplitudes."
-        if single:
-            return f"A second amplitude of {name}, such as half of it."
+    if "constant-input" in names:
+        return f"One in which {in_words(names['constant-input'])} varies."
+    drive = inputs[0] if inputs else "the input"
+    signals = [port for kind in MOTION for port in names.get(kind, ()) if port.startswith("actuator:")]
+    own = signals[0].removeprefix("actuator:") if signals else drive
+    for inside, signal in ((True, drive), (False, own)):  # forces inside first, then the signals
+        for kind, sentence in MOTION.items():
+            if any(in_series(port) != inside for port in names.get(kind, ())):
+                return sentence.format(signal)
     if sensors:
-        names = in_words([n for t in found.ties for n in t.names])
-        return f"One with another sensor, such as one of {sensors[0]}, to separate {names}."
-    if hidden := (*by_kind.get("hidden-port", ()), *by_kind.get("dead", ())):
+        tied = in_words([n for t in found.ties for n in t.names])
+        return f"One with another sensor, such as one of {sensors[0]}, to separate {tied}."
+    if hidden := (*names.get("hidden-port", ()), *names.get("dead", ())):
         return f"One with another sensor, which reacts to {in_words(hidden)}."
-    if group := by_kind.get("alike-ports", ()):
-        inside = [port for port in group if not in_series(port)]
-        if inside:
-            return f"One that also measures the force at {inside[0]}."
-        return f"One with another sensor between {in_words(group)}."
-    if "flat" in by_kind or "followed" in by_kind:
+    if group := names.get("alike-ports"):
+        forces = [port for port in group if not in_series(port)]
+        sensor = f"One with another sensor between {in_words(group)}."
+        return f"One that also measures the force at {forces[0]}." if forces else sensor
+    if "flat" in names or "followed" in names:
         return f"A longer one, with other amplitudes and rates of {drive}."
-    if "start" in by_kind:
+    if "start" in names:
         return "One that begins at rest, with initial='zero'."
     if found.ties:
         return f"No further record of these signals helps: measure {found.ties[0].names[0]} separately and fix it."

@@ -173,7 +173,7 @@ def _undetectable(row: LawRow, phi: np.ndarray, most: float, own: np.ndarray, na
         return replace(row, status="weak")
     cosines = np.abs(response @ own) / np.maximum(lengths(own), 1e-300)
     alike = np.max(cosines, initial=0.0) > TENTH
-    return replace(row, status="followed", why=names[np.argmax(cosines)] if alike else "the unknown start")
+    return replace(row, status="followed", why=names[int(np.argmax(cosines))] if alike else "the unknown start")
 
 
 def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], ...]:

@@ -282,7 +282,7 @@ def _sum(names: Sequence[str], factors: np.ndarray) -> str:
 def _finite_change(
     rows: np.ndarray, logarithmic: bool, group: np.ndarray, response: Sensitivity, bench: Workbench, fitted: Fitted
 ) -> float:
-    """Compute the change of the first recording's outputs by a step of a tenth along which the rows are constant.
+    """Compute the change of the outputs by a step of a tenth along which the rows are constant.
 
     It is a share of the change by the first parameter alone, and zero where it is below the noise; unknown initial
     states follow both.
@@ -290,22 +290,18 @@ def _finite_change(
     direction, alone = _complement(rows)[0], np.eye(len(group))[0]
     places, value = np.flatnonzero(bench.simulator.parameter_set.free)[group], response.values[group]
     step = (STEP - 1) * np.min(np.abs(value))
-    r, drive = bench.recordings[0], fitted.model.drive(bench.recordings[0])
-
-    def outputs(way: np.ndarray) -> np.ndarray:
+    sizes = []
+    for way in (direction / np.max(np.abs(direction)), alone):
         vector = fitted.vector.copy()
         vector[places] = value * STEP**way if logarithmic else value + step * way
-        y = fitted.engine.simulate(drive, vector, fitted.initial[0])[0]
-        return np.asarray((y / bench.scale)[r.skip :].ravel())
-
-    with np.errstate(all="ignore"):
-        now = outputs(0 * alone)
-        ways = direction / np.max(np.abs(direction)), alone
-        changes = np.column_stack([outputs(way) - now for way in ways])
-    if not np.all(np.isfinite(changes)):
-        return np.inf
-    size = lengths(project_off(changes, orthonormal(response.start[: len(changes)])))
-    return float(size[0] / size[1]) if size[0] > 1 else 0.0
+        values = fitted.model.parameters.unpack(vector)
+        there = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
+        if not np.isfinite(there.cost):
+            return np.inf
+        pairs = zip(there.residual, fitted.residual, bench.recordings, strict=True)
+        change = np.concatenate([((new - old) / bench.scale)[r.skip :].ravel() for new, old, r in pairs])
+        sizes.append(float(np.linalg.norm(project_off(change, orthonormal(response.start)))))
+    return sizes[0] / sizes[1] if sizes[0] > 1 else 0.0
 
 
 def helpful_sensors(bench: Workbench, fitted: Fitted, runs: Sequence[Run], response: Sensitivity) -> tuple[str, ...]:
