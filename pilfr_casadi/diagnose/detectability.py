@@ -132,10 +132,8 @@ def assess_laws(
 def _laws_at(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
     """Return the laws that may stand at a port; of the catalogue, the first form of each: finer ones are as visible."""
     placed = [law for law in (CATALOGUE if laws is None else laws) if port.kinds & set(law.places)]
-    first: dict[str, type[Law]] = {}
-    for law in placed:
-        first.setdefault(law.id, law)
-    return tuple(placed if laws is not None else first.values())
+    first = {law.id: law for law in reversed(placed)}
+    return tuple(law for law in placed if laws is not None or law is first[law.id])
 
 
 def _at_port(
@@ -272,16 +270,14 @@ def _excitation(port: str, unit: str, signals: Sequence[np.ndarray]) -> Excitati
 
 def _turning_points(z: np.ndarray, least: float) -> list[int]:
     """Find the samples at which z turns round between swings of at least `least`, the first and the last included."""
-    step = np.diff(z)
-    candidates = [0, *(np.flatnonzero(step[:-1] * step[1:] <= 0) + 1).tolist(), len(z) - 1]
-    turns, extreme, way = [0], 0, 0
-    for k in candidates[1:]:
+    turns, extreme, way = [0], 0, 0.0
+    for k, value in enumerate(z.tolist()):
         if way == 0:
-            if abs(z[k] - z[turns[0]]) >= least:
-                way, extreme = (1 if z[k] > z[turns[0]] else -1), k
-        elif way * (z[k] - z[extreme]) >= 0:
+            if abs(value - z[0]) >= least:
+                way, extreme = np.sign(value - z[0]), k
+        elif way * (value - z[extreme]) >= 0:
             extreme = k
-        elif way * (z[extreme] - z[k]) >= least:
+        elif way * (z[extreme] - value) >= least:
             turns.append(extreme)
             way, extreme = -way, k
     return [*turns, extreme] if extreme > turns[-1] else turns

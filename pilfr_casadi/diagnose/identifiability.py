@@ -72,25 +72,20 @@ class Tie:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Sensitivity of the outputs along whole recordings to parameters and unknown initial states.
+    """Sensitivity of the outputs along whole recordings to free parameters and unknown initial states.
 
     Attributes
     ----------
-    names, units : tuple of str
-        Free entries of the simulator's parameters.
-    values, room : array, shape (n,)
-        Fitted values, and the standard deviation of a value of which only the bounds are known.
-    at_bound : array, shape (n,), bool
-        Whether the fitted values are at a bound.
+    rows : tuple of ParameterRow
+        Free entries of the simulator's parameters, not assessed yet.
+    room : array, shape (n,)
+        Standard deviation of each value if only its bounds are known.
     raw, start : array, shapes (R, n) and (R, k)
         Changes of all outputs, in units of the noise, by a unit change of each parameter and unknown initial state.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: np.ndarray
+    rows: tuple[ParameterRow, ...]
     room: np.ndarray
-    at_bound: np.ndarray
     raw: np.ndarray
     start: np.ndarray
 
@@ -99,21 +94,22 @@ class Sensitivity:
         """Compute it along the runs of a bench whose scale is the noise."""
         own = bench.simulator.parameter_set
         places = np.flatnonzero(own.free)
+        units = [p.unit for p in own.values() for _ in range(p.size)]
+        values, given, lower, upper = (v[places] for v in (probe.values, own.start, own.lower, own.upper))
+        rows = tuple(
+            ParameterRow(own.labels[i], float(value), units[i], None, "", not low < value < high)
+            for i, value, low, high in zip(places, values, lower, upper, strict=True)
+        )
         raw, start = _changes(bench, runs)
         signal = np.concatenate([r.y[r.skip :] for r in bench.recordings]) / bench.scale
         # without bounds, the room is the given value; of zero, the change that moves the outputs as they have moved
         unit = np.linalg.norm(signal - signal.mean(axis=0)) / np.where(lengths(raw) > 0, lengths(raw), 1.0)
-        values, given, lower, upper = (v[places] for v in (probe.values, own.start, own.lower, own.upper))
-        units = [p.unit for p in own.values() for _ in range(p.size)]
-        return cls(
-            tuple(own.labels[i] for i in places),
-            tuple(units[i] for i in places),
-            values,
-            _room(np.where(given != 0, np.abs(given), unit), lower, upper),
-            (values <= lower) | (values >= upper),
-            raw,
-            start,
-        )
+        return cls(rows, _room(np.where(given != 0, np.abs(given), unit), lower, upper), raw, start)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free entries."""
+        return tuple(r.name for r in self.rows)
 
     @property
     def scaled(self) -> np.ndarray:
@@ -154,26 +150,24 @@ def assess_parameters(
     response: Sensitivity, bench: Workbench, fitted: Fitted
 ) -> tuple[tuple[ParameterRow, ...], tuple[Tie, ...]]:
     """Assess each free parameter, and find the groups that are traded off."""
-    n, scaled = len(response.names), response.scaled
-    status = np.full(n, "identifiable", dtype=object)
+    scaled = response.scaled
+    status = np.full(len(response.rows), "identifiable", dtype=object)
     status[lengths(scaled) < 1] = "start"
     status[response.reach < 1] = "flat"
     status[response.reach == 0] = "dead"
     status[_read_by_ports_alone(bench.simulator)] = "port"
     rest = np.flatnonzero(status == "identifiable")
     groups = [rest[own] for own in _groups(scaled[:, rest])]
-    std = np.full(n, np.nan)
-    _, s, v = np.linalg.svd(scaled[:, rest])
-    std[rest] = response.room[rest] * lengths((v[: len(s)] / np.maximum(s, 1.0)[:, None])[s >= 1])
     for group in groups:
         status[group] = "tied"
+    _, s, v = np.linalg.svd(scaled[:, rest])
+    errors = lengths((v[: len(s)] / np.maximum(s, 1.0)[:, None])[s >= 1])  # in units of the room
+    std = dict(zip(rest, (response.room[rest] * errors).tolist(), strict=True))
     rows = tuple(
-        ParameterRow(name, float(value), unit, float(error) if state == "identifiable" else None, state, bool(bound))
-        for name, value, unit, error, state, bound in zip(
-            response.names, response.values, response.units, std, status, response.at_bound, strict=True
-        )
+        replace(row, std=std[i] if status[i] == "identifiable" else None, status=status[i])
+        for i, row in enumerate(response.rows)
     )
-    return rows, tuple(Tie(tuple(response.names[i] for i in g), _only_as(response, g, bench, fitted)) for g in groups)
+    return rows, tuple(Tie(tuple(rows[i].name for i in g), _only_as(response, g, bench, fitted)) for g in groups)
 
 
 def _read_by_ports_alone(simulator: Simulator) -> np.ndarray:
@@ -212,9 +206,9 @@ def _groups(scaled: np.ndarray) -> list[list[int]]:
 
 def _only_as(response: Sensitivity, group: np.ndarray, bench: Workbench, fitted: Fitted) -> tuple[str, ...]:
     """Write what is identifiable of a group: monomials or sums with small whole numbers, or nothing."""
-    names, values = [response.names[i] for i in group], response.values[group]
+    names, values = zip(*((response.rows[i].name, response.rows[i].value) for i in group), strict=True)
     found = []
-    for unit, write in ((values, _monomial), (np.ones(len(group)), _sum)):
+    for unit, write in ((np.array(values), _monomial), (np.ones(len(group)), _sum)):
         if np.all(unit != 0) and (rows := _whole(response.scaled[:, group], response.room[group] / unit)) is not None:
             change = _finite_change(rows, write is _monomial, group, response, bench, fitted)
             found.append((change, tuple(write(names, row) for row in rows)))
@@ -288,7 +282,8 @@ def _finite_change(
     states follow both.
     """
     direction, alone = _complement(rows)[0], np.eye(len(group))[0]
-    places, value = np.flatnonzero(bench.simulator.parameter_set.free)[group], response.values[group]
+    places = np.flatnonzero(bench.simulator.parameter_set.free)[group]
+    value = fitted.vector[places]
     step = (STEP - 1) * np.min(np.abs(value))
     sizes = []
     for way in (direction / np.max(np.abs(direction)), alone):
@@ -308,16 +303,12 @@ def helpful_sensors(bench: Workbench, fitted: Fitted, runs: Sequence[Run], respo
     """Find states whose sensor, as quiet as the present ones, would determine more of the parameters; best first."""
     signal = np.std(np.concatenate([r.y for r in bench.recordings]), axis=0)
     noise = np.mean(bench.scale / signal) * np.std(along(bench, fitted)[0], axis=0)
-    count, n_x, found = len(_undetermined(response.scaled)), runs[0].a.shape[1], list[tuple[int, str]]()
-    for j, name in enumerate(bench.simulator.states):
-        if noise[j] > 0:
-            row = np.eye(n_x)[[j]]
-            sensed = [
-                replace(r, c=np.broadcast_to(row, (len(r.c), 1, n_x)), d=np.zeros((len(r.d), 1, r.d.shape[2])))
-                for r in runs
-            ]
-            raw, start = _changes(replace(bench, scale=noise[[j]]), sensed)
-            more = replace(response, raw=np.vstack([response.raw, raw]), start=np.vstack([response.start, start]))
-            left = len(_undetermined(more.scaled))
-            found += [(left, name)] if left < count else []
+    count, found = len(_undetermined(response.scaled)), list[tuple[int, str]]()
+    for j in np.flatnonzero(noise > 0):
+        row = np.eye(runs[0].a.shape[1])[j]
+        sensed = [replace(r, c=np.zeros_like(r.c[:, :1]) + row, d=np.zeros_like(r.d[:, :1])) for r in runs]
+        raw, start = _changes(replace(bench, scale=noise[[j]]), sensed)
+        more = replace(response, raw=np.vstack([response.raw, raw]), start=np.vstack([response.start, start]))
+        left = len(_undetermined(more.scaled))
+        found += [(left, bench.simulator.states[j])] if left < count else []
     return tuple(name for _, name in sorted(found))
