@@ -30,18 +30,16 @@ FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a
 HALF = 0.5  # mean square error over the outputs' power, above which the linearisation may be that of another machine
 LINEAR = ("linear_stiffness", "viscous_damping")  # what a simulator's own parameters are for
 
-IDENTIFIABLE = {
-    "identifiable": "yes",
-    "dead": "no: dead, no output reacts",
-    "flat": "no: flat within its bounds",
-    "tied": "no: traded off, see above",
-    "start": "no: traded off with the unknown start",
-    "port": "only with a law at its port",
-}
-UNIDENTIFIABLE = {
-    "dead": "No output reacts to {}.",
-    "flat": "These recordings say less about {} than the bounds do.",
-    "start": "{} cannot be distinguished from the unknown initial state; say initial='zero' if it was zero.",
+IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
+    "identifiable": ("yes", ""),
+    "dead": ("no: dead, no output reacts", "No output reacts to {}."),
+    "flat": ("no: flat within its bounds", "These recordings say less about {} than the bounds do."),
+    "start": (
+        "no: traded off with the unknown start",
+        "{} cannot be distinguished from the unknown initial state; say initial='zero' if it was zero.",
+    ),
+    "tied": ("no: traded off, see above", ""),
+    "port": ("only with a law at its port", ""),
 }
 MOTION = {  # the record that mends the blind spot
     "no-reversal": "A slow triangle of {} with reversals, at two amplitudes.",
@@ -143,7 +141,7 @@ class Check:
         for p in self.parameters:
             std = "-" if p.std is None else f"{p.std:.2g} {p.unit}"
             rows.append(
-                (p.name, f"{p.value:.4g} {p.unit}", std, IDENTIFIABLE[p.status] + ", at its bound" * p.at_bound)
+                (p.name, f"{p.value:.4g} {p.unit}", std, IDENTIFIABLE[p.status][0] + ", at its bound" * p.at_bound)
             )
         yield from _table(("parameter", "refitted", "std. error (noise only)", "identifiable"), rows)
 
@@ -314,8 +312,8 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
     if not found.parameters:
         text = "The simulator has no free parameter, so a wrong value and a missing law look alike."
         yield BlindSpot("no-free-parameter", (), text)
-    for status, sentence in UNIDENTIFIABLE.items():
-        names = [p.name for p in found.parameters if p.status == status]
+    for status, (_, sentence) in IDENTIFIABLE.items():
+        names = [p.name for p in found.parameters if sentence and p.status == status]
         own = in_words([name for name in names if name in alive])
         more = f" At the given values, before the refit, the outputs do react to {own}." if own else ""
         yield from spot(status, names, sentence + more)

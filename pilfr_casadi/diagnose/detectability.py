@@ -247,25 +247,19 @@ def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[flo
 
 
 def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator[Excitation]:
-    """Describe the motion of every live port's local coordinate along the refitted run."""
+    """Count reversals, distinct amplitudes and rests of every live port's local coordinate along the refitted run."""
     for port in _live_ports(bench.simulator):
         signals = [r.z[:, probe.ports.index(port.name)] for r in runs]
-        yield _excitation(port.name, port_units(port, bench.recordings[0])[1], signals)
-
-
-def _excitation(port: str, unit: str, signals: Sequence[np.ndarray]) -> Excitation:
-    """Count reversals, distinct amplitudes and rests of a local coordinate in recordings, arrays of shape (M,)."""
-    travel = float(max(z.max() for z in signals) - min(z.min() for z in signals))
-    if not travel > 0:
-        return Excitation(port, 0.0, unit, 0, 0, 0)
-    least = SMALLEST_SWING * travel
-    reversals, rests, swings = 0, 0, list[float]()
-    for z in signals:
-        turns = _turning_points(z, least)
-        reversals += max(len(turns) - 2, 0)
-        swings += np.abs(np.diff(z[turns])).tolist()
-        rests += _rests(z, least, 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else TENTH * len(z))
-    return Excitation(port, travel, unit, reversals, _distinct(np.array(swings)), rests)
+        travel = float(np.ptp(np.concatenate(signals)))
+        least = SMALLEST_SWING * travel
+        reversals, rests, swings = 0, 0, list[float]()
+        for z in signals if travel > 0 else ():
+            turns = _turning_points(z, least)
+            reversals += max(len(turns) - 2, 0)
+            swings += np.abs(np.diff(z[turns])).tolist()
+            rests += _rests(z, least, 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else TENTH * len(z))
+        unit = port_units(port, bench.recordings[0])[1]
+        yield Excitation(port.name, travel, unit, reversals, _distinct(np.array(swings)), rests)
 
 
 def _turning_points(z: np.ndarray, least: float) -> list[int]:

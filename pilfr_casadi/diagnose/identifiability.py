@@ -17,6 +17,7 @@ import numpy as np
 
 from .._base import in_words
 from ..simulators import Named, Simulator
+from .evidence import prior_width
 from .linearise import Probe, Run, along
 from .remainder import lengths, orthonormal, own_changes, project_off
 from .workbench import Fitted, Workbench
@@ -104,7 +105,7 @@ class Sensitivity:
         signal = np.concatenate([r.y[r.skip :] for r in bench.recordings]) / bench.scale
         # without bounds, the room is the given value; of zero, the change that moves the outputs as they have moved
         unit = np.linalg.norm(signal - signal.mean(axis=0)) / np.where(lengths(raw) > 0, lengths(raw), 1.0)
-        return cls(rows, _room(np.where(given != 0, np.abs(given), unit), lower, upper), raw, start)
+        return cls(rows, prior_width(np.where(given != 0, np.abs(given), unit), lower, upper), raw, start)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -126,18 +127,6 @@ class Sensitivity:
 def _changes(bench: Workbench, runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray]:
     known = [r.from_zero or q.begins == "given" for r, q in zip(runs, bench.recordings, strict=True)]
     return own_changes(bench, runs, [r.skip for r in bench.recordings], known)
-
-
-def _room(size: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Compute the standard deviation of values of which only the bounds are known.
-
-    Between bounds they are uniform, in logarithms where both bounds have one sign. Without bounds it is `size`.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(np.log(upper / lower)) / np.sqrt(12) * size
-    linear = (upper - lower) / np.sqrt(12)
-    bounded = np.isfinite(linear) & (linear > 0)
-    return np.where(bounded & (lower * upper > 0), ratio, np.where(bounded, linear, size))
 
 
 def _undetermined(scaled: np.ndarray) -> np.ndarray:
@@ -206,9 +195,9 @@ def _groups(scaled: np.ndarray) -> list[list[int]]:
 
 def _only_as(response: Sensitivity, group: np.ndarray, bench: Workbench, fitted: Fitted) -> tuple[str, ...]:
     """Write what is identifiable of a group: monomials or sums with small whole numbers, or nothing."""
-    names, values = zip(*((response.rows[i].name, response.rows[i].value) for i in group), strict=True)
+    names, values = [response.names[i] for i in group], np.array([response.rows[i].value for i in group])
     found = []
-    for unit, write in ((np.array(values), _monomial), (np.ones(len(group)), _sum)):
+    for unit, write in ((values, _monomial), (np.ones(len(group)), _sum)):
         if np.all(unit != 0) and (rows := _whole(response.scaled[:, group], response.room[group] / unit)) is not None:
             change = _finite_change(rows, write is _monomial, group, response, bench, fitted)
             found.append((change, tuple(write(names, row) for row in rows)))
@@ -221,16 +210,16 @@ def _whole(columns: np.ndarray, room: np.ndarray) -> np.ndarray | None:
 
     `columns` are those of J D, and `room` is D in the coordinates wanted, with their sign.
     """
-    free = (_undetermined(columns) * room)[:, ::-1]  # the first named parameter comes last, as what is divided by
+    free = _undetermined(columns) * room
     rows = _reduced(_complement(free))
     for factor in range(1, LARGEST_EXPONENT + 1):
         whole = np.round(rows * factor)
         if np.any(np.abs(whole) > LARGEST_EXPONENT) or not np.all(np.any(whole, axis=1)):
             continue
-        test = _complement(whole)[:, ::-1] / room  # directions that leave these rows as they are
+        test = _complement(whole) / room  # directions that leave these rows as they are
         test /= lengths(test.T)[:, None]
         if len(test) == len(free) and np.all(lengths(columns @ test.T) < 1):
-            return np.asarray(whole[::-1, ::-1])
+            return np.asarray(whole)
     return None
 
 
@@ -240,11 +229,11 @@ def _complement(rows: np.ndarray) -> np.ndarray:
 
 
 def _reduced(rows: np.ndarray) -> np.ndarray:
-    """Combine orthonormal rows so that the first independent columns hold the identity."""
+    """Combine orthonormal rows so that the last independent columns hold the identity; the first are divided by."""
     pivots: list[int] = []
-    for j in range(rows.shape[1]):
-        if np.linalg.matrix_rank(rows[:, [*pivots, j]], tol=1e-6) > len(pivots):
-            pivots.append(j)
+    for j in reversed(range(rows.shape[1])):
+        if np.linalg.matrix_rank(rows[:, [j, *pivots]], tol=1e-6) > len(pivots):
+            pivots = [j, *pivots]
     return np.asarray(np.linalg.lstsq(rows[:, pivots], rows)[0])
 
 
