@@ -140,9 +140,8 @@ class Check:
         rows = []
         for p in self.parameters:
             std = "-" if p.std is None else f"{p.std:.2g} {p.unit}"
-            rows.append(
-                (p.name, f"{p.value:.4g} {p.unit}", std, IDENTIFIABLE[p.status][0] + ", at its bound" * p.at_bound)
-            )
+            answer = IDENTIFIABLE[p.status][0] + ", at its bound" * p.at_bound
+            rows.append((p.name, f"{p.value:.4g} {p.unit}", std, answer))
         yield from _table(("parameter", "refitted", "std. error (noise only)", "identifiable"), rows)
 
     def _label(self, port: str) -> str:

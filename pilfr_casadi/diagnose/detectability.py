@@ -104,7 +104,7 @@ def assess_laws(
 ) -> tuple[tuple[LawRow, ...], tuple[tuple[tuple[str, str], ...], ...]]:
     """Assess every law at every port, and group those that look the same; the bench's scale is the noise.
 
-    Without `laws`, these are the plainest forms of the catalogue's. `names` are those of the free parameters.
+    Without `laws`, take the plainest form of each law of the catalogue. `names` are those of the free parameters.
     """
     tried = {port.name: _laws_at(port, laws) for port in _live_ports(bench.simulator)}
     rest = Remainder.of(bench, probe, runs, tuple(dict.fromkeys(law for own in tried.values() for law in own)))
@@ -179,7 +179,7 @@ def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], .
     order = sorted(responses, key=lambda r: -r.most)
     if not order:
         return ()
-    whole = np.column_stack([r.left / np.linalg.norm(r.left) for r in order])
+    whole = np.column_stack([r.left / max(np.linalg.norm(r.left), 1e-300) for r in order])
     explained = np.array([np.max([np.sum((q.T @ whole) ** 2, axis=0) for q in r.spans], axis=0) for r in order])
     missed = np.sqrt(np.maximum(1 - explained, 0.0))
     alike = (missed < TENTH) | (missed * [r.most for r in order] < DETECTED)
