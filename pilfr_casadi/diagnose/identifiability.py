@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -112,11 +113,15 @@ class Sensitivity:
         """Names of the free entries."""
         return tuple(r.name for r in self.rows)
 
-    @property
+    @cached_property
+    def base(self) -> np.ndarray:
+        """Orthonormal changes that unknown initial states can follow, shape (R, k)."""
+        return orthonormal(self.start)
+
+    @cached_property
     def scaled(self) -> np.ndarray:
         """J D as a triangle (n, n) with the same singular values."""
-        columns = project_off(self.raw * self.room, orthonormal(self.start))
-        return np.asarray(np.linalg.qr(columns, mode="r"))
+        return np.asarray(np.linalg.qr(project_off(self.raw * self.room, self.base), mode="r"))
 
     @property
     def reach(self) -> np.ndarray:
@@ -284,7 +289,7 @@ def _finite_change(
             return np.inf
         pairs = zip(there.residual, fitted.residual, bench.recordings, strict=True)
         change = np.concatenate([((new - old) / bench.scale)[r.skip :].ravel() for new, old, r in pairs])
-        sizes.append(float(np.linalg.norm(project_off(change, orthonormal(response.start)))))
+        sizes.append(float(np.linalg.norm(project_off(change, response.base))))
     return sizes[0] / sizes[1] if sizes[0] > 1 else 0.0
 
 
