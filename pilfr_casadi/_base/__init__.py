@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         InputError as InputError,
         existing_file as existing_file,
         filled as filled,
+        in_words as in_words,
         is_number as is_number,
         is_whole as is_whole,
         listed as listed,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
         ordered_digest as ordered_digest,
         path_text as path_text,
         short as short,
+        to_json as to_json,
         write_atomically as write_atomically,
     )
     from .interrupts import (

@@ -18,6 +18,13 @@ def listed(names: Sequence[Any], most: int = 20) -> str:
     return ", ".join(map(str, names[:most])) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
+def in_words(names: Sequence[str], most: int = 8) -> str:
+    """Join names as a sentence has them, "a, b and c"; of many, the first ones."""
+    if len(names) > most:
+        return listed(names, most)
+    return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else "".join(names)
+
+
 def usable(values: np.ndarray) -> np.ndarray:
     """Tell where the values are finite and small enough for their squares to be summed; a boolean array."""
     return np.abs(values) <= LARGEST  # False for nan

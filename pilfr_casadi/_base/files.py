@@ -1,4 +1,4 @@
-"""Files that are never half written, and SHA-256 digests by which later changes are noticed.
+"""Files that are never half written, their JSON, and SHA-256 digests by which later changes are noticed.
 
 A digest finds damage and changes made by accident or by hand. It is no signature: whoever changes a file on purpose can
 write a new digest into it.
@@ -12,8 +12,11 @@ import hashlib
 import json
 import os
 import secrets
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from .errors import InputError
 
@@ -103,3 +106,20 @@ def short(path: Any) -> str:
     """Shorten a path for a message."""
     text = str(path)
     return text if len(text) <= 200 else f"{text[:100]}...{text[-60:]}"
+
+
+def to_json(value: Any) -> Any:
+    """Convert a value to the types of standard JSON; numbers that are not finite become None."""
+    if isinstance(value, Mapping):
+        return {str(k): to_json(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return to_json(value.tolist())
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value

@@ -17,8 +17,8 @@ about. The files by stage:
   `residual_spectrum` (steady tones, ringing modes).
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
-- Before any of it: `checkup` (what the recordings can reveal), by `identifiability`,
-  `detectability` and `blind_spots`.
+- Before any of it: `checkup` (what the recordings can reveal), by `identifiability` (of parameters) and
+  `detectability` (of laws).
 - In place of a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
 """
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
-    from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect, plain as plain
+    from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect
     from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate
     from .workbench import Fitted as Fitted, Workbench as Workbench
 else:

@@ -1,7 +1,8 @@
 """Assess recordings before a diagnosis: what they and the sensors can reveal of a simulator, without fitting a law.
 
 The simulator's own parameters are refitted once; everything else follows from the simulator linearised along that run:
-`identifiability` says which parameters are identifiable, `detectability` which laws at which ports are detectable.
+`identifiability` says which parameters are identifiable, `detectability` which laws at which ports are detectable. What
+is neither is a blind spot, and the gravest one that another recording can mend says what to record next.
 """
 
 from __future__ import annotations
@@ -13,21 +14,57 @@ from typing import Any
 
 import numpy as np
 
-from .._base import one_blas_thread
+from .._base import in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import Law, display_name
+from ..simulators import in_series
 from .arguments import check_laws, matched
-from .blind_spots import BlindSpot, Excitation, excitations, find_blind_spots, helpful_sensors, next_record
-from .detectability import LawRow, assess_laws, words
-from .floor import Floor, measured_floor, white_part
+from .detectability import Excitation, LawRow, assess_laws, excitations, group_alike
+from .floor import ABOVE_NOISE, noise_floor
 from .gates import said_hold
-from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters
+from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters, helpful_sensors
 from .linearise import linearised
-from .remainder import lengths
-from .result import LEFT, plain
 from .workbench import Fitted, Workbench
 
 FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a sensor of 20 bits
+HALF = 0.5  # mean square error over the outputs' power, above which the linearisation may be that of another machine
+LINEAR = ("linear_stiffness", "viscous_damping")  # what a simulator's own parameters are for
+
+IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
+    "identifiable": ("yes", ""),
+    "dead": ("no: dead, no output reacts", "No output reacts to {}."),
+    "flat": ("no: flat within its bounds", "These recordings say less about {} than the bounds do."),
+    "start": (
+        "no: traded off with the unknown start",
+        "{} cannot be distinguished from the unknown initial state; say initial='zero' if it was zero.",
+    ),
+    "tied": ("no: traded off, see above", ""),
+    "port": ("only with a law at its port", ""),
+}
+MOTION = {  # the record that mends the blind spot
+    "no-reversal": "A slow triangle of {} with reversals, at two amplitudes.",
+    "one-amplitude": "A second amplitude of {}, such as half of it.",
+}
+HOLD_WORDS = {
+    "zero": "held",
+    "linear": "interpolated",
+    "": "not stated, here taken as held; say hold='zero' or hold='linear' if you know",
+}
+START_WORDS = {"zero": "at zero", "estimate": "estimated", "periodic": "periodic", "given": "as given"}
+SOURCES = {
+    "periods": "from the periods",
+    "repeats": "from repeated recordings",
+    "estimated": "from the refit's residual",
+}
+
+
+@dataclass(frozen=True)
+class BlindSpot:
+    """Something that the recordings cannot reveal: its kind, the names that it concerns, and a sentence."""
+
+    kind: str
+    names: tuple[str, ...]
+    sentence: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,33 +104,24 @@ class Check:
     error: float
     hold: str
     starts: tuple[str, ...]
-    next_record: str
+    next_record: str = ""
     seconds: float = 0.0
+
+    @property
+    def detectable(self) -> tuple[LawRow, ...]:
+        """Laws that are detectable."""
+        return tuple(r for r in self.laws if r.status == "detectable")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of check.json; numbers that are not finite are None."""
-        clean: dict[str, Any] = plain(
-            {
-                "schema": 1,
-                "blind_spots": [asdict(b) for b in self.blind_spots],
-                "parameters": [asdict(p) for p in self.parameters],
-                "ties": [{**asdict(t), "sentence": t.sentence} for t in self.ties],
-                "laws": [
-                    {
-                        **asdict(r),
-                        "strength": dict(zip(("name", "value", "unit"), r.strength or (), strict=False)) or None,
-                    }
-                    for r in self.laws
-                ],
-                "classes": [[{"port": p, "law": law} for p, law in group] for group in self.classes],
-                "excitation": [asdict(e) for e in self.excitation],
-                "noise": self.noise,
-                "error": self.error,
-                "hold": self.hold or None,
-                "starts": list(self.starts),
-                "next_record": self.next_record,
-            }
-        )
+        out: dict[str, Any] = {"schema": 1, **asdict(self), "hold": self.hold or None}
+        del out["seconds"]
+        for row, tie in zip(out["ties"], self.ties, strict=True):
+            row["sentence"] = tie.sentence
+        for row in out["laws"]:
+            row["strength"] = dict(zip(("name", "value", "unit"), row["strength"] or (), strict=False)) or None
+        out["classes"] = [[{"port": port, "law": law} for port, law in group] for group in self.classes]
+        clean: dict[str, Any] = to_json(out)
         return clean
 
     def __str__(self) -> str:
@@ -109,50 +137,48 @@ class Check:
         if not self.parameters:
             yield "The simulator has no free parameter."
             return
-        yield from table(
-            ("parameter", "refitted", "std. error (noise only)", "identifiable"),
-            [
-                (
-                    p.name,
-                    f"{p.value:.4g} {p.unit}",
-                    "-" if p.std is None else f"{p.std:.2g} {p.unit}",
-                    IDENTIFIABLE[p.status] + ", at its bound" * p.at_bound,
-                )
-                for p in self.parameters
-            ],
-        )
+        rows = []
+        for p in self.parameters:
+            std = "-" if p.std is None else f"{p.std:.2g} {p.unit}"
+            answer = IDENTIFIABLE[p.status][0] + ", at its bound" * p.at_bound
+            rows.append((p.name, f"{p.value:.4g} {p.unit}", std, answer))
+        yield from _table(("parameter", "refitted", "std. error (noise only)", "identifiable"), rows)
 
     def _label(self, port: str) -> str:
         """Join the names of all ports that look the same as this one."""
         groups = (b.names for b in self.blind_spots if b.kind == "alike-ports")
         return " = ".join(next((names for names in groups if port in names), (port,)))
 
+    def _law_lines(self) -> Iterator[str]:
+        rows = []
+        shown: dict[str, str] = {}
+        for r in self.laws:
+            shown.setdefault(self._label(r.port), r.port)
+        for label, port in shown.items():
+            for r in sorted((r for r in self.detectable if r.port == port), key=lambda r: r.share or 0.0):
+                share = "" if r.share is None else f"{100 * r.share:.2g} %"
+                strength = "{} = {:.2g} {}".format(*r.strength).rstrip() if r.strength else ""
+                rows.append((label, display_name(r.law), f"{r.force:.2g} {r.unit}".rstrip(), share, strength))
+            hidden = [r for r in self.laws if r.port == port and r.status != "detectable"]
+            for why in dict.fromkeys(map(_why, hidden)):
+                names = ", ".join(display_name(r.law) for r in hidden if _why(r) == why)
+                rows.append((label, names, f"no: {why}", "", ""))
+        columns = ("port", "law", "detectable from (rms)", "share", "strength")
+        yield from _table(columns, rows) if rows else ["No law is detectable at any port."]
+
     def _group_lines(self) -> Iterator[str]:
         """List groups of laws that look the same, beyond those at ports that all look the same."""
         for group in self.classes:
-            names = dict.fromkeys(words((self._label(port), law)) for port, law in group)
+            names = dict.fromkeys(f"{display_name(law)} at {self._label(port)}" for port, law in group)
             if len(names) > 1:
                 yield f"- {', '.join(names)}"
-
-    def _law_lines(self) -> Iterator[str]:
-        rows = []
-        ports = dict.fromkeys(r.port for r in self.laws)
-        first = {self._label(name): name for name in reversed(ports)}
-        for port, shown in reversed(first.items()):
-            own = [r for r in self.laws if r.port == shown]
-            found = sorted((r for r in own if r.status == "detectable"), key=lambda r: r.share or 0.0)
-            rows += [(port, display_name(r.law), _force(r), _percent(r.share), _strength(r)) for r in found]
-            for reason, laws in _undetectable(own).items():
-                rows.append((port, ", ".join(map(display_name, laws)), reason, "", ""))
-        columns = ("port", "law", "detectable from (rms)", "share", "strength")
-        yield from table(columns, rows) if rows else ["No law is detectable at any port."]
 
     def _excitation_lines(self) -> Iterator[str]:
         rows = [
             (e.port, f"{e.travel:.3g} {e.unit}", str(e.reversals), str(e.amplitudes), str(e.rests))
             for e in self.excitation
         ]
-        yield from table(("local coordinate", "travel", "reversals", "amplitudes", "rests"), rows)
+        yield from _table(("local coordinate", "travel", "reversals", "amplitudes", "rests"), rows)
 
     def _circumstances(self) -> Iterator[str]:
         noise = ", ".join(f"{name} {value:.2g}" for name, value in self.noise["deviation"].items())
@@ -160,30 +186,22 @@ class Check:
         floor = float(np.mean(list(self.noise["share"].values())))
         times = self.error / max(floor, 1e-300)
         yield f"refitted: error {100 * self.error:.3g} % of the outputs' deviation, {times:.2g} times the noise"
-        if times > LEFT:
+        if times > ABOVE_NOISE:
             yield "  Something is missing or the noise is slow: the strengths above count the noise alone."
         yield f"inputs between samples: {HOLD_WORDS[self.hold]}"
         yield f"start of each recording: {', '.join(self.starts)}"
 
 
-IDENTIFIABLE = {
-    "identifiable": "yes",
-    "dead": "no: dead, no output reacts",
-    "flat": "no: flat within its bounds",
-    "tied": "no: traded off, see above",
-    "start": "no: traded off with the unknown start",
-    "port": "only with a law at its port",
-}
-HOLD_WORDS = {
-    "zero": "held",
-    "linear": "interpolated",
-    "": "not stated, here taken as held; say hold='zero' or hold='linear' if you know",
-}
-SOURCES = {
-    "periods": "from the periods",
-    "repeats": "from repeated recordings",
-    "estimated": "from the refit's residual",
-}
+def _why(r: LawRow) -> str:
+    """Say why a law is not detectable."""
+    return {"followed": f"followed by {r.why}", "weak": "below the noise", "no data": r.why}[r.status]
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Align rows of text in columns."""
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    for row in (head, *rows):
+        yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
 
 
 @one_blas_thread
@@ -229,80 +247,144 @@ def check(
 
 def assess(bench: Workbench, fitted: Fitted, stated: str, laws: Sequence[type[Law]] | None = None) -> Check:
     """Assess the recordings of a bench along a refitted run; `stated` is the hold that somebody stated, if any."""
-    began, simulator = time.perf_counter(), bench.simulator
-    floor = measured_floor(bench.recordings) or Floor(white_part(fitted.residual), "estimated")
+    began, inputs, outputs = time.perf_counter(), bench.simulator.inputs, bench.simulator.output_names
+    floor = noise_floor(bench.recordings, fitted.residual)
     noise = np.maximum(floor.deviation, FINEST * bench.scale)
     quiet = replace(bench, scale=noise)  # everything from here on is counted in units of the noise
     probe, runs = linearised(quiet, fitted)
     response = Sensitivity.of(quiet, probe, runs)
     parameters, ties = assess_parameters(response, quiet, fitted)
-    law_rows, classes = assess_laws(quiet, fitted, probe, runs, laws, response.names)
-    moving = tuple(excitations(quiet, probe, runs))
-    sensors = helpful_sensors(quiet, fitted, probe, runs, response) if ties else ()
-    alive = _alive_as_given(quiet, fitted, parameters)
-    blind = tuple(find_blind_spots(bench, fitted, parameters, alive, ties, law_rows, classes, moving))
-    by_output = dict(zip(simulator.output_names, zip(noise, noise / bench.scale, strict=True), strict=True))
-    return Check(
-        blind_spots=blind,
+    rows, classes = assess_laws(quiet, fitted, probe, runs, laws, response.names)
+    found = Check(
+        blind_spots=(),
         parameters=parameters,
         ties=ties,
-        laws=law_rows,
+        laws=rows,
         classes=classes,
-        excitation=moving,
+        excitation=tuple(excitations(quiet, probe, runs)),
         noise={
             "source": SOURCES[floor.source],
-            "deviation": {k: float(v[0]) for k, v in by_output.items()},
-            "share": {k: float(v[1]) for k, v in by_output.items()},
+            "deviation": dict(zip(outputs, noise.tolist(), strict=True)),
+            "share": dict(zip(outputs, (noise / bench.scale).tolist(), strict=True)),
         },
         error=fitted.cost**0.5,
         hold=stated,
-        starts=tuple(_start(r) for r in bench.recordings),
-        next_record=next_record(bench, blind, ties, sensors),
-        seconds=time.perf_counter() - began,
+        starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
     )
+    swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    still = [name for name, swing in zip(inputs, swings, strict=True) if not swing > 0]
+    found = replace(
+        found, blind_spots=tuple(_find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters)))
+    )
+    sensors = helpful_sensors(quiet, fitted, runs, response) if ties else ()
+    return replace(found, next_record=_next_record(found, inputs, sensors), seconds=time.perf_counter() - began)
 
 
 def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
     """Find parameters that are dead or flat as refitted and move the outputs at the given values."""
     doubtful = [p.name for p in parameters if p.status in ("dead", "flat")]
+    if not doubtful:
+        return ()
     values = {k: p.value for k, p in fitted.model.parameters.items()}
-    given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model) if doubtful else fitted
-    if not doubtful or not np.isfinite(given.cost):
+    given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
+    if not np.isfinite(given.cost):
         return ()
     response = Sensitivity.of(bench, *linearised(bench, given))
-    moved = lengths(response.raw * response.room) >= 1
-    return tuple(name for name, there in zip(response.names, moved, strict=True) if there and name in doubtful)
+    reach = dict(zip(response.names, response.reach, strict=True))
+    return tuple(name for name in doubtful if reach[name] >= 1)
 
 
-def _start(r: Recording) -> str:
-    words = {"zero": "at zero", "estimate": "estimated", "periodic": "periodic", "given": "as given"}
-    return words[r.begins]
+def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) -> Iterator[BlindSpot]:
+    """Put everything that the recordings cannot reveal into sentences, the gravest first.
+
+    `still` are inputs that never change, `alive` dead or flat parameters that move the outputs at the given values.
+    """
+
+    def spot(kind: str, names: Sequence[str], sentence: str) -> Iterator[BlindSpot]:
+        if names:
+            yield BlindSpot(kind, tuple(names), sentence.format(in_words(names)))
+
+    if found.error**2 > HALF:
+        left = f"{100 * found.error:.3g} % of the outputs' deviation"
+        yield BlindSpot("rough", (), f"The refitted simulator leaves {left}, so all of this is rough.")
+    yield from spot("constant-input", still, "Constant in all recordings: {}.")
+    if not found.parameters:
+        text = "The simulator has no free parameter, so a wrong value and a missing law look alike."
+        yield BlindSpot("no-free-parameter", (), text)
+    for status, (_, sentence) in IDENTIFIABLE.items():
+        names = [p.name for p in found.parameters if sentence and p.status == status]
+        own = in_words([name for name in names if name in alive])
+        more = f" At the given values, before the refit, the outputs do react to {own}." if own else ""
+        yield from spot(status, names, sentence + more)
+    for tie in found.ties:
+        yield BlindSpot("tied", tie.names, tie.sentence)
+    moving = [e for e in found.excitation if e.port.removeprefix("actuator:") not in still]
+    yield from spot("no-motion", [e.port for e in moving if e.travel == 0], "Nothing moves at {}.")
+    text = "No reversal at {}: hysteresis and friction look like stiffness and damping there."
+    yield from spot("no-reversal", [e.port for e in moving if e.travel > 0 and e.reversals == 0], text)
+    text = "A single amplitude at {}: hysteresis looks like damping and stiffness there."
+    yield from spot("one-amplitude", [e.port for e in moving if e.reversals and e.amplitudes == 1], text)
+    ports, seen = (dict.fromkeys(r.port for r in rows) for rows in (found.laws, found.detectable))
+    dark = [port for port in ports if port not in seen]
+    yield from spot("hidden-port", dark, "No law of the catalogue is detectable at {}.")
+    for port in ports:
+        yield from _followed_laws(found, port)
+    for group in _alike_ports(found):
+        yield from spot("alike-ports", group, "A law looks the same at {}.")
 
 
-def _undetectable(rows: Sequence[LawRow]) -> dict[str, list[str]]:
-    """Group the laws that are not detectable by the reason in words."""
-    out: dict[str, list[str]] = {}
-    for r in rows:
-        if r.status != "detectable":
-            reason = {"followed": f"no: followed by {r.why}", "weak": "no: below the noise", "no data": f"no: {r.why}"}
-            out.setdefault(reason[r.status], []).append(r.law)
-    return out
+def _followed_laws(found: Check, port: str) -> Iterator[BlindSpot]:
+    """Find the laws of a port that own parameters follow, by the parameter that does."""
+    followed = [r for r in found.laws if r.port == port and r.status == "followed" and r.law not in LINEAR]
+    for why in dict.fromkeys(r.why for r in followed):
+        own = tuple(r.law for r in followed if r.why == why)
+        what = f"a change of {why}" if any(why == p.name for p in found.parameters) else why
+        names = in_words([display_name(name) for name in own])
+        text = f"{names[0].upper()}{names[1:]} at {port} cannot be distinguished from {what}."
+        yield BlindSpot("followed", (port, *own), text)
 
 
-def _force(r: LawRow) -> str:
-    return f"{r.force:.2g} {r.unit}".rstrip()
+def _alike_ports(found: Check) -> list[list[str]]:
+    """Find groups of ports at which every law that is detectable at both looks the same."""
+    laws: dict[str, set[str]] = {}
+    for r in found.detectable:
+        laws.setdefault(r.port, set()).add(r.law)
+    same = {(one, other) for group in found.classes for one in group for other in group}
+
+    def alike(one: str, other: str) -> bool:
+        shared = laws[one] & laws[other]
+        return bool(shared) and all(((one, law), (other, law)) in same for law in shared)
+
+    return [group for group in group_alike(laws, alike) if len(group) > 1]
 
 
-def _strength(r: LawRow) -> str:
-    return f"{r.strength[0]} = {r.strength[1]:.2g} {r.strength[2]}".rstrip() if r.strength else ""
-
-
-def _percent(share: float | None) -> str:
-    return "" if share is None else f"{100 * share:.2g} %"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Align rows of text in columns."""
-    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
-    for row in (head, *rows):
-        yield "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) -> str:
+    """Say what to record next, by the gravest blind spot that a record can mend."""
+    names = {b.kind: b.names for b in reversed(found.blind_spots)}
+    if "rough" in names:
+        return "None before the simulator follows these better: check its values and units, the start and the hold."
+    if "constant-input" in names:
+        return f"One in which {in_words(names['constant-input'])} varies."
+    drive = inputs[0] if inputs else "the input"
+    signals = [port for kind in MOTION for port in names.get(kind, ()) if port.startswith("actuator:")]
+    own = signals[0].removeprefix("actuator:") if signals else drive
+    for inside, signal in ((True, drive), (False, own)):  # forces inside first, then the signals
+        for kind, sentence in MOTION.items():
+            if any(in_series(port) != inside for port in names.get(kind, ())):
+                return sentence.format(signal)
+    if sensors:
+        tied = in_words([n for t in found.ties for n in t.names])
+        return f"One with another sensor, such as one of {sensors[0]}, to separate {tied}."
+    if hidden := (*names.get("hidden-port", ()), *names.get("dead", ())):
+        return f"One with another sensor, which reacts to {in_words(hidden)}."
+    if group := names.get("alike-ports"):
+        forces = [port for port in group if not in_series(port)]
+        sensor = f"One with another sensor between {in_words(group)}."
+        return f"One that also measures the force at {forces[0]}." if forces else sensor
+    if "flat" in names or "followed" in names:
+        return f"A longer one, with other amplitudes and rates of {drive}."
+    if "start" in names:
+        return "One that begins at rest, with initial='zero'."
+    if found.ties:
+        return f"No further record of these signals helps: measure {found.ties[0].names[0]} separately and fix it."
+    return "None is pressing; for the test take amplitudes that the training recordings do not have."

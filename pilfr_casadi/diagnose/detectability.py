@@ -1,4 +1,4 @@
-"""Detectability of laws at ports: the smallest force that recordings reveal, and the laws that look the same.
+"""Detectability of laws at ports: motion there, the smallest force that recordings reveal, and laws that look the same.
 
 With φ the outputs' changes by a law's force of unit size and φ' what own parameters and unknown initial states leave of
 them, both in units of the noise (`remainder`), a force of the size 3.29 / |φ'| is detected: 5 % false alarms and 5 % of
@@ -7,26 +7,27 @@ forces missed (Currie 1968, Anal. Chem. 40(3)). Laws whose φ' point the same wa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
 from ..data import Recording
-from ..laws import CATALOGUE, Law, display_name, readable_unit
+from ..laws import CATALOGUE, Law, readable_unit
 from ..models import map_points
 from ..simulators import Port, Simulator
-from .identifiability import Symbols
+from .identifiability import stacked
 from .linearise import Probe, Run, along
-from .remainder import Remainder, Task, block_diagonal, lengths, moved, orthonormal
+from .remainder import Remainder, Task, lengths, orthonormal, own_changes, project_off
 from .workbench import Fitted, Workbench
 
 DETECTED = 3.29  # standard errors
 TENTH = 0.1  # of an effect: no machine follows a catalogue formula more closely, and no smaller difference has a name
 FOLLOWED = TENTH**2  # share of a response: what is left below it comes from forces that are held over samples here
-LINEAR = ("linear_stiffness", "viscous_damping")  # what a simulator's own parameters are for
+SMALLEST_SWING = 0.05  # of a reversal, over the travel; smaller ones are ripple on the way
 
 
 @dataclass(frozen=True)
@@ -59,23 +60,38 @@ class LawRow:
     why: str = ""
 
 
+@dataclass(frozen=True)
+class Excitation:
+    """Motion of a port's local coordinate.
+
+    Attributes
+    ----------
+    travel : float
+        Largest minus smallest value, in `unit`.
+    reversals : int
+        Turning points with swings of at least a twentieth of the travel on both sides.
+    amplitudes : int
+        Distinct amplitudes, a tenth of the largest apart, of nine tenths of the swings.
+    rests : int
+        Stretches longer than two usual swings in which it stays within a twentieth of the travel.
+    """
+
+    port: str
+    travel: float
+    unit: str
+    reversals: int
+    amplitudes: int
+    rests: int
+
+
 @dataclass(frozen=True, eq=False)
 class _Response:
-    """Rest of a law's unit response at a port in its middle shape, and a basis of each of its shapes."""
+    """Response to a law in its middle shape, without what own parameters follow, and a basis of each of its shapes."""
 
     name: tuple[str, str]
     left: np.ndarray
     spans: list[np.ndarray]
     most: float  # deviations from the noise at the full local force
-
-
-def plainest_forms(port: Port) -> tuple[type[Law], ...]:
-    """Return the first form of each law that may stand at a port: its finer forms are detectable where this one is."""
-    first: dict[str, type[Law]] = {}
-    for law in CATALOGUE:
-        if port.kinds & set(law.places):
-            first.setdefault(law.id, law)
-    return tuple(first.values())
 
 
 def assess_laws(
@@ -88,74 +104,74 @@ def assess_laws(
 ) -> tuple[tuple[LawRow, ...], tuple[tuple[tuple[str, str], ...], ...]]:
     """Assess every law at every port, and group those that look the same; the bench's scale is the noise.
 
-    Without `laws`, these are the plainest forms of the catalogue's. `names` are those of the free parameters.
+    Without `laws`, take the plainest form of each law of the catalogue. `names` are those of the free parameters.
     """
-    ports = [port for port in bench.simulator.all_ports() if port.name not in idle_ports(bench.simulator)]
-    tried = {port.name: plainest_forms(port) if laws is None else tuple(laws) for port in ports}
+    tried = {port.name: _laws_at(port, laws) for port in _live_ports(bench.simulator)}
     rest = Remainder.of(bench, probe, runs, tuple(dict.fromkeys(law for own in tried.values() for law in own)))
-    blocks = [moved(bench, r) for r in rest.runs]
-    n = runs[0].n_free
-    changes = block_diagonal(blocks, n)
-    known = np.repeat([r.from_zero for r in rest.runs], (changes.shape[1] - n) // len(blocks))
-    base = orthonormal(np.hstack([changes[:, :n], changes[:, n:][:, ~known]]))
+    own, start = own_changes(bench, rest.runs, known=[r.from_zero for r in rest.runs])
+    base = orthonormal(np.hstack([own, start]))
     rest = replace(rest, base=base[:, :0])
-    levels = local_levels(bench, fitted, runs)
+    levels = _local_levels(bench, fitted, runs)
     rows: list[LawRow] = []
     responses: list[_Response] = []
     for task in rest.tasks:
-        if task.port.name not in tried:
+        wanted = tried.get(task.port.name, ())
+        if not wanted:
             continue
-        own = tried[task.port.name]
-        task = replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in own])
-        found, more = _at_port(rest, task, base, changes[:, :n], levels[task.index], names)
-        rows += found
-        responses += more
-        rows += [
-            LawRow(task.port.name, law.id, "no data", why=law().why_not(task.local) or "its signals do not change")
-            for law in own
-            if task.port.kinds & set(law.places) and law not in {type(other) for other, _ in task.pairs}
-        ]
+        task = replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in wanted])
+        for row, response in _at_port(rest, task, base, own, levels[task.index], names):
+            rows.append(row)
+            responses += [response] if response else []
+        seen = {type(law) for law, _ in task.pairs}
+        for law in (law for law in wanted if law not in seen):
+            why = law().why_not(task.local) or "its signals do not change"
+            rows.append(LawRow(task.port.name, law.id, "no data", why=why))
     return tuple(rows), _classes(responses)
+
+
+def _laws_at(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
+    """Return the laws that may stand at a port; of the catalogue, the first form of each: finer ones are as visible."""
+    placed = [law for law in (CATALOGUE if laws is None else laws) if port.kinds & set(law.places)]
+    first = {law.id: law for law in reversed(placed)}
+    return tuple(law for law in placed if laws is not None or law is first[law.id])
 
 
 def _at_port(
     rest: Remainder, task: Task, base: np.ndarray, own: np.ndarray, level: float | None, names: Sequence[str]
-) -> tuple[list[LawRow], list[_Response]]:
-    """Assess the laws of one port; return their rows, and the responses of those that are detectable."""
-    rows, responses = [], []
+) -> Iterator[tuple[LawRow, _Response | None]]:
+    """Assess the laws of one port; yield the row of each, and its response where it is detectable."""
     w_unit, z_unit = port_units(task.port, rest.bench.recordings[0])
-    size = np.maximum(lengths(own), 1e-300)
+    most = level or np.inf
     for law, doses in rest.doses(task):
-        left = [d.phi - base @ (base.T @ d.phi) for d in doses]
+        left = [project_off(d.phi, base) for d in doses]
         for phi, d in zip(left, doses, strict=True):
             phi[:, lengths(phi) < FOLLOWED * lengths(d.phi)] = 0.0
-        loudest = [int(np.argmax(lengths(phi))) for phi in left]
-        sizes = np.array([lengths(phi)[j] for phi, j in zip(left, loudest, strict=True)])
-        order = np.argsort(sizes)[np.sum(sizes == 0) :] if np.any(sizes) else np.arange(len(sizes))
-        middle = int(order[len(order) // 2])  # of the shapes that own parameters do not follow
-        column, dose = loudest[middle], doses[middle]
-        raw = dose.phi[:, int(np.argmax(lengths(dose.phi)))]
-        force = DETECTED / sizes[middle] if sizes[middle] > 0 else None
-        share = None if force is None or not level else force / level
+        sizes = np.array([lengths(phi).max() for phi in left])
+        shapes = np.flatnonzero(sizes) if np.any(sizes) else np.arange(len(sizes))
+        middle = int(shapes[np.argsort(sizes[shapes], kind="stable")[len(shapes) // 2]])
+        dose, size = doses[middle], float(sizes[middle])
+        force = DETECTED / size if size > 0 else None
+        share = force / level if force and level else None
         row = LawRow(task.port.name, law.id, "detectable", force, w_unit, share)
-        most = level or np.inf
         if force is None or force > most:
-            if not np.any(raw) or float(np.linalg.norm(raw)) * most < DETECTED:
-                row = replace(row, status="weak")
-            else:
-                cosines = np.abs(raw @ own) / size
-                best = names[int(np.argmax(cosines))] if len(names) and cosines.max() > TENTH else "the unknown start"
-                row = replace(row, status="followed", why=best)
-        else:
-            if len(law.strength) == 1 and dose.phi.shape[1] == 1:
-                unit = readable_unit(law.units[law.strength[0]], w_unit, z_unit)
-                row = replace(row, strength=(law.strength[0], force / float(dose.size[column]), unit))
-            spans = [orthonormal(phi) for phi in left if np.any(phi)]
-            whole = left[middle].sum(axis=1)
-            if np.any(whole):
-                responses.append(_Response((task.port.name, law.id), whole, spans, most * sizes[middle]))
-        rows.append(row)
-    return rows, responses
+            yield _undetectable(row, dose.phi, most, own, names), None
+            continue
+        if len(law.strength) == 1 and dose.phi.shape[1] == 1:
+            unit = readable_unit(law.units[law.strength[0]], w_unit, z_unit)
+            row = replace(row, strength=(law.strength[0], force / float(dose.size[0]), unit))
+        spans = [orthonormal(phi) for phi in left if np.any(phi)]
+        yield row, _Response((task.port.name, law.id), left[middle].sum(axis=1), spans, most * size)
+
+
+def _undetectable(row: LawRow, phi: np.ndarray, most: float, own: np.ndarray, names: Sequence[str]) -> LawRow:
+    """Say why a law is not detectable: it is weak at the largest local force, or follows what own parameters do."""
+    response = phi[:, np.argmax(lengths(phi))]
+    size = float(np.linalg.norm(response))
+    if size == 0 or size * most < DETECTED:
+        return replace(row, status="weak")
+    cosines = np.abs(response @ own) / np.maximum(lengths(own), 1e-300)
+    alike = np.max(cosines, initial=0.0) > TENTH
+    return replace(row, status="followed", why=names[int(np.argmax(cosines))] if alike else "the unknown start")
 
 
 def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], ...]:
@@ -163,28 +179,33 @@ def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], .
     order = sorted(responses, key=lambda r: -r.most)
     if not order:
         return ()
-    whole = np.column_stack([r.left / np.linalg.norm(r.left) for r in order])
-    alike = np.zeros((len(order), len(order)), dtype=bool)
-    most = np.array([r.most for r in order])
-    for j, r in enumerate(order):
-        shares = np.max([np.sum((q.T @ whole) ** 2, axis=0) for q in r.spans], axis=0)
-        missed = np.sqrt(np.maximum(1 - shares, 0.0))
-        alike[:, j] = (missed < TENTH) | (missed * most < DETECTED)
-    alike &= alike.T
-    out, free = [], list(range(len(order)))
-    while free:
-        first, *others = free
-        group = [first, *(i for i in others if alike[first, i])]
-        free = [i for i in others if i not in group]
-        if len(group) > 1:
-            out.append(tuple(order[i].name for i in group))
-    return tuple(out)
+    whole = np.column_stack([r.left / max(np.linalg.norm(r.left), 1e-300) for r in order])
+    explained = np.array([np.max([np.sum((q.T @ whole) ** 2, axis=0) for q in r.spans], axis=0) for r in order])
+    missed = np.sqrt(np.maximum(1 - explained, 0.0))
+    alike = (missed < TENTH) | (missed * [r.most for r in order] < DETECTED)
+    groups = group_alike(range(len(order)), lambda i, j: bool(alike[i, j] and alike[j, i]))
+    return tuple(tuple(order[i].name for i in group) for group in groups if len(group) > 1)
 
 
-def idle_ports(simulator: Simulator) -> frozenset[str]:
-    """Find ports at which nothing can be missing: inputs that no equation reads, and equations that define a speed."""
-    inputs = {f"actuator:{name}" for name in simulator.idle_inputs}
-    return frozenset(inputs | {f"equation:{name}" for name in simulator.kinematic})
+def group_alike(items: Iterable[Any], alike: Callable[[Any, Any], bool]) -> list[list[Any]]:
+    """Group items: each joins the first group whose first member it is like."""
+    groups: list[list[Any]] = []
+    for item in items:
+        group = next((g for g in groups if alike(g[0], item)), None)
+        if group is None:
+            groups.append([item])
+        else:
+            group.append(item)
+    return groups
+
+
+def _live_ports(simulator: Simulator) -> list[Port]:
+    """List the ports at which something can be missing.
+
+    Nothing is missing at inputs that no equation reads, and in equations that define a speed.
+    """
+    idle = {f"actuator:{name}" for name in simulator.idle_inputs} | {f"equation:{name}" for name in simulator.kinematic}
+    return [port for port in simulator.all_ports() if port.name not in idle]
 
 
 def port_units(port: Port, recording: Recording) -> tuple[str, str]:
@@ -196,47 +217,86 @@ def port_units(port: Port, recording: Recording) -> tuple[str, str]:
 
 
 @one_at_a_time
-def local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[float | None]:
+def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[float | None]:
     """Compute the largest rms of the simulator's own terms in the equation of each port of `all_ports`.
 
     A term is the equation's derivative with respect to a state or input times that signal's swing about its mean. In
     series it is the signal's own deviation. None where nothing moves.
     """
-    simulator, probe_z = bench.simulator, np.concatenate([r.z for r in runs])
-    at_x, at_u = along(bench, fitted)
-    terms = _term_functions(simulator)
+    simulator, z, at = bench.simulator, np.concatenate([r.z for r in runs]), along(bench, fitted)
+    swing = np.hstack([v - v.mean(axis=0) for v in at])
     own = simulator.parameter_set
-    p = own.pack({k: v for k, v in fitted.values.items() if k in own})
-    swing = np.hstack([at_x - at_x.mean(axis=0), at_u - at_u.mean(axis=0)])
+    values = own.pack({k: v for k, v in fitted.values.items() if k in own})
+    symbols = x, u, p, _ = (*simulator.symbols()[:3], ca.SX(0))
+    vectors = stacked(x), stacked(u), stacked(p)
+    changes = ca.vertsplit(simulator.derivatives(*symbols)) if simulator.states else []
+    equations = {**simulator.measured(*symbols), **dict(zip(simulator.states, changes, strict=True))}
     found: list[float | None] = []
     for j, port in enumerate(simulator.all_ports()):
         if port.series:
-            value = float(np.std(probe_z[:, j]))
+            value = float(np.std(z[:, j]))
         else:
-            slopes, factors = map_points(terms[port.name], at_x, at_u, p)
-            force = slopes * swing[:, None, :] / np.where(factors == 0, np.inf, np.abs(factors))
+            into = simulator.into(port, *symbols)
+            slopes = ca.jacobian(ca.vertcat(*(equations[name] for name in into)), ca.vertcat(*vectors[:2]))
+            terms = ca.Function("terms", [*vectors], [ca.densify(slopes), ca.densify(ca.vertcat(*into.values()))])
+            slope, factor = map_points(terms, *at, values)
+            force = slope * swing[:, None, :] / np.where(factor == 0, np.inf, np.abs(factor))
             value = float(np.max(np.sqrt(np.mean(force**2, axis=0)), initial=0.0))
         found.append(value if np.isfinite(value) and value > 0 else None)
     return found
 
 
-def _term_functions(simulator: Simulator) -> dict[str, ca.Function]:
-    """Make `(x, u, p) -> (slopes (n_targets, n_x + n_u), factors (n_targets, 1))` of each parallel port, at t = 0."""
-    s = Symbols.of(simulator)
-    x, u, p, t = s.x, s.u, s.p, ca.SX(0)
-    changes = ca.vertsplit(simulator.derivatives(x, u, p, t)) if simulator.states else []
-    equations = {**simulator.measured(x, u, p, t), **dict(zip(simulator.states, changes, strict=True))}
-    out = {}
-    for port in simulator.all_ports():
-        if not port.series:
-            into = simulator.into(port, x, u, p, t)
-            right = ca.vertcat(*(equations[name] for name in into))
-            slopes = ca.densify(ca.jacobian(right, ca.vertcat(s.states, s.inputs)))
-            factors = ca.densify(ca.vertcat(*(ca.SX(f) for f in into.values())))
-            out[port.name] = ca.Function("terms", [s.states, s.inputs, s.vector], [slopes, factors])
-    return out
+def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator[Excitation]:
+    """Count reversals, distinct amplitudes and rests of every live port's local coordinate along the refitted run."""
+    for port in _live_ports(bench.simulator):
+        signals = [r.z[:, probe.ports.index(port.name)] for r in runs]
+        travel = float(np.ptp(np.concatenate(signals)))
+        least = SMALLEST_SWING * travel
+        reversals, rests, swings = 0, 0, list[float]()
+        for z in signals if travel > 0 else ():
+            turns = _turning_points(z, least)
+            reversals += max(len(turns) - 2, 0)
+            swings += np.abs(np.diff(z[turns])).tolist()
+            rests += _rests(z, least, 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else TENTH * len(z))
+        unit = port_units(port, bench.recordings[0])[1]
+        yield Excitation(port.name, travel, unit, reversals, _distinct(np.array(swings)), rests)
 
 
-def words(name: tuple[str, str]) -> str:
-    """Name a law at a port in words."""
-    return f"{display_name(name[1])} at {name[0]}"
+def _turning_points(z: np.ndarray, least: float) -> list[int]:
+    """Find the samples at which z turns round between swings of at least `least`, the first and the last included."""
+    turns, extreme, way = [0], 0, 0.0
+    for k, value in enumerate(z.tolist()):
+        if way == 0:
+            if abs(value - z[0]) >= least:
+                way, extreme = np.sign(value - z[0]), k
+        elif way * (value - z[extreme]) >= 0:
+            extreme = k
+        elif way * (z[extreme] - value) >= least:
+            turns.append(extreme)
+            way, extreme = -way, k
+    return [*turns, extreme] if extreme > turns[-1] else turns
+
+
+def _distinct(swings: np.ndarray) -> int:
+    """Count the sizes, a tenth of the largest apart, that nine tenths of the swings have."""
+    if not len(swings):
+        return 0
+    left, counts = np.sort(swings)[::-1], list[int]()
+    apart = TENTH * float(left[0])
+    while len(left):
+        own = left > left[0] - apart
+        counts.append(int(np.sum(own)))
+        left = left[~own]
+    share = np.cumsum(sorted(counts, reverse=True)) / sum(counts)
+    return int(np.searchsorted(share, 1 - TENTH - 1e-9) + 1)
+
+
+def _rests(z: np.ndarray, least: float, samples: float) -> int:
+    """Count the stretches of more than some samples in which z stays within `least`."""
+    count, begin, low, high = 0, 0, z[0], z[0]
+    for k, value in enumerate(z):
+        low, high = min(low, value), max(high, value)
+        if high - low > least or k == len(z) - 1:
+            count += k - begin > samples
+            begin, low, high = k, value, value
+    return count

@@ -129,11 +129,7 @@ def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np
     parameters comes from their bounds, logarithmic where these span more than a decade.
     """
     parameters, values = fitted.model.parameters, fitted.vector
-    low, high = parameters.lower, parameters.upper
-    with np.errstate(divide="ignore", invalid="ignore"):
-        decades = (low > 0) & (high > 10 * low)
-        spread = np.where(decades, np.abs(values) * np.log(high / low), high - low) / np.sqrt(12)
-    width = np.where(np.isfinite(spread) & (spread > 0), spread, np.maximum(np.abs(values), 1e-300))
+    width = prior_width(np.maximum(np.abs(values), 1e-300), parameters.lower, parameters.upper)
     of_unit = np.zeros(parameters.size)
     of_unit[free] = 1 / np.sqrt(np.maximum(square, 1e-300))
     for e in laws:
@@ -142,6 +138,17 @@ def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np
             own = e.law.parameters()[name].prior
             width[where] = of_unit[where] if own is None else np.ravel(own[1])
     return np.asarray(width[free])
+
+
+def prior_width(size: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Compute the standard deviations of values (n,) of a size of which only the bounds are known.
+
+    Between bounds they are uniform, in logarithms where these span more than a decade; without bounds it is the size.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        decades = ((lower > 0) & (upper > 10 * lower)) | ((upper < 0) & (lower < 10 * upper))
+        spread = np.where(decades, size * np.abs(np.log(upper / lower)), upper - lower) / np.sqrt(12)
+    return np.where(np.isfinite(spread) & (spread > 0), spread, size)
 
 
 def log_prior(laws: Sequence[Placed], alternatives: Mapping[str, Sequence[Law]], doubtful: bool = False) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 from ..data import Recording
 
 ALIKE, CHANCE = 0.5, 1e-4  # rank correlation, and its chance in noise, of a residual that swells with a signal
+ABOVE_NOISE = 2.0  # ratio of an error to the noise from which the answers say that more is missing
 LONGEST = 400  # samples over which a residual may be correlated
 
 
@@ -32,6 +33,11 @@ class Floor:
     def nrmse(self, scale: np.ndarray) -> float:
         """Averaged over outputs, in units of their deviation."""
         return float(np.mean(self.deviation / scale))
+
+
+def noise_floor(recordings: Sequence[Recording], residuals: Sequence[np.ndarray]) -> Floor:
+    """Measure the floor on recordings, or estimate it from residuals where they repeat nothing."""
+    return measured_floor(recordings) or Floor(white_part(residuals), "estimated")
 
 
 def measured_floor(recordings: Sequence[Recording]) -> Floor | None:

@@ -1,32 +1,31 @@
-"""Which parameters of a simulator are identifiable from recordings, and which are dead, flat or traded off.
+"""Identifiability of a simulator's parameters: which ones recordings determine, and which are dead, flat or traded off.
 
 With J the outputs' changes by the parameters in units of the noise, initial states projected off, and D the room that
 the bounds leave each parameter, the singular values s of J D say how well each direction is determined. Where s < 1
-the standard error is larger than the room: the recordings add nothing to the bounds. Parameters that hold such a
-direction among themselves are traded off. A direction with whole exponents, in logarithms of the parameters, leaves
-only a ratio or a product identifiable (Bellman & Åström 1970; Brun, Reichert & Künsch 2001).
+the standard error is larger than the room: the recordings add nothing to the bounds. Parameters that share such a
+direction are traded off. A direction with whole exponents, in logarithms of the parameters, leaves only a ratio or a
+product identifiable (Bellman & Åström 1970; Brun, Reichert & Künsch 2001).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import combinations
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
-from ..models import ParameterSet
+from .._base import in_words
 from ..simulators import Named, Simulator
-from .linearise import Probe, Run, propagate
-from .remainder import block_diagonal, lengths, moved, orthonormal
+from .evidence import prior_width
+from .linearise import Probe, Run, along
+from .remainder import lengths, orthonormal, own_changes, project_off
 from .workbench import Fitted, Workbench
 
-LARGEST_GROUP = 4  # parameters of a group that is looked for; above it all combinations are too many
-SHOWN = 8  # names in a sentence
-EXPONENTS = (1, 2, 3)  # denominators of exponents; physical laws have small ones
+LARGEST_EXPONENT = 3  # in numerators and denominators: physical laws have small ones
 STEP = 1.1  # factor of a trial step that tells a product from a sum; they differ by a twentieth of it
-SAME = 0.01  # share of a parameter's own change that a step along a ratio or product leaves; of another curve, more
+SAME = 0.01  # share of a change that counts as none: steps along another curve leave more
 
 
 @dataclass(frozen=True)
@@ -74,212 +73,137 @@ class Tie:
 
 
 @dataclass(frozen=True, eq=False)
-class Symbols:
-    """Symbols that a simulator's equations are evaluated with: vectors, and by name."""
-
-    states: ca.SX
-    inputs: ca.SX
-    vector: ca.SX
-    x: Named
-    u: Named
-    p: Named
-    t: ca.SX
-
-    @classmethod
-    def of(cls, simulator: Simulator) -> Symbols:
-        """Make new symbols."""
-        own = simulator.parameter_set
-        xs, us, vector = (
-            ca.SX.sym(n, size)
-            for n, size in (("x", len(simulator.states)), ("u", len(simulator.inputs)), ("p", own.size))
-        )
-        x = Named("state", {name: xs[i] for i, name in enumerate(simulator.states)})
-        u = Named("input", {name: us[i] for i, name in enumerate(simulator.inputs)})
-        return cls(xs, us, vector, x, u, Named("parameter", own.symbols(vector)), ca.SX.sym("t"))
-
-
-def in_words(names: Sequence[str]) -> str:
-    """Names as a sentence has them; many are cut short."""
-    if len(names) > SHOWN:
-        return f"{', '.join(names[:SHOWN])} and {len(names) - SHOWN} more"
-    return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
-
-
-@dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """How parameters and unknown initial states move the outputs along whole recordings, in units of the noise.
+    """Sensitivity of the outputs along whole recordings to free parameters and unknown initial states.
 
     Attributes
     ----------
-    names, units : tuple of str
-        Free entries of the simulator's parameters.
-    values, room : array, shape (n,)
-        Fitted values, and the standard deviation of a value of which only the bounds are known.
-    at_bound : array, shape (n,), bool
-        Whether the fitted values are at a bound.
-    raw : array, shape (R, n)
-        Changes of all outputs by a unit change of each parameter.
-    start : array, shape (R, k)
-        Orthonormal changes by unknown initial states.
+    rows : tuple of ParameterRow
+        Free entries of the simulator's parameters, not assessed yet.
+    room : array, shape (n,)
+        Standard deviation of each value if only its bounds are known.
+    raw, start : array, shapes (R, n) and (R, k)
+        Changes of all outputs, in units of the noise, by a unit change of each parameter and unknown initial state.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    values: np.ndarray
+    rows: tuple[ParameterRow, ...]
     room: np.ndarray
-    at_bound: np.ndarray
     raw: np.ndarray
     start: np.ndarray
 
     @classmethod
-    def of(
-        cls, bench: Workbench, probe: Probe, runs: Sequence[Run], more: Callable[[Run], Run] | None = None
-    ) -> Sensitivity:
-        """Along the runs of a bench whose scale is the noise; `more` gives each run other outputs."""
-        own, skips = ParameterSet(dict(bench.simulator.parameters)), [r.skip for r in bench.recordings]
+    def of(cls, bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Sensitivity:
+        """Compute it along the runs of a bench whose scale is the noise."""
+        own = bench.simulator.parameter_set
         places = np.flatnonzero(own.free)
-        if more is None:
-            blocks = [moved(bench, r, skip=skip) for r, skip in zip(runs, skips, strict=True)]
-        else:
-            found = [propagate(more(r))[skip:] for r, skip in zip(runs, skips, strict=True)]
-            blocks = [v.reshape(-1, v.shape[2]) for v in found]
-        whole = block_diagonal(blocks, runs[0].n_free)
-        states = whole[:, len(places) :]
-        kept = np.repeat([not r.from_zero and q.begins != "given" for r, q in zip(runs, bench.recordings, strict=True)],
-                         states.shape[1] // len(runs))  # fmt: skip
-        raw = whole[:, : len(places)]
-        signal = np.concatenate([r.y[skip:] / bench.scale for r, skip in zip(bench.recordings, skips, strict=True)])
-        felt = np.linalg.norm(signal - signal.mean(axis=0)) / np.where(lengths(raw) > 0, lengths(raw), 1.0)
-        values, given, lower, upper = (v[places] for v in (probe.values, own.start, own.lower, own.upper))
         units = [p.unit for p in own.values() for _ in range(p.size)]
-        return cls(
-            tuple(own.labels[i] for i in places),
-            tuple(units[i] for i in places),
-            values,
-            room(np.where(given != 0, np.abs(given), felt), lower, upper),
-            (values <= lower) | (values >= upper),
-            raw,
-            orthonormal(states[:, kept]),
+        values, given, lower, upper = (v[places] for v in (probe.values, own.start, own.lower, own.upper))
+        rows = tuple(
+            ParameterRow(own.labels[i], float(value), units[i], None, "", not low < value < high)
+            for i, value, low, high in zip(places, values, lower, upper, strict=True)
         )
+        raw, start = _changes(bench, runs)
+        signal = np.concatenate([r.y[r.skip :] for r in bench.recordings]) / bench.scale
+        # without bounds, the room is the given value; of zero, the change that moves the outputs as they have moved
+        unit = np.linalg.norm(signal - signal.mean(axis=0)) / np.where(lengths(raw) > 0, lengths(raw), 1.0)
+        return cls(rows, prior_width(np.where(given != 0, np.abs(given), unit), lower, upper), raw, start)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free entries."""
+        return tuple(r.name for r in self.rows)
+
+    @cached_property
+    def base(self) -> np.ndarray:
+        """Orthonormal changes that unknown initial states can follow, shape (R, k)."""
+        return orthonormal(self.start)
+
+    @cached_property
     def scaled(self) -> np.ndarray:
-        """Changes by as much as the bounds leave room for, initial states projected off."""
-        columns = self.raw * self.room
-        return np.asarray(columns - self.start @ (self.start.T @ columns))
+        """J D as a triangle (n, n) with the same singular values."""
+        return np.asarray(np.linalg.qr(project_off(self.raw * self.room, self.base), mode="r"))
+
+    @property
+    def reach(self) -> np.ndarray:
+        """Change of the outputs within each parameter's room, in standard deviations of the noise, shape (n,)."""
+        return lengths(self.raw * self.room)
 
 
-def room(size: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Standard deviation of values of which the bounds alone are known: uniform, in logarithms if of one sign.
-
-    Without bounds it is `size`: the given value, whose sign would be unknown then; of a value given as zero the change
-    that moves the outputs as much as they have moved.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(np.log(upper / lower)) / np.sqrt(12) * size
-    linear = (upper - lower) / np.sqrt(12)
-    bounded = np.isfinite(linear) & (linear > 0)
-    return np.where(bounded & (lower * upper > 0), ratio, np.where(bounded, linear, size))
+def _changes(bench: Workbench, runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray]:
+    known = [r.from_zero or q.begins == "given" for r, q in zip(runs, bench.recordings, strict=True)]
+    return own_changes(bench, runs, [r.skip for r in bench.recordings], known)
 
 
-def count_undetermined(scaled: np.ndarray) -> int:
-    """Number of directions along which the standard error is larger than the room."""
-    return scaled.shape[1] - int(np.sum(np.linalg.svd(scaled, compute_uv=False) >= 1)) if scaled.shape[1] else 0
+def _undetermined(scaled: np.ndarray) -> np.ndarray:
+    """Find the orthonormal directions (k, n) along which the standard error is larger than the room."""
+    _, s, v = np.linalg.svd(scaled)
+    return np.asarray(v[np.append(s, np.zeros(len(v) - len(s))) < 1])
 
 
 def assess_parameters(
     response: Sensitivity, bench: Workbench, fitted: Fitted
 ) -> tuple[tuple[ParameterRow, ...], tuple[Tie, ...]]:
-    """Each free parameter, and the groups that are traded off."""
-    names, n = response.names, len(response.names)
-    if not n:
-        return (), ()
-    small = np.asarray(np.linalg.qr(response.scaled, mode="r"))  # the same singular values
-    alone, before = lengths(small), lengths(response.raw * response.room)
-    status = np.full(n, "identifiable", dtype=object)
-    status[alone < 1] = "start"
-    status[before < 1] = "flat"
-    status[before == 0] = "dead"
-    status[_port_parameters(bench.simulator)] = "port"
-    rest = [i for i in range(n) if status[i] == "identifiable"]
-    groups = _groups(small, rest)
-    for i in {i for g in groups for i in g}:
-        status[i] = "tied"
-    _, s, v = np.linalg.svd(small[:, rest])
-    weight = np.where(s >= 1, 1 / np.maximum(s, 1.0), 0.0)
-    std = response.room[rest] * np.sqrt(np.sum((weight[:, None] * v[: len(s)]) ** 2, axis=0)) if rest else np.zeros(0)
-    by_place = dict(zip(rest, std.tolist(), strict=True))
-    rows = []
-    for i, name in enumerate(names):
-        own = by_place.get(i) if status[i] == "identifiable" else None
-        value, at_bound = float(response.values[i]), bool(response.at_bound[i])
-        rows.append(ParameterRow(name, value, response.units[i], own, str(status[i]), at_bound))
-    ties = tuple(Tie(tuple(names[i] for i in g), _only_as(response, small, g, bench, fitted)) for g in groups)
-    return tuple(rows), ties
+    """Assess each free parameter, and find the groups that are traded off."""
+    scaled = response.scaled
+    status = np.full(len(response.rows), "identifiable", dtype=object)
+    status[lengths(scaled) < 1] = "start"
+    status[response.reach < 1] = "flat"
+    status[response.reach == 0] = "dead"
+    status[_read_by_ports_alone(bench.simulator)] = "port"
+    rest = np.flatnonzero(status == "identifiable")
+    groups = [rest[own] for own in _groups(scaled[:, rest])]
+    for group in groups:
+        status[group] = "tied"
+    _, s, v = np.linalg.svd(scaled[:, rest])
+    errors = lengths((v[: len(s)] / np.maximum(s, 1.0)[:, None])[s >= 1])  # in units of the room
+    std = dict(zip(rest, (response.room[rest] * errors).tolist(), strict=True))
+    rows = tuple(
+        replace(row, std=std[i] if status[i] == "identifiable" else None, status=status[i])
+        for i, row in enumerate(response.rows)
+    )
+    return rows, tuple(Tie(tuple(rows[i].name for i in g), _only_as(response, g, bench, fitted)) for g in groups)
 
 
-def _port_parameters(simulator: Simulator) -> np.ndarray:
-    """Which free entries of the parameters only the ports read, shape (n,), bool."""
-    s = Symbols.of(simulator)
-    equations = [simulator.derivatives(s.x, s.u, s.p, s.t), *simulator.measured(s.x, s.u, s.p, s.t).values()]
-    ports = [e for port in simulator.ports for e in simulator.into(port, s.x, s.u, s.p, s.t).values()]
-    read = [
-        np.array(ca.which_depends(ca.vertcat(*map(ca.SX, found)), s.vector), dtype=bool) if found else np.zeros(0, bool)
-        for found in (equations, ports)
-    ]
-    only = ~read[0] & read[1] if ports else np.zeros(s.vector.numel(), bool)
-    return np.asarray(only[simulator.parameter_set.free])
+def _read_by_ports_alone(simulator: Simulator) -> np.ndarray:
+    """Mark the free entries of the parameters that the ports read and no equation does, shape (n,), bool."""
+    symbols = simulator.symbols()
+    parameters = stacked(symbols[2])
+    equations = ca.vertcat(simulator.derivatives(*symbols), *simulator.measured(*symbols).values())
+    factors = ca.vertcat(ca.SX(0, 1), *(f for port in simulator.ports for f in simulator.into(port, *symbols).values()))
+    own, ports = (np.array(ca.which_depends(e, parameters), dtype=bool) for e in (equations, factors))
+    return np.asarray((ports & ~own)[simulator.parameter_set.free])
 
 
-def _groups(small: np.ndarray, rest: list[int]) -> list[list[int]]:
-    """Smallest sets of columns that hold an undetermined direction; those that share a parameter are one group."""
-    found: list[set[int]] = []
-    total = count_undetermined(small[:, rest])
-    share = _share(small, rest)
-    involved = [i for i, part in zip(rest, share, strict=True) if part > SAME]
-
-    def left() -> int:  # undetermined directions that no group holds
-        return total - sum(count_undetermined(small[:, sorted(g)]) for g in found)
-
-    for size in range(2, min(LARGEST_GROUP, len(involved)) + 1):
-        if left() <= 0:
-            break
-        for chosen in combinations(involved, size):
-            new = set(chosen)
-            if any(new <= g for g in found) or count_undetermined(small[:, list(chosen)]) == 0:
-                continue
-            if any(count_undetermined(small[:, list(part)]) for part in combinations(chosen, size - 1)):
-                continue  # a smaller set holds it
-            for g in [g for g in found if g & new]:
-                found.remove(g)
-                new |= g
-            found.append(new)
-            if left() <= 0:
-                break
-    if left() > 0:  # spread over many
-        wide = [i for i in involved if not any(i in g for g in found)]
-        for i in sorted(wide, key=lambda i: share[rest.index(i)]):  # the least involved first
-            others = [j for j in wide if j != i]
-            wide = others if count_undetermined(small[:, others]) == count_undetermined(small[:, wide]) else wide
-        found += [set(wide)] if len(wide) > 1 else []
-    return [sorted(g) for g in found]
+def stacked(symbols: Named) -> ca.SX:
+    """Stack symbols into one column."""
+    return ca.vertcat(ca.SX(0, 1), *(ca.vec(symbols[name]) for name in symbols))
 
 
-def _share(small: np.ndarray, rest: list[int]) -> np.ndarray:
-    """How much each parameter takes part in the undetermined directions, between 0 and 1."""
-    _, s, v = np.linalg.svd(small[:, rest])
-    s = np.append(s, np.zeros(len(v) - len(s)))
-    return np.asarray(lengths(v[s < 1]))
+def _groups(scaled: np.ndarray) -> list[list[int]]:
+    """Find the groups of columns that trade off.
+
+    Columns that the undetermined directions can do without are dropped, those that take part least first; the others
+    are one group where a direction links them.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    free = _undetermined(scaled)
+    members = list(range(scaled.shape[1])) if len(free) else []
+    for i in np.argsort(lengths(free)):
+        others = [j for j in members if j != i]
+        if len(_undetermined(scaled[:, others])) == len(free):
+            members = others
+    free = _undetermined(scaled[:, members])
+    count, group = connected_components(np.abs(free.T @ free) > SAME, directed=False)
+    return [[j for j, own in zip(members, group, strict=True) if own == k] for k in range(count)]
 
 
-def _only_as(
-    response: Sensitivity, small: np.ndarray, group: list[int], bench: Workbench, fitted: Fitted
-) -> tuple[str, ...]:
-    """What is identifiable of a group: monomials or sums of small whole numbers, or nothing where it is neither."""
-    names, values = [response.names[i] for i in group], response.values[group]
+def _only_as(response: Sensitivity, group: np.ndarray, bench: Workbench, fitted: Fitted) -> tuple[str, ...]:
+    """Write what is identifiable of a group: monomials or sums with small whole numbers, or nothing."""
+    names, values = [response.names[i] for i in group], np.array([response.rows[i].value for i in group])
     found = []
     for unit, write in ((values, _monomial), (np.ones(len(group)), _sum)):
-        if np.all(unit != 0) and (rows := _whole(small[:, group], response.room[group] / unit)) is not None:
+        if np.all(unit != 0) and (rows := _whole(response.scaled[:, group], response.room[group] / unit)) is not None:
             change = _finite_change(rows, write is _monomial, group, response, bench, fitted)
             found.append((change, tuple(write(names, row) for row in rows)))
     change, best = min(found, default=(np.inf, ()))
@@ -291,39 +215,31 @@ def _whole(columns: np.ndarray, room: np.ndarray) -> np.ndarray | None:
 
     `columns` are those of J D, and `room` is D in the coordinates wanted, with their sign.
     """
-    _, s, v = np.linalg.svd(columns)
-    s = np.append(s, np.zeros(len(v) - len(s)))
-    free = (v[s < 1] * room)[:, ::-1]  # the first named parameter comes last, as what is divided by
-    count = columns.shape[1]
-    rows = _reduced(np.linalg.svd(free)[2][len(free) :])
-    for factor in EXPONENTS:
+    free = _undetermined(columns) * room
+    rows = _reduced(_complement(free))
+    for factor in range(1, LARGEST_EXPONENT + 1):
         whole = np.round(rows * factor)
-        if np.any(np.abs(whole) > max(EXPONENTS)) or not np.all(np.any(whole, axis=1)):
+        if np.any(np.abs(whole) > LARGEST_EXPONENT) or not np.all(np.any(whole, axis=1)):
             continue
-        kept = np.linalg.svd(whole)[2][len(whole) :][:, ::-1]  # directions that leave these rows as they are
-        test = kept / room
+        test = _complement(whole) / room  # directions that leave these rows as they are
         test /= lengths(test.T)[:, None]
-        if len(kept) == count - len(rows) and np.all(lengths((test @ columns.T).T) < 1):
-            return np.asarray(whole[::-1, ::-1])
+        if len(test) == len(free) and np.all(lengths(columns @ test.T) < 1):
+            return np.asarray(whole)
     return None
 
 
+def _complement(rows: np.ndarray) -> np.ndarray:
+    """Find the orthonormal directions that are orthogonal to independent rows."""
+    return np.asarray(np.linalg.svd(rows)[2][len(rows) :])
+
+
 def _reduced(rows: np.ndarray) -> np.ndarray:
-    """Reduced row echelon form."""
-    rows = rows.copy()
-    at = 0
-    for j in range(rows.shape[1]):
-        if at == len(rows):
-            break
-        i = at + int(np.argmax(np.abs(rows[at:, j])))
-        if abs(rows[i, j]) < 1e-6:  # of rows of length one
-            continue
-        rows[[at, i]] = rows[[i, at]]
-        rows[at] /= rows[at, j]
-        others = np.arange(len(rows)) != at
-        rows[others] -= rows[others, j][:, None] * rows[at]
-        at += 1
-    return rows
+    """Combine orthonormal rows so that the last independent columns hold the identity; the first are divided by."""
+    pivots: list[int] = []
+    for j in reversed(range(rows.shape[1])):
+        if np.linalg.matrix_rank(rows[:, [j, *pivots]], tol=1e-6) > len(pivots):
+            pivots = [j, *pivots]
+    return np.asarray(np.linalg.lstsq(rows[:, pivots], rows)[0])
 
 
 def _monomial(names: Sequence[str], exponents: np.ndarray) -> str:
@@ -352,34 +268,41 @@ def _sum(names: Sequence[str], factors: np.ndarray) -> str:
 
 
 def _finite_change(
-    rows: np.ndarray, logarithmic: bool, group: list[int], response: Sensitivity, bench: Workbench, fitted: Fitted
+    rows: np.ndarray, logarithmic: bool, group: np.ndarray, response: Sensitivity, bench: Workbench, fitted: Fitted
 ) -> float:
-    """Change of the first recording's outputs by a step of a tenth along which the rows are constant.
+    """Compute the change of the outputs by a step of a tenth along which the rows are constant.
 
     It is a share of the change by the first parameter alone, and zero where it is below the noise; unknown initial
     states follow both.
     """
-    along = np.linalg.svd(rows)[2][len(rows)]
-    along /= np.max(np.abs(along))
-    places = np.flatnonzero(ParameterSet(dict(bench.simulator.parameters)).free)[group]
-    value, alone = response.values[group], np.eye(len(group))[0]
-    far = (STEP - 1) * np.min(np.abs(value))
-    r, model = bench.recordings[0], fitted.model
-    drive = model.drive(r)
-
-    def outputs(way: np.ndarray) -> np.ndarray:
+    direction, alone = _complement(rows)[0], np.eye(len(group))[0]
+    places = np.flatnonzero(bench.simulator.parameter_set.free)[group]
+    value = fitted.vector[places]
+    step = (STEP - 1) * np.min(np.abs(value))
+    sizes = []
+    for way in (direction / np.max(np.abs(direction)), alone):
         vector = fitted.vector.copy()
-        vector[places] = value * STEP**way if logarithmic else value + far * way
-        y = fitted.engine.simulate(drive, vector, fitted.initial[0])[0]
-        return np.asarray((y / bench.scale)[r.skip :].ravel())
+        vector[places] = value * STEP**way if logarithmic else value + step * way
+        values = fitted.model.parameters.unpack(vector)
+        there = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
+        if not np.isfinite(there.cost):
+            return np.inf
+        pairs = zip(there.residual, fitted.residual, bench.recordings, strict=True)
+        change = np.concatenate([((new - old) / bench.scale)[r.skip :].ravel() for new, old, r in pairs])
+        sizes.append(float(np.linalg.norm(project_off(change, response.base))))
+    return sizes[0] / sizes[1] if sizes[0] > 1 else 0.0
 
-    with np.errstate(all="ignore"):
-        now = outputs(0 * along)
-        changes = np.column_stack([outputs(along) - now, outputs(alone) - now])
-    if not np.all(np.isfinite(changes)):
-        return np.inf
-    start = response.start[: len(changes)]
-    if start.shape[1]:
-        changes = changes - start @ np.linalg.lstsq(start, changes, rcond=None)[0]
-    size = lengths(changes)
-    return float(size[0] / size[1]) if size[0] > 1 else 0.0
+
+def helpful_sensors(bench: Workbench, fitted: Fitted, runs: Sequence[Run], response: Sensitivity) -> tuple[str, ...]:
+    """Find states whose sensor, as quiet as the present ones, would determine more of the parameters; best first."""
+    signal = np.std(np.concatenate([r.y for r in bench.recordings]), axis=0)
+    noise = np.mean(bench.scale / signal) * np.std(along(bench, fitted)[0], axis=0)
+    count, found = len(_undetermined(response.scaled)), list[tuple[int, str]]()
+    for j in np.flatnonzero(noise > 0):
+        row = np.eye(runs[0].a.shape[1])[j]
+        sensed = [replace(r, c=np.zeros_like(r.c[:, :1]) + row, d=np.zeros_like(r.d[:, :1])) for r in runs]
+        raw, start = _changes(replace(bench, scale=noise[[j]]), sensed)
+        more = replace(response, raw=np.vstack([response.raw, raw]), start=np.vstack([response.start, start]))
+        left = len(_undetermined(more.scaled))
+        found += [(left, bench.simulator.states[j])] if left < count else []
+    return tuple(name for _, name in sorted(found))

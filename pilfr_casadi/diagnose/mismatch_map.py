@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base import in_words
 from ..data import Recording
 
 BINS = 6  # of amplitude, rate and level
@@ -241,9 +242,9 @@ def sentence(found: dict[str, Any]) -> str:
         parts.append("grows toward the end of the recording")
     elif max(own, beside) < 1 / CLEAR:
         parts.append("fades toward the end of the recording")
-    text, more = parts[0], parts[1:]
-    if more:
-        text += "; it " + " and ".join([", ".join(more[:-1]), more[-1]] if more[1:] else more)
+    text = parts[0]
+    if len(parts) > 1:
+        text += f"; it {in_words(parts[1:])}"
     outputs = found["outputs"]
     if len(outputs) > 1:
         name = max(outputs, key=outputs.__getitem__)

@@ -15,9 +15,9 @@ from ..data import Recording
 from ..laws import Law, readable_unit
 from ..simulators import Simulator
 from .arguments import check_laws, check_limits, matched, matched_tests, with_scaled
-from .blind_spots import BlindSpot
-from .checkup import assess
+from .checkup import BlindSpot, assess
 from .correction import Correction, as_named, find_correction
+from .detectability import port_units
 from .experiment import next_experiment, placebo
 from .gates import Gate, hold_note, said_hold
 from .mismatch_map import mismatch
@@ -329,10 +329,9 @@ def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndar
     own, unrelated = placebo(bench, search.root.fitted, named.element.port, law)
     element = next(e for e in fitted.simulator.elements if e.port == named.element.port and type(e.law) is type(law))
     port = bench.simulator.port(element.port)
-    w_unit, z_unit = port.unit, port.across_unit
-    if port.series:  # what it is in series with
-        channel = port.name.partition(":")[2]
-        w_unit = z_unit = bench.recordings[0].units.get(channel) or f"[{channel}]"
+    w_unit, z_unit = port_units(port, bench.recordings[0])
+    if port.series and not w_unit:  # what it is in series with
+        w_unit = z_unit = f"[{port.name.partition(':')[2]}]"
     values = {k: v for k, v in fitted.values.items() if k.startswith(element.prefix)}
     shown: dict[str, dict[str, Any]] = {}
     for name, value in values.items():

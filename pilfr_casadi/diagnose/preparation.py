@@ -11,7 +11,7 @@ import numpy as np
 from .._base import InputError, Stages
 from ..data import Recording
 from ..simulators import Simulator
-from .floor import Floor, measured_floor, white_part
+from .floor import Floor, noise_floor, white_part
 from .gaps import gaps
 from .gates import CURED, STRAINED, Gate, choose_hold, hold_note, opened, said_hold, slips
 from .linearise import along, linearised, observer_gain
@@ -75,7 +75,7 @@ def prepare(
     without = refitted(bench, starts)
     say(CHECKS, 2, CHECKED, without.cost**0.5)
     unsaid = said_hold(simulator, recordings, hold) is None
-    first = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+    first = noise_floor(bench.recordings, without.residual)
     noise2 = float(np.mean((first.deviation / bench.scale) ** 2))
     if without.cost > SUSPECT * noise2 and without.cost > LEAST:
         raw, found = bench, _slips(bench, without, noise2, unsaid, workers, early)
@@ -91,7 +91,7 @@ def prepare(
     say(CHECKS, 3, CHECKED, without.cost**0.5)
     bench, without, more = unclip(bench, without)
     gates += more
-    floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+    floor = noise_floor(bench.recordings, without.residual)
     noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
     bench, without, more = gaps(bench, without, noise2)
     if more:  # what looked better across a gap, and the noise that it makes, say nothing
@@ -99,7 +99,7 @@ def prepare(
         if unsaid:
             bench, without, held = _better_held(bench, without)
             gates, notes = [g for g in gates if g not in notes] + held, held
-        floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+        floor = noise_floor(bench.recordings, without.residual)
         noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
     say(CHECKS, 4, CHECKED, without.cost**0.5)
     bench, without = on_steps_as_fine(bench, without)
@@ -125,7 +125,7 @@ def prepare(
     if gates:  # values and states that wrong data led to may be a dead end
         led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
         without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
-    floor = measured_floor(bench.recordings) or Floor(white_part(without.residual), "estimated")
+    floor = noise_floor(bench.recordings, without.residual)
     bench.check_followed(without)
     bench = replace(bench, typical=along(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)

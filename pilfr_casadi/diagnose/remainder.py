@@ -81,7 +81,7 @@ class Remainder:
         ]
         error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
         base = followed(bench, short)
-        left = error - base @ (base.T @ error)
+        left = project_off(error, base)
         tasks = [t for t in _tasks(bench, probe, laws, runs, short) if at in ("", t.port.name)]
         return cls(bench, short, base, left, tuple(tasks), folds(len(left), len(runs)))
 
@@ -136,8 +136,20 @@ def moved(bench: Workbench, r: Run, forces: Sequence[tuple[int, np.ndarray]] = (
 
 def followed(bench: Workbench, runs: Sequence[Run], skips: Sequence[int] = ()) -> np.ndarray:
     """Orthonormal directions of the stacked outputs that parameters and initial states can follow, (R, n)."""
+    return orthonormal(np.hstack(own_changes(bench, runs, skips)))
+
+
+def own_changes(
+    bench: Workbench, runs: Sequence[Run], skips: Sequence[int] = (), known: Sequence[bool] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the stacked outputs' changes by free parameters (R, n_free) and by unknown initial states (R, n).
+
+    `known` marks the runs whose initial state is known; see `moved` for the units and `skips`.
+    """
     blocks = [moved(bench, r, skip=skip) for r, skip in zip(runs, skips or [0] * len(runs), strict=True)]
-    return orthonormal(block_diagonal(blocks, runs[0].n_free))
+    changes, n = block_diagonal(blocks, runs[0].n_free), runs[0].n_free
+    unknown = np.repeat(np.logical_not(known or [False] * len(runs)), (changes.shape[1] - n) // len(runs))
+    return changes[:, :n], changes[:, n:][:, unknown]
 
 
 def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
@@ -217,6 +229,11 @@ def block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
 def lengths(columns: np.ndarray) -> np.ndarray:
     """Length of each column."""
     return np.asarray(np.sqrt(np.einsum("ij,ij->j", columns, columns)))
+
+
+def project_off(columns: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """Subtract what orthonormal directions can follow of one column (R,) or several (R, n)."""
+    return np.asarray(columns - base @ (base.T @ columns))
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:

@@ -12,15 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, write_atomically
+from .._base import InputError, to_json, write_atomically
 from ..data import SAME_STEP, Recording, as_recordings, nrmse
 from ..engine import make_engine
 from ..identify import match_channels
 from ..laws import display_name
 from ..models import ParameterSet
 from ..simulators import Simulator, discretise, in_series
-from .blind_spots import BlindSpot
+from .checkup import BlindSpot
 from .correction import Correction
+from .floor import ABOVE_NOISE
 from .gates import Gate
 from .learned import Learned
 from .proof import run_free, starts_of
@@ -29,7 +30,6 @@ VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
 MOST = 8  # parameters of the simulator that are printed
-LEFT = 2.0  # ratio of the remaining training error to the noise from which the answer says that more is missing
 WORSE = 1.05  # ratio of the test errors after and before from which a correction makes the test recordings worse
 SURE = 0.5  # confidence above which an effect is stated as found; below it is a guess
 CONSTANT = 0.9  # error from which a refitted simulator is hardly better than a constant
@@ -193,7 +193,7 @@ class Diagnosis:
         if self.correction:
             raw |= {"shares": self.shares, "learned": [e.to_dict() for e in self.learned]}
         raw["blind_spots"] = [asdict(b) for b in self.blind_spots]
-        clean: dict[str, Any] = plain(raw)
+        clean: dict[str, Any] = to_json(raw)
         return clean
 
     def simulate(self, recording: Recording) -> np.ndarray:
@@ -337,7 +337,7 @@ class Diagnosis:
                 "outputs' deviation). Check its values, units and bounds before you trust a name."
             )
         times = train["after"] / max(self.floor["nrmse"], 1e-300) if train and self.effects else 1.0
-        if times > LEFT:
+        if times > ABOVE_NOISE:
             out.append(f"The remaining error is {times:.2g} times the noise: more is missing, or a law is only near.")
         far = test and train and test["after"] > FAR * max(train["after"], self.floor["nrmse"])
         if far and self.outcome != "worse":
@@ -443,20 +443,3 @@ def _change(row: Mapping[str, Any]) -> float:
     """Share by which a parameter has moved."""
     nominal = float(row["nominal"])
     return (float(row["refit_with"]) - nominal) / (abs(nominal) or 1e-300)
-
-
-def plain(value: Any) -> Any:
-    """Plain JSON types; None for what is not finite."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    return value

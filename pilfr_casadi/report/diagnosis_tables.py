@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnose import Diagnosis, learned_force, plain
+from .._base import to_json
+from ..diagnose import Diagnosis, learned_force
 from ..laws import display_name, scaled
 from ..models import Parameter, ParameterSet
 from .page import Block, Code, Table, Text, number_text, render, uncertain_text
@@ -260,7 +261,7 @@ def check_table(diagnosis: Diagnosis) -> Table | None:
 def usage(diagnosis: Diagnosis) -> str:
     """Write Python code that builds the corrected simulator from the user's simulator and simulates a recording."""
     simulator = diagnosis.corrected
-    fitted = {k: plain(np.asarray(p.value)) for k, p in simulator.parameter_set.items()}
+    fitted = {k: to_json(np.asarray(p.value)) for k, p in simulator.parameter_set.items()}
     modules: dict[str, set[str]] = {}
     for e in simulator.elements:
         for part in _parts(type(e.law))[0]:

@@ -190,7 +190,7 @@ class Equations:
                 raise InputError(f"The simulator's parameter {name!r} is {given!r}; give Parameter(value, ...).")
         object.__setattr__(self, "parameters", ParameterSet(dict(self.parameters)))
         object.__setattr__(self, "ports", _checked_ports(self.ports))
-        x, u, p, t = self._symbols()
+        x, u, p, t = self.symbols()
         derivatives = ca.vertsplit(self.derivatives(x, u, p, t)) if self.states else ()
         found = {**dict(zip(self.states, derivatives, strict=True)), **self.measured(x, u, p, t)}
         _check_expressions(found, [*x._values.values(), *u._values.values(), *p._values.values(), t])
@@ -213,7 +213,8 @@ class Equations:
         """The parameters with the layout of their vector."""
         return cast(ParameterSet, self.parameters)
 
-    def _symbols(self) -> tuple[Named, Named, Named, Any]:
+    def symbols(self) -> tuple[Named, Named, Named, Any]:
+        """Make new symbols x, u, p and t for the equations."""
         x = Named("state", {n: ca.SX.sym(n) for n in self.states})
         u = Named("input", {n: ca.SX.sym(n) for n in self.inputs})
         own = self.parameter_set
@@ -238,7 +239,7 @@ class Equations:
     @cached_property
     def output_names(self) -> tuple[str, ...]:
         """Names of the outputs."""
-        return tuple(self.measured(*self._symbols()))
+        return tuple(self.measured(*self.symbols()))
 
     def into(self, port: Port, x: Named, u: Named, p: Named, t: Any) -> dict[str, Any]:
         """Evaluate the factors of w by state or output."""
@@ -289,7 +290,7 @@ class Equations:
     @cached_property
     def _integrals(self) -> dict[str, str]:
         """States whose derivative is a single symbol, with its name."""
-        derivatives = ca.vertsplit(self.derivatives(*self._symbols())) if self.states else []
+        derivatives = ca.vertsplit(self.derivatives(*self.symbols())) if self.states else []
         return {n: d.name() for n, d in zip(self.states, derivatives, strict=True) if d.is_symbolic()}
 
     @cached_property
@@ -301,7 +302,7 @@ class Equations:
     @cached_property
     def idle_inputs(self) -> tuple[str, ...]:
         """Inputs that no equation reads: they may scale the missing physics."""
-        x, u, p, t = self._symbols()
+        x, u, p, t = self.symbols()
         read = ca.vertcat(self.derivatives(x, u, p, t), *self.measured(x, u, p, t).values())
         return tuple(name for name in self.inputs if not ca.depends_on(read, u[name]))
 

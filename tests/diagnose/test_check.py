@@ -106,6 +106,7 @@ FREE = Parameter(2.0)
         (lambda p: p.E * p.b * p.h**3, {"E": WIDE, "b": WIDE, "h": Parameter(1.0, bounds=(0.5, 2))}, "E*b*h^3"),
         (lambda p: p.a - p.b, {"a": Parameter(5.0, bounds=(1, 9)), "b": WIDE}, "a - b"),
         (lambda p: p.a + p.b + p.c, {"a": WIDE, "b": WIDE, "c": Parameter(0.0, bounds=(-1, 1))}, "a + b + c"),
+        (lambda p: p.a * p.b * p.c * p.d * p.e, dict.fromkeys("abcde", WIDE), "a*b*c*d*e"),
         (lambda p: p.g / p.l, {"g": FREE, "l": FREE}, "l/g"),
         (lambda p: p.k * p.r**2, {"k": FREE, "r": FREE}, "k*r^2"),
         (lambda p: p.a * p.b, {"a": Parameter(-3.0, bounds=(-9, -1)), "b": WIDE}, "a*b"),
