@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .._base import InputError
 from ..laws import Law
 from ..optimise import Problem
 from ..simulators import Placed
@@ -118,8 +119,11 @@ def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray]:
     theta, n_free = problem.start.copy(), problem.n_free
     states = [s for r, s in zip(bench.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
     theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
-    with np.errstate(all="ignore"):
-        return problem, np.nan_to_num(problem.normal(theta)[2], nan=np.inf)
+    try:
+        with np.errstate(all="ignore"):
+            return problem, np.nan_to_num(problem.normal(theta)[2], nan=np.inf)
+    except (InputError, RuntimeError):  # the run diverges
+        return problem, np.full((len(theta), len(theta)), np.inf)
 
 
 def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np.ndarray) -> np.ndarray:

@@ -165,8 +165,9 @@ class Search:
         found = held_out_errors(self.bench, fitted, self.workers)
         if not np.isfinite(found.mean_square):
             return found
-        v = found.mean_square + self.tolerance
-        return replace(found, spread=spread(self.bench, fitted, laws, v, self.sample.effective(0.0)))
+        own = Sample(self.floor2, _count_samples(fitted, self.bench))
+        v = fitted.cost + self.tolerance
+        return replace(found, spread=spread(self.bench, fitted, laws, v, own.effective(0.0)))
 
     def _predict(self) -> None:
         """Let the likeliest hypotheses predict what they are not fitted to.
@@ -363,7 +364,7 @@ class Search:
         Where the noise was measured, that is it. Third differences tell how much is there at least: white noise inside
         the residual. Samples count as far as that residual is not correlated.
         """
-        self.count = max(effective_size([e[r.skip :] for e, r in self._residual(self.best)]), FEWEST)
+        self.count = _count_samples(self.best.fitted, self.bench)
         if self.floor.source != "estimated":
             return
         best = self.best
@@ -479,6 +480,12 @@ class Search:
         return Trial(
             simulator.elements[len(simulator.elements) - len(laws) :] if laws else (), fitted, fitted.cost, fitted.cost
         )
+
+
+def _count_samples(fitted: Fitted, bench: Workbench) -> float:
+    """Compute the number of samples over the correlation time of a fit's residual."""
+    residual = [e[r.skip :] for e, r in zip(fitted.residual, bench.recordings, strict=True)]
+    return max(effective_size(residual), FEWEST)
 
 
 def _count(trial: Trial) -> int:

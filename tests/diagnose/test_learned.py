@@ -114,7 +114,7 @@ def test_held_out_blocks_tell_a_better_simulator():
     true = rig().with_element("ground", Nameless())
     bench = Workbench.of(rig(430.0, 5.0), [recorded(true, 0)], "zero")
     refit = bench.fit(bench.simulator)
-    (learned, *_) = candidates(bench, refit, ["ground"], ["force"])
+    (learned, *_) = candidates(bench, bench, refit, ["ground"], ["force"])
     before, after = held_out_errors(bench, refit), held_out_errors(bench, learned)
     assert after.blocks < 0.3 * before.blocks and after.ahead < 0.3 * before.ahead
     assert after.error == pytest.approx(max(after.blocks, after.ahead) ** 0.5)
