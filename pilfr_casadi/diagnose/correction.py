@@ -136,8 +136,10 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
 
 def _competing(search: Search, named: Trial | None) -> Iterator[_Competitor]:
     """Generate what competes: the refit, the named laws or the likeliest, other laws, and a learned element."""
-    first = named or max(search.memo.values(), key=lambda t: (bool(t.laws), search.promise(t)))
-    for trial in {t.key: t for t in (search.root, first, *_with_laws(search))}.values():
+    ranked = sorted((t for t in search.memo.values() if _recurs(search, t)), key=search.promise, reverse=True)
+    others = [t for i, t in enumerate(t for t in ranked if t.laws) if i < TRIED or t.key in search.held_out]
+    first = named or next(iter(others), search.root)
+    for trial in {t.key: t for t in (search.root, first, *others)}.values():
         yield from _of_trial(search, trial)
     if first.laws:
         yield from _with_learned(search, search.memo[first.key])
@@ -156,10 +158,9 @@ def _of_trial(search: Search, trial: Trial) -> Iterator[_Competitor]:
         yield trial.fitted, trial.fitted, lambda: search.predicts(trial)
 
 
-def _with_laws(search: Search) -> list[Trial]:
-    """The most promising hypotheses with laws, and those that have predicted already."""
-    ranked = sorted((t for t in search.memo.values() if t.laws), key=search.promise, reverse=True)
-    return [*ranked[:TRIED], *(t for t in ranked[TRIED:] if t.key in search.held_out)]
+def _recurs(search: Search, trial: Trial) -> bool:
+    """Tell whether a hypothesis may hold for another recording: one recording's trend in time is its own."""
+    return len(search.bench.recordings) > 1 or not any("t" in e.law.reads() for e in trial.laws)
 
 
 def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Competitor]:
