@@ -325,9 +325,10 @@ def _blind_spots(request: Request, search: Search) -> tuple[BlindSpot, ...]:
 
 
 def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
-    bench, law = search.bench, named.element.law
-    own, unrelated = placebo(bench, search.root.fitted, named.element.port, law)
-    element = next(e for e in fitted.simulator.elements if e.port == named.element.port and type(e.law) is type(law))
+    bench = search.bench
+    element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # maybe in another form
+    law = element.law
+    own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
     w_unit, z_unit = port_units(port, bench.recordings[0])
     if port.series and not w_unit:  # what it is in series with
