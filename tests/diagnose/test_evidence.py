@@ -9,7 +9,7 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.evidence import EXACT, Sample, information, log_evidence, log_prior
+from pilfr_casadi.diagnose.evidence import EXACT, Sample, information, log_evidence, log_prior, spread
 from pilfr_casadi.diagnose.posterior import share_named
 
 NONE = np.zeros(0)
@@ -56,6 +56,32 @@ def test_a_parameters_unit_does_not_change_its_information():
     softer = replace(bench, scale=2 * bench.scale)
     assert information(softer, fitted, fitted.simulator.elements)[0] == pytest.approx(told, rel=1e-6)
     assert information(bench, fitted, ()).size == 0
+
+
+def test_values_that_two_levels_of_an_input_hardly_determine_spread_predictions_between_them():
+    """A line through two levels predicts those between them; a parabola through two levels does not."""
+    device = pilfr.Simulator(
+        lambda: {},
+        lambda u, p: {"force": p.area * u.pressure + p.offset},
+        inputs=("pressure",),
+        parameters={
+            "area": pilfr.Parameter(1.0, bounds=(-10, 10)),
+            "offset": pilfr.Parameter(0.0, bounds=(-10, 10)),
+        },
+    )
+    rng = np.random.default_rng(0)
+    records = []
+    for level in (1.0, 7.0):
+        y = level + 0.01 * rng.standard_normal((200, 1))
+        records.append(pilfr.Recording(np.full((200, 1), level), y, 0.01, inputs=("pressure",), outputs=("force",)))
+    bench = Workbench.of(device, records, "zero")
+    line, parabola = (
+        bench.fit(s) for s in (device, device.with_element("sensor:force", laws.Quadratic(limits={"a_2": (-1, 1)})))
+    )
+    v = (0.01 / bench.scale[0]) ** 2
+    of_line, of_parabola = (spread(bench, f, f.simulator.elements, v, 100.0) for f in (line, parabola))
+    assert of_line < 0.1 * v  # two values from a hundred samples
+    assert of_parabola > 100 * v
 
 
 def test_the_more_a_force_would_follow_of_the_rest_the_less_the_name_is_believed():
