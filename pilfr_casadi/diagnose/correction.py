@@ -72,19 +72,20 @@ class Correction:
     def sentence(self) -> str:
         """Say what is named, what is learned, what is left, and how much better the simulator predicts."""
         named, learned, left = (f"{100 * self.shares[k]:.3g} %" for k in ("named", "learned", "left"))
-        shares = f"of what the refit leaves above the noise, named laws explain {named}, a learned force {learned}, "
-        shares += f"and {left} is left."
+        shares = (
+            f"Of the mismatch above the noise, named laws explain {named}, a learned force {learned}; {left} is left."
+        )
         if not self.elements:
             return (
                 "The corrected simulator is the refitted one: nothing that was tried is expected to predict other "
                 "recordings better."
             )
         if not np.isfinite(self.after):
-            return shares[0].upper() + shares[1:]
+            return shares
         return (
-            f"The corrected simulator has {self.words}. On blocks of the training recordings that it was not fitted to "
-            f"its error is {100 * self.after:.2g} % of the outputs' deviation, the refit's {100 * self.before:.2g} %; "
-            f"{shares}"
+            f"The corrected simulator has {self.words}. On parts of the training recordings that it was not fitted to, "
+            f"its error is {100 * self.after:.3g} % of the outputs' deviation; that of the refit is "
+            f"{100 * self.before:.3g} %. {shares}"
         )
 
     def to_dict(self) -> dict[str, Any] | None:

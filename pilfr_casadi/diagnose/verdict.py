@@ -115,24 +115,24 @@ def _unnamed(search: Search, found: Posterior, opened: dict[str, float], own: fl
     where = max(opened, key=lambda k: opened[k], default="")
     if not found.effects:
         rings = (
-            f"; what is left swings at the simulator's own {own:.3g} Hz, as from a force not recorded or a value that "
-            "varies in time"
+            f" The rest swings at the simulator's own {own:.3g} Hz, as from a force that was not recorded or a value "
+            "that varies in time."
             if own
             else ""
         )
-        at = f"; a force at {where} could explain {still:.0%} of the rest" if still > HINT else ""
+        at = f" A force at {where} could explain {still:.0%} of the rest." if still > HINT else ""
         noise = search.floor.nrmse(search.bench.scale)
         return (
-            "Something is missing and no law of the catalogue explains it: refitted, the simulator is off by "
-            f"{mean_nrmse(search.bench, root.fitted):.3g} of the outputs' deviation, the noise is about "
-            f"{noise:.3g}{at}{rings}."
+            "Physics is missing, and no law of the catalogue explains it. The refitted simulator is off by "
+            f"{100 * mean_nrmse(search.bench, root.fitted):.3g} % of the outputs' deviation; the noise is about "
+            f"{100 * noise:.3g} %.{at}{rings}"
         )
     near = found.effects[0].element
     port = where if opened.get(near.port, 0.0) < 0.5 * still else near.port
     left = (found.best.whole - search.floor2) / max(root.whole - search.floor2, 1e-300)
     rest = max(search.flexible(found.best).values(), default=0.0)
     return (
-        f"Something is missing, most likely at {port}, and no law of the catalogue explains it: the nearest, "
-        f"{display_name(near.law.id)} at {near.port}, leaves {left:.0%} of the excess, and a flexible force "
-        f"explains {rest:.0%} of what it leaves."
+        f"Physics is missing, most likely at {port}, and no law of the catalogue explains it. The closest law, "
+        f"{display_name(near.law.id)} at {near.port}, removes {1 - left:.0%} of the mismatch on the training "
+        f"recordings. The rest is not noise: a force at a port explains {rest:.0%} of it."
     )
