@@ -6,8 +6,8 @@ about. The files by stage:
 
 - The whole: `pipeline` (the steps in their order), `arguments` (their checks), `workbench` (what all steps share).
 - Preparation: `preparation` calls the checks of recordings `recording_faults` (glitches, stale and clipped samples,
-  unsettled periods), `gates` (sign, unit, exchange, hold), `gaps`, `timing` and `offset`; `equilibrium_state` sets the
-  state in which laws begin, `step_refinement` the integration steps, `floor` the noise.
+  unsettled periods), `gates` (sign, unit, exchange, hold), `gaps`, `timing` and `offset`;
+  `step_refinement` chooses the integration steps, `floor` the noise.
 - Search: `search` moves from hypothesis to hypothesis; `linearise`, `remainder`, `screen`, `pairs` and `relatives` say
   which are worth a fit, `trials` fits them.
 - Evidence: `evidence` (log evidence), `cross_validation` (held-out

@@ -20,13 +20,14 @@ from ..simulators import (
     MOST_SUBSTEPS,
     Simulator,
     choose_substeps,
+    compute_equilibrium,
     discretise,
     fastest_rates,
     growth_rate,
     needed_substeps,
     rate_at_start,
+    resting_elements,
 )
-from .equilibrium_state import equilibrium_state, resting_elements
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
 HUGE, ENDLESS = 1e6, 1e20  # times the largest measured value, and mean square error, of what grows without end
@@ -294,7 +295,7 @@ class Workbench:
             state = np.asarray(given, dtype=float)[:n]
             full = np.zeros(n)
             if r.begins == "estimate" and len(state) < n and resting_elements(simulator):
-                full = equilibrium_state(simulator, self.dt / model.substeps, vector, state, r.u[0])
+                full = compute_equilibrium(simulator, self.dt / model.substeps, vector, state, r.u[0])
             out.append(np.append(state, full[len(state) :]))
         return out
 

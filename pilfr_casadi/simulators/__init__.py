@@ -1,7 +1,8 @@
 """The user's equations with ports for missing physics.
 
 `equations` evaluates them with their laws, `integration` makes them a discrete-time `Model`, `simulator` holds the
-class `Simulator`, and `adapters` accept a Python file, a state space or a fitted model in its place.
+class `Simulator`, `equilibrium_state` computes the state in which its laws begin at rest, and `adapters` accept a
+Python file, a state space or a fitted model in its place.
 """
 
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
         user_variable as user_variable,
     )
     from .equations import Named as Named, Placed as Placed, Port as Port, in_series as in_series
+    from .equilibrium_state import compute_equilibrium as compute_equilibrium, resting_elements as resting_elements
     from .integration import (
         LARGEST_STEP as LARGEST_STEP,
         MOST_SUBSTEPS as MOST_SUBSTEPS,

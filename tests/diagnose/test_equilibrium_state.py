@@ -6,7 +6,6 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.equilibrium_state import equilibrium_state
 from pilfr_casadi.diagnose.offset import Offset
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import (
@@ -21,7 +20,7 @@ from pilfr_casadi.laws import (
     TwoStageCreep,
     unit_forces,
 )
-from pilfr_casadi.simulators import discretise
+from pilfr_casadi.simulators import compute_equilibrium, discretise
 
 DT, M = 0.05, 1500
 
@@ -60,7 +59,7 @@ def test_a_law_begins_as_if_the_signal_had_stood_still(kind):
     simulator = placed(law.at({**shape, **strengths}))
     model = discretise(simulator, DT, substeps=4)
     x, u = np.array([5.0, 5.0]), np.array([5.0])
-    state = equilibrium_state(simulator, DT / 4, model.parameters.start, x, u)
+    state = compute_equilibrium(simulator, DT / 4, model.parameters.start, x, u)
     assert np.array_equal(state[:2], x) and len(state) == model.n_state and np.max(state[2:]) == 7
     r = recorded(5.0).with_(u=np.full((M, 1), 5.0))
     y, after = make_engine(model).simulate(model.drive(r), model.parameters.start, state)

@@ -13,7 +13,8 @@ import numpy as np
 
 from .._base import one_at_a_time
 from ..models import ParameterSet, map_points
-from ..simulators import ClosedEquations, Instant, Simulator, on_grid
+from .integration import ClosedEquations, Instant, on_grid
+from .simulator import Simulator
 
 
 def resting_elements(simulator: Simulator) -> list[int]:
@@ -23,7 +24,7 @@ def resting_elements(simulator: Simulator) -> list[int]:
 
 
 @one_at_a_time
-def equilibrium_state(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+def compute_equilibrium(simulator: Simulator, h: float, vector: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Compute the state with laws' own states and memory at rest, (n_state,), on steps of h seconds.
 
     Parameters
