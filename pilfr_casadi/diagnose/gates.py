@@ -1,57 +1,174 @@
-"""Faults of whole channels, looked for first: sign, unit, exchange, unit of time; and the choice of the hold.
+"""Faults of recordings as edits, and the faults of whole channels: sign, unit, exchange, unit of time, another zero.
 
-Each is a change of the recordings; it counts when the simulator, refitted, follows the changed recordings far better
-than the given ones.
+Every fault is looked for in one way. An edit of the recordings (`Gate.change`), or an element at a sensor, puts the
+fault right; the simulator is refitted with it; and the edit is accepted by the share of the mean square error that it
+leaves of the refit's (`CURED`, `EXPLAINED`), and against the noise (`AT_NOISE`). Parameters that an edit adds have to
+gain more than they cost (`gain`; Schwarz 1978). Each check takes a `Checked` and returns one.
+
+Edits are screened to first order (`FirstOrder`): with base the orthonormal directions that parameters and initial
+states can follow, an error e leaves `e - base baseᵀ e`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from .._base import InputError, side_by_side
 from ..data import Recording
 from ..engine import make_engine
+from ..laws import Law
 from ..optimise import GaussNewton
-from .workbench import QUICK, Fitted, Workbench
+from .floor import Floor, effective_size, measured_floor, white_part
+from .linearise import Probe, Run, linearised
+from .remainder import followed, lengths, moved
+from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]
-Trial = tuple[str, str, Any, Change]  # channel, finding, value, what puts it right
+
+# share of the mean square left at most: by a fault of a whole channel, which other physics hardly mimics; by others
+CURED, EXPLAINED = 0.12, 0.3
+ROOM = 12.0  # nats that parameters of an edit have to gain beyond their number's cost: odds of about 1e5
+ABOVE_NOISE, AT_NOISE = (
+    2.0,
+    5.0,
+)  # times the noise (rms), from which faults are looked for, and up to which none is left
+ASTRAY, LOST = 0.04, 0.25  # mean square error of a refit that may have gone astray, and that says nothing
+SAME = 1.02  # ratio of errors that say the same
+
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
-FAHRENHEIT = 1.8  # its zero is another one: it comes with an offset
 FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))
-GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
-# mean square error that a wrong unit of time leaves at least, and where it has driven parameters to their bounds
-HOPELESS, STRAINED = 0.1, 0.01
-MOST_AT_BOUNDS = 0.3  # share of the parameters at their bounds, beyond which a unit of time has bent the simulator
-CURED = 0.12  # share of the mean square that a sign or a unit put right leaves at most
-SEVERAL = 0.8  # share of the mean square that one channel in another unit leaves, for all to be
+FAHRENHEIT = (1.8, 1 / 1.8)  # its zero is another one: it comes with an offset
+TIME_UNITS = (1e-3, 1e3, 60.0, 1 / 60)
+FAST_TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600)  # where the simulator is too fast for the recordings' step
 NEAR = 6.0  # a factor is tried where it brings the simulated and the measured size this near
+BENT = 0.3  # share of the parameters at their bounds, beyond which a unit of time has bent the simulator
+SEVERAL = 0.8  # share of the mean square that one channel in another unit leaves, for all to be
+GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
+
+LEAST = 0.01  # share of the mean square that an offset has to take away, to first order
+STILL = 0.1  # of the value it was found with, that an offset has to keep beside effects to be told
+CERTAIN = 3.0  # standard errors by which an offset is not zero
 
 
 @dataclass(frozen=True)
 class Gate:
-    """One finding about a channel; `fault` where it is a fault of the recording rather than a note."""
+    """One finding about a channel, and the edit that puts it right.
+
+    Attributes
+    ----------
+    corrected : bool
+        Whether the diagnosis goes on with it put right.
+    fault : bool
+        Whether it is a fault of the recording rather than a note.
+    change : callable
+        Edit of a recording, where one puts it right.
+    parameter : str
+        Parameter of the simulator that stands for it.
+    left : float
+        Share of the mean square error that is left once it is put right.
+    """
 
     channel: str
     finding: str
     value: Any
-    sentence: str
-    corrected: bool
+    sentence: str = ""
+    corrected: bool = True
     fault: bool = False
     change: Change | None = None
     parameter: str = ""
-    left: float = 1.0  # share of the mean square error that is left once it is put right
+    left: float = 1.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as in diagnosis.json."""
         keys = ("channel", "finding", "value", "sentence", "corrected")
         return {k: getattr(self, k) for k in keys}
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """Recordings as far as they are checked, the simulator refitted to them, and what was found so far."""
+
+    bench: Workbench
+    fitted: Fitted
+    gates: tuple[Gate, ...] = ()
+
+    @property
+    def cost(self) -> float:
+        """Mean square error of the refit, outputs in units of their deviation."""
+        return self.fitted.cost
+
+    @property
+    def floor(self) -> Floor:
+        """The noise, measured or estimated from the refit."""
+        return measured_floor(self.bench.recordings) or Floor(white_part(self.fitted.residual), "estimated")
+
+    @property
+    def noise2(self) -> float:
+        """Mean square of the noise in units of the outputs' variance."""
+        return float(np.mean((self.floor.deviation / self.bench.scale) ** 2))
+
+    def then(self, bench: Workbench, fitted: Fitted, *gates: Gate) -> Checked:
+        """Go on with another bench and refit, and further findings."""
+        return Checked(bench, fitted, (*self.gates, *gates))
+
+
+def fall(before: float, after: float) -> str:
+    """Say how far an edit lets the mean square error fall."""
+    return f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
+
+
+def gain(before: float, after: float, residual: Sequence[np.ndarray], parameters: int = 1) -> float:
+    """Compute the gain in log evidence, nats, of a fit with more parameters, by BIC on its effective samples."""
+    n = max(effective_size(residual), 30.0)
+    return float(0.5 * n * np.log(before / max(after, 1e-300)) - 0.5 * parameters * np.log(n))
+
+
+@dataclass(frozen=True, eq=False)
+class FirstOrder:
+    """The refitted simulator linearised along its runs, for edits to first order.
+
+    Attributes
+    ----------
+    base : array, shape (R, n)
+        Orthonormal directions of the stacked outputs that parameters and initial states can follow.
+    error : array, shape (R,)
+        The stacked error in units of the outputs' deviation.
+    """
+
+    bench: Workbench
+    probe: Probe
+    runs: list[Run]
+    base: np.ndarray
+    error: np.ndarray
+
+    @classmethod
+    def of(cls, bench: Workbench, fitted: Fitted) -> FirstOrder:
+        """Linearise a fit."""
+        probe, runs = linearised(bench, fitted)
+        skips = [r.skip for r in bench.recordings]
+        error = [(one.error / bench.scale)[skip:].ravel() for one, skip in zip(runs, skips, strict=True)]
+        return cls(bench, probe, runs, followed(bench, runs, skips), np.concatenate(error))
+
+    def left(self, columns: np.ndarray) -> np.ndarray:
+        """Subtract what parameters and initial states can follow."""
+        return np.asarray(columns - self.base @ (self.base.T @ columns))
+
+    def response(self, ports: Sequence[str], forces: Sequence[np.ndarray]) -> np.ndarray:
+        """Compute the stacked outputs' changes (R, n) by forces at ports, (M, n_k) a recording; see `propagate`."""
+        out = []
+        for run, r, force in zip(self.runs, self.bench.recordings, forces, strict=True):
+            at = [(self.probe.ports.index(name), force) for name in ports]
+            out.append(moved(self.bench, run, at, r.skip)[:, -len(ports) * force.shape[1] :])
+        return np.concatenate(out)
+
+
+# edits of recordings
 
 
 def scaled(kind: str, index: int | list[int], factor: float) -> Change:
@@ -74,42 +191,6 @@ def exchanged(kind: str, one: int, other: int) -> Change:
         return r.with_(**{kind: values})
 
     return change
-
-
-def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, cut: bool = True) -> Change:
-    """Read some channels at `t + seconds + rate t`, interpolated.
-
-    Samples read from before the recording are skipped, samples from behind it are cut off; without `cut`, the ends are
-    held. A periodic recording goes round.
-    """
-
-    def change(r: Recording) -> Recording:
-        values, at = np.array(getattr(r, kind)), r.t * (1 + rate) + seconds
-        end = len(r) * r.dt if r.period and len(r) % r.period == 0 and not rate else None
-        for i in index:
-            values[:, i] = _read(r.t, values[:, i], at, end, smooth=kind == "y")
-        other = r.with_(**{kind: values})
-        if kind == "y" and r.begins == "zero":  # at rest when it was said to be
-            other = other.with_(initial="estimate")
-        if end is not None or not cut:
-            return other
-        early, late = int(np.sum(at < 0)), int(np.sum(at > r.t[-1] + 1e-9 * r.dt))
-        if early:
-            other = other.with_(skip=min(max(r.skip, early), len(r) - 2))
-        return other.slice(0, max(len(r) - late, other.skip + 2)) if late else other
-
-    return change
-
-
-def _read(t: np.ndarray, v: np.ndarray, at: np.ndarray, end: float | None, smooth: bool) -> np.ndarray:
-    """Interpolate a signal: an output along a cubic spline, an input along its chords; ends are held."""
-    if not smooth:
-        return np.interp(at, t, v, period=end)
-    from scipy.interpolate import CubicSpline
-
-    if end is None:
-        return np.asarray(CubicSpline(t, v)(np.clip(at, t[0], t[-1])))
-    return np.asarray(CubicSpline(np.append(t, end), np.append(v, v[0]), bc_type="periodic")(at))
 
 
 def slower_by(factor: float) -> Change:
@@ -152,44 +233,10 @@ def refit(
     return found if found.cost < within else None
 
 
-def said_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
-    """Return the hold that the user, the simulator or a recording states; None if none does."""
-    return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
+# sign, unit, exchange, unit of time
 
 
-def choose_hold(
-    simulator: Any, recordings: tuple[Recording, ...], said: str | None, engine: str
-) -> tuple[str, list[Gate]]:
-    """Choose the hold: as stated, else the one that fits better."""
-    known = said_hold(simulator, recordings, said)
-    if known is not None:
-        return known, []
-    errors = {}
-    for hold in ("zero", "linear"):
-        try:
-            found = refit(Workbench.of(simulator, recordings, hold, engine))
-        except InputError:  # said again, or put right, where the bench is opened for good
-            return "zero", []
-        errors[hold] = np.inf if found is None else found.cost
-    best = "linear" if errors["linear"] < errors["zero"] else "zero"
-    ratio = np.sqrt(max(errors.values()) / max(min(errors.values()), 1e-300))
-    return (best, [hold_note(simulator, best, ratio)]) if ratio >= 1.02 else ("zero", [])
-
-
-def hold_note(simulator: Any, hold: str, ratio: float) -> Gate:
-    """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
-    words = {"zero": "held over each sample", "linear": "interpolated between samples"}
-    why = f"fits better (error {ratio:.3g} times smaller)"
-    return Gate(
-        ", ".join(simulator.inputs),
-        "hold",
-        hold,
-        f"The recordings do not say what inputs do between samples; {words[hold]} {why} and is used.",
-        True,
-    )
-
-
-def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:
+def opened(simulator: Any, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:
     """Make the bench; if the simulator is too fast for the recordings' step, with the time in another unit.
 
     Raises
@@ -200,94 +247,94 @@ def opened(simulator: Any, recordings: tuple[Recording, ...], hold: str, engine:
     try:
         return Workbench.of(simulator, recordings, hold, engine), []
     except InputError as error:
-        for factor in (1e-3, 1 / 60, 1e-6, 1 / 3600):
-            slower = tuple(r.with_(dt=r.dt * factor) for r in recordings)
+        for factor in FAST_TIME_UNITS:
             try:
-                bench = Workbench.of(simulator, slower, hold, engine)
+                bench = Workbench.of(simulator, [slower_by(factor)(r) for r in recordings], hold, engine)
             except InputError:
                 continue
-            found = refit(bench)
-            if found is not None and found.cost < 0.25:
+            found = refit(bench, within=LOST)
+            if found is not None:
                 words = (
                     f"The time of the recordings is off by a factor of {1 / factor:.4g}, as from a wrong unit: as "
                     f"given, the simulator cannot follow at all; corrected, its error is {found.cost**0.5:.3g} of the "
                     "outputs' deviation."
                 )
-                return bench, [Gate("time", "time-unit", factor, words, True, True, slower_by(factor))]
+                return bench, [Gate("time", "time-unit", factor, words, fault=True, change=slower_by(factor))]
         raise error
 
 
-def slips(bench: Workbench, plain: Fitted, workers: int, beside: str = "") -> tuple[Workbench, Fitted, list[Gate]]:
-    """Try sign and unit slips of each channel and of the time, and exchanged channels, `workers` at a time.
+def slips(now: Checked, workers: int, beside: str = "") -> Checked:
+    """Try sign and unit of each channel, of all outputs and of the time, and exchanged channels, `workers` at a time.
 
     With `beside`, only slips of that channel are tried, beside the offset that it has already.
     """
-    trials: list[Trial] = []
+    bench, plain = now.bench, now.fitted
     # beside an offset there is a working point, which a run from rest would first have to come to
     sizes = _sizes(bench, plain.residual if beside else _from_rest(bench))
-    lost = plain.cost > 1  # a size says nothing where a simulator has left its working range
-    factors = (*FACTORS, FAHRENHEIT, 1 / FAHRENHEIT) if beside else FACTORS
-    for i, name in enumerate(bench.simulator.output_names):
-        trials.append((name, "sign", -1.0, scaled("y", i, -1.0)))
-        trials += [(name, "unit", f, scaled("y", i, f)) for f in factors if lost or _near(f * sizes[i])]
-    for i, name in enumerate(bench.simulator.inputs):
-        trials.append((name, "sign", -1.0, scaled("u", i, -1.0)))
-        trials += [(name, "unit", f, scaled("u", i, f)) for f in factors if lost or any(_near(v / f) for v in sizes)]
-    names = bench.simulator.output_names
-    for f in FACTORS if len(names) > 1 else ():
-        if lost or all(_near(f * size) for size in sizes):
-            trials.append((", ".join(names), "unit", f, scaled("y", list(range(len(names))), f)))
+    near = (lambda ratio: True) if plain.cost > 1 else _near  # a size says nothing of a run that left its range
+    outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
+    trials = list[Gate]()
+    for kind, names in (("y", outputs), ("u", inputs)):
+        for i, name in enumerate(names):
+            trials.append(Gate(name, "sign", -1.0, change=scaled(kind, i, -1.0)))
+            for f in (*FACTORS, *FAHRENHEIT) if beside else FACTORS:
+                if near(f * sizes[i]) if kind == "y" else any(near(v / f) for v in sizes):
+                    trials.append(Gate(name, "unit", f, change=scaled(kind, i, f)))
     if beside:
-        return _best_slip(bench, plain, [t for t in trials if t[0] == beside], workers, " and an offset")
-    for kind, names in (("y", bench.simulator.output_names), ("u", bench.simulator.inputs)):
-        for i, j in combinations(range(len(names)), 2) if plain.cost > STRAINED else ():
-            trials.append((f"{names[i]}, {names[j]}", "exchange", [names[i], names[j]], exchanged(kind, i, j)))
-    hopeless = plain.cost > (STRAINED if plain.at_bounds > MOST_AT_BOUNDS else HOPELESS)
-    for factor in (1e-3, 1e3, 60.0, 1 / 60) if hopeless else ():
-        trials.append(("time", "time-unit", factor, slower_by(factor)))
-    return _best_slip(bench, plain, trials, workers)
+        return _best_slip(now, [g for g in trials if g.channel == beside], workers, " and an offset")
+    for f in FACTORS if len(outputs) > 1 else ():
+        if all(near(f * size) for size in sizes):
+            trials.append(Gate(", ".join(outputs), "unit", f, change=scaled("y", list(range(len(outputs))), f)))
+    for kind, names in (("y", outputs), ("u", inputs)) if plain.cost > ASTRAY else ():
+        for i, j in combinations(range(len(names)), 2):
+            both = [names[i], names[j]]
+            trials.append(Gate(", ".join(both), "exchange", both, change=exchanged(kind, i, j)))
+    for f in TIME_UNITS if plain.cost > ASTRAY else ():
+        trials.append(Gate("time", "time-unit", f, change=slower_by(f)))
+    return _best_slip(now, trials, workers)
 
 
-def _best_slip(
-    bench: Workbench, plain: Fitted, trials: Sequence[Trial], workers: int, more: str = ""
-) -> tuple[Workbench, Fitted, list[Gate]]:
+def _best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: str = "") -> Checked:
     """Take the trial after which the simulator follows best, if that is far better than without."""
-    best, found = plain, None
+    bench, plain = now.bench, now.fitted
     channels = (*bench.simulator.inputs, *bench.simulator.output_names)
 
-    def tried(trial: Trial) -> tuple[Workbench, Fitted | None]:
-        other: Workbench = changed(bench, trial[3])
+    def tried(gate: Gate) -> Checked | None:
+        assert gate.change is not None
+        other: Workbench = changed(bench, gate.change)
         same: Fitted | None = plain
-        if trial[1] == "time-unit":
+        if gate.finding == "time-unit":
             try:
                 other, same = Workbench.of(bench.simulator, other.recordings, bench.hold, bench.engine), None
             except InputError:
-                return other, None
-        near = refit(other, solver=GLANCE, within=plain.cost, same=same)
-        return other, None if near is None else refit(other, near, same=near)
+                return None
+        glanced = refit(other, solver=GLANCE, within=plain.cost, same=same)
+        found = None if glanced is None else refit(other, glanced, same=glanced)
+        if found is None or (gate.finding == "time-unit" and found.at_bounds > BENT):
+            return None
+        return now.then(other, found, gate)
 
-    for trial, (other, result) in zip(trials, side_by_side(tried, trials, workers), strict=True):
-        bent = trial[1] == "time-unit" and result is not None and result.at_bounds > MOST_AT_BOUNDS
-        # for a linear simulator, a unit of all outputs is one of its input
-        clearly = SEVERAL if trial[1] == "unit" and trial[0] not in channels else 1.0
-        if result is not None and result.cost < clearly * best.cost and not bent:
-            best, found = result, (*trial, other)
-    if found is None or best.cost > CURED * plain.cost or best.cost > 0.3:
-        return bench, plain, []
-    name, finding, value, change, other = found
-    if finding == "sign":
-        words = f"{name} has the wrong sign{more}"
-    elif finding == "exchange":
-        words = f"{value[0]} and {value[1]} are exchanged"
-    else:
-        what, be = (name, "are" if name not in channels else "is") if finding == "unit" else ("the time", "is")
-        words = f"{what} {be} off by a factor of {1 / value:.4g}{more}, as from a wrong unit"
-    sentence = (
-        f"In the recordings {words}: with it corrected the refitted simulator's error falls from "
-        f"{np.sqrt(plain.cost):.3g} to {np.sqrt(best.cost):.3g} of the outputs' deviation."
-    )
-    left = best.cost / plain.cost
-    return other, best, [Gate(name, finding, value, sentence, True, True, change, left=left)]
+    best = now
+    for found in side_by_side(tried, trials, workers):
+        # for a linear simulator, a unit of all outputs is one of its input, and one of its output that of its input
+        joint = found is not None and found.gates[-1].finding == "unit" and found.gates[-1].channel not in channels
+        if found is not None and found.cost < (SEVERAL if joint else 1 - 1e-6) * best.cost:
+            best = found
+    if best is now or best.cost > min(CURED * plain.cost, LOST):
+        return now
+    gate = best.gates[-1]
+    words = _slip_in_words(gate, "is" if gate.channel in (*channels, "time") else "are", more)
+    sentence = f"In the recordings {words}: with it corrected {fall(plain.cost, best.cost)}."
+    return now.then(best.bench, best.fitted, replace(gate, sentence=sentence, fault=True, left=best.cost / plain.cost))
+
+
+def _slip_in_words(gate: Gate, be: str, more: str) -> str:
+    if gate.finding == "sign":
+        return f"{gate.channel} has the wrong sign{more}"
+    if gate.finding == "exchange":
+        return f"{gate.value[0]} and {gate.value[1]} are exchanged"
+    what = "the time" if gate.finding == "time-unit" else gate.channel
+    return f"{what} {be} off by a factor of {1 / gate.value:.4g}{more}, as from a wrong unit"
 
 
 def _sizes(bench: Workbench, errors: Sequence[np.ndarray]) -> np.ndarray:
@@ -308,3 +355,148 @@ def _from_rest(bench: Workbench) -> list[np.ndarray]:
 
 def _near(ratio: float) -> bool:
     return not np.isfinite(ratio) or ratio == 0 or 1 / NEAR < ratio < NEAR
+
+
+# another zero: a constant at an input or an output (a bias of an amplifier, the zero of a sensor, a constant load)
+
+
+class Offset(Law):
+    """A constant added to a signal; it stays a parameter of the simulator, so that laws are fitted together with it."""
+
+    id = "offset"
+    equation = "w = w_0"
+    source = "Ljung (1999), System Identification, sec. 14.1"
+    sentence = "a constant offset of the signal"
+    units: ClassVar[Mapping[str, str]] = {"w_0": "w"}
+    strength: ClassVar[tuple[str, ...]] = ("w_0",)
+    places: ClassVar[tuple[str, ...]] = ("series",)
+
+    def force(self, p: Any) -> Any:
+        """Return the constant."""
+        return p.w_0
+
+
+def another_zero(now: Checked, slipped: Checked, workers: int) -> Checked:
+    """Return what slips put right, or where far better, the slip of an output whose zero is another one as well.
+
+    The offset is told, and kept, by `offsets`.
+    """
+    bench = now.bench
+    for name in bench.simulator.output_names if slipped.cost > ASTRAY else ():
+        placed = replace(bench, simulator=bench.simulator.with_element(f"sensor:{name}", Offset()))
+        try:
+            level = placed.fit(placed.simulator, [{}, now.fitted.values], states=now.fitted.begin)
+        except InputError:
+            continue
+        found = slips(Checked(placed, level, now.gates), workers, name)
+        if len(found.gates) > len(now.gates) and found.cost < CURED * slipped.cost:
+            slipped = replace(found, bench=replace(found.bench, simulator=bench.simulator))
+    return slipped
+
+
+def offsets(now: Checked) -> Checked:
+    """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
+
+    Laws that were fitted beside the simulator stay where they are. Offsets are a fault where they were the mismatch.
+    """
+    begin = now
+    laws = now.fitted.simulator.elements[len(now.bench.simulator.elements) :]
+    ports = [f"actuator:{n}" for n in now.bench.simulator.inputs]
+    ports += [f"sensor:{n}" for n in now.bench.simulator.output_names]
+    taken = {e.port for e in now.fitted.simulator.elements}
+    ports = [port for port in ports if port not in taken]
+    while ports:
+        bench, plain = now.bench, now.fitted
+        share = taken_by_constants(bench, plain, ports)
+        port = max(share, key=lambda name: share[name])
+        if share[port] < LEAST:
+            break
+        other = replace(bench, simulator=bench.simulator.with_element(port, Offset()))
+        parameter = f"{other.simulator.elements[-1].prefix}w_0"
+        placed = other.simulator
+        for e in laws:
+            placed = placed.with_element(e.port, e.law)
+        placed = placed.with_parameters({**placed.parameters, **plain.simulator.parameters})  # as they are bounded now
+        try:
+            found = other.fit(placed, [plain.values], states=plain.initial, solver=THOROUGH)
+        except InputError:
+            break
+        if gain(plain.cost, found.cost, found.residual) < ROOM:
+            break
+        value = float(found.values[parameter])
+        sentence = f"{_constant(port, value)}; with it as a parameter {fall(plain.cost, found.cost)}."
+        now = now.then(other, found, Gate(port.split(":", 1)[1], "offset", value, sentence, parameter=parameter))
+        ports.remove(port)
+    fault = now.cost < CURED * begin.cost and not laws
+    told = (replace(g, fault=fault) for g in now.gates[len(begin.gates) :])
+    return begin.then(now.bench, now.fitted, *told)
+
+
+def taken_by_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
+    """Compute the share of the mean square that a constant at each port takes away, to first order."""
+    first = FirstOrder.of(bench, fitted)
+    columns = first.response(ports, [np.ones((len(r), 1)) for r in bench.recordings])
+    rest = first.left(columns)
+    seen = lengths(rest) > 1e-6 * lengths(columns)  # a constant that the initial state can follow is not
+    along = np.where(seen, rest.T @ first.error / np.maximum(lengths(rest), 1e-150), 0.0)
+    return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))
+
+
+def _constant(port: str, value: float) -> str:
+    kind, name = port.split(":", 1)
+    where, load = ("input", ", or a constant load acts like one") if kind == "actuator" else ("output", "")
+    return f"The {where} {name} has a constant offset of about {value:.3g}{load}"
+
+
+def offset_gates(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Gate]:
+    """List the offsets among fitted laws as findings."""
+    out = []
+    for e in elements:
+        if isinstance(e.law, Offset):
+            parameter = f"{e.prefix}w_0"
+            value = float(values[parameter])
+            sentence = f"{_constant(e.port, value)}; it is a parameter of the corrected simulator."
+            out.append(Gate(e.port.split(":", 1)[1], "offset", value, sentence, parameter=parameter))
+    return out
+
+
+def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
+    """Hold offsets that gain nothing beside effects at zero: an effect may have looked like one."""
+    before = len(bench.simulator.elements)
+    placed = fitted.simulator.elements
+    for element in placed[:before] if len(placed) > before else ():
+        if not isinstance(element.law, Offset):
+            continue
+        name = f"{element.prefix}w_0"
+        held = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
+        simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: held})
+        start = {k: v for k, v in fitted.values.items() if k != name}
+        try:
+            found = bench.fit(simulator, [start], states=fitted.initial, solver=THOROUGH)
+        except InputError:
+            continue
+        if gain(found.cost, fitted.cost, fitted.residual) <= ROOM:
+            fitted = found
+    return fitted
+
+
+def as_it_came_out(
+    gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
+) -> tuple[Gate, ...]:
+    """Return the findings with the offsets that are still there, at their fitted values, beside effects or none."""
+    out = []
+    for gate in gates:
+        if not gate.parameter:
+            out.append(gate)
+            continue
+        value, error = float(after.values[gate.parameter]), float(std[gate.parameter])
+        if not (abs(value) > CERTAIN * error and abs(value) > STILL * abs(gate.value)):
+            continue
+        sentence = gate.sentence
+        if effects:  # what it came to without them says little
+            element = next(e for e in after.simulator.elements if gate.parameter.startswith(e.prefix))
+            sentence = offset_gates([element], after.values)[0].sentence
+        if not sure:
+            sentence += " As long as the mismatch has no sure name, it may be a part of that."
+        out.append(replace(gate, value=value, sentence=sentence))
+    return tuple(out)

@@ -19,22 +19,16 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import display_name
 from ..simulators import states_along
-from .floor import effective_size
-from .gates import Gate, opened_at_the_start
+from .gates import EXPLAINED, LOST, ROOM, SAME, Gate, fall, gain, opened_at_the_start
 from .posterior import Posterior, posterior
 from .proof import deviations
 from .search import Search
-from .verdict import SURE
+from .verdict import AT_FLOOR, SURE
 from .workbench import THOROUGH, Fitted, Workbench
 
-LIKE = 0.03  # share by which errors differ that say the same
-AT_FLOOR, WELL_ABOVE = 1.15, 3.0  # times the noise that counts as being at it, and as being far from it
-HELPLESS = 0.5  # error of a refit that says little of a machine: a value may be powers of ten away
-FAR = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)
+WELL_ABOVE = 3.0  # times the noise beyond which something else is missing
+FAR = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)  # times its start that a value may be, where the refit says nothing
 LINEAR = ("linear_stiffness", "viscous_damping")
-
-SHARE = 0.25  # of the mean square that values of their own leave at most
-ROOM = 12.0  # nats that they have to gain beyond what their number costs
 CLEARLY = 5.0  # standard errors by which a value differs
 NAMED = 3  # values told
 
@@ -57,9 +51,9 @@ def held_value(search: Search, answer: Posterior) -> Held | None:
     named = [e.element for e in answer.effects]
     linear = len(named) == 1 and named[0].law.id in LINEAR
     bench, without = search.bench, search.root.fitted
-    if not linear and without.cost < HELPLESS**2:
+    if not linear and without.cost < LOST:
         return None
-    as_well = (1 + LIKE) ** 2 * answer.best.whole if named else np.inf
+    as_well = SAME**2 * answer.best.whole if named else np.inf
     enough = min(as_well, (WELL_ABOVE if named else AT_FLOOR) ** 2 * search.floor2)  # else something is missing
     best: tuple[str, Fitted] | None = None
     for name, p in bench.simulator.parameters.items():
@@ -94,8 +88,8 @@ def held_value(search: Search, answer: Posterior) -> Held | None:
     like = f", no further off than with {words}" if named else ""
     sentence = (
         f"Nothing is missing but a value: with {name} = {value:.5g}{unit}, which is {kept} "
-        f"{float(without.values[name]):.4g}{unit}, the refitted simulator's error falls from {without.cost**0.5:.3g} "
-        f"to {found.cost**0.5:.3g} of the outputs' deviation{like}; let it go there, or say what takes its place."
+        f"{float(without.values[name]):.4g}{unit}, {fall(without.cost, found.cost)}{like}; let it go there, or say "
+        "what takes its place."
     )
     return Held(name, value, found, sentence)
 
@@ -123,7 +117,7 @@ def beyond_the_ports(search: Search) -> Sequence[Gate]:
         f"No declared port reaches it: in the equation of {state}, {display_name(law)} explains it (refitted with it, "
         f"the error is {found.best.error:.3g} of the outputs' deviation). Declare the port that it acts through."
     )
-    return (Gate(state, "undeclared", law.replace("_", " "), sentence, False),)
+    return (Gate(state, "undeclared", law.replace("_", " "), sentence, corrected=False),)
 
 
 Group = tuple[str, Sequence[Recording], Sequence[np.ndarray]]  # what it is called, recordings, and first states
@@ -174,9 +168,8 @@ def _told(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
     cost = float(np.average([f.cost for f in fits], weights=sizes))
     begun = sum(len(part.recordings) for part in benches) - len(bench.recordings)
     more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * begun
-    n = effective_size([e for f in fits for e in f.residual])
-    gained = 0.5 * n * np.log(whole.cost / max(cost, search.floor2)) - 0.5 * more * np.log(max(n, 2.0))
-    if cost > SHARE * whole.cost or gained < ROOM:
+    residual = [e for f in fits for e in f.residual]
+    if cost > EXPLAINED * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < ROOM:
         return None
     values = _apart(whole, fits, benches)
     if not values:
@@ -188,7 +181,7 @@ def _told(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
         f"instead of {whole.cost**0.5:.3g} ({listed}): something differs between them, such as a setting, a "
         "temperature or a level that the simulator does not know."
     )
-    return Gate(", ".join(name for name, _ in values), "varying", [v for _, v in values], sentence, False)
+    return Gate(", ".join(name for name, _ in values), "varying", [v for _, v in values], sentence, corrected=False)
 
 
 def _apart(whole: Fitted, fits: Sequence[Fitted], benches: Sequence[Workbench]) -> list[tuple[str, list[float]]]:

@@ -19,15 +19,13 @@ from .checkup import BlindSpot, assess
 from .correction import Correction, as_named, find_correction
 from .detectability import port_units
 from .experiment import next_experiment, placebo
-from .gates import Gate, hold_note, said_hold
+from .gates import Gate, Offset, as_it_came_out, offset_gates, without_idle_offsets
 from .mismatch_map import mismatch
-from .offset import Offset, as_it_came_out, offset_gates, without_idle_offsets
 from .other_explanations import beyond_the_ports, held_value, varying
 from .posterior import Named, Posterior, names, posterior
-from .preparation import CHECKS, Prepared, prepare
+from .preparation import CHECKS, Prepared, hold_note, prepare, said_hold
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
-from .recording_faults import clipped_input
-from .residual_spectrum import tones
+from .recording_faults import clipped_input, tones
 from .result import Diagnosis, Effect
 from .search import Search
 from .surrogates import told_of_surrogate
@@ -142,7 +140,7 @@ def _searched_both_holds(request: Request) -> tuple[Prepared, Search]:
         search.interrupted = again.interrupted
         return ready, search.settled(request.most_effects)
     ratio = float(np.sqrt(search.best.whole / max(again.best.whole, 1e-300)))
-    return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
+    return replace(other, gates=(*other.gates, hold_note(again.bench, ratio))), again
 
 
 def _searched(request: Request) -> tuple[Prepared, Search]:

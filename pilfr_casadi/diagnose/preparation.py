@@ -11,25 +11,23 @@ import numpy as np
 from .._base import InputError, Stages
 from ..data import Recording
 from ..simulators import Simulator
-from .floor import Floor, noise_floor, white_part
-from .gaps import gaps
-from .gates import CURED, STRAINED, Gate, choose_hold, hold_note, opened, said_hold, slips
+from .floor import Floor, white_part
+from .gates import ASTRAY, AT_NOISE, CURED, SAME, Checked, Gate, another_zero, offsets, opened, refit, slips
 from .linearise import along, linearised, observer_gain
-from .offset import another_zero, offsets
 from .proof import errors_of
 from .recording_faults import stale_samples, unclip, without_glitches, without_transients
 from .step_refinement import on_steps_as_fine
-from .timing import FAR, as_given, in_steps, timing
+from .timing import AVERAGED, as_given, gaps, in_steps, timing
 from .workbench import THOROUGH, Fitted, Workbench
 
-SUSPECT, LEAST = 25.0, 4e-4  # times the noise, and mean square error, beyond which signs and units are looked at
+SMALL = 4e-4  # mean square error up to which signs and units are not looked at
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the parts of it that are reported
 LED = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer in turn
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What the search starts from.
+    """The start of the search.
 
     Attributes
     ----------
@@ -66,99 +64,99 @@ def prepare(
     say(CHECKS, 0, CHECKED)
     recordings, spikes = without_glitches(recordings)
     recordings, transients = without_transients(recordings)
-    bench, gates = opened(simulator, recordings, hold or "zero", engine)
-    gates = [*spikes, *transients, *stale_samples(recordings), *gates]
-    between, notes = choose_hold(simulator, bench.recordings, hold, engine)
-    bench = Workbench.of(simulator, bench.recordings, between, engine)
+    said = said_hold(simulator, recordings, hold)
+    bench, times = opened(simulator, recordings, said or "zero", engine)
+    bench, held = (bench, ()) if said else choose_hold(bench)
     nominal = errors_of(bench, bench.model(simulator))
     say(CHECKS, 1, CHECKED)
-    without = refitted(bench, starts)
-    say(CHECKS, 2, CHECKED, without.cost**0.5)
-    unsaid = said_hold(simulator, recordings, hold) is None
-    first = noise_floor(bench.recordings, without.residual)
-    noise2 = float(np.mean((first.deviation / bench.scale) ** 2))
-    if without.cost > SUSPECT * noise2 and without.cost > LEAST:
-        raw, found = bench, _slips(bench, without, noise2, unsaid, workers, early)
-        without = found[1]
-        if found[2]:  # what looked better on wrong data says nothing
-            asked, (between, notes) = between, choose_hold(simulator, found[0].recordings, hold, engine)
-            if between != asked:  # of two units that are near, the wrong hold may have fitted the wrong one
-                found = _slips_again(raw, between, noise2, unsaid, workers, early) or found
-            bench = Workbench.of(simulator, found[0].recordings, between, engine)
-            without = bench.fit(simulator, [found[1].values, {}, *starts], solver=THOROUGH)
-            gates = [*gates, *found[2]]
-    gates = [*gates, *notes]
-    say(CHECKS, 3, CHECKED, without.cost**0.5)
-    bench, without, more = unclip(bench, without)
-    gates += more
-    floor = noise_floor(bench.recordings, without.residual)
-    noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
-    bench, without, more = gaps(bench, without, noise2)
-    if more:  # what looked better across a gap, and the noise that it makes, say nothing
-        gates += more
-        if unsaid:
-            bench, without, held = _better_held(bench, without)
-            gates, notes = [g for g in gates if g not in notes] + held, held
-        floor = noise_floor(bench.recordings, without.residual)
-        noise2 = float(np.mean((floor.deviation / bench.scale) ** 2))
-    say(CHECKS, 4, CHECKED, without.cost**0.5)
-    bench, without = on_steps_as_fine(bench, without)
-    given, before = bench, without
-    # where inputs are taken as held but are interpolated, a late channel is late by half a sample more or less
-    bench, without, more = timing(given, before, noise2, 0.5 if unsaid else 1.0, early)
-    if more and unsaid:  # out of step, what looked better says nothing
-        other = given.otherwise_held()
-        found = timing(other, other.fit(other.simulator, [before.values], states=before.initial), noise2, 0.5, early)
-        costs = _honest(without, more, bench.dt), _honest(found[1], found[2], bench.dt)
-        if costs[1] < costs[0]:
-            bench, without, more = found
-        if any(_late_by_a_part(g, bench.dt) for g in more):  # a delay is physics
-            bench, without, more = given, before, []
-        else:
-            ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
-            held = [hold_note(simulator, bench.hold, ratio)] if ratio > 1.02 else []
-            gates = [g for g in gates if g not in notes] + held
-    gates += more
-    say(CHECKS, 5, CHECKED, without.cost**0.5)
-    bench, without, more = offsets(bench, without)
-    gates += more
-    if gates:  # values and states that wrong data led to may be a dead end
+    now = Checked(bench, refitted(bench, starts), (*spikes, *transients, *stale_samples(recordings), *times, *held))
+    say(CHECKS, 2, CHECKED, now.cost**0.5)
+    if now.cost > max(AT_NOISE**2 * now.noise2, SMALL):
+        now = _without_slips(now, not said, workers, starts, early)
+    say(CHECKS, 3, CHECKED, now.cost**0.5)
+    whole = unclip(now)
+    now = gaps(whole)
+    if now is not whole and not said:  # what looked better across a gap says nothing
+        now = _held_again(now)
+    say(CHECKS, 4, CHECKED, now.cost**0.5)
+    now = now.then(*on_steps_as_fine(now.bench, now.fitted))
+    now = _in_step(now, not said, early)
+    say(CHECKS, 5, CHECKED, now.cost**0.5)
+    now = offsets(now)
+    bench, without = now.bench, now.fitted
+    if now.gates:  # values and states that wrong data led to may be a dead end
         led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
         without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
-    floor = noise_floor(bench.recordings, without.residual)
+    floor = now.then(bench, without).floor
     bench.check_followed(without)
     bench = replace(bench, typical=along(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
-    return Prepared(bench, without, nominal, tuple(gates), floor)
+    return Prepared(bench, without, nominal, now.gates, floor)
 
 
-def _slips(
-    bench: Workbench, without: Fitted, noise2: float, unsaid: bool, workers: int, early: bool
-) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Signs, units and exchanged channels; or a shift in time, since late by half a swing looks like another sign."""
-    found = another_zero(bench, without, slips(bench, without, workers), workers)
-    if not found[2] or found[1].cost <= STRAINED:
+def _without_slips(
+    now: Checked, unsaid: bool, workers: int, starts: Sequence[Mapping[str, Any]], early: bool
+) -> Checked:
+    """Put signs, units and exchanged channels right; on wrong data the better hold says nothing, so choose it again."""
+    found = _slips(now, unsaid, workers, early)
+    if len(found.gates) == len(now.gates):
         return found
-    late = timing(bench, without, noise2, 0.5 if unsaid else 1.0, early)
-    return late if late[1].cost < CURED * found[1].cost else found
+    raw, held = now.bench, tuple[Gate, ...]()
+    bench = Workbench.of(raw.simulator, found.bench.recordings, raw.hold, raw.engine)
+    if unsaid:
+        bench, held = choose_hold(bench)
+        if bench.hold != raw.hold:  # of two units that are near, the wrong hold may have fitted the wrong one
+            other = raw.otherwise_held()
+            try:
+                again = _slips(Checked(other, refitted(other), now.gates), unsaid, workers, early)
+                if len(again.gates) > len(now.gates):
+                    found = again
+                    bench = Workbench.of(raw.simulator, found.bench.recordings, other.hold, raw.engine)
+            except InputError:
+                pass
+        found = _noted(found, held)
+    return found.then(bench, bench.fit(bench.simulator, [found.fitted.values, {}, *starts], solver=THOROUGH))
 
 
-def _slips_again(
-    raw: Workbench, hold: str, noise2: float, unsaid: bool, workers: int, early: bool
-) -> tuple[Workbench, Fitted, list[Gate]] | None:
-    """The same on the recordings as given, with the other hold; None where that shows no slip or cannot be run."""
-    try:
-        bench = Workbench.of(raw.simulator, raw.recordings, hold, raw.engine)
-        found = _slips(bench, refitted(bench), noise2, unsaid, workers, early)
-    except InputError:
-        return None
-    return found if found[2] else None
+def _slips(now: Checked, unsaid: bool, workers: int, early: bool) -> Checked:
+    """Find signs, units and exchanged channels; or a shift in time, since late by half a swing looks like a sign."""
+    found = another_zero(now, slips(now, workers), workers)
+    if len(found.gates) == len(now.gates) or found.cost <= ASTRAY:
+        return found
+    late = timing(now, 0.5 if unsaid else 1.0, early)
+    return late if late.cost < CURED * found.cost else found
+
+
+def _in_step(now: Checked, unsaid: bool, early: bool) -> Checked:
+    """Put shifts and clocks right; where nobody said what inputs do between samples, with the better hold.
+
+    Where inputs are taken as held but are interpolated, a late channel is late by half a sample more or less.
+    """
+    found = timing(now, 0.5 if unsaid else 1.0, early)
+    if len(found.gates) == len(now.gates) or not unsaid:
+        return found
+    other = now.bench.otherwise_held()
+    again = other.fit(other.simulator, [now.fitted.values], states=now.fitted.initial)
+    both = found, timing(Checked(other, again, now.gates), 0.5, early)
+    costs = [_honest(c, len(now.gates)) for c in both]
+    best = both[int(costs[1] < costs[0])]
+    shifts = [g.value for g in best.gates[len(now.gates) :] if g.finding == "alignment"]
+    if any(v > 0 and not in_steps(v, now.bench.dt) for v in shifts):  # a delay is physics
+        return now
+    ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
+    return _noted(best, (hold_note(best.bench, ratio),) if ratio > SAME else ())
+
+
+def _honest(found: Checked, before: int) -> float:
+    """Compute the mean square error as if no channel read between its samples had its noise averaged away."""
+    shifts = [g.value for g in found.gates[before:] if g.finding == "alignment"]
+    return found.cost / (AVERAGED if any(not in_steps(v, found.bench.dt) for v in shifts) else 1)
 
 
 def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitted:
-    """The simulator fitted from the user's values and from others; far off, led there by an observer as well."""
+    """Fit the simulator from the user's values and from others; far off, lead it there by an observer as well."""
     plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
-    if plain.cost < FAR:
+    if plain.cost < ASTRAY:
         return plain
     probe, runs = linearised(bench, as_given(bench, plain))
     gain = observer_gain(probe, runs, white_part(plain.residual))
@@ -172,25 +170,45 @@ def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitt
     return found if found.cost < plain.cost else plain
 
 
-def _better_held(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
-    """The bench with what fits better of inputs held and interpolated between samples; and what is to be told."""
-    other = bench.otherwise_held()
-    try:
-        found = other.fit(other.simulator, [fitted.values], states=fitted.begin, solver=THOROUGH)
-    except InputError:
-        return bench, fitted, []
-    ratio = (max(found.cost, fitted.cost) / max(min(found.cost, fitted.cost), 1e-300)) ** 0.5
-    if found.cost < fitted.cost and ratio > 1.02:
-        bench, fitted = other, found
-    return bench, fitted, [hold_note(bench.simulator, bench.hold, ratio)] if ratio > 1.02 else []
+# what inputs do between samples
 
 
-def _honest(fitted: Fitted, gates: Sequence[Gate], dt: float) -> float:
-    """Mean square error; a channel read between its samples has up to half of its noise averaged away."""
-    between = any(g.finding == "alignment" and not in_steps(g.value, dt) for g in gates)
-    return fitted.cost * (2 if between else 1)
+def said_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
+    """Return the hold that the user, the simulator or a recording states; None if none does."""
+    return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
 
 
-def _late_by_a_part(gate: Gate, dt: float) -> bool:
-    """Whether a channel comes late, and not by whole samples."""
-    return gate.finding == "alignment" and gate.value > 0 and not in_steps(gate.value, dt)
+def choose_hold(bench: Workbench, previous: Fitted | None = None) -> tuple[Workbench, tuple[Gate, ...]]:
+    """Choose the hold that fits better, and note it; the bench's own where the errors are the same."""
+    both = bench, bench.otherwise_held()
+    fits = [refit(b, previous) for b in both]
+    costs = [np.inf if found is None else found.cost for found in fits]
+    ratio = float(np.sqrt(max(costs) / max(min(costs), 1e-300)))
+    if not ratio >= SAME:
+        return bench, ()
+    best = both[int(costs[1] < costs[0])]
+    return best, (hold_note(best, ratio),)
+
+
+def _held_again(now: Checked) -> Checked:
+    """Choose the hold again, and refit where it is the other one."""
+    bench, held = choose_hold(now.bench, now.fitted)
+    fitted = now.fitted
+    if bench is not now.bench:
+        fitted = bench.fit(bench.simulator, [fitted.values], states=fitted.begin, solver=THOROUGH)
+    return _noted(now.then(bench, fitted), held)
+
+
+def _noted(now: Checked, held: Sequence[Gate]) -> Checked:
+    """Put another note about the hold in place of the last one."""
+    return replace(now, gates=(*(g for g in now.gates if g.finding != "hold"), *held))
+
+
+def hold_note(bench: Workbench, ratio: float) -> Gate:
+    """Note that the bench's hold was chosen from the data; the other's error is `ratio` times as large."""
+    words = {"zero": "held over each sample", "linear": "interpolated between samples"}[bench.hold]
+    sentence = (
+        f"The recordings do not say what inputs do between samples; {words} fits better (error {ratio:.3g} times "
+        "smaller) and is used."
+    )
+    return Gate(", ".join(bench.simulator.inputs), "hold", bench.hold, sentence)

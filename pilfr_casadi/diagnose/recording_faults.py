@@ -1,4 +1,4 @@
-"""Faults of single channels that the recordings themselves show: glitches, stale, clipped and unsettled samples.
+"""Faults that the recorded samples themselves show: glitches, stale, clipped and unsettled samples, and steady tones.
 
 - Glitches, as from a lost bit or a loose contact: a sample far off the cubic through its four neighbours, compared with
   the distances nearby. With it replaced by that cubic nothing around it stands out; around a step or a shock it does.
@@ -6,24 +6,29 @@
   repeats values too, but has few of them, and so does an encoder that moves by no more than its step; a machine at rest
   repeats one value for long, and a clipped channel its limit.
 - Clipped channels: extremes that are repeated exactly. A clipped output can be compared with a simulation that is
-  clipped alike; what a clipped input was beyond its limit is lost.
+  clipped alike; the part of a clipped input beyond its limit is lost.
 - Periods that have not settled: the rms differences of neighbouring periods are the same where only noise differs, and
   larger at first where a transient dies away. Then the first sample is not on the steady cycle, and the periods'
   differences are not the noise.
+- Tones, as from mains hum, a fan or an unbalanced motor: a line of the residual's spectrum far above those around it.
+  Its amplitude and phase stay over the record, and it is neither in an input nor a harmonic or a mixture of an input's
+  few lines. A residual that swings at one of the simulator's own frequencies is no noise either: a force that is not
+  recorded leaves such a residual, and no law at any port explains it.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
-from .gates import Gate, opened_at_the_start, refit
+from .gates import CURED, LOST, ROOM, Checked, FirstOrder, Gate, fall, gain, opened_at_the_start, refit
 from .linearise import linearised
-from .remainder import folds, followed, held_out, moved
+from .remainder import folds, held_out
 from .workbench import Fitted, Workbench
 
 CUBIC = np.array([-1, 4, 0, 4, -1]) / 6  # through the neighbours at -2, -1, 1, 2
@@ -32,34 +37,45 @@ USUAL_QUANTILE = 0.75  # of the distances nearby, that a glitch is compared with
 GLITCH_FAR, GLITCH_SIZE = 12.0, 0.1  # times that quantile, and times the output's deviation
 CLEAN_AROUND = 0.12  # of a glitch, that distances around it reach at most once it is replaced
 MOST_GLITCHES = 0.02  # of the samples that may be glitches
-MOSTLY_GLITCHES = 0.5  # share of all squared distances beyond which they are a fault
 
-STALE_SHARE, DISTINCT_LEVELS = 0.01, 0.5  # of the samples: those that repeat, and values that differ
-LONGEST_REPEAT = 5  # samples
-ENCODER_STEPS = 4.5  # steps of an encoder in a sample, after which it may still have stood
-CHANCE_REPEATS = 3.0  # times as many repeats as changes by one step up: noise makes about as many of both
+STALE_SHARE = 0.01  # of the samples that repeat
+CONTINUOUS = 0.5  # share of the samples with values of their own, above which a signal is not quantised
+STANDING = 5  # samples that an encoder or a machine may have stood, and steps of an encoder in a sample
+BY_CHANCE = 3.0  # times as many repeats as noise makes
 
-MOST_LEFT = 0.5  # share of the mismatch that what lies beyond an input's limit leaves at most
+MOST_LEFT = 0.5  # share of the mismatch that is left at most by the part of an input beyond its limit
 
 DYING_RATIO = 1.5  # times the least difference of neighbouring periods that the first one is, where it dies away
+
+FEWEST, SLOWEST = 256, 10  # samples, and periods in the record, that a tone is told from
+FAR, OVER = 50.0, 10.0  # times the lines around that a tone is; that a line of an input or a mode's is
+AROUND, OWN = 30, 3  # lines on either side that are compared with, and that belong to the tone
+POWER = 0.05  # of the residual's power that a tone has at least, and of an input's strongest line that others have
+STEADY = 0.5  # of the amplitude by which a quarter's may differ
+LINES, ORDER, HARMONICS = 3, 7, 60  # of an input that is mixed: its lines at most, and orders of mixtures and harmonics
+
+LIGHT = 0.15  # damping ratio below which a mode rings
+FINE, AVERAGED = 10, 4  # lines of the spectrum up to a mode, and half-overlapping segments that it is averaged over
+BAND = 1.2, 1.8  # times a mode's frequency, above and below, where the spectrum is compared with
 
 
 def without_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
     """Replace glitches by what lies between their neighbours; return the recordings and the findings."""
-    gates = []
+    gates = list[Gate]()
     for i, name in enumerate(recordings[0].outputs):
-        places = [glitches(r.y[:, i])[0] for r in recordings]
+        places, clean = zip(*(glitches(r.y[:, i]) for r in recordings), strict=True)
         count = sum(map(len, places))
         if not count:
             continue
-        off = [distances(r.y[:, i]) ** 2 for r in recordings]
-        weight = sum(float(np.sum(d[k])) for d, k in zip(off, places, strict=True)) / float(np.sum(np.concatenate(off)))
+        before, after = (
+            sum(float(np.sum(distances(y) ** 2)) for y in ys) for ys in ([r.y[:, i] for r in recordings], clean)
+        )
         first = next(r.dt * k[0] for r, k in zip(recordings, places, strict=True) if len(k))
         sentence = (
             f"Single samples of {name} are far off their neighbours, as from glitches: {count}, the first at "
             f"t = {first:.6g} s. What lies between their neighbours is taken instead."
         )
-        gates.append(Gate(name, "glitch", count, sentence, True, weight > MOSTLY_GLITCHES, mended))
+        gates.append(Gate(name, "glitch", count, sentence, fault=after < CURED * before, change=mended))
     return (tuple(map(mended, recordings)) if gates else tuple(recordings)), gates
 
 
@@ -112,7 +128,7 @@ def stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
         repeated = float(np.mean(np.concatenate([_repeated(r.y[r.skip :, i], step) for r in recordings])))
         changes = np.concatenate([np.diff(r.y[r.skip :, i]) for r in recordings])
         up = float(np.mean(np.abs(changes - step) < 0.5 * step))
-        if repeated > max(STALE_SHARE, CHANCE_REPEATS * up) and len(levels) > DISTINCT_LEVELS * len(values):
+        if repeated > max(STALE_SHARE, BY_CHANCE * up) and len(levels) > CONTINUOUS * len(values):
             sentence = (
                 f"{repeated:.0%} of the samples of {name} repeat the one before, as from lost or stale samples; the "
                 "error that this makes is taken for noise: record again, or leave them out."
@@ -130,72 +146,78 @@ def _repeated(y: np.ndarray, step: float) -> np.ndarray:
     """Tell which samples repeat the one before, away from the limits, in short runs that a jump follows."""
     same = np.append(False, y[1:] == y[:-1]) & (y > np.min(y)) & (y < np.max(y))
     for begin, end in stretches(same):
-        if end - begin > LONGEST_REPEAT or abs(y[min(end, len(y) - 1)] - y[begin]) <= ENCODER_STEPS * step:
+        if end - begin > STANDING or abs(y[min(end, len(y) - 1)] - y[begin]) < STANDING * step:
             same[begin:end] = False
     return same
 
 
-def unclip(bench: Workbench, plain: Fitted) -> tuple[Workbench, Fitted, list[Gate]]:
+@dataclass(frozen=True)
+class Clipping:
+    """A channel that repeats its extremes exactly: its column, the limits (infinite where none), samples at them."""
+
+    column: int
+    low: float
+    high: float
+    count: int
+
+    @property
+    def limits(self) -> list[float]:
+        """Limits that there are."""
+        return [v for v in (self.low, self.high) if np.isfinite(v)]
+
+    def __str__(self) -> str:
+        at = " and ".join(f"{v:.6g}" for v in self.limits)
+        return f"clipped at {at} ({self.count} samples at the limit)"
+
+
+def unclip(now: Checked) -> Checked:
     """Clip the simulator's outputs where the recorder clipped the machine's; the rest of these outputs still counts."""
-    gates = []
-    for i, low, high, count in clipped(bench.recordings, "y"):
-        name = bench.simulator.output_names[i]
-        law = AsymmetricSaturation().at({"low": max(low, -1e300), "high": min(high, 1e300)})
+    for found in clipped(now.bench.recordings, "y"):
+        bench, plain = now.bench, now.fitted
+        name = bench.simulator.output_names[found.column]
+        law = AsymmetricSaturation().at({"low": max(found.low, -1e300), "high": min(found.high, 1e300)})
         placed = bench.simulator.with_element(f"sensor:{name}", law)
         prefix = placed.elements[-1].prefix
         held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
         other = replace(bench, simulator=placed.with_parameters(held))
-        found = refit(other, plain)
-        if found is None or found.cost > min(0.97 * plain.cost, 0.3):
+        after = refit(other, plain, within=LOST)
+        if after is None or gain(plain.cost, after.cost, after.residual, 0) < ROOM:
             continue
-        at = " and ".join(f"{v:.6g}" for v in _finite_limits(low, high))
-        sentence = (
-            f"{name} is clipped at {at} ({count} samples at the limit); with the simulator's output clipped alike the "
-            f"refitted error falls from {plain.cost**0.5:.3g} to {found.cost**0.5:.3g} of the outputs' deviation."
-        )
-        left = found.cost / plain.cost
-        gates.append(Gate(name, "clipping", _finite_limits(low, high), sentence, True, fault=True, left=left))
-        bench, plain = other, found
-    return bench, plain, gates
+        sentence = f"{name} is {found}; with the simulator's output clipped alike {fall(plain.cost, after.cost)}."
+        gate = Gate(name, "clipping", found.limits, sentence, fault=True, left=after.cost / plain.cost)
+        now = now.then(other, after, gate)
+    return now
 
 
 def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | None:
     """Find the clipped input beyond whose limits most of the mismatch lies, if no law leaves less (`remains`) of it.
 
-    What went into the machine there is not in the recording; what goes on as smoothly stands for it (`_beyond_limit`).
+    The input to the machine there is not in the recording; what goes on as smoothly stands for it (`_beyond_limit`).
     """
-    for i, low, high, count in clipped(bench.recordings, "u"):
-        name = bench.simulator.inputs[i]
-        left = 1 - _explained(bench, without, i, low, high)
-        if left < min(MOST_LEFT, remains):
-            at = " and ".join(f"{v:.6g}" for v in _finite_limits(low, high))
+    for found in clipped(bench.recordings, "u"):
+        name = bench.simulator.inputs[found.column]
+        explained = _explained(bench, without, found)
+        if 1 - explained < min(MOST_LEFT, remains):
             sentence = (
-                f"{name} is clipped at {at} ({count} samples at the limit), and what it may have been beyond explains "
-                f"{1 - left:.0%} of the mismatch: what went into the machine there is not in the recording. Record it "
-                "with a larger range."
+                f"{name} is {found}, and what it may have been beyond explains {explained:.0%} of the mismatch: what "
+                "went into the machine there is not in the recording. Record it with a larger range."
             )
-            return Gate(name, "clipping", _finite_limits(low, high), sentence, False, fault=True)
+            return Gate(name, "clipping", found.limits, sentence, corrected=False, fault=True)
     return None
 
 
-def _explained(bench: Workbench, without: Fitted, i: int, low: float, high: float) -> float:
-    """Compute the share of the error that input i beyond its limits explains, on blocks that it was not fitted to."""
-    probe, runs = linearised(bench, without)
-    port = probe.ports.index(f"actuator:{bench.simulator.inputs[i]}")
-    skips = [r.skip for r in bench.recordings]
-    limits = [(v, sign) for v, sign in ((low, -1.0), (high, 1.0)) if np.isfinite(v)]
-    phi, error = [], []
-    for run, r in zip(runs, bench.recordings, strict=True):
-        beyond = np.column_stack([sign * _beyond_limit(r.u[:, i], v) for v, sign in limits])
-        phi.append(moved(bench, run, [(port, beyond)], r.skip)[:, -len(limits) :])
-        error.append((run.error / bench.scale)[r.skip :].ravel())
-    base = followed(bench, runs, skips)
-    left, columns = np.concatenate(error), np.concatenate(phi)
-    left = left - base @ (base.T @ left)
-    columns = columns - base @ (base.T @ columns)
+def _explained(bench: Workbench, without: Fitted, found: Clipping) -> float:
+    """Compute the share of the error that an input beyond its limits explains, on blocks that it was not fitted to."""
+    first = FirstOrder.of(bench, without)
+    signs = [(v, 1.0 if v == found.high else -1.0) for v in found.limits]
+    beyond = [
+        np.column_stack([sign * _beyond_limit(r.u[:, found.column], v) for v, sign in signs]) for r in bench.recordings
+    ]
+    left = first.left(first.error)
+    columns = first.left(first.response([f"actuator:{bench.simulator.inputs[found.column]}"], beyond))
     if np.any(np.linalg.lstsq(columns, left, rcond=1e-8)[0] > 0):  # it would have been within the limit
         return 0.0
-    return held_out(columns, left, folds(len(left), len(runs)))
+    return held_out(columns, left, folds(len(left), len(first.runs)))
 
 
 def _beyond_limit(u: np.ndarray, limit: float) -> np.ndarray:
@@ -208,41 +230,28 @@ def _beyond_limit(u: np.ndarray, limit: float) -> np.ndarray:
     return out
 
 
-def _finite_limits(low: float, high: float) -> list[float]:
-    """Return the limits that there are."""
-    return [v for v in (low, high) if np.isfinite(v)]
-
-
-def clipped(recordings: Sequence[Recording], kind: str) -> list[tuple[int, float, float, int]]:
-    """Find channels that repeat their extremes exactly over several samples: (column, low, high, samples at limits).
-
-    `kind` is "u" for the inputs, "y" for the outputs.
-    """
+def clipped(recordings: Sequence[Recording], kind: str) -> list[Clipping]:
+    """Find inputs (`kind` "u") or outputs ("y") that repeat their extremes exactly over several samples."""
     out = []
     for i in range(getattr(recordings[0], kind).shape[1]):
         y = np.concatenate([getattr(r, kind)[:, i] for r in recordings])
         limits, count = [-np.inf, np.inf], 0
+        still = float(np.mean(np.diff(y) == 0))
         for j, extreme in enumerate((y.min(), y.max())):
             at = y == extreme
             runs = np.diff(stretches(at)).ravel()
-            neighbours = np.mean(np.abs(np.diff(y)) == 0)
-            if (
-                at.sum() >= 6
-                and runs.max(initial=0) >= 3
-                and np.sum(runs > 1) > 1
-                and at.mean() > 3 * _quantised(y)
-                and neighbours < 0.5
-            ):
+            several = runs.max(initial=0) >= 3 and np.sum(runs > 1) > 1
+            if several and at.mean() > BY_CHANCE * _quantised(y) and still < CONTINUOUS:
                 limits[j], count = float(extreme), count + int(at.sum())
         if count:
-            out.append((i, limits[0], limits[1], count))
+            out.append(Clipping(i, limits[0], limits[1], count))
     return out
 
 
 def _quantised(y: np.ndarray) -> float:
     """Compute the share of samples at a level of a quantised signal near its extremes; 0 for a continuous one."""
     values, counts = np.unique(y, return_counts=True)
-    if len(values) > 0.5 * len(y):
+    if len(values) > CONTINUOUS * len(y):
         return 0.0
     return float(np.median(np.concatenate([counts[1:6], counts[-6:-1]])) / len(y))
 
@@ -259,7 +268,7 @@ def without_transients(recordings: Sequence[Recording]) -> tuple[tuple[Recording
         "much as later ones; initial states are estimated, and the periods do not tell the noise."
     )
     return tuple(map(opened_at_the_start, recordings)), [
-        Gate(name, "transient", ratio, sentence, True, change=opened_at_the_start)
+        Gate(name, "transient", ratio, sentence, change=opened_at_the_start)
     ]
 
 
@@ -271,3 +280,111 @@ def _transient_ratios(r: Recording) -> np.ndarray:
     periods = r.y[r.skip :][: count * r.period].reshape(count, r.period, r.n_y)
     steps = np.sqrt(np.mean(np.diff(periods, axis=0) ** 2, axis=1))
     return np.asarray(steps[0] / np.maximum(steps.min(axis=0), 1e-9 * np.std(r.y, axis=0) + 1e-300))
+
+
+def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
+    """Note each output in whose residual, in every recording, the same tone stands."""
+    found = []
+    for i, name in enumerate(bench.simulator.output_names):
+        pairs = zip(fitted.residual, bench.recordings, strict=True)
+        each = [tone(e[r.skip :, i], r) for e, r in pairs if len(r) - r.skip >= FEWEST]
+        told = [t for t in each if t is not None]
+        longest = max((len(r) for r in bench.recordings), default=0) * bench.dt
+        if not told or len(told) < len(each) or np.ptp([f for f, _ in told]) > 2 / longest:
+            continue
+        f, amplitude = float(np.mean([f for f, _ in told])), float(np.mean([a for _, a in told]))
+        unit = bench.recordings[0].units.get(name, "")
+        sentence = (
+            f"{name} holds a steady tone of {f:.4g} Hz, amplitude {amplitude:.3g}{f' {unit}' if unit else ''}, that is "
+            "in no input, as from mains hum or a fan: shield or filter it, or record what causes it."
+        )
+        share = amplitude**2 / 2 / bench.scale[i] ** 2 / len(bench.scale) / fitted.cost
+        found.append(Gate(name, "tone", f, sentence, corrected=False, left=1 - min(share, 1.0)))
+    return found
+
+
+def tone(e: np.ndarray, r: Recording) -> tuple[float, float] | None:
+    """Find frequency, Hz, and amplitude of the tone in the residual of one output; None where there is none."""
+    n, e = len(e), e - np.mean(e)
+    power = _power(e)
+    k = SLOWEST + int(np.argmax(power[SLOWEST:-OWN]))
+    if power[k] < FAR * _around(power, k):
+        return None
+    f = _refined(e, k)
+    whole = _wave(e, f, slice(None))
+    quarters = [_wave(e, f, slice(q * n // 4, (q + 1) * n // 4)) for q in range(4)]
+    unsteady = max(abs(q - whole) for q in quarters) > STEADY * abs(whole)
+    if unsteady or abs(whole) ** 2 / 2 < POWER * float(np.mean(e**2)):
+        return None
+    return None if any(_of_input(u, f, r) for u in r.u[r.skip :].T) else (f / r.dt, abs(whole))
+
+
+def _power(v: np.ndarray) -> np.ndarray:
+    return np.asarray(np.abs(np.fft.rfft((v - np.mean(v)) * np.hanning(len(v)))) ** 2)
+
+
+def _around(power: np.ndarray, k: int) -> float:
+    """Return the median of the lines around line k."""
+    near = np.arange(max(k - AROUND, 1), min(k + AROUND + 1, len(power)))
+    return float(np.median(power[near[np.abs(near - k) > OWN]]))
+
+
+def _wave(e: np.ndarray, f: float, part: slice) -> complex:
+    """Fit amplitude and phase of the frequency f, a share of the sampling rate, in a part of e, by least squares."""
+    angle = 2 * np.pi * f * np.arange(len(e))[part]
+    a, b, _ = np.linalg.lstsq(np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))]), e[part])[0]
+    return complex(a, -b)
+
+
+def _refined(e: np.ndarray, k: int) -> float:
+    """Find the frequency of the strongest wave near line k, as a share of the sampling rate."""
+    from scipy.optimize import minimize_scalar
+
+    ends = (k - 1) / len(e), (k + 1) / len(e)
+    found = minimize_scalar(lambda f: -abs(_wave(e, f, slice(None))), bounds=ends, options={"xatol": 1e-3 / len(e)})
+    return float(found.x)
+
+
+def _of_input(u: np.ndarray, f: float, r: Recording) -> bool:
+    """Tell whether an input holds the frequency, or its few lines or its period make it in something nonlinear."""
+    from scipy.signal import find_peaks
+
+    n, power = len(u), _power(u)
+    k = round(f * n)
+    if np.max(power[max(k - 1, 0) : k + 2]) > OVER * _around(power, k):
+        return True
+    if r.period and abs(f * r.period - round(f * r.period)) * n < r.period:
+        return True
+    strong = find_peaks(power, POWER * np.max(power), distance=2 * OWN)[0]
+    lines = [_refined(u, j) for j in strong[: LINES + 1]]
+    order = ORDER
+    if lines and all(abs(v / lines[0] - round(v / lines[0])) < 0.05 for v in lines):
+        lines, order = lines[:1], HARMONICS if lines[0] * n > AROUND else ORDER
+    if not 0 < len(lines) <= LINES:
+        return False
+    orders = itertools.product(range(-order, order + 1), repeat=len(lines))
+    made = np.array([np.dot(c, lines) for c in orders if sum(map(abs, c)) <= order])
+    return bool(np.any(np.abs(np.abs(made - np.round(made)) - f) * n < 2))  # above half the sampling rate they fold
+
+
+def ringing(bench: Workbench, fitted: Fitted) -> float | None:
+    """Find the frequency, Hz, of a lightly damped mode that stands out of a fit's residual, or None."""
+    a = linearised(bench, fitted)[1][0].mean[0]
+    with np.errstate(divide="ignore"):
+        poles = np.log(np.linalg.eigvals(a).astype(complex)) * fitted.model.substeps / bench.dt
+    modes = [abs(s) / (2 * np.pi) for s in poles if s.imag > 0 and -s.real < LIGHT * abs(s)]
+    rest = [e[r.skip :, i] for e, r in zip(fitted.residual, bench.recordings, strict=True) for i in range(r.n_y)]
+    return next((f for f in sorted(modes) if any(_stands_out(e, f * bench.dt) for e in rest)), None)
+
+
+def _stands_out(e: np.ndarray, f: float) -> bool:
+    """Tell whether the spectrum of e at frequency f, a share of the sampling rate, is far above that around it."""
+    from scipy.signal import welch
+
+    length = int(np.ceil(FINE / f))
+    if BAND[1] * f > 0.5 or 2 * len(e) // length - 1 < AVERAGED:
+        return False
+    lines, power = welch(e, nperseg=length)
+    far = np.maximum(lines / f, f / np.maximum(lines, 1e-12))
+    around = power[(far > BAND[0]) & (far < BAND[1])]
+    return bool(np.max(power[far < 1 + 1.5 / FINE]) > OVER * np.median(around))

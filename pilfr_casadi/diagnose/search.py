@@ -23,9 +23,8 @@ from ..simulators import Placed, Simulator
 from .cross_validation import HeldOut, held_out_errors
 from .evidence import EXACT, MORE, Sample, information, log_evidence, log_prior, spread
 from .floor import Floor, effective_size, white_part
-from .gates import Gate
+from .gates import Gate, Offset
 from .linearise import linearised
-from .offset import Offset
 from .pairs import fitted_together, promising
 from .relatives import complements, relatives
 from .remainder import Remainder

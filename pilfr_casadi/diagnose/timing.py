@@ -1,234 +1,509 @@
-"""Gates of time: a channel that was recorded too early or too late, or by a clock that runs differently.
+"""Faults of time: a channel recorded too early or too late, or by another clock; samples that were lost.
 
-The residual of the refitted simulator, with one channel read at another time, is projected off what the simulator's own
+Shifts and clocks. The error of the refitted simulator, with one channel read at another time, is projected off what
 parameters and initial states can follow; the shift (or clock rate) with the smallest remainder is confirmed by a
 refit. A late output may be physics (a delay); a shift of many whole samples is the mark of a recorder, and an output
 that comes before its cause is nothing else.
+
+Gaps. Where samples were lost and the time renumbered, every state jumps at once. Along the refitted run, a jump δ of
+the state at sample k changes what comes after by `Φ_k δ`. With e what parameters and initial states leave of the error,
+and base what they can follow, the best jump takes away
+
+    s' (S - G G')⁻¹ s,    S = Φ_k'Φ_k,  G = Φ_k' base,  s = Φ_k' e
+
+of e'e; S, G and s follow from those of the next sample, so that every sample is tried at once. A shock or a stop moves
+no state that is the integral of another, and a step of a force or of a sensor moves none: where one of these does about
+as well, or where no state is such an integral, nothing is said. A jump is confirmed by a refit to the two pieces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from .gates import Change, Gate, changed, refit, shifted
-from .linearise import linearised
-from .remainder import followed
-from .workbench import Fitted, Workbench
+from .._base import InputError
+from ..data import Recording
+from ..simulators import states_along
+from .gates import (
+    ABOVE_NOISE,
+    ASTRAY,
+    AT_NOISE,
+    EXPLAINED,
+    SAME,
+    Change,
+    Checked,
+    FirstOrder,
+    Gate,
+    changed,
+    fall,
+    refit,
+)
+from .linearise import Run
+from .workbench import THOROUGH, Fitted, Workbench
+
+TURNS = 8  # of an edit and a refit, until the edit stays where it is
 
 SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples
 RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 0.05, 28)])
 WHOLE = 0.12  # samples within which a shift counts as whole
 LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
-FAR = 0.04  # mean square error of a refit that may have gone astray
 PROMISING = 0.7  # share of the remainder that a shift or clock rate worth a refit leaves
 NOTHING = 0.02  # share of the mean square that a late channel which is all that is wrong leaves at most
-ALONE = 5.0  # times the noise that a shift or a clock leaves which is not all that is wrong
-AVERAGED = 0.4  # of a channel's noise, which reading it between its samples takes away
-DROP = 0.3  # share of the mean square that has to be left at most
+AVERAGED = 0.5  # of a channel's noise, which reading it between its samples takes away at most
 
-Trial = tuple[float, str, str, float, str, tuple[int, ...]]  # share left, channel, what, value, "u" or "y", columns
+MOST_GAPS = 3
+SHARE = 0.2  # of the mean square that a jump takes away at least
+WORSE, BETTER = 2.0, 1.1  # times what a jump leaves that a rival leaves at least, and that a jump beside it does
+SHORTEST = 40  # samples of a piece
+BESIDE = 5  # samples around a jump at which rivals are tried, and where a drift would do as well
+BETWEEN = (-0.5, 0.0, 0.5)  # samples, by which a shock may come later
+CHUNK = 256  # samples solved for at a time
+RIDGE = 1e-6  # of a jump that initial states can follow nothing is known
 
 
-def nominal_directions(bench: Workbench, fitted: Fitted) -> np.ndarray:
-    """Orthonormal basis of what parameters and initial states can change in the stacked outputs."""
-    return followed(bench, linearised(bench, fitted)[1], [r.skip for r in bench.recordings])
+@dataclass(frozen=True)
+class Step:
+    """Channels (columns of "u" or "y") that are out of step: late by seconds, or by a clock that runs faster."""
+
+    channel: str
+    finding: str
+    kind: str
+    columns: tuple[int, ...]
+
+    def change(self, value: float, cut: bool = True) -> Change:
+        """Read the channels at another time; see `shifted`."""
+        seconds, rate = (value, 0.0) if self.finding == "alignment" else (0.0, value)
+        return shifted(self.kind, self.columns, seconds, rate, cut)
+
+    def at(self, now: Checked, value: float, previous: Fitted) -> Checked | None:
+        """Refit to the channels read at another time."""
+        bench = changed(now.bench, self.change(value))
+        found = refit(bench, previous)
+        return None if found is None else now.then(bench, found)
 
 
-def _remainder(bench: Workbench, fitted: Fitted, basis: np.ndarray, change: Change, simulate: bool) -> float:
-    """Mean square that parameters and initial states leave of the error on changed recordings.
+def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, cut: bool = True) -> Change:
+    """Read some channels at `t + seconds + rate t`, interpolated.
 
-    Without `simulate` the run of the fit stands, as it does where no input is changed.
+    Samples read from before the recording are skipped, samples from behind it are cut off; without `cut`, the ends are
+    held. A periodic recording goes round.
     """
-    parts = []
-    with np.errstate(over="ignore", invalid="ignore"):  # what diverges leaves everything
-        for r, e, state in zip(bench.recordings, fitted.residual, fitted.initial, strict=True):
-            other = change(r)
-            y = fitted.engine.simulate(fitted.model.drive(other), fitted.vector, state)[0] if simulate else e + r.y
-            parts.append(((y - other.y) / bench.scale)[r.skip :].ravel())
-        error = np.concatenate(parts)
-        left = error - basis @ (basis.T @ error)
-        value = float(left @ left) / len(error)
-    return value if np.isfinite(value) else np.inf
+
+    def change(r: Recording) -> Recording:
+        values, at = np.array(getattr(r, kind)), r.t * (1 + rate) + seconds
+        end = len(r) * r.dt if r.period and len(r) % r.period == 0 and not rate else None
+        for i in index:
+            values[:, i] = _read(r.t, values[:, i], at, end, smooth=kind == "y")
+        other = r.with_(**{kind: values})
+        if kind == "y" and r.begins == "zero":  # at rest when it was said to be
+            other = other.with_(initial="estimate")
+        if end is not None or not cut:
+            return other
+        early, late = int(np.sum(at < 0)), int(np.sum(at > r.t[-1] + 1e-9 * r.dt))
+        if early:
+            other = other.with_(skip=min(max(r.skip, early), len(r) - 2))
+        return other.slice(0, max(len(r) - late, other.skip + 2)) if late else other
+
+    return change
 
 
-def timing(
-    bench: Workbench, plain: Fitted, noise2: float, part: float = 1.0, early: bool = True
-) -> tuple[Workbench, Fitted, list[Gate]]:
-    """Look for a shifted channel or clock; returns the corrected bench where it is a fault of the recording.
+def _read(t: np.ndarray, v: np.ndarray, at: np.ndarray, end: float | None, smooth: bool) -> np.ndarray:
+    """Interpolate a signal: an output along a cubic spline, an input along its chords; ends are held."""
+    if not smooth:
+        return np.interp(at, t, v, period=end)
+    from scipy.interpolate import CubicSpline
+
+    if end is None:
+        return np.asarray(CubicSpline(t, v)(np.clip(at, t[0], t[-1])))
+    return np.asarray(CubicSpline(np.append(t, end), np.append(v, v[0]), bc_type="periodic")(at))
+
+
+def timing(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
+    """Look for a shifted channel or clock, and put it right where it is a fault of the recording.
 
     A late channel counts as shifted where it is late by a multiple of `part` samples; and, as an early one without
     `early`, where it is all that is wrong.
     """
-    if plain.cost < 4 * noise2:
-        return bench, plain, []
-    dt = bench.dt
-    references = [plain] if plain.cost < FAR else [plain, as_given(bench, plain)]
-    trials = [trial for reference in references for trial in _trials(bench, reference)]
-    best: tuple[float, str, str, float, Workbench, Fitted, Change] | None = None
-    for _, name, what, value, kind, i in _best_of_each(trials):
-        make, cut = _maker(kind, i, what), _maker(kind, i, what, cut=True)
-        unit = dt if what == "alignment" else abs(value)
-        settled = _settled(bench, plain, make, cut, value, unit)
+    bench, plain, noise2 = now.bench, now.fitted, now.noise2
+    if plain.cost < ABOVE_NOISE**2 * noise2:
+        return now
+    best: tuple[float, Step, float, Checked] | None = None
+    for step, value in _promising(bench, plain):
+        settled = _settled_step(now, step, value)
         if settled is None:
             continue
-        at, now, current = settled
-        if what == "alignment":
-            near = _refit_at(bench, cut, round(at / dt) * dt, current)
-            if near is not None and near[1].cost < 1.02 * current.cost + AVERAGED * noise2:
-                at, (now, current) = round(at / dt) * dt, near
-        relative = current.cost * float(np.mean((now.scale / bench.scale) ** 2))
+        at, found = settled
+        if step.finding == "alignment":
+            whole = round(at / bench.dt) * bench.dt
+            near = step.at(now, whole, found.fitted)
+            if near is not None and near.cost < SAME * found.cost + AVERAGED * noise2:
+                at, found = whole, near
+        relative = found.cost * float(np.mean((found.bench.scale / bench.scale) ** 2))
         if best is None or relative < best[0]:
-            best = (relative, name, what, at if kind == "y" else -at, now, current, cut(at))
-    if best is None or best[0] > DROP * plain.cost:
-        return bench, plain, []
-    relative, name, what, value, other, found, change = best
-    back = refit(bench, found)
-    if back is not None and relative > DROP * back.cost:  # it only led the refit out of a local minimum
-        return bench, back, []
-    late, alone = what == "alignment" and value > 0, 3.0 if what == "alignment" else ALONE
-    if (late or what == "clock" or not early) and relative > max(NOTHING * plain.cost, alone**2 * noise2):
-        return bench, plain, []  # what comes late or runs slow, next to something else that is wrong, may be physics
-    gate = _gate(name, what, value, dt, plain.cost, relative, change, part, noise2)
-    return (other, found, [gate]) if gate else (bench, plain, [])
+            best = relative, step, at, found
+    if best is None or best[0] > EXPLAINED * plain.cost:
+        return now
+    left, step, at, found = best
+    back = refit(bench, found.fitted)
+    if back is not None and left > EXPLAINED * back.cost:  # it only led the refit out of a local minimum
+        return now.then(bench, back)
+    value = at if step.kind == "y" else -at
+    late = step.finding == "clock" or value > 0
+    if (late or not early) and left > max(NOTHING * plain.cost, AT_NOISE**2 * noise2):
+        return now  # what comes late or runs slow, next to something else that is wrong, may be physics
+    samples = value / bench.dt
+    if step.finding == "alignment" and samples > -WHOLE and not (in_steps(value, bench.dt, part) and samples > LONG):
+        return now  # late, and not by whole samples: a delay is physics
+    sentence = f"{_step_in_words(step, value, bench.dt)}; with it corrected {fall(plain.cost, left)}"
+    if left > AT_NOISE**2 * noise2:
+        sentence += (
+            f", still {(left / max(noise2, 1e-300)) ** 0.5:.2g} times the noise: more is wrong, with the time "
+            "(samples that were lost, say) or otherwise"
+        )
+    gate = Gate(step.channel, step.finding, value, f"{sentence}.", fault=True, change=step.change(at))
+    return found.then(found.bench, found.fitted, replace(gate, left=left / plain.cost))
+
+
+def _step_in_words(step: Step, value: float, dt: float) -> str:
+    if step.finding == "clock":
+        return f"The clock of {step.channel} runs {value * 100:+.3g} % off the others'"
+    word = "late" if value > 0 else "early"
+    return f"{step.channel} is recorded {abs(value / dt):.3g} samples ({abs(value):.3g} s) too {word}"
 
 
 def as_given(bench: Workbench, plain: Fitted) -> Fitted:
-    """The simulator at the user's values: a refit to channels out of step may have gone astray."""
+    """Run the simulator at the user's values: a refit to channels out of step may have gone astray."""
     values = {name: p.value for name, p in bench.simulator.parameters.items()}
     unknown = [r.begins == "estimate" for r in bench.recordings]
     initial = [0 * state if u else state for u, state in zip(unknown, plain.initial, strict=True)]
     return bench.result(bench.simulator, values, initial, plain.engine, plain.model)
 
 
-def _trials(bench: Workbench, fitted: Fitted) -> list[Trial]:
-    """The best shift and clock rate of every channel that make the remainder clearly smaller, with its share."""
-    names = bench.simulator.output_names
-    channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(names)]
-    if len(names) > 1:
-        channels.append(("y", tuple(range(len(names))), ", ".join(names)))
-    if len(bench.simulator.inputs) > 1:
-        channels += [("u", (i,), name) for i, name in enumerate(bench.simulator.inputs)]
-    basis, out = nominal_directions(bench, fitted), list[Trial]()
-    straight = _remainder(bench, fitted, basis, lambda r: r, False)
-    for kind, i, name in channels:
-        for what, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
-            make = _maker(kind, i, what)
-
-            def left(value: float, make: Callable[[float], Change] = make, kind: str = kind) -> float:
-                return _remainder(bench, fitted, basis, make(value), kind == "u") / straight
-
-            shares = [left(value) for value in values]
-            best = int(np.argmin(shares))
-            value, share = float(values[best]), shares[best]
-            if what == "clock":  # over a whole record a small step of a rate is many samples
-                value, share = _narrowed(left, values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)])
-            if share < PROMISING:
-                out.append((share, name, what, value, kind, i))
-    return out
-
-
-def _narrowed(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """Where the remainder is smallest between two values, and the remainder there."""
-    from scipy.optimize import minimize_scalar
-
-    found = minimize_scalar(left, bounds=(low, high), method="bounded", options={"maxiter": 20})
-    return float(found.x), float(found.fun)
-
-
-def _refit_at(
-    bench: Workbench, cut: Callable[[float], Change], at: float, previous: Fitted
-) -> tuple[Workbench, Fitted] | None:
-    other = changed(bench, cut(at))
-    found = refit(other, previous)
-    return None if found is None else (other, found)
-
-
-def _settled(
-    bench: Workbench,
-    plain: Fitted,
-    make: Callable[[float], Change],
-    cut: Callable[[float], Change],
-    value: float,
-    unit: float,
-) -> tuple[float, Workbench, Fitted] | None:
-    """Shift and parameters in turn, until the shift stays where it is."""
-    best: tuple[float, Workbench, Fitted] | None = None
-    at, previous = value, plain
-    for _ in range(8):
-        found = _refit_at(bench, cut, at, previous)
-        if found is None:
-            break
-        if best is None or found[1].cost < best[2].cost:
-            best = (at, *found)
-        previous = found[1]
-        step = _refined(bench, found[0], previous, make, at, unit)
-        if abs(step - at) < 2e-3 * unit:
-            break
-        at = step
-    return best
-
-
-def _best_of_each(trials: list[Trial]) -> list[Trial]:
-    """The best shift and the best clock of each channel, best first, three at most."""
-    best: dict[tuple[str, str], Trial] = {}
-    for trial in sorted(trials, key=lambda t: t[0]):
-        best.setdefault(trial[1:3], trial)
-    return list(best.values())[:3]
-
-
-def _maker(kind: str, i: tuple[int, ...], what: str, cut: bool = False) -> Callable[[float], Change]:
-    if what == "alignment":
-        return lambda value: shifted(kind, i, value, 0.0, cut)
-    return lambda value: shifted(kind, i, 0.0, value, cut)
-
-
-def _refined(
-    bench: Workbench, now: Workbench, fitted: Fitted, make: Callable[[float], Change], at: float, width: float
-) -> float:
-    """Shift of the original recordings that fits best around `at`."""
-    original = replace(bench, scale=now.scale)
-    basis = nominal_directions(original, fitted)
-
-    def left(value: float) -> float:
-        return _remainder(original, fitted, basis, make(value), True)
-
-    return _narrowed(left, at - width, at + width)[0]
-
-
 def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
-    """Whether a shift is a multiple of `part` samples."""
+    """Tell whether a shift is a multiple of `part` samples."""
     return abs(value / dt - part * round(value / dt / part)) < WHOLE
 
 
-def _gate(
-    name: str,
-    what: str,
-    value: float,
-    dt: float,
-    before: float,
-    after: float,
-    change: Change,
-    part: float,
-    noise2: float,
-) -> Gate | None:
-    fall = f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
-    if after > ALONE**2 * noise2:
-        fall += (
-            f", still {(after / max(noise2, 1e-300)) ** 0.5:.2g} times the noise: more is wrong, with the time "
-            "(samples that were lost, say) or otherwise"
-        )
-    if what == "clock":
-        sentence = f"The clock of {name} runs {value * 100:+.3g} % off the others'; with it corrected {fall}."
-        return Gate(name, "clock", value, sentence, True, True, change, left=after / before)
-    samples = value / dt
-    whole = in_steps(value, dt, part) and abs(samples) > LONG
-    if samples > -0.3 and not whole:
-        return None  # late, and not by whole samples: a delay is physics
-    word = "late" if samples > 0 else "early"
+def _promising(bench: Workbench, plain: Fitted) -> list[tuple[Step, float]]:
+    """List the shifts and clock rates that make the remainder clearly smaller, best first, three at most."""
+    outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
+    channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(outputs)]
+    if len(outputs) > 1:
+        channels.append(("y", tuple(range(len(outputs))), ", ".join(outputs)))
+    if len(inputs) > 1:
+        channels += [("u", (i,), name) for i, name in enumerate(inputs)]
+    found = list[tuple[float, Step, float]]()
+    for reference in [plain] if plain.cost < ASTRAY else [plain, as_given(bench, plain)]:
+        first = FirstOrder.of(bench, reference)
+        straight = _remainder(first, reference, lambda r: r, False)
+        for kind, columns, name in channels:
+            for finding, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
+                step = Step(name, finding, kind, columns)
+                shares = [_remainder(first, reference, step.change(v, False), kind == "u") / straight for v in values]
+                k = int(np.argmin(shares))
+                value, share = float(values[k]), shares[k]
+                if finding == "clock":  # over a whole record a small step of a rate is many samples
+                    ends = float(values[max(k - 1, 0)]), float(values[min(k + 1, len(values) - 1)])
+                    value, share = _narrowed(first, reference, step, ends, kind == "u")
+                    share /= straight
+                if share < PROMISING:
+                    found.append((share, step, value))
+    best = dict[Step, float]()
+    for _, step, value in sorted(found, key=lambda t: t[0]):
+        best.setdefault(step, value)
+    return list(best.items())[:3]
+
+
+def _remainder(first: FirstOrder, fitted: Fitted, change: Change, simulate: bool) -> float:
+    """Compute the mean square that parameters and initial states leave of the error on changed recordings.
+
+    Without `simulate` the run of the fit stands, as it does where no input is changed.
+    """
+    parts = []
+    with np.errstate(over="ignore", invalid="ignore"):  # what diverges leaves everything
+        for r, e, state in zip(first.bench.recordings, fitted.residual, fitted.initial, strict=True):
+            other = change(r)
+            y = fitted.engine.simulate(fitted.model.drive(other), fitted.vector, state)[0] if simulate else e + r.y
+            parts.append(((y - other.y) / first.bench.scale)[r.skip :].ravel())
+        value = float(np.mean(first.left(np.concatenate(parts)) ** 2))
+    return value if np.isfinite(value) else np.inf
+
+
+def _narrowed(
+    first: FirstOrder, fitted: Fitted, step: Step, ends: tuple[float, float], simulate: bool
+) -> tuple[float, float]:
+    """Find where the remainder is smallest between two values, and the remainder there."""
+    from scipy.optimize import minimize_scalar
+
+    def left(value: float) -> float:
+        return _remainder(first, fitted, step.change(value, False), simulate)
+
+    found = minimize_scalar(left, bounds=ends, method="bounded", options={"maxiter": 20})
+    return float(found.x), float(found.fun)
+
+
+def _settled_step(now: Checked, step: Step, at: float) -> tuple[float, Checked] | None:
+    """Refit parameters and shift in turn, until the shift stays where it is."""
+    best: tuple[float, Checked] | None = None
+    previous, width = now.fitted, now.bench.dt if step.finding == "alignment" else abs(at)
+    for _ in range(TURNS):
+        found = step.at(now, at, previous)
+        if found is None:
+            break
+        if best is None or found.cost < best[1].cost:
+            best = at, found
+        previous = found.fitted
+        first = FirstOrder.of(replace(now.bench, scale=found.bench.scale), previous)
+        moved = _narrowed(first, previous, step, (at - width, at + width), True)[0]
+        if abs(moved - at) < 2e-3 * width:
+            break
+        at = moved
+    return best
+
+
+# samples that were lost
+
+
+Origin = tuple[str, int]  # label of the recording as given, and its sample that a piece begins with
+Pieces = tuple[Checked, list[Origin]]
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A jump of the state at a sample of a recording; the shares are of the mean square that it takes away.
+
+    Attributes
+    ----------
+    rival : float
+        Share that a shock nearby, or a step of one force or sensor there, takes away.
+    beside : float
+        Share that a jump some samples away takes away.
+    size : array, shape (n_x,)
+        The jump.
+    """
+
+    recording: int
+    sample: int
+    share: float
+    rival: float
+    beside: float
+    size: np.ndarray
+
+    @property
+    def distinct(self) -> bool:
+        """Tell whether it takes much away, and every rival leaves clearly more."""
+        return self.share > SHARE and 1 - self.rival > BETTER * max(1 - self.share, 0.0)
+
+    @property
+    def told(self) -> bool:
+        """Tell whether every rival also leaves far more."""
+        return self.distinct and 1 - self.rival > WORSE * max(1 - self.share, 0.0)
+
+    @property
+    def sharp(self) -> bool:
+        """Tell whether it does so at this very sample only; a drift does so around it too."""
+        return 1 - self.beside > BETTER * (1 - self.share)
+
+
+def gaps(now: Checked) -> Checked:
+    """Look for lost samples; cut the recordings there if that cures most of the mismatch.
+
+    The state at the first sample of a later piece is estimated. Recordings in periodic steady state are left alone.
+    """
+    noise2 = min(now.noise2, _quiet(now) or np.inf)
+    stages: list[Pieces] = [(now, [(r.label, 0) for r in now.bench.recordings])]
+    while len(stages) <= MOST_GAPS and stages[-1][0].cost > ABOVE_NOISE**2 * noise2:
+        last, origins = stages[-1]
+        settled = _settled_jump(last)
+        if settled is None or not settled[0].distinct or settled[1].cost > (1 - SHARE / 2) * last.cost:
+            break
+        jump, found = settled
+        label, begin = origins[jump.recording]
+        at = jump.recording + 1
+        stages.append((found, [*origins[:at], (label, begin + jump.sample), *origins[at:]]))
+    for found, origins in reversed(stages[1:]):  # what looked like one more may be another cause's
+        confirmed = _confirmed(found, origins, noise2) if found.cost < EXPLAINED * now.cost else None
+        if confirmed is not None:
+            found, origins = confirmed
+            pieces = [_named(r, begin) for r, (_, begin) in zip(found.bench.recordings, origins, strict=True)]
+            gate = _gap(now, [o for o in origins if o[1]], found.cost)
+            return now.then(replace(found.bench, recordings=tuple(pieces)), found.fitted, gate)
+    return now
+
+
+def _confirmed(found: Checked, origins: list[Origin], noise2: float) -> Pieces | None:
+    """Test each gap again, now that the others are cut; return None if one of them is no gap."""
+    sharp, origins = True, list(origins)
+    for i, (label, begin) in enumerate(origins):
+        if not begin:
+            continue
+        settled = _settled_jump(_joined(found, i))
+        if settled is None or settled[0].recording != i - 1 or not settled[0].told:
+            return None
+        jump, found = settled
+        origins[i] = label, origins[i - 1][1] + jump.sample
+        sharp = sharp and jump.sharp
+    return (found, origins) if sharp or found.cost < AT_NOISE**2 * noise2 else None
+
+
+def _named(r: Recording, begin: int) -> Recording:
+    """Name a piece by the time at which it begins."""
+    return r.with_(name=f"{r.name} from {begin * r.dt:.6g} s".strip()) if begin else r
+
+
+def _joined(found: Checked, i: int) -> Checked:
+    """Put a piece back behind the one before, at the same values."""
+    bench, fitted = found.bench, found.fitted
+    one, other = bench.recordings[i - 1 : i + 1]
+    whole = one.with_(u=np.concatenate([one.u, other.u]), y=np.concatenate([one.y, other.y]))
+    before = replace(bench, recordings=(*bench.recordings[: i - 1], whole, *bench.recordings[i + 1 :]))
+    return found.then(before, _same(before, fitted, [*fitted.initial[:i], *fitted.initial[i + 1 :]]))
+
+
+def _same(bench: Workbench, fitted: Fitted, initial: list[np.ndarray]) -> Fitted:
+    """Run another bench's fit on this one's recordings at its values."""
+    return bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
+
+
+def _settled_jump(now: Checked) -> tuple[Jump, Checked] | None:
+    """Repeat jump and fit to the pieces until the jump stays: a fit across a gap may have gone astray."""
+    bench, along = now.bench, now.fitted
+    best: tuple[Jump, Checked] | None = None
+    for _ in range(TURNS):
+        jump = find_jump(bench, along)
+        if jump is None or jump.share < SHARE:
+            break
+        i, r = jump.recording, bench.recordings[jump.recording]
+        if best is not None and (i, jump.sample) == (best[0].recording, best[0].sample):
+            return jump, best[1]
+        pieces = r.slice(0, jump.sample), r.slice(jump.sample).with_(initial="estimate", period=None)
+        other = replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
+        states = [*along.begin[: i + 1], _begin(along, r, jump), *along.begin[i + 1 :]]
+        starts: list[dict[str, Any]] = [along.values, {}]
+        model, engine = now.fitted.model, now.fitted.engine
+        try:
+            found = other.fit(other.simulator, starts, states=states, solver=THOROUGH, model=model, engine=engine)
+        except InputError:
+            break
+        best = jump, now.then(other, found)
+        along = _same(bench, found, [*found.initial[: i + 1], *found.initial[i + 2 :]])
+    return best
+
+
+def _quiet(now: Checked) -> float:
+    """Estimate the mean square of white noise from the median of third differences, which a few jumps do not move."""
+    thirds = np.abs(np.concatenate([np.diff(e, 3, axis=0) for e in now.fitted.residual]))
+    return float(np.mean((1.4826 * np.median(thirds, axis=0) / now.bench.scale) ** 2) / 20)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
+    """Find the jump of the simulator's states that takes most away, to first order; None if gaps cannot be told."""
+    simulator = bench.simulator
+    if not simulator.kinematic:
+        return None
+    first = FirstOrder.of(bench, fitted)
+    runs, base, error = first.runs, first.base, first.left(first.error)
+    n_x = len(simulator.states)
+    moved = [i for i, name in enumerate(simulator.states) if name not in simulator.kinematic]
+    best: Jump | None = None
+    at = 0
+    for i, (r, one) in enumerate(zip(bench.recordings, runs, strict=True)):
+        rows = slice(at, at + (len(r) - r.skip) * r.n_y)
+        at = rows.stop
+        if r.begins == "periodic" or len(r) - r.skip < 2 * SHORTEST:
+            continue
+        shares, rivals, sizes = _taken(one, bench.scale, base[rows], error[rows], r.skip, n_x, moved)
+        shares[: r.skip + SHORTEST] = shares[len(r) - SHORTEST :] = 0.0
+        k = int(np.argmax(shares))
+        if best is None or shares[k] > best.share:
+            rival = float(np.max(rivals[max(k - BESIDE, 0) : k + BESIDE + 1]))
+            beside = float(max(shares[k - BESIDE], shares[k + BESIDE]))
+            best = Jump(i, k, float(shares[k]), rival, beside, sizes[k])
+    total = max(float(error @ error), 1e-300)
+    if best is None:
+        return None
+    return replace(best, share=best.share / total, rival=best.rival / total, beside=best.beside / total)
+
+
+def _taken(
+    run: Run, scale: np.ndarray, base: np.ndarray, error: np.ndarray, skip: int, n_x: int, moved: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the share that the best jump of the state takes away at each sample, its best rival's, and that jump.
+
+    Shapes (M,), (M,) and (M, n_x); `moved` are the states that a shock moves.
+    """
+    m, n, _ = run.a.shape
+    full = n + run.b.shape[2] - run.n_free
+    taken, rival, size = np.zeros(m), np.zeros(m), np.zeros((m, n_x))
+    unit, shock = np.eye(full), np.eye(full)[:, list(moved)]
+    steps = [unit[:, [j]] for j in range(n, full)]
+    for now, s, g, e in _backwards(run, scale, base, error, skip):
+        left = s - g @ np.swapaxes(g, 1, 2)
+        turn = np.zeros_like(s)
+        turn[:, :n, :n] = run.a[now] - np.eye(n)
+        shocks = [shock + part * turn @ shock for part in BETWEEN]
+        taken[now], size[now] = _solved(left, s, e, unit[:, :n_x])
+        rival[now] = np.max([_solved(left, s, e, way)[0] for way in (*shocks, *steps)], axis=0)
+    return taken, rival, size
+
+
+def _solved(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the shares that jumps along some ways, (n, k) or (K, n, k), take away, and their lengths."""
+    across = np.swapaxes(ways, -1, -2)
+    size = np.sqrt(np.maximum(np.einsum("...ii->...i", across @ s @ ways), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    matrix = across @ left @ ways / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(ways.shape[-1])
+    wanted = (across @ e[:, :, None])[:, :, 0] / size
+    lost = ~(np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(wanted).all(axis=1))  # where a run grows without end
+    matrix[lost], wanted[lost] = np.eye(ways.shape[-1]), 0.0
+    found = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0]
+    return np.sum(found * wanted, axis=1), found / size
+
+
+def _backwards(
+    run: Run, scale: np.ndarray, base: np.ndarray, error: np.ndarray, skip: int
+) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield S, G and s of states and of forces that stay from a sample on, some samples at a time, the last first."""
+    m, n_y, n = run.c.shape
+    forces = run.b.shape[2] - run.n_free
+    full, n_b = n + forces, base.shape[1]
+    read = np.zeros((m - skip, n_y, n_b + 1))
+    read[:, :, :n_b] = base.reshape(m - skip, n_y, n_b)
+    read[:, :, n_b] = error.reshape(m - skip, n_y)
+    c = np.concatenate([run.c, run.d[:, :, run.n_free :]], axis=2) / scale[:, None]
+    s, g = np.zeros((full, full)), np.zeros((full, n_b + 1))
+    a = np.eye(full)
+    for stop in range(m, skip, -CHUNK):
+        now = slice(max(stop - CHUNK, skip), stop)
+        every_s, every_g = np.zeros((stop - now.start, full, full)), np.zeros((stop - now.start, full, n_b + 1))
+        for k in range(stop - 1, now.start - 1, -1):
+            a[:n, :n], a[:n, n:] = run.a[k], run.b[k, :, run.n_free :]
+            s = c[k].T @ c[k] + a.T @ s @ a
+            g = c[k].T @ read[k - skip] + a.T @ g
+            every_s[k - now.start], every_g[k - now.start] = s, g
+        yield now, every_s, every_g[:, :, :n_b], every_g[:, :, n_b]
+
+
+def _begin(fitted: Fitted, r: Recording, jump: Jump) -> np.ndarray:
+    """Compute the simulator's own states after a jump, to first order."""
+    model = fitted.model
+    states = states_along(model, model.drive(r), fitted.vector, fitted.initial[jump.recording])
+    return np.asarray(states[jump.sample * model.substeps, : len(jump.size)] - jump.size)
+
+
+def _gap(now: Checked, places: Sequence[Origin], after: float) -> Gate:
+    """Describe the gaps before some samples."""
+    ordered = sorted(places)
+    bench, before = now.bench, now.cost
+    dt, several = bench.dt, len({label for label, _ in ordered}) > 1 or len(bench.recordings) > 1
+    at = " and ".join(f"t = {k * dt:.6g} s (sample {k}{f' of {label}' if several else ''})" for label, k in ordered)
+    names = ", ".join([*bench.simulator.inputs, *bench.simulator.output_names])
     sentence = (
-        f"{name} is recorded {abs(samples):.3g} samples ({abs(value):.3g} s) too {word}; with it corrected {fall}."
+        f"Samples are missing just before {at}: the state jumps there as no force and no shock could make it, as where "
+        f"a logger lost some and counted on. With the recording cut there {fall(before, after)}."
     )
-    return Gate(name, "alignment", value, sentence, True, True, change, left=after / before)
+    return Gate(names, "gap", [k * dt for _, k in ordered], sentence, fault=True, left=after / before)

@@ -12,7 +12,7 @@ from .floor import swells_with, white_part
 from .gates import Gate
 from .posterior import Posterior
 from .proof import mean_nrmse
-from .residual_spectrum import ringing
+from .recording_faults import ringing
 from .search import Search
 
 AT_FLOOR = 1.15  # times the noise that counts as being at it

@@ -11,8 +11,9 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.gaps import _settled, find_jump, gaps
+from pilfr_casadi.diagnose.gates import Checked
 from pilfr_casadi.diagnose.preparation import prepare, refitted
+from pilfr_casadi.diagnose.timing import _settled_jump, find_jump, gaps
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 
@@ -33,9 +34,9 @@ def bench(*train):
 def looked(*train):
     """Samples of the gaps found, by recording."""
     made, plain = bench(*train)
-    other, found, told = gaps(made, plain, 1e-6)
-    assert (other is made and found is plain) or (found.cost < 0.3 * plain.cost and told)
-    return [len(r) for r in other.recordings], told
+    found = gaps(Checked(made, plain))
+    assert (found.bench is made and found.fitted is plain) or (found.cost < 0.3 * plain.cost and found.gates)
+    return [len(r) for r in found.bench.recordings], found.gates
 
 
 def test_a_gap_is_a_fault_of_the_recording(tmp_path):
@@ -88,9 +89,9 @@ def test_a_shock_is_no_gap(samples):
     push = np.zeros((2500, 1))
     push[1200 : 1200 + samples] = 5000 / samples
     made, plain = bench(*pushed(push))
-    jump, _, pieces = _settled(made, plain)
+    jump, pieces = _settled_jump(Checked(made, plain))
     assert pieces.cost < 0.1 * plain.cost and not jump.told  # cutting would cure it, and yet
-    assert gaps(made, plain, 1e-6)[2] == []
+    assert not gaps(Checked(made, plain)).gates
 
 
 @pytest.mark.parametrize("kind", ["step", "ramp", "sensor"])

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pilfr_casadi.diagnose.offset import Offset
+from pilfr_casadi.diagnose.gates import Offset
 from pilfr_casadi.diagnose.posterior import posterior, share_named, unfollowed
 from pilfr_casadi.diagnose.trials import Trial
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, DirectionalFriction, QuadraticDrag

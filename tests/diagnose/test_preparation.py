@@ -7,7 +7,7 @@ from test_slips import DT, recorded, tanks
 
 from pilfr_casadi import Recording
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.offset import as_it_came_out, offset_gates, offsets
+from pilfr_casadi.diagnose.gates import Checked, as_it_came_out, offset_gates, offsets
 from pilfr_casadi.diagnose.preparation import prepare, refitted
 
 
@@ -48,12 +48,12 @@ def test_a_wrong_sign_beside_another_zero_is_told():
 
 def test_a_constant_of_a_sensor_is_found_and_kept():
     bench = Workbench.of(tanks(1.15), [of_tanks(recorded()[1] + [0, 0.3])], "zero")
-    _, fitted, gates = offsets(bench, refitted(bench))
-    (gate,) = gates
+    found = offsets(Checked(bench, refitted(bench)))
+    fitted, (gate,) = found.fitted, found.gates
     assert (gate.channel, gate.finding, gate.fault) == ("lower", "offset", True)
     assert gate.value == pytest.approx(0.3, rel=0.02)
     (again,) = offset_gates(fitted.simulator.elements, fitted.values)
     assert again.value == gate.value and "parameter of the corrected simulator" in again.sentence
-    (told,) = as_it_came_out(gates, fitted, {gate.parameter: np.array(0.03)}, False, False)
+    (told,) = as_it_came_out([gate], fitted, {gate.parameter: np.array(0.03)}, False, False)
     assert "may be a part of that" in told.sentence
-    assert not as_it_came_out(gates, fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none
+    assert not as_it_came_out([gate], fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none

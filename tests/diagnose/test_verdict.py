@@ -7,7 +7,7 @@ import pytest
 from diagnosis_rig import recordings, rig
 
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.offset import Offset, without_idle_offsets
+from pilfr_casadi.diagnose.gates import Offset, without_idle_offsets
 from pilfr_casadi.diagnose.verdict import _gone
 from pilfr_casadi.laws import CoulombFriction
 

@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.diagnose.residual_spectrum import tone
+from pilfr_casadi.diagnose.recording_faults import tone
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 
