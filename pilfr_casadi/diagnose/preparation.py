@@ -66,91 +66,91 @@ def prepare(
     recordings, transients = without_transients(recordings)
     said = said_hold(simulator, recordings, hold)
     bench, times = opened(simulator, recordings, said or "zero", engine)
-    bench, held = (bench, ()) if said else choose_hold(bench)
+    gates = (*spikes, *transients, *stale_samples(recordings), *times)
+    held: Sequence[Gate] = ()
+    if not said:
+        bench, held = _better_held(bench)
     nominal = errors_of(bench, bench.model(simulator))
     say(CHECKS, 1, CHECKED)
-    now = Checked(bench, refitted(bench, starts), (*spikes, *transients, *stale_samples(recordings), *times, *held))
-    say(CHECKS, 2, CHECKED, now.cost**0.5)
-    if now.cost > max(AT_NOISE**2 * now.noise2, SMALL):
-        now = _without_slips(now, not said, workers, starts, early)
-    say(CHECKS, 3, CHECKED, now.cost**0.5)
-    whole = unclip(now)
-    now = gaps(whole)
-    if now is not whole and not said:  # what looked better across a gap says nothing
-        now = _held_again(now)
-    say(CHECKS, 4, CHECKED, now.cost**0.5)
-    now = now.then(*on_steps_as_fine(now.bench, now.fitted))
-    now = _in_step(now, not said, early)
-    say(CHECKS, 5, CHECKED, now.cost**0.5)
-    now = offsets(now)
+    checks = _Checks(gates, workers, starts, early, say)
+    now = checks.run(bench, 1.0 if said else 0.5)
+    if not said and len(now.gates) > len(gates):  # on wrong data the better hold says nothing
+        now, held = _with_better_hold(checks, now, bench, held)
     bench, without = now.bench, now.fitted
-    if now.gates:  # values and states that wrong data led to may be a dead end
+    if now.gates or held:  # values and states that wrong data led to may be a dead end
         led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
         without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
-    floor = now.then(bench, without).floor
     bench.check_followed(without)
     bench = replace(bench, typical=along(bench, without))
     say(CHECKS, CHECKED, CHECKED, without.cost**0.5)
-    return Prepared(bench, without, nominal, now.gates, floor)
+    return Prepared(bench, without, nominal, (*now.gates, *held), Checked(bench, without).floor)
 
 
-def _without_slips(
-    now: Checked, unsaid: bool, workers: int, starts: Sequence[Mapping[str, Any]], early: bool
-) -> Checked:
-    """Put signs, units and exchanged channels right; on wrong data the better hold says nothing, so choose it again."""
-    found = _slips(now, unsaid, workers, early)
-    if len(found.gates) == len(now.gates):
-        return found
-    raw, held = now.bench, tuple[Gate, ...]()
-    bench = Workbench.of(raw.simulator, found.bench.recordings, raw.hold, raw.engine)
-    if unsaid:
-        bench, held = choose_hold(bench)
-        if bench.hold != raw.hold:  # of two units that are near, the wrong hold may have fitted the wrong one
-            other = raw.otherwise_held()
-            try:
-                again = _slips(Checked(other, refitted(other), now.gates), unsaid, workers, early)
-                if len(again.gates) > len(now.gates):
-                    found = again
-                    bench = Workbench.of(raw.simulator, found.bench.recordings, other.hold, raw.engine)
-            except InputError:
-                pass
-        found = _noted(found, held)
-    return found.then(bench, bench.fit(bench.simulator, [found.fitted.values, {}, *starts], solver=THOROUGH))
+@dataclass(frozen=True)
+class _Checks:
+    """The checks of recordings in their order, from a bench on."""
+
+    gates: tuple[Gate, ...]
+    workers: int
+    starts: Sequence[Mapping[str, Any]]
+    early: bool
+    say: Stages
+
+    def run(self, bench: Workbench, part: float) -> Checked:
+        """Refit, and put faults right one after the other; `part` is of a sample, see `timing`."""
+        now = self._report(2, Checked(bench, refitted(bench, self.starts), self.gates))
+        if now.cost > max(AT_NOISE**2 * now.noise2, SMALL):
+            found = self._slips(now, part)
+            if len(found.gates) > len(now.gates):
+                bench = Workbench.of(bench.simulator, found.bench.recordings, bench.hold, bench.engine)
+                starts = [found.fitted.values, {}, *self.starts]
+                found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
+            now = found
+        now = gaps(unclip(self._report(3, now)))
+        now = now.then(*on_steps_as_fine(now.bench, self._report(4, now).fitted))
+        return offsets(self._report(5, timing(now, part, self.early)))
+
+    def _report(self, done: int, now: Checked) -> Checked:
+        self.say(CHECKS, done, CHECKED, now.cost**0.5)
+        return now
+
+    def _slips(self, now: Checked, part: float) -> Checked:
+        """Find signs, units and exchanged channels; or a shift, since late by half a swing looks like a sign."""
+        found = another_zero(now, slips(now, self.workers), self.workers)
+        if len(found.gates) == len(now.gates) or found.cost <= ASTRAY:
+            return found
+        late = timing(now, part, self.early)
+        return late if late.cost < CURED * found.cost else found
 
 
-def _slips(now: Checked, unsaid: bool, workers: int, early: bool) -> Checked:
-    """Find signs, units and exchanged channels; or a shift in time, since late by half a swing looks like a sign."""
-    found = another_zero(now, slips(now, workers), workers)
-    if len(found.gates) == len(now.gates) or found.cost <= ASTRAY:
-        return found
-    late = timing(now, 0.5 if unsaid else 1.0, early)
-    return late if late.cost < CURED * found.cost else found
-
-
-def _in_step(now: Checked, unsaid: bool, early: bool) -> Checked:
-    """Put shifts and clocks right; where nobody said what inputs do between samples, with the better hold.
+def _with_better_hold(
+    checks: _Checks, now: Checked, bench: Workbench, held: Sequence[Gate]
+) -> tuple[Checked, Sequence[Gate]]:
+    """Repeat the checks with the other hold, and take the one with the smaller error; return the note about it.
 
     Where inputs are taken as held but are interpolated, a late channel is late by half a sample more or less.
     """
-    found = timing(now, 0.5 if unsaid else 1.0, early)
-    if len(found.gates) == len(now.gates) or not unsaid:
-        return found
-    other = now.bench.otherwise_held()
-    again = other.fit(other.simulator, [now.fitted.values], states=now.fitted.initial)
-    both = found, timing(Checked(other, again, now.gates), 0.5, early)
-    costs = [_honest(c, len(now.gates)) for c in both]
-    best = both[int(costs[1] < costs[0])]
-    shifts = [g.value for g in best.gates[len(now.gates) :] if g.finding == "alignment"]
-    if any(v > 0 and not in_steps(v, now.bench.dt) for v in shifts):  # a delay is physics
-        return now
+    try:
+        both = now, checks.run(bench.otherwise_held(), 0.5)
+    except InputError:
+        return now, held
+    costs = [_honest(found) for found in both]
+    now = both[int(costs[1] < costs[0])]
     ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
-    return _noted(best, (hold_note(best.bench, ratio),) if ratio > SAME else ())
+    held = [hold_note(now.bench, ratio)] if ratio > SAME else []
+    if any(v > 0 and not in_steps(v, now.bench.dt) for v in _shifts(now)):  # a delay is physics
+        now = checks.run(replace(bench, hold=now.bench.hold), 1.0)
+    return now, held
 
 
-def _honest(found: Checked, before: int) -> float:
+def _shifts(found: Checked) -> list[float]:
+    return [g.value for g in found.gates if g.finding == "alignment"]
+
+
+def _honest(found: Checked) -> float:
     """Compute the mean square error as if no channel read between its samples had its noise averaged away."""
-    shifts = [g.value for g in found.gates[before:] if g.finding == "alignment"]
-    return found.cost / (AVERAGED if any(not in_steps(v, found.bench.dt) for v in shifts) else 1)
+    between = any(not in_steps(v, found.bench.dt) for v in _shifts(found))
+    return found.cost / (AVERAGED if between else 1)
 
 
 def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitted:
@@ -178,30 +178,15 @@ def said_hold(simulator: Any, recordings: Sequence[Recording], said: str | None)
     return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
 
 
-def choose_hold(bench: Workbench, previous: Fitted | None = None) -> tuple[Workbench, tuple[Gate, ...]]:
-    """Choose the hold that fits better, and note it; the bench's own where the errors are the same."""
+def _better_held(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
+    """Choose the hold with the smaller error of a refit, and note it; the bench's own where the errors are the same."""
     both = bench, bench.otherwise_held()
-    fits = [refit(b, previous) for b in both]
-    costs = [np.inf if found is None else found.cost for found in fits]
+    costs = [np.inf if (found := refit(b)) is None else found.cost for b in both]
     ratio = float(np.sqrt(max(costs) / max(min(costs), 1e-300)))
     if not ratio >= SAME:
         return bench, ()
     best = both[int(costs[1] < costs[0])]
-    return best, (hold_note(best, ratio),)
-
-
-def _held_again(now: Checked) -> Checked:
-    """Choose the hold again, and refit where it is the other one."""
-    bench, held = choose_hold(now.bench, now.fitted)
-    fitted = now.fitted
-    if bench is not now.bench:
-        fitted = bench.fit(bench.simulator, [fitted.values], states=fitted.begin, solver=THOROUGH)
-    return _noted(now.then(bench, fitted), held)
-
-
-def _noted(now: Checked, held: Sequence[Gate]) -> Checked:
-    """Put another note about the hold in place of the last one."""
-    return replace(now, gates=(*(g for g in now.gates if g.finding != "hold"), *held))
+    return best, [hold_note(best, ratio)]
 
 
 def hold_note(bench: Workbench, ratio: float) -> Gate:

@@ -18,7 +18,7 @@ as well, or where no state is such an integral, nothing is said. A jump is confi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -60,7 +60,6 @@ WORSE, BETTER = 2.0, 1.1  # times what a jump leaves that a rival leaves at leas
 SHORTEST = 40  # samples of a piece
 BESIDE = 5  # samples around a jump at which rivals are tried, and where a drift would do as well
 BETWEEN = (-0.5, 0.0, 0.5)  # samples, by which a shock may come later
-CHUNK = 256  # samples solved for at a time
 RIDGE = 1e-6  # of a jump that initial states can follow nothing is known
 
 
@@ -434,25 +433,33 @@ def _taken(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the share that the best jump of the state takes away at each sample, its best rival's, and that jump.
 
-    Shapes (M,), (M,) and (M, n_x); `moved` are the states that a shock moves.
+    Shapes (M,), (M,) and (M, n_x); `moved` are the states that a shock moves. Forces that stay from a sample on count
+    as further states.
     """
-    m, n, _ = run.a.shape
-    full = n + run.b.shape[2] - run.n_free
-    taken, rival, size = np.zeros(m), np.zeros(m), np.zeros((m, n_x))
+    m, n_y, n = run.c.shape
+    forces = run.b[:, :, run.n_free :]
+    full, n_b = n + forces.shape[2], base.shape[1]
+    a = np.tile(np.eye(full), (m, 1, 1))
+    a[:, :n, :n], a[:, :n, n:] = run.a, forces
+    c = np.concatenate([run.c, run.d[:, :, run.n_free :]], axis=2) / scale[:, None]
+    read = np.zeros((m, n_y, n_b + 1))
+    read[skip:] = np.column_stack([base, error]).reshape(m - skip, n_y, n_b + 1)
+    s, g = np.zeros((full, full)), np.zeros((full, n_b + 1))
+    size2, left, along = np.zeros((m, full, full)), np.zeros((m, full, full)), np.zeros((m, full))
+    for k in range(m - 1, skip - 1, -1):
+        s = c[k].T @ c[k] + a[k].T @ s @ a[k]
+        g = c[k].T @ read[k] + a[k].T @ g
+        size2[k], left[k], along[k] = s, s - g[:, :n_b] @ g[:, :n_b].T, g[:, n_b]
     unit, shock = np.eye(full), np.eye(full)[:, list(moved)]
-    steps = [unit[:, [j]] for j in range(n, full)]
-    for now, s, g, e in _backwards(run, scale, base, error, skip):
-        left = s - g @ np.swapaxes(g, 1, 2)
-        turn = np.zeros_like(s)
-        turn[:, :n, :n] = run.a[now] - np.eye(n)
-        shocks = [shock + part * turn @ shock for part in BETWEEN]
-        taken[now], size[now] = _solved(left, s, e, unit[:, :n_x])
-        rival[now] = np.max([_solved(left, s, e, way)[0] for way in (*shocks, *steps)], axis=0)
-    return taken, rival, size
+    taken, size = _solved(left, size2, along, unit[:, :n_x])
+    later = a - np.eye(full)
+    later[:, :, n:] = 0.0
+    rivals = [shock + part * later @ shock for part in BETWEEN] + [unit[:, [j]] for j in range(n, full)]
+    return taken, np.max([_solved(left, size2, along, way)[0] for way in rivals], axis=0), size
 
 
 def _solved(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the shares that jumps along some ways, (n, k) or (K, n, k), take away, and their lengths."""
+    """Compute the shares that jumps along some ways, (n, k) or (M, n, k), take away, and their lengths."""
     across = np.swapaxes(ways, -1, -2)
     size = np.sqrt(np.maximum(np.einsum("...ii->...i", across @ s @ ways), 0.0))
     size = np.where(size > 0, size, 1.0)
@@ -462,30 +469,6 @@ def _solved(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) ->
     matrix[lost], wanted[lost] = np.eye(ways.shape[-1]), 0.0
     found = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0]
     return np.sum(found * wanted, axis=1), found / size
-
-
-def _backwards(
-    run: Run, scale: np.ndarray, base: np.ndarray, error: np.ndarray, skip: int
-) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield S, G and s of states and of forces that stay from a sample on, some samples at a time, the last first."""
-    m, n_y, n = run.c.shape
-    forces = run.b.shape[2] - run.n_free
-    full, n_b = n + forces, base.shape[1]
-    read = np.zeros((m - skip, n_y, n_b + 1))
-    read[:, :, :n_b] = base.reshape(m - skip, n_y, n_b)
-    read[:, :, n_b] = error.reshape(m - skip, n_y)
-    c = np.concatenate([run.c, run.d[:, :, run.n_free :]], axis=2) / scale[:, None]
-    s, g = np.zeros((full, full)), np.zeros((full, n_b + 1))
-    a = np.eye(full)
-    for stop in range(m, skip, -CHUNK):
-        now = slice(max(stop - CHUNK, skip), stop)
-        every_s, every_g = np.zeros((stop - now.start, full, full)), np.zeros((stop - now.start, full, n_b + 1))
-        for k in range(stop - 1, now.start - 1, -1):
-            a[:n, :n], a[:n, n:] = run.a[k], run.b[k, :, run.n_free :]
-            s = c[k].T @ c[k] + a.T @ s @ a
-            g = c[k].T @ read[k - skip] + a.T @ g
-            every_s[k - now.start], every_g[k - now.start] = s, g
-        yield now, every_s, every_g[:, :, :n_b], every_g[:, :, n_b]
 
 
 def _begin(fitted: Fitted, r: Recording, jump: Jump) -> np.ndarray:
