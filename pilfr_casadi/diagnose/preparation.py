@@ -74,7 +74,7 @@ def prepare(
     say(CHECKS, 1, CHECKED)
     checks = _Checks(gates, workers, starts, early, say)
     now = checks.run(bench, 1.0 if said else 0.5)
-    if not said and len(now.gates) > len(gates):  # on wrong data the better hold says nothing
+    if not said and any(g.fault for g in now.gates[len(gates) :]):  # on wrong data the better hold says nothing
         now, held = _with_better_hold(checks, now, bench, held)
     bench, without = now.bench, now.fitted
     if now.gates or held:  # values and states that wrong data led to may be a dead end

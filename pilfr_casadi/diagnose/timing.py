@@ -267,7 +267,6 @@ def _settled_step(now: Checked, step: Step, at: float) -> tuple[float, Checked] 
 
 
 Origin = tuple[str, int]  # label of the recording as given, and its sample that a piece begins with
-Pieces = tuple[Checked, list[Origin]]
 
 
 @dataclass(frozen=True)
@@ -313,53 +312,27 @@ def gaps(now: Checked) -> Checked:
     The state at the first sample of a later piece is estimated. Recordings in periodic steady state are left alone.
     """
     noise2 = min(now.noise2, _quiet(now) or np.inf)
-    stages: list[Pieces] = [(now, [(r.label, 0) for r in now.bench.recordings])]
-    while len(stages) <= MOST_GAPS and stages[-1][0].cost > ABOVE_NOISE**2 * noise2:
-        last, origins = stages[-1]
+    origins: list[Origin] = [(r.label, 0) for r in now.bench.recordings]
+    last, kept = now, list[tuple[Checked, list[Origin]]]()
+    while len(origins) - len(now.bench.recordings) < MOST_GAPS and last.cost > ABOVE_NOISE**2 * noise2:
         settled = _settled_jump(last)
-        if settled is None or not settled[0].distinct or settled[1].cost > (1 - SHARE / 2) * last.cost:
+        if settled is None or not settled[0].distinct:
             break
-        jump, found = settled
-        label, begin = origins[jump.recording]
-        at = jump.recording + 1
-        stages.append((found, [*origins[:at], (label, begin + jump.sample), *origins[at:]]))
-    for found, origins in reversed(stages[1:]):  # what looked like one more may be another cause's
-        confirmed = _confirmed(found, origins, noise2) if found.cost < EXPLAINED * now.cost else None
-        if confirmed is not None:
-            found, origins = confirmed
-            pieces = [_named(r, begin) for r, (_, begin) in zip(found.bench.recordings, origins, strict=True)]
-            gate = _gap(now, [o for o in origins if o[1]], found.cost)
-            return now.then(replace(found.bench, recordings=tuple(pieces)), found.fitted, gate)
-    return now
-
-
-def _confirmed(found: Checked, origins: list[Origin], noise2: float) -> Pieces | None:
-    """Test each gap again, now that the others are cut; return None if one of them is no gap."""
-    sharp, origins = True, list(origins)
-    for i, (label, begin) in enumerate(origins):
-        if not begin:
-            continue
-        settled = _settled_jump(_joined(found, i))
-        if settled is None or settled[0].recording != i - 1 or not settled[0].told:
-            return None
-        jump, found = settled
-        origins[i] = label, origins[i - 1][1] + jump.sample
-        sharp = sharp and jump.sharp
-    return (found, origins) if sharp or found.cost < AT_NOISE**2 * noise2 else None
+        (jump, last), at = settled, settled[0].recording + 1
+        origins = [*origins[:at], (origins[at - 1][0], origins[at - 1][1] + jump.sample), *origins[at:]]
+        if jump.told and last.cost < EXPLAINED * now.cost and (jump.sharp or last.cost < AT_NOISE**2 * noise2):
+            kept.append((last, origins))
+    if not kept:
+        return now
+    found, origins = kept[-1]
+    pieces = [_named(r, begin) for r, (_, begin) in zip(found.bench.recordings, origins, strict=True)]
+    gate = _gap(now, [o for o in origins if o[1]], found.cost)
+    return now.then(replace(found.bench, recordings=tuple(pieces)), found.fitted, gate)
 
 
 def _named(r: Recording, begin: int) -> Recording:
     """Name a piece by the time at which it begins."""
     return r.with_(name=f"{r.name} from {begin * r.dt:.6g} s".strip()) if begin else r
-
-
-def _joined(found: Checked, i: int) -> Checked:
-    """Put a piece back behind the one before, at the same values."""
-    bench, fitted = found.bench, found.fitted
-    one, other = bench.recordings[i - 1 : i + 1]
-    whole = one.with_(u=np.concatenate([one.u, other.u]), y=np.concatenate([one.y, other.y]))
-    before = replace(bench, recordings=(*bench.recordings[: i - 1], whole, *bench.recordings[i + 1 :]))
-    return found.then(before, _same(before, fitted, [*fitted.initial[:i], *fitted.initial[i + 1 :]]))
 
 
 def _same(bench: Workbench, fitted: Fitted, initial: list[np.ndarray]) -> Fitted:
