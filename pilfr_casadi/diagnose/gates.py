@@ -323,18 +323,15 @@ def _best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: str = "
     if best is now or best.cost > min(CURED * plain.cost, LOST):
         return now
     gate = best.gates[-1]
-    words = _slip_in_words(gate, "is" if gate.channel in (*channels, "time") else "are", more)
+    factor = 1 / gate.value if isinstance(gate.value, float) else 1.0
+    be = "is" if gate.channel in (*channels, "time") else "are"
+    what = f"{'the time' if gate.channel == 'time' else gate.channel} {be}"
+    words = {
+        "sign": f"{gate.channel} has the wrong sign{more}",
+        "exchange": f"{gate.channel.replace(', ', ' and ')} are exchanged",
+    }.get(gate.finding, f"{what} off by a factor of {factor:.4g}{more}, as from a wrong unit")
     sentence = f"In the recordings {words}: with it corrected {fall(plain.cost, best.cost)}."
     return now.then(best.bench, best.fitted, replace(gate, sentence=sentence, fault=True, left=best.cost / plain.cost))
-
-
-def _slip_in_words(gate: Gate, be: str, more: str) -> str:
-    if gate.finding == "sign":
-        return f"{gate.channel} has the wrong sign{more}"
-    if gate.finding == "exchange":
-        return f"{gate.value[0]} and {gate.value[1]} are exchanged"
-    what = "the time" if gate.finding == "time-unit" else gate.channel
-    return f"{what} {be} off by a factor of {1 / gate.value:.4g}{more}, as from a wrong unit"
 
 
 def _sizes(bench: Workbench, errors: Sequence[np.ndarray]) -> np.ndarray:

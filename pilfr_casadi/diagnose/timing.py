@@ -18,7 +18,7 @@ as well, or where no state is such an integral, nothing is said. A jump is confi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -194,53 +194,50 @@ def _promising(bench: Workbench, plain: Fitted) -> list[tuple[Step, float]]:
         channels.append(("y", tuple(range(len(outputs))), ", ".join(outputs)))
     if len(inputs) > 1:
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
+    steps = [Step(name, finding, kind, i) for kind, i, name in channels for finding in ("alignment", "clock")]
     found = list[tuple[float, Step, float]]()
     for reference in [plain] if plain.cost < ASTRAY else [plain, as_given(bench, plain)]:
         first = FirstOrder.of(bench, reference)
-        straight = _remainder(first, reference, lambda r: r, False)
-        for kind, columns, name in channels:
-            for finding, values in (("alignment", bench.dt * SHIFTS), ("clock", RATES)):
-                step = Step(name, finding, kind, columns)
-                shares = [_remainder(first, reference, step.change(v, False), kind == "u") / straight for v in values]
-                k = int(np.argmin(shares))
-                value, share = float(values[k]), shares[k]
-                if finding == "clock":  # over a whole record a small step of a rate is many samples
-                    ends = float(values[max(k - 1, 0)]), float(values[min(k + 1, len(values) - 1)])
-                    value, share = _narrowed(first, reference, step, ends, kind == "u")
-                    share /= straight
-                if share < PROMISING:
-                    found.append((share, step, value))
+        for step in steps:
+            left = _remainder(first, reference, step)
+            values = bench.dt * SHIFTS if step.finding == "alignment" else RATES
+            shares = [left(float(v)) for v in values]
+            k = int(np.argmin(shares))
+            value, share = float(values[k]), shares[k]
+            if step.finding == "clock":  # over a whole record a small step of a rate is many samples
+                value, share = _narrowed(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
+            if share < PROMISING * left(0.0):
+                found.append((share / left(0.0), step, value))
     best = dict[Step, float]()
     for _, step, value in sorted(found, key=lambda t: t[0]):
         best.setdefault(step, value)
     return list(best.items())[:3]
 
 
-def _remainder(first: FirstOrder, fitted: Fitted, change: Change, simulate: bool) -> float:
-    """Compute the mean square that parameters and initial states leave of the error on changed recordings.
+def _remainder(first: FirstOrder, fitted: Fitted, step: Step) -> Callable[[float], float]:
+    """Return the mean square that parameters and initial states leave, as a function of a shift or a clock rate."""
+    recordings = first.bench.recordings
 
-    Without `simulate` the run of the fit stands, as it does where no input is changed.
-    """
-    parts = []
-    with np.errstate(over="ignore", invalid="ignore"):  # what diverges leaves everything
-        for r, e, state in zip(first.bench.recordings, fitted.residual, fitted.initial, strict=True):
-            other = change(r)
-            y = fitted.engine.simulate(fitted.model.drive(other), fitted.vector, state)[0] if simulate else e + r.y
-            parts.append(((y - other.y) / first.bench.scale)[r.skip :].ravel())
-        value = float(np.mean(first.left(np.concatenate(parts)) ** 2))
-    return value if np.isfinite(value) else np.inf
+    def simulated(r: Recording, state: np.ndarray) -> np.ndarray:
+        return np.asarray(fitted.engine.simulate(fitted.model.drive(r), fitted.vector, state)[0])
+
+    @np.errstate(over="ignore", invalid="ignore")  # what diverges leaves everything
+    def left(value: float) -> float:
+        others = list(map(step.change(value, cut=False), recordings))
+        y = as_recorded or map(simulated, others, fitted.initial)
+        parts = [((v - other.y) / first.bench.scale)[other.skip :].ravel() for v, other in zip(y, others, strict=True)]
+        mean = float(np.mean(first.left(np.concatenate(parts)) ** 2))
+        return mean if np.isfinite(mean) else np.inf
+
+    as_recorded = [] if step.kind == "u" else list(map(simulated, recordings, fitted.initial))
+    return left
 
 
-def _narrowed(
-    first: FirstOrder, fitted: Fitted, step: Step, ends: tuple[float, float], simulate: bool
-) -> tuple[float, float]:
+def _narrowed(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
     """Find where the remainder is smallest between two values, and the remainder there."""
     from scipy.optimize import minimize_scalar
 
-    def left(value: float) -> float:
-        return _remainder(first, fitted, step.change(value, False), simulate)
-
-    found = minimize_scalar(left, bounds=ends, method="bounded", options={"maxiter": 20})
+    found = minimize_scalar(left, bounds=(low, high), method="bounded", options={"maxiter": 20})
     return float(found.x), float(found.fun)
 
 
@@ -256,7 +253,7 @@ def _settled_step(now: Checked, step: Step, at: float) -> tuple[float, Checked] 
             best = at, found
         previous = found.fitted
         first = FirstOrder.of(replace(now.bench, scale=found.bench.scale), previous)
-        moved = _narrowed(first, previous, step, (at - width, at + width), True)[0]
+        moved = _narrowed(_remainder(first, previous, step), at - width, at + width)[0]
         if abs(moved - at) < 2e-3 * width:
             break
         at = moved
@@ -290,20 +287,9 @@ class Jump:
     beside: float
     size: np.ndarray
 
-    @property
-    def distinct(self) -> bool:
-        """Tell whether it takes much away, and every rival leaves clearly more."""
-        return self.share > SHARE and 1 - self.rival > BETTER * max(1 - self.share, 0.0)
-
-    @property
-    def told(self) -> bool:
-        """Tell whether every rival also leaves far more."""
-        return self.distinct and 1 - self.rival > WORSE * max(1 - self.share, 0.0)
-
-    @property
-    def sharp(self) -> bool:
-        """Tell whether it does so at this very sample only; a drift does so around it too."""
-        return 1 - self.beside > BETTER * (1 - self.share)
+    def beats(self, other: float, times: float) -> bool:
+        """Tell whether another jump, which takes away the share `other`, leaves more than so many times as much."""
+        return 1 - other > times * max(1 - self.share, 0.0)
 
 
 def gaps(now: Checked) -> Checked:
@@ -316,11 +302,12 @@ def gaps(now: Checked) -> Checked:
     last, kept = now, list[tuple[Checked, list[Origin]]]()
     while len(origins) - len(now.bench.recordings) < MOST_GAPS and last.cost > ABOVE_NOISE**2 * noise2:
         settled = _settled_jump(last)
-        if settled is None or not settled[0].distinct:
+        if settled is None or not settled[0].beats(settled[0].rival, BETTER):
             break
         (jump, last), at = settled, settled[0].recording + 1
         origins = [*origins[:at], (origins[at - 1][0], origins[at - 1][1] + jump.sample), *origins[at:]]
-        if jump.told and last.cost < EXPLAINED * now.cost and (jump.sharp or last.cost < AT_NOISE**2 * noise2):
+        sharp = jump.beats(jump.beside, BETTER) or last.cost < AT_NOISE**2 * noise2  # a drift does so around it too
+        if sharp and jump.beats(jump.rival, WORSE) and last.cost < EXPLAINED * now.cost:
             kept.append((last, origins))
     if not kept:
         return now
