@@ -5,16 +5,15 @@ one log evidence; verdict, effects and confidence are sums over their posterior.
 about. The files by stage:
 
 - The whole: `pipeline` (the steps in their order), `arguments` (their checks), `workbench` (what all steps share).
-- Preparation: `preparation` calls the checks of recordings `recording_faults` (glitches, stale and clipped samples,
-  unsettled periods), `gates` (sign, unit, exchange, hold), `gaps`, `timing` and `offset`;
-  `step_refinement` chooses the integration steps, `floor` the noise.
+- Preparation: `preparation` calls the checks of recordings, each an edit that puts a fault right: `gates` (the edit
+  and its acceptance; sign, unit, exchange, offset), `recording_faults` (glitches, stale and clipped samples, unsettled
+  periods, tones) and `timing` (shift, clock, gap). `step_refinement` chooses the integration steps, `floor` the noise.
 - Search: `search` moves from hypothesis to hypothesis; `linearise`, `remainder`, `screen`, `pairs` and `relatives` say
   which are worth a fit, `trials` fits them.
 - Evidence: `evidence` (log evidence), `cross_validation` (held-out
   blocks), `posterior`, `verdict`.
 - Correction: `correction` chooses the simulator to hand back, with a `learned` element where names do not reach.
-- Other readings: `other_explanations` (a pinned value, an undeclared port, a machine that changed) and
-  `residual_spectrum` (steady tones, ringing modes).
+- Other readings: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
 - Before any of it: `checkup` (what the recordings can reveal), by `identifiability` (of parameters) and

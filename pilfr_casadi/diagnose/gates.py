@@ -33,11 +33,13 @@ Change = Callable[[Recording], Recording]
 # share of the mean square left at most: by a fault of a whole channel, which other physics hardly mimics; by others
 CURED, EXPLAINED = 0.12, 0.3
 ROOM = 12.0  # nats that parameters of an edit have to gain beyond their number's cost: odds of about 1e5
+CERTAIN = (2 * ROOM) ** 0.5  # the same in standard errors of one parameter
 ABOVE_NOISE, AT_NOISE = (
     2.0,
     5.0,
 )  # times the noise (rms), from which faults are looked for, and up to which none is left
 ASTRAY, LOST = 0.04, 0.25  # mean square error of a refit that may have gone astray, and that says nothing
+CLEARLY = 0.8  # share of the mean square left at most by an edit that is clearly better than another, or than none
 SAME = 1.02  # ratio of errors that say the same
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
@@ -48,12 +50,9 @@ TIME_UNITS = (1e-3, 1e3, 60.0, 1 / 60)
 FAST_TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600)  # where the simulator is too fast for the recordings' step
 NEAR = 6.0  # a factor is tried where it brings the simulated and the measured size this near
 BENT = 0.3  # share of the parameters at their bounds, beyond which a unit of time has bent the simulator
-SEVERAL = 0.8  # share of the mean square that one channel in another unit leaves, for all to be
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 
-LEAST = 0.01  # share of the mean square that an offset has to take away, to first order
 STILL = 0.1  # of the value it was found with, that an offset has to keep beside effects to be told
-CERTAIN = 3.0  # standard errors by which an offset is not zero
 
 
 @dataclass(frozen=True)
@@ -318,7 +317,7 @@ def _best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: str = "
     for found in side_by_side(tried, trials, workers):
         # for a linear simulator, a unit of all outputs is one of its input, and one of its output that of its input
         joint = found is not None and found.gates[-1].finding == "unit" and found.gates[-1].channel not in channels
-        if found is not None and found.cost < (SEVERAL if joint else 1 - 1e-6) * best.cost:
+        if found is not None and found.cost < (CLEARLY if joint else 1 - 1e-6) * best.cost:
             best = found
     if best is now or best.cost > min(CURED * plain.cost, LOST):
         return now
@@ -406,7 +405,7 @@ def offsets(now: Checked) -> Checked:
         bench, plain = now.bench, now.fitted
         share = taken_by_constants(bench, plain, ports)
         port = max(share, key=lambda name: share[name])
-        if share[port] < LEAST:
+        if gain(plain.cost, (1 - share[port]) * plain.cost, plain.residual) < ROOM:
             break
         other = replace(bench, simulator=bench.simulator.with_element(port, Offset()))
         parameter = f"{other.simulator.elements[-1].prefix}w_0"

@@ -19,7 +19,7 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import display_name
 from ..simulators import states_along
-from .gates import EXPLAINED, LOST, ROOM, SAME, Gate, fall, gain, opened_at_the_start
+from .gates import CERTAIN, EXPLAINED, LOST, ROOM, SAME, Gate, fall, gain, opened_at_the_start
 from .posterior import Posterior, posterior
 from .proof import deviations
 from .search import Search
@@ -29,7 +29,6 @@ from .workbench import THOROUGH, Fitted, Workbench
 WELL_ABOVE = 3.0  # times the noise beyond which something else is missing
 FAR = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)  # times its start that a value may be, where the refit says nothing
 LINEAR = ("linear_stiffness", "viscous_damping")
-CLEARLY = 5.0  # standard errors by which a value differs
 NAMED = 3  # values told
 
 
@@ -195,6 +194,6 @@ def _apart(whole: Fitted, fits: Sequence[Fitted], benches: Sequence[Workbench]) 
         errors = [float(np.ravel(s[name])[0]) for s in spreads]
         error = np.sqrt(np.nanmean(np.square(errors))) if np.any(np.isfinite(errors)) else np.inf
         clear = np.ptp(values) / max(error, 1e-300)
-        if clear > CLEARLY:
+        if clear > CERTAIN:
             out.append((clear, name, values))
     return [(name, values) for _, name, values in sorted(out, reverse=True)[:NAMED]]

@@ -26,7 +26,7 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
-from .gates import CURED, LOST, ROOM, Checked, FirstOrder, Gate, fall, gain, opened_at_the_start, refit
+from .gates import CURED, EXPLAINED, LOST, ROOM, Checked, FirstOrder, Gate, fall, gain, opened_at_the_start, refit
 from .linearise import linearised
 from .remainder import folds, held_out
 from .workbench import Fitted, Workbench
@@ -35,7 +35,6 @@ CUBIC = np.array([-1, 4, 0, 4, -1]) / 6  # through the neighbours at -2, -1, 1, 
 GLITCH_REACH = 12  # samples on either side that a distance is compared with
 USUAL_QUANTILE = 0.75  # of the distances nearby, that a glitch is compared with
 GLITCH_FAR, GLITCH_SIZE = 12.0, 0.1  # times that quantile, and times the output's deviation
-CLEAN_AROUND = 0.12  # of a glitch, that distances around it reach at most once it is replaced
 MOST_GLITCHES = 0.02  # of the samples that may be glitches
 
 STALE_SHARE = 0.01  # of the samples that repeat
@@ -43,19 +42,17 @@ CONTINUOUS = 0.5  # share of the samples with values of their own, above which a
 STANDING = 5  # samples that an encoder or a machine may have stood, and steps of an encoder in a sample
 BY_CHANCE = 3.0  # times as many repeats as noise makes
 
-MOST_LEFT = 0.5  # share of the mismatch that is left at most by the part of an input beyond its limit
-
 DYING_RATIO = 1.5  # times the least difference of neighbouring periods that the first one is, where it dies away
 
-FEWEST, SLOWEST = 256, 10  # samples, and periods in the record, that a tone is told from
 FAR, OVER = 50.0, 10.0  # times the lines around that a tone is; that a line of an input or a mode's is
 AROUND, OWN = 30, 3  # lines on either side that are compared with, and that belong to the tone
+FINE = 10  # lines of the spectrum up to a tone or a mode at least
 POWER = 0.05  # of the residual's power that a tone has at least, and of an input's strongest line that others have
 STEADY = 0.5  # of the amplitude by which a quarter's may differ
 LINES, ORDER, HARMONICS = 3, 7, 60  # of an input that is mixed: its lines at most, and orders of mixtures and harmonics
 
 LIGHT = 0.15  # damping ratio below which a mode rings
-FINE, AVERAGED = 10, 4  # lines of the spectrum up to a mode, and half-overlapping segments that it is averaged over
+SEGMENTS = 4  # half-overlapping, that a mode's spectrum is averaged over
 BAND = 1.2, 1.8  # times a mode's frequency, above and below, where the spectrum is compared with
 
 
@@ -115,7 +112,7 @@ def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
     whole = slice(max(k - 4, 0), min(k + 5, len(y)))
     other = np.array(y[whole])
     other[k - whole.start] -= distances(y)[k]
-    return bool(np.max(np.abs(distances(other))) < CLEAN_AROUND * d[k])
+    return bool(np.max(np.abs(distances(other))) < CURED * d[k])
 
 
 def stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
@@ -197,7 +194,7 @@ def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | N
     for found in clipped(bench.recordings, "u"):
         name = bench.simulator.inputs[found.column]
         explained = _explained(bench, without, found)
-        if 1 - explained < min(MOST_LEFT, remains):
+        if 1 - explained < min(EXPLAINED, remains):
             sentence = (
                 f"{name} is {found}, and what it may have been beyond explains {explained:.0%} of the mismatch: what "
                 "went into the machine there is not in the recording. Record it with a larger range."
@@ -287,7 +284,7 @@ def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
     found = []
     for i, name in enumerate(bench.simulator.output_names):
         pairs = zip(fitted.residual, bench.recordings, strict=True)
-        each = [tone(e[r.skip :, i], r) for e, r in pairs if len(r) - r.skip >= FEWEST]
+        each = [tone(e[r.skip :, i], r) for e, r in pairs if len(r) - r.skip >= 8 * AROUND]
         told = [t for t in each if t is not None]
         longest = max((len(r) for r in bench.recordings), default=0) * bench.dt
         if not told or len(told) < len(each) or np.ptp([f for f, _ in told]) > 2 / longest:
@@ -307,7 +304,7 @@ def tone(e: np.ndarray, r: Recording) -> tuple[float, float] | None:
     """Find frequency, Hz, and amplitude of the tone in the residual of one output; None where there is none."""
     n, e = len(e), e - np.mean(e)
     power = _power(e)
-    k = SLOWEST + int(np.argmax(power[SLOWEST:-OWN]))
+    k = FINE + int(np.argmax(power[FINE:-OWN]))
     if power[k] < FAR * _around(power, k):
         return None
     f = _refined(e, k)
@@ -382,7 +379,7 @@ def _stands_out(e: np.ndarray, f: float) -> bool:
     from scipy.signal import welch
 
     length = int(np.ceil(FINE / f))
-    if BAND[1] * f > 0.5 or 2 * len(e) // length - 1 < AVERAGED:
+    if BAND[1] * f > 0.5 or 2 * len(e) // length - 1 < SEGMENTS:
         return False
     lines, power = welch(e, nperseg=length)
     far = np.maximum(lines / f, f / np.maximum(lines, 1e-12))

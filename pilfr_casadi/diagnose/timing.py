@@ -31,6 +31,7 @@ from .gates import (
     ABOVE_NOISE,
     ASTRAY,
     AT_NOISE,
+    CLEARLY,
     EXPLAINED,
     SAME,
     Change,
@@ -50,13 +51,10 @@ SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # sampl
 RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 0.05, 28)])
 WHOLE = 0.12  # samples within which a shift counts as whole
 LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
-PROMISING = 0.7  # share of the remainder that a shift or clock rate worth a refit leaves
-NOTHING = 0.02  # share of the mean square that a late channel which is all that is wrong leaves at most
 AVERAGED = 0.5  # of a channel's noise, which reading it between its samples takes away at most
 
 MOST_GAPS = 3
-SHARE = 0.2  # of the mean square that a jump takes away at least
-WORSE, BETTER = 2.0, 1.1  # times what a jump leaves that a rival leaves at least, and that a jump beside it does
+WORSE = 2.0  # times what a jump leaves that a shock or a step leaves at least
 SHORTEST = 40  # samples of a piece
 BESIDE = 5  # samples around a jump at which rivals are tried, and where a drift would do as well
 BETWEEN = (-0.5, 0.0, 0.5)  # samples, by which a shock may come later
@@ -151,7 +149,7 @@ def timing(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
         return now.then(bench, back)
     value = at if step.kind == "y" else -at
     late = step.finding == "clock" or value > 0
-    if (late or not early) and left > max(NOTHING * plain.cost, AT_NOISE**2 * noise2):
+    if (late or not early) and left > AT_NOISE**2 * noise2:
         return now  # what comes late or runs slow, next to something else that is wrong, may be physics
     samples = value / bench.dt
     if step.finding == "alignment" and samples > -WHOLE and not (in_steps(value, bench.dt, part) and samples > LONG):
@@ -206,7 +204,7 @@ def _promising(bench: Workbench, plain: Fitted) -> list[tuple[Step, float]]:
             value, share = float(values[k]), shares[k]
             if step.finding == "clock":  # over a whole record a small step of a rate is many samples
                 value, share = _narrowed(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
-            if share < PROMISING * left(0.0):
+            if share < CLEARLY * left(0.0):
                 found.append((share / left(0.0), step, value))
     best = dict[Step, float]()
     for _, step, value in sorted(found, key=lambda t: t[0]):
@@ -302,11 +300,13 @@ def gaps(now: Checked) -> Checked:
     last, kept = now, list[tuple[Checked, list[Origin]]]()
     while len(origins) - len(now.bench.recordings) < MOST_GAPS and last.cost > ABOVE_NOISE**2 * noise2:
         settled = _settled_jump(last)
-        if settled is None or not settled[0].beats(settled[0].rival, BETTER):
+        if settled is None or not settled[0].beats(settled[0].rival, SAME**2):
             break
         (jump, last), at = settled, settled[0].recording + 1
         origins = [*origins[:at], (origins[at - 1][0], origins[at - 1][1] + jump.sample), *origins[at:]]
-        sharp = jump.beats(jump.beside, BETTER) or last.cost < AT_NOISE**2 * noise2  # a drift does so around it too
+        sharp = (
+            jump.beats(jump.beside, 1 / CLEARLY) or last.cost < AT_NOISE**2 * noise2
+        )  # a drift does so around it too
         if sharp and jump.beats(jump.rival, WORSE) and last.cost < EXPLAINED * now.cost:
             kept.append((last, origins))
     if not kept:
@@ -333,7 +333,7 @@ def _settled_jump(now: Checked) -> tuple[Jump, Checked] | None:
     best: tuple[Jump, Checked] | None = None
     for _ in range(TURNS):
         jump = find_jump(bench, along)
-        if jump is None or jump.share < SHARE:
+        if jump is None or jump.share < 1 - CLEARLY:
             break
         i, r = jump.recording, bench.recordings[jump.recording]
         if best is not None and (i, jump.sample) == (best[0].recording, best[0].sample):
