@@ -32,22 +32,18 @@ Change = Callable[[Recording], Recording]
 
 # share of the mean square left at most: by a fault of a whole channel, which other physics hardly mimics; by others
 CURED, EXPLAINED = 0.12, 0.3
+CLEARLY = 0.8  # the same by an edit that is clearly better than another, or than none
+ABOVE_NOISE, AT_NOISE = 2.0, 5.0  # times the noise (rms) from which faults are looked for, up to which none is left
+ASTRAY, LOST = 0.04, 0.25  # mean square error of a refit that may have gone astray, and that says nothing
+SAME = 1.02  # ratio of errors that say the same
 ROOM = 12.0  # nats that parameters of an edit have to gain beyond their number's cost: odds of about 1e5
 CERTAIN = (2 * ROOM) ** 0.5  # the same in standard errors of one parameter
-ABOVE_NOISE, AT_NOISE = (
-    2.0,
-    5.0,
-)  # times the noise (rms), from which faults are looked for, and up to which none is left
-ASTRAY, LOST = 0.04, 0.25  # mean square error of a refit that may have gone astray, and that says nothing
-CLEARLY = 0.8  # share of the mean square left at most by an edit that is clearly better than another, or than none
-SAME = 1.02  # ratio of errors that say the same
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
 FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))
 FAHRENHEIT = (1.8, 1 / 1.8)  # its zero is another one: it comes with an offset
-TIME_UNITS = (1e-3, 1e3, 60.0, 1 / 60)
-FAST_TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600)  # where the simulator is too fast for the recordings' step
+TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600, 60.0, 1e3)
 NEAR = 6.0  # a factor is tried where it brings the simulated and the measured size this near
 BENT = 0.3  # share of the parameters at their bounds, beyond which a unit of time has bent the simulator
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
@@ -246,7 +242,7 @@ def opened(simulator: Any, recordings: Sequence[Recording], hold: str, engine: s
     try:
         return Workbench.of(simulator, recordings, hold, engine), []
     except InputError as error:
-        for factor in FAST_TIME_UNITS:
+        for factor in TIME_UNITS:
             try:
                 bench = Workbench.of(simulator, [slower_by(factor)(r) for r in recordings], hold, engine)
             except InputError:

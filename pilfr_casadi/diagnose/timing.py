@@ -304,9 +304,8 @@ def gaps(now: Checked) -> Checked:
             break
         (jump, last), at = settled, settled[0].recording + 1
         origins = [*origins[:at], (origins[at - 1][0], origins[at - 1][1] + jump.sample), *origins[at:]]
-        sharp = (
-            jump.beats(jump.beside, 1 / CLEARLY) or last.cost < AT_NOISE**2 * noise2
-        )  # a drift does so around it too
+        # a drift is followed by jumps around it as well
+        sharp = jump.beats(jump.beside, 1 / CLEARLY) or last.cost < AT_NOISE**2 * noise2
         if sharp and jump.beats(jump.rival, WORSE) and last.cost < EXPLAINED * now.cost:
             kept.append((last, origins))
     if not kept:
