@@ -23,6 +23,7 @@ from ..data import Recording
 from ..engine import make_engine
 from ..laws import Law
 from ..optimise import GaussNewton
+from ..simulators import Simulator
 from .floor import Floor, effective_size, measured_floor, white_part
 from .linearise import Probe, Run, linearised
 from .remainder import followed, lengths, moved
@@ -207,25 +208,20 @@ def changed(bench: Workbench, change: Change) -> Workbench:
 
 def refit(
     bench: Workbench,
-    previous: Fitted | None = None,
+    starts: Sequence[Mapping[str, Any]] = ({},),
+    simulator: Simulator | None = None,
+    *,
+    states: Sequence[np.ndarray] = (),
     solver: GaussNewton = QUICK,
-    within: float = np.inf,
-    same: Fitted | None = None,
+    like: Fitted | None = None,
 ) -> Fitted | None:
-    """Fit the simulator from the user's values and from a previous fit; `same` lends its compiled model.
-
-    Returns None where it diverges, or does not come within the mean square error `within`.
-    """
-    starts: list[dict[str, Any]] = [{}]
-    if previous is not None:
-        starts.append(previous.values)
+    """Fit a simulator, by default the bench's; None where it diverges. `like` lends its compiled model."""
+    model, engine = (like.model, like.engine) if like else (None, None)
+    simulator = simulator or bench.simulator
     try:
-        model, engine = (same.model, same.engine) if same else (None, None)
-        states = () if previous is None else previous.begin
-        found = bench.fit(bench.simulator, starts, states=states, solver=solver, model=model, engine=engine)
+        return bench.fit(simulator, starts, states=states, solver=solver, model=model, engine=engine)
     except InputError:
         return None
-    return found if found.cost < within else None
 
 
 # sign, unit, exchange, unit of time
@@ -247,8 +243,8 @@ def opened(simulator: Any, recordings: Sequence[Recording], hold: str, engine: s
                 bench = Workbench.of(simulator, [slower_by(factor)(r) for r in recordings], hold, engine)
             except InputError:
                 continue
-            found = refit(bench, within=LOST)
-            if found is not None:
+            found = refit(bench)
+            if found is not None and found.cost < LOST:
                 words = (
                     f"The time of the recordings is off by a factor of {1 / factor:.4g}, as from a wrong unit: as "
                     f"given, the simulator cannot follow at all; corrected, its error is {found.cost**0.5:.3g} of the "
@@ -297,14 +293,16 @@ def _best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: str = "
     def tried(gate: Gate) -> Checked | None:
         assert gate.change is not None
         other: Workbench = changed(bench, gate.change)
-        same: Fitted | None = plain
+        like: Fitted | None = plain
         if gate.finding == "time-unit":
             try:
-                other, same = Workbench.of(bench.simulator, other.recordings, bench.hold, bench.engine), None
+                other, like = Workbench.of(bench.simulator, other.recordings, bench.hold, bench.engine), None
             except InputError:
                 return None
-        glanced = refit(other, solver=GLANCE, within=plain.cost, same=same)
-        found = None if glanced is None else refit(other, glanced, same=glanced)
+        glanced = refit(other, solver=GLANCE, like=like)
+        if glanced is None or not glanced.cost < plain.cost:
+            return None
+        found = refit(other, [{}, glanced.values], states=glanced.begin, like=glanced)
         if found is None or (gate.finding == "time-unit" and found.at_bounds > BENT):
             return None
         return now.then(other, found, gate)
@@ -376,9 +374,8 @@ def another_zero(now: Checked, slipped: Checked, workers: int) -> Checked:
     bench = now.bench
     for name in bench.simulator.output_names if slipped.cost > ASTRAY else ():
         placed = replace(bench, simulator=bench.simulator.with_element(f"sensor:{name}", Offset()))
-        try:
-            level = placed.fit(placed.simulator, [{}, now.fitted.values], states=now.fitted.begin)
-        except InputError:
+        level = refit(placed, [{}, now.fitted.values], states=now.fitted.begin)
+        if level is None:
             continue
         found = slips(Checked(placed, level, now.gates), workers, name)
         if len(found.gates) > len(now.gates) and found.cost < CURED * slipped.cost:
@@ -409,11 +406,8 @@ def offsets(now: Checked) -> Checked:
         for e in laws:
             placed = placed.with_element(e.port, e.law)
         placed = placed.with_parameters({**placed.parameters, **plain.simulator.parameters})  # as they are bounded now
-        try:
-            found = other.fit(placed, [plain.values], states=plain.initial, solver=THOROUGH)
-        except InputError:
-            break
-        if gain(plain.cost, found.cost, found.residual) < ROOM:
+        found = refit(other, [plain.values], placed, states=plain.initial, solver=THOROUGH)
+        if found is None or gain(plain.cost, found.cost, found.residual) < ROOM:
             break
         value = float(found.values[parameter])
         sentence = f"{_constant(port, value)}; with it as a parameter {fall(plain.cost, found.cost)}."
@@ -463,11 +457,8 @@ def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
         held = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
         simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: held})
         start = {k: v for k, v in fitted.values.items() if k != name}
-        try:
-            found = bench.fit(simulator, [start], states=fitted.initial, solver=THOROUGH)
-        except InputError:
-            continue
-        if gain(found.cost, fitted.cost, fitted.residual) <= ROOM:
+        found = refit(bench, [start], simulator, states=fitted.initial, solver=THOROUGH)
+        if found is not None and gain(found.cost, fitted.cost, fitted.residual) <= ROOM:
             fitted = found
     return fitted
 

@@ -19,7 +19,7 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import display_name
 from ..simulators import states_along
-from .gates import CERTAIN, EXPLAINED, LOST, ROOM, SAME, Gate, fall, gain, opened_at_the_start
+from .gates import CERTAIN, EXPLAINED, LOST, ROOM, SAME, Gate, fall, gain, opened_at_the_start, refit
 from .posterior import Posterior, posterior
 from .proof import deviations
 from .search import Search
@@ -64,15 +64,14 @@ def held_value(search: Search, answer: Posterior) -> Held | None:
         far = () if linear else FAR
         starts = [without.values, *({**without.values, name: p.value * by} for by in far)]
         try:
-            found = bench.fit(simulator, starts, states=without.initial, solver=THOROUGH)
-        except InputError:
-            continue
+            found = refit(bench, starts, simulator, states=without.initial, solver=THOROUGH)
         except KeyboardInterrupt:
-            search.interrupted = True
+            found, search.interrupted = None, True
+        search.interrupted = search.interrupted or bool(bench.struck)
+        if search.interrupted:
             return None
-        if bench.struck:
-            search.interrupted = True
-            return None
+        if found is None:
+            continue
         (low, high), value = p.bounds, float(found.values[name])
         beyond = bool(np.all(p.fixed)) or not np.all((low <= value) & (value <= high))
         if beyond and (best is None or found.cost < best[1].cost):
@@ -157,9 +156,8 @@ def _told(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
     fits, benches = list[Fitted](), list[Workbench]()
     for _, recordings, states in groups:
         part = bench.on(recordings)
-        try:
-            fitted = part.fit(whole.simulator, [whole.values], states=states, model=whole.model, engine=whole.engine)
-        except InputError:
+        fitted = refit(part, [whole.values], whole.simulator, states=states, like=whole)
+        if fitted is None:
             return None
         fits.append(fitted)
         benches.append(part)

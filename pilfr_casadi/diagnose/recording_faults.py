@@ -177,8 +177,8 @@ def unclip(now: Checked) -> Checked:
         prefix = placed.elements[-1].prefix
         held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
         other = replace(bench, simulator=placed.with_parameters(held))
-        after = refit(other, plain, within=LOST)
-        if after is None or gain(plain.cost, after.cost, after.residual, 0) < ROOM:
+        after = refit(other, [{}, plain.values], states=plain.begin)
+        if after is None or after.cost > LOST or gain(plain.cost, after.cost, after.residual, 0) < ROOM:
             continue
         sentence = f"{name} is {found}; with the simulator's output clipped alike {fall(plain.cost, after.cost)}."
         gate = Gate(name, "clipping", found.limits, sentence, fault=True, left=after.cost / plain.cost)

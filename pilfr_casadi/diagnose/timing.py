@@ -20,11 +20,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from .._base import InputError
 from ..data import Recording
 from ..simulators import states_along
 from .gates import (
@@ -78,7 +76,7 @@ class Step:
     def at(self, now: Checked, value: float, previous: Fitted) -> Checked | None:
         """Refit to the channels read at another time."""
         bench = changed(now.bench, self.change(value))
-        found = refit(bench, previous)
+        found = refit(bench, [{}, previous.values], states=previous.begin)
         return None if found is None else now.then(bench, found)
 
 
@@ -144,7 +142,7 @@ def timing(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
     if best is None or best[0] > EXPLAINED * plain.cost:
         return now
     left, step, at, found = best
-    back = refit(bench, found.fitted)
+    back = refit(bench, [{}, found.fitted.values], states=found.fitted.begin)
     if back is not None and left > EXPLAINED * back.cost:  # it only led the refit out of a local minimum
         return now.then(bench, back)
     value = at if step.kind == "y" else -at
@@ -340,11 +338,8 @@ def _settled_jump(now: Checked) -> tuple[Jump, Checked] | None:
         pieces = r.slice(0, jump.sample), r.slice(jump.sample).with_(initial="estimate", period=None)
         other = replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
         states = [*along.begin[: i + 1], _begin(along, r, jump), *along.begin[i + 1 :]]
-        starts: list[dict[str, Any]] = [along.values, {}]
-        model, engine = now.fitted.model, now.fitted.engine
-        try:
-            found = other.fit(other.simulator, starts, states=states, solver=THOROUGH, model=model, engine=engine)
-        except InputError:
+        found = refit(other, [along.values, {}], states=states, solver=THOROUGH, like=now.fitted)
+        if found is None:
             break
         best = jump, now.then(other, found)
         along = _same(bench, found, [*found.initial[: i + 1], *found.initial[i + 2 :]])
