@@ -386,13 +386,12 @@ def another_zero(now: Checked, slipped: Checked, workers: int) -> Checked:
 def offsets(now: Checked) -> Checked:
     """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
 
-    Laws that were fitted beside the simulator stay where they are. Offsets are a fault where they were the mismatch.
+    They are a fault where they were the mismatch.
     """
     begin = now
-    laws = now.fitted.simulator.elements[len(now.bench.simulator.elements) :]
     ports = [f"actuator:{n}" for n in now.bench.simulator.inputs]
     ports += [f"sensor:{n}" for n in now.bench.simulator.output_names]
-    taken = {e.port for e in now.fitted.simulator.elements}
+    taken = {e.port for e in now.bench.simulator.elements}
     ports = [port for port in ports if port not in taken]
     while ports:
         bench, plain = now.bench, now.fitted
@@ -402,18 +401,14 @@ def offsets(now: Checked) -> Checked:
             break
         other = replace(bench, simulator=bench.simulator.with_element(port, Offset()))
         parameter = f"{other.simulator.elements[-1].prefix}w_0"
-        placed = other.simulator
-        for e in laws:
-            placed = placed.with_element(e.port, e.law)
-        placed = placed.with_parameters({**placed.parameters, **plain.simulator.parameters})  # as they are bounded now
-        found = refit(other, [plain.values], placed, states=plain.initial, solver=THOROUGH)
+        found = refit(other, [plain.values], states=plain.initial, solver=THOROUGH)
         if found is None or gain(plain.cost, found.cost, found.residual) < ROOM:
             break
         value = float(found.values[parameter])
         sentence = f"{_constant(port, value)}; with it as a parameter {fall(plain.cost, found.cost)}."
         now = now.then(other, found, Gate(port.split(":", 1)[1], "offset", value, sentence, parameter=parameter))
         ports.remove(port)
-    fault = now.cost < CURED * begin.cost and not laws
+    fault = now.cost < CURED * begin.cost
     told = (replace(g, fault=fault) for g in now.gates[len(begin.gates) :])
     return begin.then(now.bench, now.fitted, *told)
 
