@@ -167,7 +167,7 @@ class FirstOrder:
 # edits of recordings
 
 
-def scaled(kind: str, index: int | list[int], factor: float) -> Change:
+def scale_channels(kind: str, index: int | list[int], factor: float) -> Change:
     """Multiply one channel, or several."""
 
     def change(r: Recording) -> Recording:
@@ -178,7 +178,7 @@ def scaled(kind: str, index: int | list[int], factor: float) -> Change:
     return change
 
 
-def exchanged(kind: str, one: int, other: int) -> Change:
+def exchange_channels(kind: str, one: int, other: int) -> Change:
     """Exchange two channels."""
 
     def change(r: Recording) -> Recording:
@@ -189,17 +189,17 @@ def exchanged(kind: str, one: int, other: int) -> Change:
     return change
 
 
-def slower_by(factor: float) -> Change:
+def scale_time(factor: float) -> Change:
     """Multiply the time."""
     return lambda r: r.with_(dt=r.dt * factor)
 
 
-def opened_at_the_start(r: Recording) -> Recording:
+def open_start(r: Recording) -> Recording:
     """Leave the initial state of a periodic recording that is not on its steady cycle to be estimated."""
     return r.with_(initial="estimate", period=None) if r.begins == "periodic" else r
 
 
-def changed(bench: Workbench, change: Change) -> Workbench:
+def change_recordings(bench: Workbench, change: Change) -> Workbench:
     """Return the bench with changed recordings, errors in units of their own deviation."""
     recordings = tuple(change(r) for r in bench.recordings)
     scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
@@ -227,7 +227,7 @@ def refit(
 # sign, unit, exchange, unit of time
 
 
-def opened(simulator: Any, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:
+def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:
     """Make the bench; if the simulator is too fast for the recordings' step, with the time in another unit.
 
     Raises
@@ -240,7 +240,7 @@ def opened(simulator: Any, recordings: Sequence[Recording], hold: str, engine: s
     except InputError as error:
         for factor in TIME_UNITS:
             try:
-                bench = Workbench.of(simulator, [slower_by(factor)(r) for r in recordings], hold, engine)
+                bench = Workbench.of(simulator, [scale_time(factor)(r) for r in recordings], hold, engine)
             except InputError:
                 continue
             found = refit(bench)
@@ -250,11 +250,11 @@ def opened(simulator: Any, recordings: Sequence[Recording], hold: str, engine: s
                     f"given, the simulator cannot follow at all; corrected, its error is {found.cost**0.5:.3g} of the "
                     "outputs' deviation."
                 )
-                return bench, [Gate("time", "time-unit", factor, words, fault=True, change=slower_by(factor))]
+                return bench, [Gate("time", "time-unit", factor, words, fault=True, change=scale_time(factor))]
         raise error
 
 
-def slips(now: Checked, workers: int, beside: str = "") -> Checked:
+def find_slips(now: Checked, workers: int, beside: str = "") -> Checked:
     """Try sign and unit of each channel, of all outputs and of the time, and exchanged channels, `workers` at a time.
 
     With `beside`, only slips of that channel are tried, beside the offset that it has already.
@@ -267,32 +267,32 @@ def slips(now: Checked, workers: int, beside: str = "") -> Checked:
     trials = list[Gate]()
     for kind, names in (("y", outputs), ("u", inputs)):
         for i, name in enumerate(names):
-            trials.append(Gate(name, "sign", -1.0, change=scaled(kind, i, -1.0)))
+            trials.append(Gate(name, "sign", -1.0, change=scale_channels(kind, i, -1.0)))
             for f in (*FACTORS, *FAHRENHEIT) if beside else FACTORS:
                 if near(f * sizes[i]) if kind == "y" else any(near(v / f) for v in sizes):
-                    trials.append(Gate(name, "unit", f, change=scaled(kind, i, f)))
+                    trials.append(Gate(name, "unit", f, change=scale_channels(kind, i, f)))
     if beside:
-        return _best_slip(now, [g for g in trials if g.channel == beside], workers, " and an offset")
+        return _take_best_slip(now, [g for g in trials if g.channel == beside], workers, " and an offset")
     for f in FACTORS if len(outputs) > 1 else ():
         if all(near(f * size) for size in sizes):
-            trials.append(Gate(", ".join(outputs), "unit", f, change=scaled("y", list(range(len(outputs))), f)))
+            trials.append(Gate(", ".join(outputs), "unit", f, change=scale_channels("y", list(range(len(outputs))), f)))
     for kind, names in (("y", outputs), ("u", inputs)) if plain.cost > ASTRAY else ():
         for i, j in combinations(range(len(names)), 2):
             both = [names[i], names[j]]
-            trials.append(Gate(", ".join(both), "exchange", both, change=exchanged(kind, i, j)))
+            trials.append(Gate(", ".join(both), "exchange", both, change=exchange_channels(kind, i, j)))
     for f in TIME_UNITS if plain.cost > ASTRAY else ():
-        trials.append(Gate("time", "time-unit", f, change=slower_by(f)))
-    return _best_slip(now, trials, workers)
+        trials.append(Gate("time", "time-unit", f, change=scale_time(f)))
+    return _take_best_slip(now, trials, workers)
 
 
-def _best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: str = "") -> Checked:
+def _take_best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: str = "") -> Checked:
     """Take the trial after which the simulator follows best, if that is far better than without."""
     bench, plain = now.bench, now.fitted
     channels = (*bench.simulator.inputs, *bench.simulator.output_names)
 
     def tried(gate: Gate) -> Checked | None:
         assert gate.change is not None
-        other: Workbench = changed(bench, gate.change)
+        other: Workbench = change_recordings(bench, gate.change)
         like: Fitted | None = plain
         if gate.finding == "time-unit":
             try:
@@ -366,7 +366,7 @@ class Offset(Law):
         return p.w_0
 
 
-def another_zero(now: Checked, slipped: Checked, workers: int) -> Checked:
+def find_slip_beside_offset(now: Checked, slipped: Checked, workers: int) -> Checked:
     """Return what slips put right, or where far better, the slip of an output whose zero is another one as well.
 
     The offset is told, and kept, by `offsets`.
@@ -377,13 +377,13 @@ def another_zero(now: Checked, slipped: Checked, workers: int) -> Checked:
         level = refit(placed, [{}, now.fitted.values], states=now.fitted.begin)
         if level is None:
             continue
-        found = slips(Checked(placed, level, now.gates), workers, name)
+        found = find_slips(Checked(placed, level, now.gates), workers, name)
         if len(found.gates) > len(now.gates) and found.cost < CURED * slipped.cost:
             slipped = replace(found, bench=replace(found.bench, simulator=bench.simulator))
     return slipped
 
 
-def offsets(now: Checked) -> Checked:
+def find_offsets(now: Checked) -> Checked:
     """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
 
     They are a fault where they were the mismatch.
@@ -395,7 +395,7 @@ def offsets(now: Checked) -> Checked:
     ports = [port for port in ports if port not in taken]
     while ports:
         bench, plain = now.bench, now.fitted
-        share = taken_by_constants(bench, plain, ports)
+        share = share_of_constants(bench, plain, ports)
         port = max(share, key=lambda name: share[name])
         if gain(plain.cost, (1 - share[port]) * plain.cost, plain.residual) < ROOM:
             break
@@ -413,7 +413,7 @@ def offsets(now: Checked) -> Checked:
     return begin.then(now.bench, now.fitted, *told)
 
 
-def taken_by_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
+def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
     """Compute the share of the mean square that a constant at each port takes away, to first order."""
     first = FirstOrder.of(bench, fitted)
     columns = first.response(ports, [np.ones((len(r), 1)) for r in bench.recordings])

@@ -19,7 +19,7 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import display_name
 from ..simulators import states_along
-from .gates import CERTAIN, EXPLAINED, LOST, ROOM, SAME, Gate, fall, gain, opened_at_the_start, refit
+from .gates import CERTAIN, EXPLAINED, LOST, ROOM, SAME, Gate, fall, gain, open_start, refit
 from .posterior import Posterior, posterior
 from .proof import deviations
 from .search import Search
@@ -128,7 +128,7 @@ def varying(search: Search) -> tuple[Gate, ...]:
         return ()
     try:
         for groups, where in ((_each(bench, whole), "the recordings"), (_halves(bench, whole), "the halves")):
-            found = _told(search, groups, where) if len(groups) > 1 else None
+            found = _compare_groups(search, groups, where) if len(groups) > 1 else None
             if found is not None:
                 return (found,)
     except KeyboardInterrupt:
@@ -145,13 +145,13 @@ def _halves(bench: Workbench, whole: Fitted) -> list[Group]:
     first, second, middle = list[Recording](), list[Recording](), list[np.ndarray]()
     for r, x in zip(bench.recordings, whole.initial, strict=True):
         cut = (r.skip + len(r)) // 2
-        first.append(opened_at_the_start(r.slice(0, cut)))
-        second.append(opened_at_the_start(r.slice(cut)))
+        first.append(open_start(r.slice(0, cut)))
+        second.append(open_start(r.slice(cut)))
         middle.append(states_along(whole.model, whole.model.drive(r), whole.vector, x)[cut * whole.model.substeps])
     return [("first", first, whole.initial), ("second", second, middle)]
 
 
-def _told(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
+def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
     bench, whole = search.bench, search.root.fitted
     fits, benches = list[Fitted](), list[Workbench]()
     for _, recordings, states in groups:
@@ -168,7 +168,7 @@ def _told(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
     residual = [e for f in fits for e in f.residual]
     if cost > EXPLAINED * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < ROOM:
         return None
-    values = _apart(whole, fits, benches)
+    values = _clearest_differences(whole, fits, benches)
     if not values:
         return None
     listed = "; ".join(f"{name}: {' / '.join(f'{v:.4g}' for v in found)}" for name, found in values)
@@ -181,7 +181,9 @@ def _told(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
     return Gate(", ".join(name for name, _ in values), "varying", [v for _, v in values], sentence, corrected=False)
 
 
-def _apart(whole: Fitted, fits: Sequence[Fitted], benches: Sequence[Workbench]) -> list[tuple[str, list[float]]]:
+def _clearest_differences(
+    whole: Fitted, fits: Sequence[Fitted], benches: Sequence[Workbench]
+) -> list[tuple[str, list[float]]]:
     """List the parameters whose values differ most clearly, the clearest first."""
     spreads = [deviations(part, f) for part, f in zip(benches, fits, strict=True)]
     out = list[tuple[float, str, list[float]]]()

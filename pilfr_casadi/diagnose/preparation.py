@@ -12,12 +12,24 @@ from .._base import InputError, Stages
 from ..data import Recording
 from ..simulators import Simulator
 from .floor import Floor, white_part
-from .gates import ASTRAY, AT_NOISE, CURED, SAME, Checked, Gate, another_zero, offsets, opened, refit, slips
+from .gates import (
+    ASTRAY,
+    AT_NOISE,
+    CURED,
+    SAME,
+    Checked,
+    Gate,
+    find_offsets,
+    find_slip_beside_offset,
+    find_slips,
+    open_bench,
+    refit,
+)
 from .linearise import along, linearised, observer_gain
 from .proof import errors_of
-from .recording_faults import stale_samples, unclip, without_glitches, without_transients
+from .recording_faults import find_stale_samples, open_unsettled, remove_glitches, unclip
 from .step_refinement import on_steps_as_fine
-from .timing import AVERAGED, as_given, gaps, in_steps, timing
+from .timing import AVERAGED, find_gaps, find_time_shift, in_steps, run_as_given
 from .workbench import THOROUGH, Fitted, Workbench
 
 SMALL = 4e-4  # mean square error up to which signs and units are not looked at
@@ -62,11 +74,11 @@ def prepare(
     """
     say = say or Stages(lambda *_: None)
     say(CHECKS, 0, CHECKED)
-    recordings, spikes = without_glitches(recordings)
-    recordings, transients = without_transients(recordings)
+    recordings, spikes = remove_glitches(recordings)
+    recordings, transients = open_unsettled(recordings)
     said = said_hold(simulator, recordings, hold)
-    bench, times = opened(simulator, recordings, said or "zero", engine)
-    gates = (*spikes, *transients, *stale_samples(recordings), *times)
+    bench, times = open_bench(simulator, recordings, said or "zero", engine)
+    gates = (*spikes, *transients, *find_stale_samples(recordings), *times)
     held: Sequence[Gate] = ()
     if not said:
         bench, held = _better_held(bench)
@@ -106,9 +118,9 @@ class _Checks:
                 starts = [found.fitted.values, {}, *self.starts]
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found
-        now = gaps(unclip(self._report(3, now)))
+        now = find_gaps(unclip(self._report(3, now)))
         now = now.then(*on_steps_as_fine(now.bench, self._report(4, now).fitted))
-        return offsets(self._report(5, timing(now, part, self.early)))
+        return find_offsets(self._report(5, find_time_shift(now, part, self.early)))
 
     def _report(self, done: int, now: Checked) -> Checked:
         self.say(CHECKS, done, CHECKED, now.cost**0.5)
@@ -116,10 +128,10 @@ class _Checks:
 
     def _slips(self, now: Checked, part: float) -> Checked:
         """Find signs, units and exchanged channels; or a shift, since late by half a swing looks like a sign."""
-        found = another_zero(now, slips(now, self.workers), self.workers)
+        found = find_slip_beside_offset(now, find_slips(now, self.workers), self.workers)
         if len(found.gates) == len(now.gates) or found.cost <= ASTRAY:
             return found
-        late = timing(now, part, self.early)
+        late = find_time_shift(now, part, self.early)
         return late if late.cost < CURED * found.cost else found
 
 
@@ -158,7 +170,7 @@ def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitt
     plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
     if plain.cost < ASTRAY:
         return plain
-    probe, runs = linearised(bench, as_given(bench, plain))
+    probe, runs = linearised(bench, run_as_given(bench, plain))
     gain = observer_gain(probe, runs, white_part(plain.residual))
     if not gain.any():
         return plain

@@ -26,7 +26,7 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
-from .gates import CURED, EXPLAINED, LOST, ROOM, Checked, FirstOrder, Gate, fall, gain, opened_at_the_start, refit
+from .gates import CURED, EXPLAINED, LOST, ROOM, Checked, FirstOrder, Gate, fall, gain, open_start, refit
 from .linearise import linearised
 from .remainder import folds, held_out
 from .workbench import Fitted, Workbench
@@ -56,11 +56,11 @@ SEGMENTS = 4  # half-overlapping, that a mode's spectrum is averaged over
 BAND = 1.2, 1.8  # times a mode's frequency, above and below, where the spectrum is compared with
 
 
-def without_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
+def remove_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
     """Replace glitches by what lies between their neighbours; return the recordings and the findings."""
     gates = list[Gate]()
     for i, name in enumerate(recordings[0].outputs):
-        places, clean = zip(*(glitches(r.y[:, i]) for r in recordings), strict=True)
+        places, clean = zip(*(find_glitches(r.y[:, i]) for r in recordings), strict=True)
         count = sum(map(len, places))
         if not count:
             continue
@@ -72,16 +72,16 @@ def without_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, 
             f"Single samples of {name} are far off their neighbours, as from glitches: {count}, the first at "
             f"t = {first:.6g} s. What lies between their neighbours is taken instead."
         )
-        gates.append(Gate(name, "glitch", count, sentence, fault=after < CURED * before, change=mended))
-    return (tuple(map(mended, recordings)) if gates else tuple(recordings)), gates
+        gates.append(Gate(name, "glitch", count, sentence, fault=after < CURED * before, change=mend))
+    return (tuple(map(mend, recordings)) if gates else tuple(recordings)), gates
 
 
-def mended(r: Recording) -> Recording:
+def mend(r: Recording) -> Recording:
     """Replace each glitch of a recording's outputs by the cubic through its neighbours."""
-    return r.with_(y=np.column_stack([glitches(column)[1] for column in r.y.T]))
+    return r.with_(y=np.column_stack([find_glitches(column)[1] for column in r.y.T]))
 
 
-def glitches(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_glitches(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find single samples far off their neighbours, shape (k,); return them and the output without them."""
     clean, found, deviation = np.array(y), np.zeros(0, dtype=int), float(np.std(y))
     while len(y) > 4 * GLITCH_REACH and len(found) < MOST_GLITCHES * len(y):
@@ -115,14 +115,14 @@ def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
     return bool(np.max(np.abs(distances(other))) < CURED * d[k])
 
 
-def stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
+def find_stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
     """Note each output that repeats samples."""
     found = []
     for i, name in enumerate(recordings[0].outputs):
         values = np.concatenate([r.y[r.skip :, i] for r in recordings])
         levels = np.unique(values)
         step = np.min(np.diff(levels), initial=np.inf)
-        repeated = float(np.mean(np.concatenate([_repeated(r.y[r.skip :, i], step) for r in recordings])))
+        repeated = float(np.mean(np.concatenate([_find_repeats(r.y[r.skip :, i], step) for r in recordings])))
         changes = np.concatenate([np.diff(r.y[r.skip :, i]) for r in recordings])
         up = float(np.mean(np.abs(changes - step) < 0.5 * step))
         if repeated > max(STALE_SHARE, BY_CHANCE * up) and len(levels) > CONTINUOUS * len(values):
@@ -134,15 +134,15 @@ def stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
     return found
 
 
-def stretches(mask: np.ndarray) -> np.ndarray:
+def find_stretches(mask: np.ndarray) -> np.ndarray:
     """Find begin and end of each stretch of a mask (M,) that is true, shape (n, 2)."""
     return np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]]))).reshape(-1, 2)
 
 
-def _repeated(y: np.ndarray, step: float) -> np.ndarray:
+def _find_repeats(y: np.ndarray, step: float) -> np.ndarray:
     """Tell which samples repeat the one before, away from the limits, in short runs that a jump follows."""
     same = np.append(False, y[1:] == y[:-1]) & (y > np.min(y)) & (y < np.max(y))
-    for begin, end in stretches(same):
+    for begin, end in find_stretches(same):
         if end - begin > STANDING or abs(y[min(end, len(y) - 1)] - y[begin]) < STANDING * step:
             same[begin:end] = False
     return same
@@ -169,7 +169,7 @@ class Clipping:
 
 def unclip(now: Checked) -> Checked:
     """Clip the simulator's outputs where the recorder clipped the machine's; the rest of these outputs still counts."""
-    for found in clipped(now.bench.recordings, "y"):
+    for found in find_clipping(now.bench.recordings, "y"):
         bench, plain = now.bench, now.fitted
         name = bench.simulator.output_names[found.column]
         law = AsymmetricSaturation().at({"low": max(found.low, -1e300), "high": min(found.high, 1e300)})
@@ -191,9 +191,9 @@ def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | N
 
     The input to the machine there is not in the recording; what goes on as smoothly stands for it (`_beyond_limit`).
     """
-    for found in clipped(bench.recordings, "u"):
+    for found in find_clipping(bench.recordings, "u"):
         name = bench.simulator.inputs[found.column]
-        explained = _explained(bench, without, found)
+        explained = _explained_beyond(bench, without, found)
         if 1 - explained < min(EXPLAINED, remains):
             sentence = (
                 f"{name} is {found}, and what it may have been beyond explains {explained:.0%} of the mismatch: what "
@@ -203,7 +203,7 @@ def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | N
     return None
 
 
-def _explained(bench: Workbench, without: Fitted, found: Clipping) -> float:
+def _explained_beyond(bench: Workbench, without: Fitted, found: Clipping) -> float:
     """Compute the share of the error that an input beyond its limits explains, on blocks that it was not fitted to."""
     first = FirstOrder.of(bench, without)
     signs = [(v, 1.0 if v == found.high else -1.0) for v in found.limits]
@@ -220,14 +220,14 @@ def _explained(bench: Workbench, without: Fitted, found: Clipping) -> float:
 def _beyond_limit(u: np.ndarray, limit: float) -> np.ndarray:
     """Estimate how far a signal was beyond a limit: the cubic that leaves and comes back with its slopes around it."""
     out, rise = np.zeros(len(u)), np.abs(np.diff(u, prepend=u[0], append=u[-1]))
-    for begin, end in stretches(u == limit):  # the step to the limit is cut short, the one before it may be
+    for begin, end in find_stretches(u == limit):  # the step to the limit is cut short, the one before it may be
         leaves, back = np.max(rise[max(begin - 1, 0) : begin + 1]), np.max(rise[end : end + 2])
         t = (np.arange(end - begin) + 0.5) / (end - begin)
         out[begin:end] = (end - begin) * t * (1 - t) * (leaves * (1 - t) + back * t)
     return out
 
 
-def clipped(recordings: Sequence[Recording], kind: str) -> list[Clipping]:
+def find_clipping(recordings: Sequence[Recording], kind: str) -> list[Clipping]:
     """Find inputs (`kind` "u") or outputs ("y") that repeat their extremes exactly over several samples."""
     out = []
     for i in range(getattr(recordings[0], kind).shape[1]):
@@ -236,16 +236,16 @@ def clipped(recordings: Sequence[Recording], kind: str) -> list[Clipping]:
         still = float(np.mean(np.diff(y) == 0))
         for j, extreme in enumerate((y.min(), y.max())):
             at = y == extreme
-            runs = np.diff(stretches(at)).ravel()
+            runs = np.diff(find_stretches(at)).ravel()
             several = runs.max(initial=0) >= 3 and np.sum(runs > 1) > 1
-            if several and at.mean() > BY_CHANCE * _quantised(y) and still < CONTINUOUS:
+            if several and at.mean() > BY_CHANCE * _share_at_level(y) and still < CONTINUOUS:
                 limits[j], count = float(extreme), count + int(at.sum())
         if count:
             out.append(Clipping(i, limits[0], limits[1], count))
     return out
 
 
-def _quantised(y: np.ndarray) -> float:
+def _share_at_level(y: np.ndarray) -> float:
     """Compute the share of samples at a level of a quantised signal near its extremes; 0 for a continuous one."""
     values, counts = np.unique(y, return_counts=True)
     if len(values) > CONTINUOUS * len(y):
@@ -253,7 +253,7 @@ def _quantised(y: np.ndarray) -> float:
     return float(np.median(np.concatenate([counts[1:6], counts[-6:-1]])) / len(y))
 
 
-def without_transients(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
+def open_unsettled(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
     """Leave the initial states of recordings that settle only within the record to be estimated, and note this."""
     pairs = ((r, zip(r.outputs, _transient_ratios(r), strict=True)) for r in recordings)
     found = [(float(ratio), name, r) for r, ratios in pairs for name, ratio in ratios]
@@ -264,9 +264,7 @@ def without_transients(recordings: Sequence[Recording]) -> tuple[tuple[Recording
         f"{name} has not settled{f' in {r.name}' if r.name else ''}: its first two periods differ {ratio:.2g} times as "
         "much as later ones; initial states are estimated, and the periods do not tell the noise."
     )
-    return tuple(map(opened_at_the_start, recordings)), [
-        Gate(name, "transient", ratio, sentence, change=opened_at_the_start)
-    ]
+    return tuple(map(open_start, recordings)), [Gate(name, "transient", ratio, sentence, change=open_start)]
 
 
 def _transient_ratios(r: Recording) -> np.ndarray:
@@ -284,7 +282,7 @@ def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
     found = []
     for i, name in enumerate(bench.simulator.output_names):
         pairs = zip(fitted.residual, bench.recordings, strict=True)
-        each = [tone(e[r.skip :, i], r) for e, r in pairs if len(r) - r.skip >= 8 * AROUND]
+        each = [find_tone(e[r.skip :, i], r) for e, r in pairs if len(r) - r.skip >= 8 * AROUND]
         told = [t for t in each if t is not None]
         longest = max((len(r) for r in bench.recordings), default=0) * bench.dt
         if not told or len(told) < len(each) or np.ptp([f for f, _ in told]) > 2 / longest:
@@ -300,60 +298,60 @@ def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
     return found
 
 
-def tone(e: np.ndarray, r: Recording) -> tuple[float, float] | None:
+def find_tone(e: np.ndarray, r: Recording) -> tuple[float, float] | None:
     """Find frequency, Hz, and amplitude of the tone in the residual of one output; None where there is none."""
     n, e = len(e), e - np.mean(e)
-    power = _power(e)
+    power = _power_lines(e)
     k = FINE + int(np.argmax(power[FINE:-OWN]))
-    if power[k] < FAR * _around(power, k):
+    if power[k] < FAR * _lines_around(power, k):
         return None
-    f = _refined(e, k)
-    whole = _wave(e, f, slice(None))
-    quarters = [_wave(e, f, slice(q * n // 4, (q + 1) * n // 4)) for q in range(4)]
+    f = _refine_frequency(e, k)
+    whole = _fit_wave(e, f, slice(None))
+    quarters = [_fit_wave(e, f, slice(q * n // 4, (q + 1) * n // 4)) for q in range(4)]
     unsteady = max(abs(q - whole) for q in quarters) > STEADY * abs(whole)
     if unsteady or abs(whole) ** 2 / 2 < POWER * float(np.mean(e**2)):
         return None
-    return None if any(_of_input(u, f, r) for u in r.u[r.skip :].T) else (f / r.dt, abs(whole))
+    return None if any(_comes_from_input(u, f, r) for u in r.u[r.skip :].T) else (f / r.dt, abs(whole))
 
 
-def _power(v: np.ndarray) -> np.ndarray:
+def _power_lines(v: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(np.fft.rfft((v - np.mean(v)) * np.hanning(len(v)))) ** 2)
 
 
-def _around(power: np.ndarray, k: int) -> float:
+def _lines_around(power: np.ndarray, k: int) -> float:
     """Return the median of the lines around line k."""
     near = np.arange(max(k - AROUND, 1), min(k + AROUND + 1, len(power)))
     return float(np.median(power[near[np.abs(near - k) > OWN]]))
 
 
-def _wave(e: np.ndarray, f: float, part: slice) -> complex:
+def _fit_wave(e: np.ndarray, f: float, part: slice) -> complex:
     """Fit amplitude and phase of the frequency f, a share of the sampling rate, in a part of e, by least squares."""
     angle = 2 * np.pi * f * np.arange(len(e))[part]
     a, b, _ = np.linalg.lstsq(np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))]), e[part])[0]
     return complex(a, -b)
 
 
-def _refined(e: np.ndarray, k: int) -> float:
+def _refine_frequency(e: np.ndarray, k: int) -> float:
     """Find the frequency of the strongest wave near line k, as a share of the sampling rate."""
     from scipy.optimize import minimize_scalar
 
     ends = (k - 1) / len(e), (k + 1) / len(e)
-    found = minimize_scalar(lambda f: -abs(_wave(e, f, slice(None))), bounds=ends, options={"xatol": 1e-3 / len(e)})
+    found = minimize_scalar(lambda f: -abs(_fit_wave(e, f, slice(None))), bounds=ends, options={"xatol": 1e-3 / len(e)})
     return float(found.x)
 
 
-def _of_input(u: np.ndarray, f: float, r: Recording) -> bool:
+def _comes_from_input(u: np.ndarray, f: float, r: Recording) -> bool:
     """Tell whether an input holds the frequency, or its few lines or its period make it in something nonlinear."""
     from scipy.signal import find_peaks
 
-    n, power = len(u), _power(u)
+    n, power = len(u), _power_lines(u)
     k = round(f * n)
-    if np.max(power[max(k - 1, 0) : k + 2]) > OVER * _around(power, k):
+    if np.max(power[max(k - 1, 0) : k + 2]) > OVER * _lines_around(power, k):
         return True
     if r.period and abs(f * r.period - round(f * r.period)) * n < r.period:
         return True
     strong = find_peaks(power, POWER * np.max(power), distance=2 * OWN)[0]
-    lines = [_refined(u, j) for j in strong[: LINES + 1]]
+    lines = [_refine_frequency(u, j) for j in strong[: LINES + 1]]
     order = ORDER
     if lines and all(abs(v / lines[0] - round(v / lines[0])) < 0.05 for v in lines):
         lines, order = lines[:1], HARMONICS if lines[0] * n > AROUND else ORDER

@@ -36,7 +36,7 @@ from .gates import (
     Checked,
     FirstOrder,
     Gate,
-    changed,
+    change_recordings,
     fall,
     refit,
 )
@@ -60,7 +60,7 @@ RIDGE = 1e-6  # of a jump that initial states can follow nothing is known
 
 
 @dataclass(frozen=True)
-class Step:
+class TimeShift:
     """Channels (columns of "u" or "y") that are out of step: late by seconds, or by a clock that runs faster."""
 
     channel: str
@@ -69,18 +69,18 @@ class Step:
     columns: tuple[int, ...]
 
     def change(self, value: float, cut: bool = True) -> Change:
-        """Read the channels at another time; see `shifted`."""
+        """Read the channels at another time; see `shift_channels`."""
         seconds, rate = (value, 0.0) if self.finding == "alignment" else (0.0, value)
-        return shifted(self.kind, self.columns, seconds, rate, cut)
+        return shift_channels(self.kind, self.columns, seconds, rate, cut)
 
     def at(self, now: Checked, value: float, previous: Fitted) -> Checked | None:
         """Refit to the channels read at another time."""
-        bench = changed(now.bench, self.change(value))
+        bench = change_recordings(now.bench, self.change(value))
         found = refit(bench, [{}, previous.values], states=previous.begin)
         return None if found is None else now.then(bench, found)
 
 
-def shifted(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, cut: bool = True) -> Change:
+def shift_channels(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, cut: bool = True) -> Change:
     """Read some channels at `t + seconds + rate t`, interpolated.
 
     Samples read from before the recording are skipped, samples from behind it are cut off; without `cut`, the ends are
@@ -116,7 +116,7 @@ def _read(t: np.ndarray, v: np.ndarray, at: np.ndarray, end: float | None, smoot
     return np.asarray(CubicSpline(np.append(t, end), np.append(v, v[0]), bc_type="periodic")(at))
 
 
-def timing(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
+def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
     """Look for a shifted channel or clock, and put it right where it is a fault of the recording.
 
     A late channel counts as shifted where it is late by a multiple of `part` samples; and, as an early one without
@@ -125,9 +125,9 @@ def timing(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
     bench, plain, noise2 = now.bench, now.fitted, now.noise2
     if plain.cost < ABOVE_NOISE**2 * noise2:
         return now
-    best: tuple[float, Step, float, Checked] | None = None
-    for step, value in _promising(bench, plain):
-        settled = _settled_step(now, step, value)
+    best: tuple[float, TimeShift, float, Checked] | None = None
+    for step, value in _screen_shifts(bench, plain):
+        settled = _settle_shift(now, step, value)
         if settled is None:
             continue
         at, found = settled
@@ -152,7 +152,7 @@ def timing(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
     samples = value / bench.dt
     if step.finding == "alignment" and samples > -WHOLE and not (in_steps(value, bench.dt, part) and samples > LONG):
         return now  # late, and not by whole samples: a delay is physics
-    sentence = f"{_step_in_words(step, value, bench.dt)}; with it corrected {fall(plain.cost, left)}"
+    sentence = f"{_shift_in_words(step, value, bench.dt)}; with it corrected {fall(plain.cost, left)}"
     if left > AT_NOISE**2 * noise2:
         sentence += (
             f", still {(left / max(noise2, 1e-300)) ** 0.5:.2g} times the noise: more is wrong, with the time "
@@ -162,14 +162,14 @@ def timing(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
     return found.then(found.bench, found.fitted, replace(gate, left=left / plain.cost))
 
 
-def _step_in_words(step: Step, value: float, dt: float) -> str:
+def _shift_in_words(step: TimeShift, value: float, dt: float) -> str:
     if step.finding == "clock":
         return f"The clock of {step.channel} runs {value * 100:+.3g} % off the others'"
     word = "late" if value > 0 else "early"
     return f"{step.channel} is recorded {abs(value / dt):.3g} samples ({abs(value):.3g} s) too {word}"
 
 
-def as_given(bench: Workbench, plain: Fitted) -> Fitted:
+def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:
     """Run the simulator at the user's values: a refit to channels out of step may have gone astray."""
     values = {name: p.value for name, p in bench.simulator.parameters.items()}
     unknown = [r.begins == "estimate" for r in bench.recordings]
@@ -182,7 +182,7 @@ def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
     return abs(value / dt - part * round(value / dt / part)) < WHOLE
 
 
-def _promising(bench: Workbench, plain: Fitted) -> list[tuple[Step, float]]:
+def _screen_shifts(bench: Workbench, plain: Fitted) -> list[tuple[TimeShift, float]]:
     """List the shifts and clock rates that make the remainder clearly smaller, best first, three at most."""
     outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
     channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(outputs)]
@@ -190,27 +190,27 @@ def _promising(bench: Workbench, plain: Fitted) -> list[tuple[Step, float]]:
         channels.append(("y", tuple(range(len(outputs))), ", ".join(outputs)))
     if len(inputs) > 1:
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
-    steps = [Step(name, finding, kind, i) for kind, i, name in channels for finding in ("alignment", "clock")]
-    found = list[tuple[float, Step, float]]()
-    for reference in [plain] if plain.cost < ASTRAY else [plain, as_given(bench, plain)]:
+    steps = [TimeShift(name, finding, kind, i) for kind, i, name in channels for finding in ("alignment", "clock")]
+    found = list[tuple[float, TimeShift, float]]()
+    for reference in [plain] if plain.cost < ASTRAY else [plain, run_as_given(bench, plain)]:
         first = FirstOrder.of(bench, reference)
         for step in steps:
-            left = _remainder(first, reference, step)
+            left = _remainder_of(first, reference, step)
             values = bench.dt * SHIFTS if step.finding == "alignment" else RATES
             shares = [left(float(v)) for v in values]
             k = int(np.argmin(shares))
             value, share = float(values[k]), shares[k]
             if step.finding == "clock":  # over a whole record a small step of a rate is many samples
-                value, share = _narrowed(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
+                value, share = _minimise(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
             if share < CLEARLY * left(0.0):
                 found.append((share / left(0.0), step, value))
-    best = dict[Step, float]()
+    best = dict[TimeShift, float]()
     for _, step, value in sorted(found, key=lambda t: t[0]):
         best.setdefault(step, value)
     return list(best.items())[:3]
 
 
-def _remainder(first: FirstOrder, fitted: Fitted, step: Step) -> Callable[[float], float]:
+def _remainder_of(first: FirstOrder, fitted: Fitted, step: TimeShift) -> Callable[[float], float]:
     """Return the mean square that parameters and initial states leave, as a function of a shift or a clock rate."""
     recordings = first.bench.recordings
 
@@ -229,7 +229,7 @@ def _remainder(first: FirstOrder, fitted: Fitted, step: Step) -> Callable[[float
     return left
 
 
-def _narrowed(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
+def _minimise(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
     """Find where the remainder is smallest between two values, and the remainder there."""
     from scipy.optimize import minimize_scalar
 
@@ -237,7 +237,7 @@ def _narrowed(left: Callable[[float], float], low: float, high: float) -> tuple[
     return float(found.x), float(found.fun)
 
 
-def _settled_step(now: Checked, step: Step, at: float) -> tuple[float, Checked] | None:
+def _settle_shift(now: Checked, step: TimeShift, at: float) -> tuple[float, Checked] | None:
     """Refit parameters and shift in turn, until the shift stays where it is."""
     best: tuple[float, Checked] | None = None
     previous, width = now.fitted, now.bench.dt if step.finding == "alignment" else abs(at)
@@ -249,7 +249,7 @@ def _settled_step(now: Checked, step: Step, at: float) -> tuple[float, Checked] 
             best = at, found
         previous = found.fitted
         first = FirstOrder.of(replace(now.bench, scale=found.bench.scale), previous)
-        moved = _narrowed(_remainder(first, previous, step), at - width, at + width)[0]
+        moved = _minimise(_remainder_of(first, previous, step), at - width, at + width)[0]
         if abs(moved - at) < 2e-3 * width:
             break
         at = moved
@@ -288,16 +288,16 @@ class Jump:
         return 1 - other > times * max(1 - self.share, 0.0)
 
 
-def gaps(now: Checked) -> Checked:
+def find_gaps(now: Checked) -> Checked:
     """Look for lost samples; cut the recordings there if that cures most of the mismatch.
 
     The state at the first sample of a later piece is estimated. Recordings in periodic steady state are left alone.
     """
-    noise2 = min(now.noise2, _quiet(now) or np.inf)
+    noise2 = min(now.noise2, _quiet_noise2(now) or np.inf)
     origins: list[Origin] = [(r.label, 0) for r in now.bench.recordings]
     last, kept = now, list[tuple[Checked, list[Origin]]]()
     while len(origins) - len(now.bench.recordings) < MOST_GAPS and last.cost > ABOVE_NOISE**2 * noise2:
-        settled = _settled_jump(last)
+        settled = _settle_jump(last)
         if settled is None or not settled[0].beats(settled[0].rival, SAME**2):
             break
         (jump, last), at = settled, settled[0].recording + 1
@@ -309,22 +309,22 @@ def gaps(now: Checked) -> Checked:
     if not kept:
         return now
     found, origins = kept[-1]
-    pieces = [_named(r, begin) for r, (_, begin) in zip(found.bench.recordings, origins, strict=True)]
-    gate = _gap(now, [o for o in origins if o[1]], found.cost)
+    pieces = [_name_piece(r, begin) for r, (_, begin) in zip(found.bench.recordings, origins, strict=True)]
+    gate = _describe_gaps(now, [o for o in origins if o[1]], found.cost)
     return now.then(replace(found.bench, recordings=tuple(pieces)), found.fitted, gate)
 
 
-def _named(r: Recording, begin: int) -> Recording:
+def _name_piece(r: Recording, begin: int) -> Recording:
     """Name a piece by the time at which it begins."""
     return r.with_(name=f"{r.name} from {begin * r.dt:.6g} s".strip()) if begin else r
 
 
-def _same(bench: Workbench, fitted: Fitted, initial: list[np.ndarray]) -> Fitted:
+def _run_at(bench: Workbench, fitted: Fitted, initial: list[np.ndarray]) -> Fitted:
     """Run another bench's fit on this one's recordings at its values."""
     return bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
 
 
-def _settled_jump(now: Checked) -> tuple[Jump, Checked] | None:
+def _settle_jump(now: Checked) -> tuple[Jump, Checked] | None:
     """Repeat jump and fit to the pieces until the jump stays: a fit across a gap may have gone astray."""
     bench, along = now.bench, now.fitted
     best: tuple[Jump, Checked] | None = None
@@ -337,16 +337,16 @@ def _settled_jump(now: Checked) -> tuple[Jump, Checked] | None:
             return jump, best[1]
         pieces = r.slice(0, jump.sample), r.slice(jump.sample).with_(initial="estimate", period=None)
         other = replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
-        states = [*along.begin[: i + 1], _begin(along, r, jump), *along.begin[i + 1 :]]
+        states = [*along.begin[: i + 1], _state_after(along, r, jump), *along.begin[i + 1 :]]
         found = refit(other, [along.values, {}], states=states, solver=THOROUGH, like=now.fitted)
         if found is None:
             break
         best = jump, now.then(other, found)
-        along = _same(bench, found, [*found.initial[: i + 1], *found.initial[i + 2 :]])
+        along = _run_at(bench, found, [*found.initial[: i + 1], *found.initial[i + 2 :]])
     return best
 
 
-def _quiet(now: Checked) -> float:
+def _quiet_noise2(now: Checked) -> float:
     """Estimate the mean square of white noise from the median of third differences, which a few jumps do not move."""
     thirds = np.abs(np.concatenate([np.diff(e, 3, axis=0) for e in now.fitted.residual]))
     return float(np.mean((1.4826 * np.median(thirds, axis=0) / now.bench.scale) ** 2) / 20)
@@ -369,7 +369,7 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
         at = rows.stop
         if r.begins == "periodic" or len(r) - r.skip < 2 * SHORTEST:
             continue
-        shares, rivals, sizes = _taken(one, bench.scale, base[rows], error[rows], r.skip, n_x, moved)
+        shares, rivals, sizes = _jump_shares(one, bench.scale, base[rows], error[rows], r.skip, n_x, moved)
         shares[: r.skip + SHORTEST] = shares[len(r) - SHORTEST :] = 0.0
         k = int(np.argmax(shares))
         if best is None or shares[k] > best.share:
@@ -382,7 +382,7 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
     return replace(best, share=best.share / total, rival=best.rival / total, beside=best.beside / total)
 
 
-def _taken(
+def _jump_shares(
     run: Run, scale: np.ndarray, base: np.ndarray, error: np.ndarray, skip: int, n_x: int, moved: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the share that the best jump of the state takes away at each sample, its best rival's, and that jump.
@@ -405,14 +405,14 @@ def _taken(
         g = c[k].T @ read[k] + a[k].T @ g
         size2[k], left[k], along[k] = s, s - g[:, :n_b] @ g[:, :n_b].T, g[:, n_b]
     unit, shock = np.eye(full), np.eye(full)[:, list(moved)]
-    taken, size = _solved(left, size2, along, unit[:, :n_x])
+    taken, size = _solve_jumps(left, size2, along, unit[:, :n_x])
     later = a - np.eye(full)
     later[:, :, n:] = 0.0
     rivals = [shock + part * later @ shock for part in BETWEEN] + [unit[:, [j]] for j in range(n, full)]
-    return taken, np.max([_solved(left, size2, along, way)[0] for way in rivals], axis=0), size
+    return taken, np.max([_solve_jumps(left, size2, along, way)[0] for way in rivals], axis=0), size
 
 
-def _solved(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _solve_jumps(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the shares that jumps along some ways, (n, k) or (M, n, k), take away, and their lengths."""
     across = np.swapaxes(ways, -1, -2)
     size = np.sqrt(np.maximum(np.einsum("...ii->...i", across @ s @ ways), 0.0))
@@ -425,14 +425,14 @@ def _solved(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) ->
     return np.sum(found * wanted, axis=1), found / size
 
 
-def _begin(fitted: Fitted, r: Recording, jump: Jump) -> np.ndarray:
+def _state_after(fitted: Fitted, r: Recording, jump: Jump) -> np.ndarray:
     """Compute the simulator's own states after a jump, to first order."""
     model = fitted.model
     states = states_along(model, model.drive(r), fitted.vector, fitted.initial[jump.recording])
     return np.asarray(states[jump.sample * model.substeps, : len(jump.size)] - jump.size)
 
 
-def _gap(now: Checked, places: Sequence[Origin], after: float) -> Gate:
+def _describe_gaps(now: Checked, places: Sequence[Origin], after: float) -> Gate:
     """Describe the gaps before some samples."""
     ordered = sorted(places)
     bench, before = now.bench, now.cost

@@ -23,7 +23,7 @@ from ..laws import Law
 from ..models import Model
 from ..optimise import GaussNewton
 from ..simulators import Placed, Simulator
-from .gates import opened_at_the_start
+from .gates import open_start
 from .screen import Scored
 from .step_refinement import knees, on_finer_steps
 from .workbench import QUICK, THOROUGH, Fitted, Workbench, started
@@ -319,7 +319,7 @@ def _agree(found: Sequence[Trial | None]) -> bool:
 def _head(r: Recording, share: float) -> Recording:
     """The first part of a recording."""
     cut = max(int(share * len(r)), min(len(r), r.skip + 20))
-    return r if cut >= len(r) else opened_at_the_start(r.slice(0, cut))
+    return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 
 def survivors(scored: Sequence[Scored], best: int = BEST) -> list[list[Scored]]:

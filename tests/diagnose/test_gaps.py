@@ -13,7 +13,7 @@ from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Checked
 from pilfr_casadi.diagnose.preparation import prepare, refitted
-from pilfr_casadi.diagnose.timing import WORSE, _settled_jump, find_jump, gaps
+from pilfr_casadi.diagnose.timing import WORSE, _settle_jump, find_gaps, find_jump
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 
@@ -34,7 +34,7 @@ def bench(*train):
 def looked(*train):
     """Samples of the gaps found, by recording."""
     made, plain = bench(*train)
-    found = gaps(Checked(made, plain))
+    found = find_gaps(Checked(made, plain))
     assert (found.bench is made and found.fitted is plain) or (found.cost < 0.3 * plain.cost and found.gates)
     return [len(r) for r in found.bench.recordings], found.gates
 
@@ -89,9 +89,9 @@ def test_a_shock_is_no_gap(samples):
     push = np.zeros((2500, 1))
     push[1200 : 1200 + samples] = 5000 / samples
     made, plain = bench(*pushed(push))
-    jump, pieces = _settled_jump(Checked(made, plain))
+    jump, pieces = _settle_jump(Checked(made, plain))
     assert pieces.cost < 0.1 * plain.cost and not jump.beats(jump.rival, WORSE)  # cutting would cure it, and yet
-    assert not gaps(Checked(made, plain)).gates
+    assert not find_gaps(Checked(made, plain)).gates
 
 
 @pytest.mark.parametrize("kind", ["step", "ramp", "sensor"])

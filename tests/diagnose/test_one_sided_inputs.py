@@ -6,7 +6,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose.preparation import prepare
-from pilfr_casadi.diagnose.recording_faults import clipped, clipped_input
+from pilfr_casadi.diagnose.recording_faults import clipped_input, find_clipping
 
 DT = 0.02
 
@@ -85,7 +85,7 @@ def swinging(m=1200):
 def test_a_command_that_stops_at_its_limits_is_no_fault_beside_a_missing_law():
     u = np.clip(swinging(), -9, 9)
     bench, ready = _prepared(u, moved(np.sign(u) * np.abs(u) ** 0.6))
-    assert [(c.column, c.limits) for c in clipped(bench.recordings, "u")] == [(0, [-9.0, 9.0])]
+    assert [(c.column, c.limits) for c in find_clipping(bench.recordings, "u")] == [(0, [-9.0, 9.0])]
     assert clipped_input(bench, ready, 1.0) is None
 
 

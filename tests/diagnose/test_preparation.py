@@ -7,7 +7,7 @@ from test_slips import DT, recorded, tanks
 
 from pilfr_casadi import Recording
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.gates import Checked, as_it_came_out, offset_gates, offsets
+from pilfr_casadi.diagnose.gates import Checked, as_it_came_out, find_offsets, offset_gates
 from pilfr_casadi.diagnose.preparation import prepare, refitted
 
 
@@ -48,7 +48,7 @@ def test_a_wrong_sign_beside_another_zero_is_told():
 
 def test_a_constant_of_a_sensor_is_found_and_kept():
     bench = Workbench.of(tanks(1.15), [of_tanks(recorded()[1] + [0, 0.3])], "zero")
-    found = offsets(Checked(bench, refitted(bench)))
+    found = find_offsets(Checked(bench, refitted(bench)))
     fitted, (gate,) = found.fitted, found.gates
     assert (gate.channel, gate.finding, gate.fault) == ("lower", "offset", True)
     assert gate.value == pytest.approx(0.3, rel=0.02)

@@ -7,7 +7,13 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose.floor import measured_floor
-from pilfr_casadi.diagnose.recording_faults import glitches, mended, stale_samples, without_glitches, without_transients
+from pilfr_casadi.diagnose.recording_faults import (
+    find_glitches,
+    find_stale_samples,
+    mend,
+    open_unsettled,
+    remove_glitches,
+)
 
 # single samples far off their neighbours
 
@@ -24,12 +30,12 @@ def spoilt(r, places=PLACES, size=3.0):
 
 def test_glitches_are_found_replaced_and_told():
     (r,) = recordings(count=1)
-    (clean,), (gate,) = without_glitches([spoilt(r)])
+    (clean,), (gate,) = remove_glitches([spoilt(r)])
     assert (gate.channel, gate.finding, gate.value, gate.corrected, gate.fault) == ("x2", "glitch", 4, True, True)
     assert "the first at t = 0.2 s" in gate.sentence
     np.testing.assert_array_equal(np.flatnonzero(clean.y != spoilt(r).y), PLACES)
     assert np.max(np.abs(clean.y - r.y)) < 0.01 * np.std(r.y)
-    np.testing.assert_array_equal(mended(r).y, r.y)
+    np.testing.assert_array_equal(mend(r).y, r.y)
 
 
 @pytest.mark.parametrize("kind", ["noise", "step", "pulse", "shock", "coarse", "short"])
@@ -49,7 +55,7 @@ def test_what_lasts_longer_than_a_sample_is_no_glitch(kind):
     if kind == "short":
         y = y[:40]
         y[20] += 3
-    assert not len(glitches(y)[0])
+    assert not len(find_glitches(y)[0])
 
 
 @pytest.mark.slow
@@ -74,7 +80,7 @@ def lost(r, share, seed=0):
 @pytest.mark.slow
 def test_stale_samples_are_told_and_where():
     (r,) = recordings(count=1)
-    (gate,) = stale_samples([lost(r, 0.1)])
+    (gate,) = find_stale_samples([lost(r, 0.1)])
     assert (gate.channel, gate.finding, gate.corrected, gate.fault) == ("x2", "stale", False, False)
     assert gate.value == pytest.approx(0.1, abs=0.02)
     found = pilfr.diagnose(rig(OFF), lost(r, 0.1))
@@ -93,7 +99,7 @@ def test_a_converter_and_a_rest_are_not_stale(kind):
         y = np.clip(y, *np.quantile(y, [0.05, 0.95]))
     if kind == "encoder":  # more levels than half of the samples, and slow ways between them
         y = np.round(np.linspace(0, 1, len(y))[:, None] ** 4 + 0.01 * y / np.std(y), 3)
-    assert not stale_samples([r.with_(y=y)])
+    assert not find_stale_samples([r.with_(y=y)])
 
 
 # periodic recordings whose periods still differ by what dies away
@@ -112,14 +118,14 @@ def periodic(decay, noise=1e-3, seed=0):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_noise_is_no_transient(seed):
-    kept, gates = without_transients([periodic(0.0, 0.05, seed), periodic(0.0, 1e-3, seed + 50)])
+    kept, gates = open_unsettled([periodic(0.0, 0.05, seed), periodic(0.0, 1e-3, seed + 50)])
     assert not gates
     assert all(r.initial == "periodic" and r.period == 500 for r in kept)
 
 
 def test_what_dies_away_is_said_and_the_initial_state_estimated():
     whole, dying = periodic(0.0), periodic(0.1)
-    kept, (gate,) = without_transients([whole, dying])
+    kept, (gate,) = open_unsettled([whole, dying])
     assert all(r.initial == "estimate" and r.period is None for r in kept)
     assert (gate.finding, gate.channel, gate.corrected, gate.fault) == ("transient", "y", True, False)
     assert "has not settled in first" in gate.sentence
@@ -147,7 +153,7 @@ def test_a_given_state_is_neither_periodic_nor_in_the_way():
     """What a recording begins with may be numbers, though it has a period."""
     r = periodic(0.1).with_(initial=np.array([1.0, 2.0]))
     assert r.begins == "given"
-    kept, gates = without_transients([r])
+    kept, gates = open_unsettled([r])
     assert not gates and kept[0] is r
     assert measured_floor([r, r.with_(y=r.y + 1e-3)]).source == "repeats"
 

@@ -7,7 +7,7 @@ from pilfr_casadi.data import Recording
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Checked, Gate
 from pilfr_casadi.diagnose.preparation import hold_note
-from pilfr_casadi.diagnose.timing import timing
+from pilfr_casadi.diagnose.timing import find_time_shift
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import Creep, CubicStiffness, PeriodicForce, Relaxation, TwoStageCreep, TwoStageRelaxation
 from pilfr_casadi.models import Parameter
@@ -45,7 +45,7 @@ def shaken(hold, clock=0.0, m=3000, dt=0.02, law=None, early=0):
 
 def test_a_clock_between_the_rates_looked_at_is_found_and_is_that_of_both_outputs():
     bench = Workbench.of(spring(), [shaken("zero", 3.36e-3)], "zero")
-    found = timing(Checked(bench, bench.fit(bench.simulator)))
+    found = find_time_shift(Checked(bench, bench.fit(bench.simulator)))
     gates = found.gates
     assert [(g.channel, g.finding) for g in gates] == [("pos, vel", "clock")] and isinstance(gates[0], Gate)
     assert gates[0].value == pytest.approx(-3.36e-3, rel=0.02)
@@ -58,7 +58,7 @@ def test_what_seems_early_while_more_is_wrong_may_be_no_fault(stiffening):
     bench = Workbench.of(spring(), [shaken("zero", law=law, early=6)], "zero")
     plain = bench.fit(spring())
     for early in (True, False):
-        gates = timing(Checked(bench, plain), early=early).gates
+        gates = find_time_shift(Checked(bench, plain), early=early).gates
         assert [g.finding for g in gates] == (["alignment"] if early or not stiffening else [])
 
 

@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
-from pilfr_casadi.diagnose.recording_faults import tone
+from pilfr_casadi.diagnose.recording_faults import find_tone
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.simulators import discretise
 
@@ -21,7 +21,7 @@ TIME = np.arange(COUNT) * STEP
 def measured(e, u=None):
     """What is told of a residual beside an input, by default noise."""
     u = np.random.default_rng(1).standard_normal(COUNT) if u is None else u
-    return tone(e, pilfr.Recording(u, e, STEP))
+    return find_tone(e, pilfr.Recording(u, e, STEP))
 
 
 def noise(seed=0, pole=0.0):
