@@ -49,6 +49,7 @@ NEAR = 6.0  # a factor is tried where it brings the simulated and the measured s
 BENT = 0.3  # share of the parameters at their bounds, beyond which a unit of time has bent the simulator
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 
+LEAST = 0.01  # share of the mean square that an offset has to take away, to first order
 STILL = 0.1  # of the value it was found with, that an offset has to keep beside effects to be told
 
 
@@ -397,7 +398,7 @@ def find_offsets(now: Checked) -> Checked:
         bench, plain = now.bench, now.fitted
         share = share_of_constants(bench, plain, ports)
         port = max(share, key=lambda name: share[name])
-        if gain(plain.cost, (1 - share[port]) * plain.cost, plain.residual) < ROOM:
+        if share[port] < LEAST:
             break
         other = replace(bench, simulator=bench.simulator.with_element(port, Offset()))
         parameter = f"{other.simulator.elements[-1].prefix}w_0"

@@ -2,10 +2,10 @@
 
 - A spring or a damper in a port where the simulator has one is the same as another value of that one. It comes out as
   missing only where the value is fixed, or its bounds do not let it go there; then that is what has to be said. With a
-  value whose bounds are in another unit no law says anything of the machine: it is looked for powers of ten away.
+  value whose bounds are in another unit, no law says anything about the machine; values powers of ten away are tried.
 - A mismatch that no declared port explains may have a sure name in the equation of a state.
-- One set of values for every recording is put up against one for each, or one for the first halves and one for the
-  second. Where these follow far better, what differs is said; why, only the engineer knows.
+- One set of values for all recordings is compared with one for each, or with one for the first halves and one for the
+  second. Where these follow far better, the values that differ are told; only the engineer can know why.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""From the user's simulator and recordings to a refitted simulator on recordings without dull faults."""
+"""The checks of the recordings in their order: from the user's simulator to a refitted one on recordings without faults.
+
+Where nobody said what inputs do between samples, the hold with the smaller error is taken; after a fault was found, both
+holds go through all checks again, because wrong data say nothing about the hold.
+"""
 
 from __future__ import annotations
 
@@ -68,9 +72,9 @@ def prepare(
     early: bool = True,
     say: Stages | None = None,
 ) -> Prepared:
-    """Open the bench, look at the dull causes, refit from the user's values and from `starts`, measure the floor.
+    """Put faults of the recordings right, refit from the user's values and from `starts`, and measure the noise.
 
-    Without `early` a channel that seems early is so only where it is all that is wrong.
+    Without `early`, an early channel counts as a fault only where nothing else is wrong.
     """
     say = say or Stages(lambda *_: None)
     say(CHECKS, 0, CHECKED)

@@ -119,8 +119,8 @@ def _read(t: np.ndarray, v: np.ndarray, at: np.ndarray, end: float | None, smoot
 def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
     """Look for a shifted channel or clock, and put it right where it is a fault of the recording.
 
-    A late channel counts as shifted where it is late by a multiple of `part` samples; and, as an early one without
-    `early`, where it is all that is wrong.
+    A late channel counts as a fault where it is late by a multiple of `part` samples and nothing else is wrong. Without
+    `early`, an early channel counts as one only where nothing else is wrong, too.
     """
     bench, plain, noise2 = now.bench, now.fitted, now.noise2
     if plain.cost < ABOVE_NOISE**2 * noise2:
