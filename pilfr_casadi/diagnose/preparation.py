@@ -1,7 +1,7 @@
-"""The checks of the recordings in their order: from the user's simulator to a refitted one on recordings without faults.
+"""The checks of the recordings in their order, from the user's simulator to a refitted one.
 
-Where nobody said what inputs do between samples, the hold with the smaller error is taken; after a fault was found, both
-holds go through all checks again, because wrong data say nothing about the hold.
+Where nobody said what inputs do between samples, the hold with the smaller error is taken. Wrong data say nothing about
+the hold: where a fault was found, the other hold goes through all checks as well.
 """
 
 from __future__ import annotations
