@@ -19,14 +19,11 @@ from ..data import Recording
 from ..laws import Law, display_name
 from ..simulators import in_series
 from .arguments import check_laws, matched
-from .blind_spots import BlindSpot, Excitation, excitations, find_blind_spots, helpful_sensors, next_record
-from .detectability import LawRow, assess_laws, words
-from .floor import Floor, measured_floor, white_part
-from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters
+from .detectability import Excitation, LawRow, assess_laws, excitations, group_alike
+from .floor import ABOVE_NOISE, noise_floor
+from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters, helpful_sensors
 from .linearise import linearised
 from .preparation import said_hold
-from .remainder import lengths
-from .result import LEFT, plain
 from .workbench import Fitted, Workbench
 
 FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a sensor of 20 bits

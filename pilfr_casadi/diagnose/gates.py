@@ -24,9 +24,9 @@ from ..engine import make_engine
 from ..laws import Law
 from ..optimise import GaussNewton
 from ..simulators import Simulator
-from .floor import Floor, effective_size, measured_floor, white_part
+from .floor import Floor, effective_size, noise_floor
 from .linearise import Probe, Run, linearised
-from .remainder import followed, lengths, moved
+from .remainder import followed, lengths, moved, project_off
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]
@@ -34,7 +34,7 @@ Change = Callable[[Recording], Recording]
 # share of the mean square left at most: by a fault of a whole channel, which other physics hardly mimics; by others
 CURED, EXPLAINED = 0.12, 0.3
 CLEARLY = 0.8  # the same by an edit that is clearly better than another, or than none
-ABOVE_NOISE, AT_NOISE = 2.0, 5.0  # times the noise (rms) from which faults are looked for, up to which none is left
+AT_NOISE = 5.0  # times the noise (rms) up to which nothing else is wrong; faults are looked for from ABOVE_NOISE on
 ASTRAY, LOST = 0.04, 0.25  # mean square error of a refit that may have gone astray, and that says nothing
 SAME = 1.02  # ratio of errors that say the same
 ROOM = 12.0  # nats that parameters of an edit have to gain beyond their number's cost: odds of about 1e5
@@ -103,7 +103,7 @@ class Checked:
     @property
     def floor(self) -> Floor:
         """The noise, measured or estimated from the refit."""
-        return measured_floor(self.bench.recordings) or Floor(white_part(self.fitted.residual), "estimated")
+        return noise_floor(self.bench.recordings, self.fitted.residual)
 
     @property
     def noise2(self) -> float:
@@ -154,7 +154,7 @@ class FirstOrder:
 
     def left(self, columns: np.ndarray) -> np.ndarray:
         """Subtract what parameters and initial states can follow."""
-        return np.asarray(columns - self.base @ (self.base.T @ columns))
+        return project_off(columns, self.base)
 
     def response(self, ports: Sequence[str], forces: Sequence[np.ndarray]) -> np.ndarray:
         """Compute the stacked outputs' changes (R, n) by forces at ports, (M, n_k) a recording; see `propagate`."""

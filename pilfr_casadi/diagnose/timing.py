@@ -25,8 +25,8 @@ import numpy as np
 
 from ..data import Recording
 from ..simulators import states_along
+from .floor import ABOVE_NOISE
 from .gates import (
-    ABOVE_NOISE,
     ASTRAY,
     AT_NOISE,
     CLEARLY,
