@@ -140,7 +140,7 @@ def _searched_both_holds(request: Request) -> tuple[Prepared, Search]:
         search.interrupted = again.interrupted
         return ready, search.settled(request.most_effects)
     ratio = float(np.sqrt(search.best.whole / max(again.best.whole, 1e-300)))
-    return replace(other, gates=(*other.gates, hold_note(again.bench, ratio))), again
+    return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
 
 
 def _searched(request: Request) -> tuple[Prepared, Search]:

@@ -153,7 +153,7 @@ def _with_better_hold(
     costs = [_honest(found) for found in both]
     now = both[int(costs[1] < costs[0])]
     ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
-    held = [hold_note(now.bench, ratio)] if ratio > SAME else []
+    held = [hold_note(now.bench.simulator, now.bench.hold, ratio)] if ratio > SAME else []
     if any(v > 0 and not in_steps(v, now.bench.dt) for v in _shifts(now)):  # a delay is physics
         now = checks.run(replace(bench, hold=now.bench.hold), 1.0)
     return now, held
@@ -202,14 +202,14 @@ def _better_held(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
     if not ratio >= SAME:
         return bench, ()
     best = both[int(costs[1] < costs[0])]
-    return best, [hold_note(best, ratio)]
+    return best, [hold_note(best.simulator, best.hold, ratio)]
 
 
-def hold_note(bench: Workbench, ratio: float) -> Gate:
-    """Note that the bench's hold was chosen from the data; the other's error is `ratio` times as large."""
-    words = {"zero": "held over each sample", "linear": "interpolated between samples"}[bench.hold]
+def hold_note(simulator: Simulator, hold: str, ratio: float) -> Gate:
+    """Note that the hold was chosen from the data; the other's error is `ratio` times as large."""
+    words = {"zero": "held over each sample", "linear": "interpolated between samples"}[hold]
     sentence = (
         f"The recordings do not say what inputs do between samples; {words} fits better (error {ratio:.3g} times "
         "smaller) and is used."
     )
-    return Gate(", ".join(bench.simulator.inputs), "hold", bench.hold, sentence)
+    return Gate(", ".join(simulator.inputs), "hold", hold, sentence)
