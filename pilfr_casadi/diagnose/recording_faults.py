@@ -26,7 +26,7 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
-from .gates import CURED, EXPLAINED, LOST, ROOM, Checked, FirstOrder, Gate, fall, gain, open_start, refit
+from .gates import CURED, LOST, ROOM, Checked, FirstOrder, Gate, fall, gain, open_start, refit
 from .linearise import linearised
 from .remainder import folds, held_out
 from .workbench import Fitted, Workbench
@@ -41,6 +41,8 @@ STALE_SHARE = 0.01  # of the samples that repeat
 CONTINUOUS = 0.5  # share of the samples with values of their own, above which a signal is not quantised
 STANDING = 5  # samples that an encoder or a machine may have stood, and steps of an encoder in a sample
 BY_CHANCE = 3.0  # times as many repeats as noise makes
+
+MOST_LEFT = 0.5  # share of the mismatch that is left at most by the part of an input beyond its limit
 
 DYING_RATIO = 1.5  # times the least difference of neighbouring periods that the first one is, where it dies away
 
@@ -194,7 +196,7 @@ def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | N
     for found in find_clipping(bench.recordings, "u"):
         name = bench.simulator.inputs[found.column]
         explained = _explained_beyond(bench, without, found)
-        if 1 - explained < min(EXPLAINED, remains):
+        if 1 - explained < min(MOST_LEFT, remains):
             sentence = (
                 f"{name} is {found}, and what it may have been beyond explains {explained:.0%} of the mismatch: what "
                 "went into the machine there is not in the recording. Record it with a larger range."

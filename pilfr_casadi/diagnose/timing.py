@@ -53,6 +53,7 @@ AVERAGED = 0.5  # of a channel's noise, which reading it between its samples tak
 
 MOST_GAPS = 3
 WORSE = 2.0  # times what a jump leaves that a shock or a step leaves at least
+SHARP = 1.1  # times what a jump leaves that one some samples beside it leaves at least
 SHORTEST = 40  # samples of a piece
 BESIDE = 5  # samples around a jump at which rivals are tried, and where a drift would do as well
 BETWEEN = (-0.5, 0.0, 0.5)  # samples, by which a shock may come later
@@ -303,7 +304,7 @@ def find_gaps(now: Checked) -> Checked:
         (jump, last), at = settled, settled[0].recording + 1
         origins = [*origins[:at], (origins[at - 1][0], origins[at - 1][1] + jump.sample), *origins[at:]]
         # a drift is followed by jumps around it as well
-        sharp = jump.beats(jump.beside, 1 / CLEARLY) or last.cost < AT_NOISE**2 * noise2
+        sharp = jump.beats(jump.beside, SHARP) or last.cost < AT_NOISE**2 * noise2
         if sharp and jump.beats(jump.rival, WORSE) and last.cost < EXPLAINED * now.cost:
             kept.append((last, origins))
     if not kept:
