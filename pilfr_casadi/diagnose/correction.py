@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -156,7 +157,7 @@ def _of_trial(search: Search, trial: Trial) -> Iterator[_Competitor]:
     """Generate a hypothesis of the search, if it can be simulated."""
     with suppress(InputError):
         trial = search.thorough(trial)
-        yield trial.fitted, trial.fitted, lambda: search.predicts(trial)
+        yield trial.fitted, trial.fitted, partial(search.predicts, trial)
 
 
 def _recurs(search: Search, trial: Trial) -> bool:
@@ -171,7 +172,7 @@ def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> I
     with suppress(InputError, np.linalg.LinAlgError):
         inputs, part = search.bench.simulator.inputs, search.fits.part
         for fitted in candidates(search.bench, part, base.fitted, ports, inputs, search.workers)[:JUDGED]:
-            yield fitted, base.fitted, lambda one=fitted: search.predict(one, _own_elements(search, one))
+            yield fitted, base.fitted, partial(search.predict, fitted, _own_elements(search, fitted))
 
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
