@@ -216,6 +216,8 @@ def _whole(columns: np.ndarray, room: np.ndarray) -> np.ndarray | None:
     `columns` are those of J D, and `room` is D in the coordinates wanted, with their sign.
     """
     free = _undetermined(columns) * room
+    if not len(free):  # only other parameters leave a direction of these undetermined
+        return None
     rows = _reduced(_complement(free))
     for factor in range(1, LARGEST_EXPONENT + 1):
         whole = np.round(rows * factor)
