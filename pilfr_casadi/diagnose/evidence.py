@@ -34,7 +34,7 @@ LEAST_WRONG = 0.05  # share of the error that is never taken for noise
 MORE = np.log(0.5)  # log prior probability of one effect more
 FLEXIBLE = ("hysteresis", "static_curve", "extra_mode", "stribeck_friction", "periodic_force", "drift")
 IMITATES = np.log(0.2)  # log prior probability of a flexible law, which can imitate others, beside that of another
-NEARER = 0.7  # factor on the inputs for which the spread of predictions is computed: well inside what was recorded
+SMALLER = 0.7  # factor on the inputs for which the spread of predictions is computed: well inside what was recorded
 ALMOST_NOTHING = 1e-9  # precision of the prior of initial states, over what a sample tells of them
 DOUBTFUL = np.log(0.01)  # log prior probability of values at which a law is hardly what its name says
 
@@ -78,16 +78,14 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
 def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
     """Compute the mean square by which predictions for other inputs are uncertain, in units of the outputs' variance.
 
-    The other inputs are the recorded ones, brought nearer to their mean over all recordings. The parameters have the
+    The other inputs are the recorded ones at SMALLER times their size. The parameters have the
     covariance (n H / v + P)^-1 of Laplace's approximation, with H the Fisher information of a sample and P the
     precision of the prior; with H' the information of a sample for the other inputs, it is tr(H' (n H / v + P)^-1).
     Parameters that the recordings hardly determine show here, and nowhere in a cross-validation on the same recordings:
     a curve of a pressure that had two levels, say.
     """
-    mean = np.mean(np.concatenate([r.u for r in bench.recordings]), axis=0)
-    nearer = bench.on([r.with_(u=mean + NEARER * (r.u - mean)) for r in bench.recordings])
     problem, told = _hessian(bench, fitted)
-    _, asked = _hessian(nearer, fitted)
+    _, asked = _hessian(bench.on([r.with_(u=SMALLER * r.u) for r in bench.recordings]), fitted)
     free = int(problem.free.sum())
     if not free:
         return 0.0

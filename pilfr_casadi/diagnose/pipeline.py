@@ -207,8 +207,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     corrected: tuple[Correction, Fitted] | None = None
     if verdict.kind == "missing-physics":
         correction, fitted = corrected = find_correction(search, answer, named=True)
-        kept = {e.name for e in answer.effects} <= {(port, law) for port, law, _ in correction.elements}
-        answer = answer.beside_learned(correction.shares["learned"] if kept else 1.0)
+        answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
         verdict = judge(search, answer, gates)
         if verdict.kind == "missing-physics":
             said = f"{verdict.sentence} {correction.sentence}" if correction.learned else verdict.sentence

@@ -17,7 +17,7 @@ one half.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,13 +81,15 @@ class Posterior:
         """Confidence of the least sure effect; zero without effects."""
         return min((e.confidence for e in self.effects), default=0.0)
 
-    def beside_learned(self, share: float) -> Posterior:
-        """The same where a learned force follows a share of the mismatch beside the named laws."""
-        named = min(self.named, share_named(share))
+    def within(self, elements: Collection[Name], learned: float) -> Posterior:
+        """The same where the corrected simulator has some elements, and a learned force of a share of the mismatch.
+
+        Effects that predict other recordings worse than what stands in their place lose their names.
+        """
+        effects = [e for e in self.effects if e.name in elements]
+        named = min(self.named, share_named(learned if effects else 1.0))
         ratio = named / max(self.named, 1e-300)
-        return replace(
-            self, named=named, effects=tuple(replace(e, confidence=ratio * e.confidence) for e in self.effects)
-        )
+        return replace(self, named=named, effects=tuple(replace(e, confidence=ratio * e.confidence) for e in effects))
 
 
 def names(trial: Trial) -> frozenset[Name]:
