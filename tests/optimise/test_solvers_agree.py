@@ -187,7 +187,7 @@ def test_infeasible_constraints(limits, solver):
     p = case("pi_wiener").problem(constraints=limits)
     s = SOLVERS[solver].solve(p)
     assert s.status is Status.INFEASIBLE
-    assert s.violation >= 0.05
+    assert s.violation >= 0.05 * (1 - 1e-12)  # the least that contradicting limits allow, up to rounding
     assert np.all(s.theta >= p.lower)
 
 
