@@ -56,6 +56,19 @@ def test_two_laws_that_tie_share_the_confidence(behind, share):
     assert list(found.effects[0].alike) == ([("a", "cubic_stiffness")] if behind < 3 else [])
 
 
+def test_an_effect_keeps_its_name_only_in_the_corrected_simulator():
+    both = trial(DRY, ("b", CubicStiffness()))
+    found = posterior(searched([(trial(left=1.0), 0.0), (both, 60.0), (trial(DRY), 40.0)]))
+    assert len(found.effects) == 2
+    one = found.within({("a", "coulomb_friction"), ("b", "backlash")}, learned=0.0)
+    assert [e.name for e in one.effects] == [("a", "coulomb_friction")]
+    assert one.sure == pytest.approx(found.sure)
+    beside = found.within({e.name for e in found.effects}, learned=0.3)
+    assert len(beside.effects) == 2 and beside.sure < 0.5 * found.sure  # a learned force does much of it
+    none = found.within({("b", "backlash")}, learned=0.0)
+    assert none.effects == () and none.named < 0.5
+
+
 def test_the_same_law_at_two_ports_that_are_not_told_apart_keeps_its_confidence():
     there = trial(("b", CoulombFriction()))
     found = posterior(searched([(trial(left=1.0), 0.0), (trial(DRY), 60.0), (there, 59.9)]))

@@ -353,3 +353,11 @@ def test_old_spellings_in_a_law_of_ones_own_work():
     local = laws.Local(np.linspace(-1, 1, 5), np.ones(5), 0.1, (5,), max_stiffness=8.0)
     assert Wall().why_not(local) == "never"
     assert Wall().bounds(local) == {"k": (0.0, 4.0)}
+
+
+def test_a_rectifying_sensor_sees_no_signs():
+    law, z = laws.Rectified(), np.linspace(-2.0, 2.0, 9)
+    both, one = (Local(z=signal, dz=np.ones(9), dt=0.1, lengths=(9,)) for signal in (z, np.abs(z)))
+    (force,) = unit_forces(law, both, [{"n": 1.5, "b": 0.1}])[:, 0].T
+    np.testing.assert_allclose(z + force, np.abs(z) ** 1.5 + 0.1, atol=1e-9)
+    assert law.why_not(one) and not law.why_not(both)
