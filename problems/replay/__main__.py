@@ -30,7 +30,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from .suites import ON_REQUEST, SUITES, differences, drifts, keys, timed
+from .suites import ON_REQUEST, SUITES, differences, drifts, keys, paired, timed
 
 FOLDER = Path(__file__).parent
 
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", default=None, metavar="KEY", help="only these keys")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args(arguments)
-    different, compared = [], 0
+    different, compared, pairs = [], 0, list[tuple[dict[str, Any], dict[str, Any]]]()
     with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
         for suite in options.suites or [s for s in SUITES if s not in ON_REQUEST]:
             old = banked(suite)
@@ -81,6 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     print(f"{suite:9} {key:24} {row['seconds']:7.1f} s  not in the bank", flush=True)
                     continue
                 compared += 1
+                pairs.append((old[key], row))
                 found = differences(suite, old[key], row)
                 different += [f"{suite} {key}: {text}" for text in found]
                 words = "; ".join(found) or "same"
@@ -91,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     print(f"\n{compared} compared, {len(different)} different")
     print("\n".join(different))
+    print(paired(pairs), end="")
     return 1 if different or not compared else 0
 
 

@@ -7,7 +7,7 @@ import io
 import re
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 import pilfr_casadi as pilfr
 
-from .. import accuracy, bank, concealed, masing_diagnosis, real_machines, speed, table2, zoo
+from .. import accuracy, bank, concealed, concealed_score, masing_diagnosis, real_machines, speed, table2, zoo
 from ..masing_data import benchmark
 
 DIGITS = 10  # of exported steps
@@ -182,3 +182,25 @@ def drifts(suite: str, old: Answer, new: Answer) -> list[str]:
         if abs(was - sure) > 0.005:
             out.append(f"{law} at {port} {was:.2f} -> {sure:.2f}")
     return out
+
+
+def paired(answers: Sequence[tuple[Answer, Answer]]) -> str:
+    """Table of right answers and seconds, of the bank and of now, on the same concealed cases; empty without any."""
+    scored = [(old, new) for old, new in answers if "score" in old and "score" in new]
+    if not scored:
+        return ""
+    lines = [f"{'':24}{'bank':>12}{'now':>12}"]
+    for mark in FIRST_NAME[:4]:
+        both = [(old["score"].get(mark), new["score"].get(mark)) for old, new in scored]
+        known = [pair for pair in both if None not in pair]
+        counts = [f"{sum(map(bool, one))} of {len(known)}" for one in zip(*known, strict=True)] or ["-", "-"]
+        lines.append(f"{mark.replace('_', ' '):24}" + "".join(f"{c:>12}" for c in counts))
+    for share, name in ((0.5, "median"), (0.9, "slowest tenth")):
+        figures = [np.quantile([row["seconds"] for row in rows], share) for rows in zip(*scored, strict=True)]
+        lines.append(f"{name + ', s':24}" + "".join(f"{f:12.1f}" for f in figures))
+    sure = [p for _, new in scored for p in new["score"].get("certainties") or ()]
+    if sure:
+        lines.append(f"{'Brier score':24}{'':12}{concealed_score.brier(*np.array(sure, dtype=float).T):12.3f}")
+    wrong = sum(bool(new["score"].get("sure_wrong")) for _, new in scored)
+    lines.append(f"{'sure and wrong':24}{'':12}{wrong:12d}")
+    return "\n".join(lines) + "\n"
