@@ -39,7 +39,7 @@ def correction_words(diagnosis: Diagnosis) -> str:
         stated = diagnosis.sure and diagnosis.outcome in ("better", "")
         return f"with {' and '.join(names)} {'put back' if stated else 'added'}"
     if diagnosis.nameless:
-        return f"with {diagnosis.nameless.words} added"
+        return "corrected"
     return f"with {diagnosis.let_go} let go" if diagnosis.let_go else ""
 
 
@@ -67,7 +67,10 @@ def headline(diagnosis: Diagnosis) -> str:
     """Write the verdict with its errors."""
     role, errors = errors_that_count(diagnosis)
     on = "On held-out recordings" if role == "test" else "On the training recordings (no test was given)"
-    text = f"{diagnosis.summary.rstrip('. ')}. {on} the error is {percent(errors.get('nominal'))} as given"
+    summary = diagnosis.summary
+    if diagnosis.nameless:  # the section below tells what it consists of
+        summary = summary.replace(f" {diagnosis.nameless.sentence}", "")
+    text = f"{summary.rstrip('. ')}. {on} the error is {percent(errors.get('nominal'))} as given"
     text += f", {percent(errors.get('before'))} refitted"
     if what := correction_words(diagnosis):
         text += f", {percent(errors.get('after'))} {what}"
