@@ -6,11 +6,11 @@ The features phi_j are stops of z with fixed thresholds and their powers (loops)
 curves of dz/dt (friction), some of them times z. u~ is an input of the simulator, standardised, where one scales the
 force. The force is linear in its weights c and d, which are fitted together with the simulator's own parameters in
 simulation error. They start from the linear solution of the projected sensitivities (`remainder`), with a ridge prior
-on the size of the force whose strength is chosen on held-out blocks. It is the discrepancy of Kennedy & O'Hagan (2001,
-J. R. Statist. Soc. B 63), inside the loop.
+on the size of the force, whose strength is chosen on held-out blocks. This is the discrepancy of Kennedy & O'Hagan
+(2001, J. R. Statist. Soc. B 63), placed inside the loop.
 
-Beyond the range of z, dz/dt and u that the training recordings visit, the signals are saturated: the force goes on a
-little way and then stays as it is. The saturation keeps a slope everywhere, so an unknown initial state can be
+Outside the range of z, dz/dt and u in the training recordings, the signals are saturated: the force changes a little
+further and then stays constant. The saturation has a nonzero slope everywhere, so an unknown initial state can be
 estimated from outside the range.
 """
 
@@ -35,30 +35,32 @@ from .remainder import Remainder, Task, lengths, usable
 from .workbench import QUICK, Fitted, Workbench, started
 
 STOPS = 8
-# over half the range of z: from presliding to a stop that slips in every loud motion, which so forgets how it began
+# thresholds over half the range of z: from presliding to a stop that slips in every large motion and so forgets its
+# start
 THRESHOLDS = np.geomspace(0.02, 0.7, STOPS)
-POWERS = 3  # of each stop: odd ones for symmetric loops, the even one for one-sided forces
-KNEES = (0.01, 0.05, 0.25)  # of the curves v / (|v| + knee), over the largest speed: from dry friction to a soft bend
+POWERS = 3  # highest power of each stop: odd ones for symmetric loops, the even one for one-sided forces
+KNEES = (0.01, 0.05, 0.25)  # of the curves v / (|v| + knee), over the largest speed: from dry friction to a smooth bend
 FEATURES = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)
-ROOM = 0.5  # of half the range, by which the signals go on at most beyond the range seen
-FREE = 5.0  # times the same while it is fitted: the refit's run may be a poor guess of the range
-RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # tried, over the mean square response to a force of unit size
-SHARES = (1.0, 0.3, 0.0)  # of the linear solution that a fit may start from
+ROOM = 0.5  # largest extension of a signal beyond its range, over half the range
+FREE = 5.0  # the same during the fit, because the refit's run may be a poor guess of the range
+# ridge strengths tried, relative to the mean square response to a force of unit size
+RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+SHARES = (1.0, 0.3, 0.0)  # fractions of the linear solution from which a fit may start
 FITS = 3  # elements that are fitted at most: the best by the linear solution
-SAME_SIGNAL = 0.99  # correlation of an input with z or dz/dt from which it is that signal and scales nothing
-SHOWN = 3  # nearest laws that are told
-LONGEST = 8000  # samples along which laws are compared with the learned force
+SAME_SIGNAL = 0.99  # correlation with z or dz/dt above which an input counts as that signal and scales nothing
+SHOWN = 3  # nearest laws that are reported
+LONGEST = 8000  # samples on which laws are compared with the learned force
 
 
 class LearnedForce(Law):
-    """A force of z, dz/dt and memory, linear in its weights; the scales of its features are held."""
+    """A force of z, dz/dt and memory, linear in its weights; the scales of its features are fixed."""
 
     id = "learned"
     equation = "w = sum_j c_j phi_j(z, dz/dt, stops of z)"
     source = "Kennedy & O'Hagan (2001), J. R. Statist. Soc. B 63(3)"
     sentence = "a learned force of the local coordinate, its rate and its turning points"
     # weights with their prior deviations; centre, reach and half the range of z, largest speed, mean and deviation of
-    # the input that scales it; ends of the ranges seen, and the room beyond them
+    # the scaling input; ends of the ranges seen, and the extension beyond them
     units: ClassVar[Mapping[str, str]] = {
         "c": "w", "std": "w", "z_0": "z", "z_s": "z", "z_h": "z", "v_s": "z/s", "u_0": "", "u_s": "",
         "z_low": "z", "z_high": "z", "v_low": "z/s", "v_high": "z/s", "u_low": "", "u_high": "",
@@ -72,11 +74,11 @@ class LearnedForce(Law):
 
     @classmethod
     def reads(cls) -> set[str]:
-        """It reads z; where dz/dt is always zero its curves of dz/dt are silent."""
+        """Return {"z"}; the curves of dz/dt vanish if dz/dt is always zero."""
         return {"z"}
 
     def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0, u: Any = None) -> tuple[Any, Any]:
-        """Force and next memory."""
+        """Compute the force and the next memory."""
         z = _saturated(z, p["z_low"], p["z_high"], p["z_room"])
         v = _saturated(dz, p["v_low"], p["v_high"], p["v_room"]) / p["v_s"]
         x = (z - p["z_0"]) / p["z_s"]
@@ -95,7 +97,7 @@ class LearnedForce(Law):
         return w, ca.vertcat(*following)
 
     def parameters(self) -> dict[str, Parameter]:
-        """Weights with their prior, free where the recordings move them, and the scales, fixed."""
+        """Return the weights with their prior, free if the recordings move them, and the fixed scales."""
         given = {**dict.fromkeys(self.units, 1.0), **self.defaults, "c": 0.0, **self.values}
         shape = (FEATURES * (2 if self.factor else 1),)
         c, std = (np.broadcast_to(np.asarray(given[name], dtype=float), shape) for name in ("c", "std"))
@@ -107,7 +109,7 @@ class LearnedForce(Law):
         return {"c": weights, **held}
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        """Generate the scales of the signals along recordings; |z| bends at zero where z is on both sides of it."""
+        """Generate the scales of the signals along recordings; |z| bends at zero if z takes both signs."""
         both = min(-local.low, local.high) > 0.1 * local.half
         centre = 0.0 if both else local.middle
         speed = local.speed if np.any(local.dz) else 1.0
@@ -116,13 +118,13 @@ class LearnedForce(Law):
 
 
 def _saturated(x: Any, low: Any, high: Any, room: Any) -> Any:
-    """Follow x from low to high, and beyond them approach low - room and high + room, with a slope all the way."""
+    """Follow x from low to high; outside, approach low - room and high + room with a nonzero slope."""
     above, below = ca.fmax(x - high, 0), ca.fmax(low - x, 0)
     return ca.fmin(ca.fmax(x, low), high) + room * above / (room + above) - room * below / (room + below)
 
 
 def _limits(room: float, **signals: np.ndarray) -> dict[str, float]:
-    """Give the range of each signal, and the room beyond it."""
+    """Return the range of each signal, and its extension beyond the range."""
     out: dict[str, float] = {}
     for name, values in signals.items():
         low, high = float(np.min(values)), float(np.max(values))
@@ -132,7 +134,7 @@ def _limits(room: float, **signals: np.ndarray) -> dict[str, float]:
 
 @functools.cache  # the same class for the same input
 def learned_force(factor: str = "") -> type[LearnedForce]:
-    """Make the class of learned forces, with an input that scales a part of the force where one is named."""
+    """Make the class of learned forces; the input `factor`, if any, scales a part of the force."""
     if not factor:
         return LearnedForce
     own = {
@@ -147,7 +149,7 @@ def learned_force(factor: str = "") -> type[LearnedForce]:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A learned element as the linear problem gives it: the law at its start values, and the share it explains.
+    """A learned element from the linear problem: the law at its start values, and the share that it explains.
 
     The share is that of the residual's power on blocks that the weights were not fitted to.
     """
@@ -158,7 +160,7 @@ class Start:
 
 
 def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str], inputs: Sequence[str]) -> list[Start]:
-    """Solve the linear problem at each port, without and with each input that scales the force, best first."""
+    """Solve the linear problem at each port, without and with each input that may scale the force, best first."""
     probe, runs = linearised(bench, base)
     rest = Remainder.of(bench, probe, runs, (LearnedForce,))
     samples = sum(len(r) - r.skip for r in bench.recordings) * len(bench.scale)
@@ -174,7 +176,7 @@ def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str], inp
 
 
 def _scales(task: Task, name: str) -> bool:
-    """Whether an input may scale the force at a port: it varies, and is not one of the port's own signals."""
+    """Tell whether an input may scale the force at a port: it varies, and is not one of the port's own signals."""
     u, local = task.local.inputs[name], task.local
     if task.port.series or not np.ptp(u) > 0:
         return False
@@ -185,9 +187,9 @@ def _scales(task: Task, name: str) -> bool:
 def _solved(
     rest: Remainder, task: Task, forces: np.ndarray, shape: Mapping[str, Any], factor: str, repeated: float
 ) -> Start:
-    """Fit the weights to the projected residual by ridge regression, its strength chosen on held-out blocks.
+    """Fit the weights to the projected residual by ridge regression; its strength is chosen on held-out blocks.
 
-    `repeated` is the number of scored samples for each that is looked at: the prior counts once.
+    `repeated` is the number of scored samples per fitted sample; the prior counts once.
     """
     scales, columns = dict(shape), forces.copy()
     if factor:
@@ -212,7 +214,7 @@ def _ridge(a: np.ndarray, b: np.ndarray, ridge: float) -> np.ndarray:
 
 
 def _error_unseen(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> float:
-    """Sum of squares on every second block by weights fitted to the others, and the other way round."""
+    """Compute the sum of squares on every second block by weights fitted to the others, and vice versa."""
     parts = ((fold, ~fold) for fold in (odd, ~odd))
     return sum(float(np.sum((left[b] - phi[b] @ _ridge(phi[a], left[a], ridge)) ** 2)) for a, b in parts)
 
@@ -225,23 +227,23 @@ def candidates(
     inputs: Sequence[str] = (),
     workers: int = 1,
 ) -> list[Fitted]:
-    """Fit a learned element on top of a fitted simulator, which may have elements already, at each of some ports.
+    """Fit a learned element at each of some ports, on top of a fitted simulator, which may already have elements.
 
     Parameters
     ----------
     part : Workbench
-        The bench with as much of the recordings as is enough to choose by; the chosen elements are fitted to all.
+        The bench with as much of the recordings as is needed to choose; the chosen elements are fitted to all.
     port_names : sequence of str
         Ports to try.
     inputs : sequence of str
-        Inputs that may scale the force, each tried besides the force alone.
+        Inputs that may scale the force; each is tried in addition to the force alone.
     workers : int
-        Threads; the best few by the linear solution are fitted.
+        Threads; the best few elements by the linear solution are fitted.
 
     Returns
     -------
     list of Fitted
-        The learned element is the last; smallest error first. Fits that diverge are left out.
+        Smallest error first; the learned element is the last of each. Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names, inputs) if s.share > 0]
     found = side_by_side(lambda start: _fitted(bench, part, base, start), starts[:FITS], workers)
@@ -249,7 +251,7 @@ def candidates(
 
 
 def _fitted(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fitted | None:
-    """Fit a learned element with the simulator's own parameters; None where every start diverges."""
+    """Fit a learned element together with the simulator's own parameters; None if every start diverges."""
     placed = base.simulator.with_element(start.port, start.law)
     model = bench.model(placed)
     engine = make_engine(model, bench.engine)
@@ -274,7 +276,7 @@ def _fitted(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fi
 
 
 def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Local coordinate, rate and force of an element along the fitted runs of all recordings, (M,) each."""
+    """Compute local coordinate, rate and force of an element along the fitted runs of all recordings, (M,) each."""
     number %= len(fitted.simulator.elements)
     found = [law_signals(bench, fitted, number, i) for i in range(len(bench.recordings))]
     z, dz, w = (np.concatenate(part) for part in zip(*found, strict=True))
@@ -283,7 +285,7 @@ def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[n
 
 @dataclass(frozen=True, eq=False)
 class NearLaw:
-    """A named law that follows the learned force: its rms error over the force's deviation, and its force (M,)."""
+    """A named law close to the learned force: its rms error over the force's deviation, and its force (M,)."""
 
     law: str
     form: str
@@ -291,7 +293,7 @@ class NearLaw:
     force: np.ndarray
 
     def to_dict(self) -> dict[str, Any]:
-        """As in diagnosis.json."""
+        """Return the content for diagnosis.json."""
         return {"law": self.law, "form": self.form, "error": self.error}
 
 
@@ -302,13 +304,13 @@ class Learned:
     Attributes
     ----------
     port, factor : str
-        Where it acts, and the input that scales a part of it, if any.
+        Its port, and the input that scales a part of it, if any.
     share : float
-        Share of what the refit leaves above the noise that it follows beyond the named laws.
+        Share of the refit's error above the noise that it explains in addition to the named laws.
     z, dz, force : array, shape (M,)
         Local coordinate, rate and force along the training recordings.
     nearest : tuple of NearLaw
-        Laws of the catalogue that come nearest to the force, best first.
+        Laws of the catalogue closest to the force, best first.
     """
 
     port: str
@@ -321,7 +323,7 @@ class Learned:
 
     @property
     def sentence(self) -> str:
-        """Say where it acts, on which range it holds, and which laws are near."""
+        """Describe its port, the range on which it holds, and the nearest laws."""
         by = f", a part of it scaled by {self.factor}" if self.factor else ""
         names = ", ".join(f"{display_name(n.law)} (off by {100 * n.error:.2g} %)" for n in self.nearest)
         near = f" The nearest laws are {names}." if names else ""
@@ -332,7 +334,7 @@ class Learned:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As in diagnosis.json."""
+        """Return the content for diagnosis.json."""
         return {
             "port": self.port,
             "factor": self.factor,
@@ -344,7 +346,7 @@ class Learned:
 
 
 def described(bench: Workbench, fitted: Fitted, share: float, laws: Collection[type[Law]]) -> Learned:
-    """Describe the learned element that is the last of a fitted simulator, with the laws that come nearest."""
+    """Describe the last element of a fitted simulator, a learned one, with the nearest laws."""
     element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)
     inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in bench.recordings]).T, strict=True))
@@ -360,9 +362,9 @@ def described(bench: Workbench, fitted: Fitted, share: float, laws: Collection[t
 
 
 def nearest_laws(local: Local, force: np.ndarray, laws: Sequence[type[Law]]) -> tuple[NearLaw, ...]:
-    """Find the laws that come nearest to a force along z and dz/dt, linear in strengths, shapes on their grids.
+    """Find the laws nearest to a force along z and dz/dt: strengths by least squares, shapes on their grids.
 
-    A constant is free, since offsets are a matter of where z is zero. Of several forms of a law the best one counts.
+    A constant is free, because the zero of z is arbitrary. Of several forms of a law, the best one counts.
     """
     most = max(LONGEST // len(local.lengths), 1)
     ends = np.cumsum((0, *local.lengths))

@@ -1,4 +1,4 @@
-"""The diagnosis, step by step: how an answer comes about."""
+"""The steps of a diagnosis in their order."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from .trials import Trial
 from .verdict import SURE, Verdict, judge
 from .workbench import Fitted
 
-AS_GIVEN = 0.5  # ratio of mean squares from which a search on channels that were not shifted replaces the first one
+AS_GIVEN = 0.5  # ratio of mean squares below which a search without shifted early channels replaces the first search
 SEARCHING = 0.7  # share of the remaining time for the search; the rest is for the correction
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What is diagnosed, and how; see `diagnose`."""
+    """Arguments of `diagnose`, checked; see there."""
 
     simulator: Simulator
     recordings: Sequence[Recording]
@@ -60,18 +60,18 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class Conclusion:
-    """What a search came to.
+    """Answer of a search.
 
     Attributes
     ----------
     fitted : Fitted
-        The corrected simulator; the refitted one where there is nothing to correct.
+        The corrected simulator, or the refitted one if there is nothing to correct.
     correction : Correction
-        What `fitted` has beside the refitted simulator.
+        The elements that `fitted` has beside the refitted simulator.
     effects : tuple of Named
-        The effects that are named.
+        The named effects.
     let_go : str
-        The fixed parameter whose other value explains what a law was named for.
+        The pinned parameter whose other value explains as much as the named law.
     """
 
     verdict: Verdict
@@ -100,11 +100,11 @@ def diagnose_in_steps(
 ) -> Diagnosis:
     """Carry out `diagnose`, whose parameters these are.
 
-    1. The arguments are checked, and channels are matched by name.
-    2. The recordings are checked for faults, the simulator is refitted, and the noise is measured (`preparation`).
-    3. The search fits hypotheses, sets of laws in ports, and keeps all of them (`search`).
-    4. All hypotheses are weighed; verdict, effects and corrected simulator are chosen (`conclude`).
-    5. Test recordings, placebos and standard errors are the proof (`proof`); they change nothing above.
+    1. Check the arguments, and match channels by name.
+    2. Check the recordings for faults, refit the simulator, and measure the noise (`preparation`).
+    3. Fit hypotheses, which are sets of laws in ports, and keep all of them (`search`).
+    4. Weigh all hypotheses; choose verdict, effects and corrected simulator (`conclude`).
+    5. Compute the proof (`proof`): errors on test recordings, placebos, standard errors. It changes nothing above.
     """
     began = time.perf_counter()
     workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
@@ -126,14 +126,14 @@ def diagnose_in_steps(
 
 
 def _searched_both_holds(request: Request) -> tuple[Prepared, Search]:
-    """Search; where nobody said what inputs do between samples and it matters, take the hold with the smaller error."""
+    """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
     ready, search = _searched(request)
     if search.interrupted or not search.misheld():
         return ready, search
     hold = search.bench.otherwise_held().hold
     try:
         other, again = _searched(replace(request, hold=hold, say=request.say.under("other hold: ")))
-    except InputError:  # it cannot be run so
+    except InputError:  # the simulator cannot be run with this hold
         return ready, search.settled(request.most_effects)
     only_refitted = again.interrupted and len(again.memo) < 2
     if again.best.whole > search.best.whole or only_refitted:
@@ -144,7 +144,7 @@ def _searched_both_holds(request: Request) -> tuple[Prepared, Search]:
 
 
 def _searched(request: Request) -> tuple[Prepared, Search]:
-    """Prepare and search; once more without shifting channels that seemed early, where that leaves far less."""
+    """Prepare and search; repeat without shifting early channels if these were shifted, and keep the better search."""
     ready, search = _searched_once(request, shift_early=True)
     seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
     if not seemed_early or search.interrupted or search.out_of_time or not search.room(search.best):
@@ -188,13 +188,13 @@ def _searched_once(request: Request, shift_early: bool) -> tuple[Prepared, Searc
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """Draw the conclusion from a search.
 
-    1. The posterior gives a verdict.
-    2. A parameter that is fixed at a wrong value, or an input that was clipped, may explain as much as a law.
-    3. Named laws compete with a learned force on held-out data. Where the force predicts better, the name is refuted.
-    4. For what has no name, undeclared ports and varying values are looked at, and the best predictor is handed back.
+    1. Compute the posterior, which gives a verdict.
+    2. Check whether a wrong fixed parameter, or a clipped input, explains as much as a law.
+    3. Compare named laws with a learned force on held-out data. If the force predicts better, the name is refuted.
+    4. If there is no name, check undeclared ports and varying values, and return the best predictor.
 
-    After Ctrl-C and at the time limit 2 and the first half of 4 are left out; after Ctrl-C a name that was found stays,
-    and else the refitted simulator is handed back.
+    After Ctrl-C and at the time limit, step 2 and the first half of step 4 are skipped. After Ctrl-C, a name that was
+    found stays; otherwise the refitted simulator is returned.
     """
     answer, interrupted = posterior(search), search.interrupted
     finished = not (interrupted or search.out_of_time)
@@ -230,7 +230,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
 
 
 def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: Sequence[Gate]) -> Conclusion | None:
-    """A parameter held at a wrong value, or an input that was clipped, where that explains as much as laws do."""
+    """Conclude that a parameter has a wrong pinned value, or an input was clipped, if that explains as much as laws."""
     held = held_value(search, answer)
     if held is not None:
         corrected = as_named(search, held.fitted)
@@ -314,7 +314,7 @@ def _build_diagnosis(
 
 
 def _blind_spots(request: Request, search: Search) -> tuple[BlindSpot, ...]:
-    """What the recordings cannot reveal of the refitted simulator; nothing where that cannot be told."""
+    """Find what the recordings cannot reveal of the refitted simulator; empty if that cannot be computed."""
     bench = search.bench
     with suppress(InputError, np.linalg.LinAlgError):
         return assess(bench, search.root.fitted, bench.hold if request.hold_said else "").blind_spots
@@ -323,7 +323,7 @@ def _blind_spots(request: Request, search: Search) -> tuple[BlindSpot, ...]:
 
 def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
     bench = search.bench
-    element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # maybe in another form
+    element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # its form may differ
     law = element.law
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
@@ -353,7 +353,7 @@ def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndar
 
 
 def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
-    """The experiment that would separate the first tie, where there is one."""
+    """Design the experiment that would separate the first tie, if there is one."""
     for effect in effects:
         if effect.alike:
             name, other = next(iter(effect.alike.items()))
@@ -368,7 +368,7 @@ def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] 
 
 
 def _row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
-    """A candidate as in diagnosis.json."""
+    """Return a candidate's row for diagnosis.json."""
     held_out = search.held_out.get(t.key)
     gain = search.evidence(t) - search.evidence(parent)
     return {

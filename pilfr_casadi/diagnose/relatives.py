@@ -1,13 +1,13 @@
-"""Further hypotheses that what came out best asks for, and that the screen did not let through.
+"""Further hypotheses that are related to the best ones, and that the screen did not select.
 
-Each is a pair of port and law with start values of its own:
+Each is a pair of port and law with its own start values:
 
 - a special case of the best law, and a law that the best one refines;
 - another form of a law that came near;
 - a law with one more term than one that came near, from its values;
-- a resonance whose frequency is known: as a mass carried along at another port, or in place of a delay or a lag;
-- a law of a signal that takes time, at the other end of a simulator that is nearly linear;
-- a simple law whose force is most like the one that a flexible law makes along its port's own signal.
+- a resonance of known frequency: as a mass attached at another port, or in place of a delay or a lag;
+- a law of a signal with its own time scale, at the other end of a nearly linear simulator;
+- a simple law whose force is most like that of a flexible law along its port's own signal.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from .screen import Scored, start_values
 from .trials import Trial
 from .workbench import Fitted, Workbench
 
-AHEAD = 1.5  # times the best error beyond which a relative is worth another start
-BEHIND = 3.0  # times the best error of a delay or a lag that may stand for a resonance
-DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in its place
-LIKEST = 3  # simple laws whose force is like that of a flexible one
-SEEN = 4000  # samples that forces are compared on, about
-HUGE = 1e60  # signals that a simulation which diverges comes to
-# a law -> laws that are special cases of it
+AHEAD = 1.5  # ratio to the best error beyond which a related law gets another start
+BEHIND = 3.0  # largest ratio to the best error of a delay or a lag that may represent a resonance
+DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in place of a delay or a lag
+LIKEST = 3  # simple laws, with a force like that of a flexible law, that are tried
+SEEN = 4000  # approximate number of samples on which forces are compared
+HUGE = 1e60  # bound on signals, above which a simulation diverges
+# by law: the laws that are special cases of it
 CONTAINS = {
     "hysteresis": ("backlash", "coulomb_friction", "linear_stiffness"),
     "stribeck_friction": ("coulomb_friction",),
@@ -44,7 +44,7 @@ CONTAINS = {
 
 
 def complements(one: Law, other: Law) -> bool:
-    """Whether two laws of a port are different physics: one opposes motion, the other is a curve of position.
+    """Tell whether two laws of a port are different physics: one opposes motion, the other is a curve of position.
 
     A constant offset may stand beside any other law.
     """
@@ -56,7 +56,7 @@ def complements(one: Law, other: Law) -> bool:
 
 
 def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Pairs of port and law to be fitted as well; trials and what was scored are best first."""
+    """Select further pairs of port and law for a fit; trials and scored entries are best first."""
     if not trials:
         return []
     found = [
@@ -68,19 +68,19 @@ def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored
 
 
 def _near(trials: Sequence[Trial]) -> set[tuple[str, type[Law]]]:
-    """Pairs that came near."""
+    """Return the pairs of port and law that came near the best error."""
     return {(t.port, type(t.law)) for t in trials if t.error < AHEAD * trials[0].error}
 
 
 def _special(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Special cases of the best law at its port, which may have been left where a few steps led."""
+    """Select special cases of the best law at its port that did not come near, as from a wrong minimum."""
     best, near = trials[0], _near(trials)
     cases = CONTAINS.get(best.law.id, ())
     return [s for s in scored if s.port == best.port and s.law.id in cases and (s.port, type(s.law)) not in near]
 
 
 def _forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Other forms of the laws that came near, where they were not tried."""
+    """Select untried forms of the laws that came near."""
     tried = {(t.port, type(t.law)) for t in trials}
     ids = {(t.port, t.law.id) for t in trials if t.error < AHEAD * trials[0].error}
     out: dict[tuple[str, type[Law]], Scored] = {}
@@ -91,7 +91,7 @@ def _forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
 
 
 def _carried(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Carried masses at every port where none came near, from the frequency and damping of the best resonance."""
+    """Select attached masses at every port where none came near, from frequency and damping of the best resonance."""
     best, near = trials[0], _near(trials)
     if not {"W", "D"} <= set(best.law.units) or isinstance(best.law, Attached):
         return []
@@ -100,7 +100,7 @@ def _carried(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
 
 
 def _late(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Damped resonances where a delay or a lag of T came near: at low frequencies they are 2 D / W late."""
+    """Select damped resonances in place of a delay or a lag T that came near: at low frequencies T = 2 D / W."""
     late: dict[str, float] = {}
     for t in trials:
         if isinstance(t.law, Delay | Lag) and t.error < BEHIND * trials[0].error and t.port not in late:
@@ -113,7 +113,7 @@ def _late(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
 
 
 def _other_end(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """The best law of a signal that takes time, at every actuator and sensor where it did not come near."""
+    """Select the best law, if it has its own time scale, at every actuator and sensor where it did not come near."""
     best, near = trials[0], _near(trials)
     if not in_series(best.port) or not (best.law.order or best.law.shifts):
         return []
@@ -123,7 +123,7 @@ def _other_end(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored
 
 
 def _started(entries: Iterator[Scored], starts: Sequence[dict[str, Any]]) -> list[Scored]:
-    """The first entry of each pair, started at some values besides its own."""
+    """Return the first entry of each pair, with starts at some given values added."""
     out: dict[tuple[str, type], Scored] = {}
     for s in entries:
         more = [{**own, **start} for own in s.starts for start in starts]
@@ -132,7 +132,7 @@ def _started(entries: Iterator[Scored], starts: Sequence[dict[str, Any]]) -> lis
 
 
 def _refined(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Laws that came near with one more term, where that came out worse or was not tried: from their values."""
+    """Select laws with one more term than one that came near, if worse or untried: from its values."""
     least = {(t.port, type(t.law)): t.error for t in reversed(trials)}
     out: dict[tuple[str, type], Scored] = {}
     for t in trials:
@@ -148,7 +148,7 @@ def _refined(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
 
 
 def _plainer(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """The law that one which came near refines, where that was not tried or came out far worse: from its values."""
+    """Select the law that one which came near refines, if untried or far worse: from its values."""
     near, out = _near(trials), dict[tuple[str, type], Scored]()
     for t in trials:
         plain: Any = type(t.law).__base__
@@ -165,7 +165,7 @@ def _plainer(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
 
 
 def _imitated(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Simple laws at the best one's port whose force is most like its, started there; none where it is simple."""
+    """Select simple laws at the best law's port with the most similar force; none if the best law is simple."""
     best, near = trials[0], _near(trials)
     if best.law.id not in FLEXIBLE:
         return []
@@ -174,7 +174,8 @@ def _imitated(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored
         if s.port == best.port and s.law.id not in FLEXIBLE and (s.port, type(s.law)) not in near:
             entries.setdefault(type(s.law), s)
     local = felt(bench, best.fitted, best.port)
-    if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):  # nor nan, as of a root below zero
+    # also excludes nan, for example from the root of a negative number
+    if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):
         return []
     values, law = best.own, best.law
     shape = {k: v for k, v in values.items() if k not in law.strength}
@@ -187,7 +188,7 @@ def _imitated(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored
 
 
 def felt(bench: Workbench, fitted: Fitted, port: str) -> Local:
-    """What a port feels along the fitted runs of all recordings."""
+    """Compute the local signals of a port along the fitted runs of all recordings."""
     simulator, model = fitted.simulator, fitted.model
     index = [p.name for p in simulator.all_ports()].index(port)
     own, parts = signals(simulator), []
@@ -205,7 +206,7 @@ def felt(bench: Workbench, fitted: Fitted, port: str) -> Local:
 
 
 def _likest(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:
-    """Share of a force that a law leaves, beside what gains of the signal and its rate follow, and its start values."""
+    """Compute the share of a force that a law leaves, beside gains of the signal and its rate, and its start values."""
     shapes = list(law.shapes(local))
     every = max(len(force) // SEEN, 1)
     base = np.column_stack([np.ones_like(local.z), local.z, local.dz])[::every]
@@ -218,7 +219,7 @@ def _likest(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str,
         if not np.all(np.isfinite(columns)):
             continue
         found = np.linalg.lstsq(columns, target, rcond=1e-9)[0]
-        if not law.strength and found[0] <= 0:  # the simulator's gain may scale it, not turn it round
+        if not law.strength and found[0] <= 0:  # the simulator's gain may scale the force, but not change its sign
             continue
         left = float(np.sum((target - columns @ found) ** 2)) / max(total, 1e-300)
         if left < best:

@@ -1,8 +1,8 @@
 """Fits of hypotheses: a simulator with laws put into its ports, all parameters estimated together.
 
-A pair of port and law is fitted briefly from its best initial values. The best pairs are fitted again from several.
-Those that may win are fitted to convergence and to all samples. A sharp knee, as of dry friction, is fitted on steps
-that are fine enough for it.
+A pair of port and law is fitted briefly from its best initial values. The best pairs are fitted again from several
+initial values. Those that may win are fitted to convergence and to all samples. A sharp knee, such as that of dry
+friction, is fitted on steps that are fine enough for it.
 """
 
 from __future__ import annotations
@@ -28,32 +28,33 @@ from .screen import Scored
 from .step_refinement import knees, on_finer_steps
 from .workbench import QUICK, THOROUGH, Fitted, Workbench, started
 
-LONG = 8000  # samples that brief fits look at
+LONG = 8000  # samples used by brief fits
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
-BEST, FEW = 10, 4  # pairs of each list of the screen that are fitted besides the best of each port; to look again
-EQUAL = 1e-3  # difference of shares that is none
-REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first, or to look again
-AGAIN = 3  # starts that a pair is fitted from again
-SAME = 1.02  # times the mean square error of fits that came to the same place
-BEHIND = 3.0  # times the best error of a pair that is not worth more starts
-FAINT = 0.01  # of the share that the other run sees, below which one has seen nothing to start at
+# pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
+BEST, FEW = 10, 4
+EQUAL = 1e-3  # difference of shares that counts as zero
+REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first, or if `again`
+AGAIN = 3  # starts from which a pair is fitted again
+SAME = 1.02  # ratio of mean square errors within which fits count as equal
+BEHIND = 3.0  # ratio to the best error above which a pair gets no more starts
+FAINT = 0.01  # ratio to the larger share of the two runs below which a run's start values are not used
 Key = frozenset[tuple[str, type[Law]]]
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A hypothesis, fitted: laws in ports beside the simulator.
+    """A fitted hypothesis: laws in ports of the simulator.
 
     Attributes
     ----------
     laws : tuple of Placed
-        The laws put in, in the order in which they were.
+        The added laws, in their order.
     part : float
-        Mean square error on the part of the recordings that it was fitted to, in units of the outputs' variance.
+        Mean square error on the part of the recordings used by the fit, in units of the outputs' variance.
     whole : float
-        The same on everything.
+        The same on all recordings.
     thorough : bool
-        Whether it was fitted to everything.
+        Whether it was fitted to convergence and to all samples.
     information : array
         See `evidence.information`.
     """
@@ -67,38 +68,38 @@ class Trial:
 
     @property
     def key(self) -> Key:
-        """What makes two hypotheses the same."""
+        """Ports and classes of the laws; equal keys mean the same hypothesis."""
         return frozenset((e.port, type(e.law)) for e in self.laws)
 
     def supersedes(self, other: Trial) -> bool:
-        """Whether it is the better fit of the same hypothesis; a thorough one counts before a brief one."""
+        """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
         if self.thorough != other.thorough:
             return self.thorough or self.whole < other.whole / SAME
         return self.whole < other.whole
 
     @property
     def element(self) -> Placed:
-        """The law put in last."""
+        """The law added last."""
         return self.laws[-1]
 
     @property
     def port(self) -> str:
-        """Port of the law put in last."""
+        """Port of the law added last."""
         return self.element.port
 
     @property
     def law(self) -> Law:
-        """The law put in last."""
+        """The law added last."""
         return self.element.law
 
     @property
     def name(self) -> tuple[str, str]:
-        """Port and id of the law put in last."""
+        """Port and id of the law added last."""
         return self.port, self.law.id
 
     @property
     def own(self) -> dict[str, Any]:
-        """Fitted values of the law put in last, by its own names."""
+        """Fitted values of the law added last, by its own names."""
         return self.element.own(self.fitted.values)
 
     @property
@@ -108,19 +109,19 @@ class Trial:
 
     @property
     def knee(self) -> str:
-        """Full name of the speed within which the last law's force turns round, where it has one."""
+        """Full name of the knee, the speed within which the last law's force reverses, if it has one."""
         knee = getattr(self.law, "knee", "")
         return f"{self.element.prefix}{knee}" if knee else ""
 
     @functools.cached_property
     def doubtful(self) -> bool:
-        """Whether a law at its fitted values is hardly what its name says."""
+        """Whether a law degenerates at its fitted values."""
         return any(e.law.doubtful(e.own(self.fitted.values)) for e in self.laws)
 
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """Fits hypotheses on the recordings of a bench, some side by side, until a time (of `time.perf_counter`)."""
+    """Fits of hypotheses to the recordings of a bench, in parallel, until a time (of `time.perf_counter`)."""
 
     bench: Workbench
     workers: int
@@ -128,19 +129,19 @@ class Trials:
 
     @property
     def over(self) -> bool:
-        """Whether the time is over."""
+        """Whether the time limit has passed."""
         return time.perf_counter() > self.until
 
     @property
     def part(self) -> Workbench:
-        """The bench with as much of the recordings as brief fits look at."""
+        """The bench with the part of the recordings that brief fits use."""
         total = sum(map(len, self.bench.recordings))
         return self.bench.on([_head(r, LONG / total) for r in self.bench.recordings]) if total > LONG else self.bench
 
     def fitted(
         self, simulator: Simulator, starts: Sequence[Mapping[str, Any]], count: int, **options: Any
     ) -> Trial | None:
-        """Fit a simulator whose last `count` elements are the hypothesis' laws; None where every start diverges.
+        """Fit a simulator whose last `count` elements are the hypothesis' laws; None if every start diverges.
 
         `options` are those of `Workbench.fit`.
         """
@@ -160,9 +161,9 @@ class Trials:
         return Trial(laws, found, found.cost, whole if np.isfinite(whole) else np.inf)
 
     def polished(self, trial: Trial) -> Trial:
-        """Fit a trial thoroughly and to everything."""
+        """Fit a trial to convergence and to all samples."""
         bench = replace(self.bench, at_least=max(self.bench.at_least, trial.fitted.model.substeps))
-        placed = trial.fitted.corrected()  # sub-steps for the laws as they were fitted
+        placed = trial.fitted.corrected()  # choose sub-steps for the fitted laws
         model = bench.model(placed)
         engine = make_engine(model, bench.engine)
         starts, states = knees(trial), trial.fitted.initial
@@ -186,10 +187,10 @@ class Trials:
         report: Callable[[int, int, float], None],
         again: bool = False,
     ) -> list[Trial]:
-        """Fit every pair of port and law that the screen lets through beside a parent's laws, smallest error first.
+        """Fit every pair of port and law that the screen selects beside a parent's laws, smallest error first.
 
-        Where one of the first comes below the error `enough`, those that are far behind it are not refined. To look
-        `again`, in place of a law that is known, a few are enough.
+        If one of the first comes below the error `enough`, those far behind it are not refined. With `again`, in place
+        of a known law, fewer pairs are fitted.
         """
         pairs = survivors(scored, FEW if again else BEST)
         most = FIRST if again else REFINED
@@ -233,7 +234,8 @@ class Trials:
         engine = make_engine(model, self.bench.engine)
         nominal = {k: p.value for k, p in base.simulator.parameters.items()}
         starts: list[Mapping[str, Any]] = []
-        led: list[Mapping[str, Any]] = []  # the observer's run may be near the truth where the simulation is not
+        # values from the observer's run, which may be near the truth if the simulation is not
+        led: list[Mapping[str, Any]] = []
         for entry in entries:
             for i, own in enumerate(entry.starts):
                 _, named = put_in(base.simulator, entry, own)
@@ -241,7 +243,7 @@ class Trials:
                 if i == 0:
                     led += [starts[-1]] if entry.source == "observer" else []
                     starts.append({**nominal, **named})
-        if set(first.law.parameters()) == set(first.law.strength):  # with nothing of it the simulator is as it was
+        if set(first.law.parameters()) == set(first.law.strength):  # at zero strength the simulator is unchanged
             _, named = put_in(base.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
             starts.append({**base.values, **named})
         best, *rest = self._by_cost(placed, model, engine, starts, base)
@@ -252,7 +254,7 @@ class Trials:
         return _Begun(placed, model, engine, ranked, base.begin, count, brief)
 
     def _refined(self, pairs: Sequence[_Begun], led: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
-        """Fit pairs from several starts, and `led` by the observer as well; three that agree are enough."""
+        """Fit pairs from several starts, and if `led` by the observer as well; three that agree are enough."""
 
         def submit(pair: _Begun, some: slice) -> list[Future[Trial | None]]:
             options = {"states": pair.states, "model": pair.model, "engine": pair.engine}
@@ -278,7 +280,7 @@ class Trials:
         starts: Sequence[Mapping[str, Any]],
         base: Fitted,
     ) -> list[Mapping[str, Any]]:
-        """Order starts by their error as they stand, from the initial states of a fit."""
+        """Order starts by their error before a fit, from the initial states of a fit."""
         part = self.part
         initial = part.begun(placed, model, started(model, starts[0]), base.begin)
 
@@ -292,7 +294,7 @@ class Trials:
 
 @dataclass(frozen=True, eq=False)
 class _Begun:
-    """A pair with its compiled model and its starts, best first."""
+    """A pair with its compiled model, its starts, best first, and its brief fit."""
 
     placed: Simulator
     model: Model
@@ -303,7 +305,7 @@ class _Begun:
     trial: Trial | None
 
     def starts_again(self, led: bool) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
-        """Starts to fit from again, each with the observer's gains on its way: led first, where it is."""
+        """Return the starts for further fits, each with the observer's gains; those with the observer come first."""
         starts = self.starts[:AGAIN]
         if self.trial is not None:
             starts = [self.trial.fitted.values, *starts[1:]]
@@ -311,19 +313,19 @@ class _Begun:
 
 
 def _agree(found: Sequence[Trial | None]) -> bool:
-    """Whether three fits came to the same place."""
+    """Tell whether three fits came to the same minimum."""
     costs = sorted(t.part for t in found if t)
     return len(costs) > 2 and costs[2] < SAME * costs[0]
 
 
 def _head(r: Recording, share: float) -> Recording:
-    """The first part of a recording."""
+    """Return the first part of a recording."""
     cut = max(int(share * len(r)), min(len(r), r.skip + 20))
     return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 
 def survivors(scored: Sequence[Scored], best: int = BEST) -> list[list[Scored]]:
-    """Pick the pairs worth a full fit: the best of both lists and the best of each port."""
+    """Select the pairs worth a full fit: the best of both lists and the best of each port."""
     chosen: dict[tuple[str, type[Law]], list[Scored]] = {}
     for source in ("simulation", "observer"):
         ports, passed = set[str](), list[Scored]()
@@ -340,7 +342,7 @@ def survivors(scored: Sequence[Scored], best: int = BEST) -> list[list[Scored]]:
 
 
 def _adds_nothing(one: Scored, other: Scored) -> bool:
-    """Whether of two laws at a port the one refines the other and scores the same."""
+    """Tell whether, of two laws at a port, one refines the other and they score the same."""
     a, b = type(one.law), type(other.law)
     return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < EQUAL
 
