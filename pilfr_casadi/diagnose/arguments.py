@@ -16,7 +16,7 @@ from ..simulators import Simulator, as_simulator
 FEWEST_SAMPLES = 20  # samples in all training recordings together; fewer cannot determine a model
 
 
-def matched(
+def match_recordings(
     simulator: Any, train: Recording | Sequence[Recording], hold: str | None, excited: bool = True
 ) -> tuple[Simulator, tuple[Recording, ...]]:
     """Return the simulator, and the recordings with its channels in its order.
@@ -36,7 +36,7 @@ def matched(
     return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited)
 
 
-def matched_tests(
+def match_tests(
     simulator: Simulator, test: Recording | Sequence[Recording] | None, train: Sequence[Recording]
 ) -> tuple[Recording, ...]:
     """Return the test recordings with the simulator's channels; refuse training data and other steps."""
@@ -57,7 +57,7 @@ def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
     return CATALOGUE if laws is None else tuple(laws)
 
 
-def with_scaled(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
+def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
     """Return the laws, and scaled versions of some of them for each input that the equations do not read."""
     return (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
 

@@ -19,12 +19,12 @@ from .._base import in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import Law, display_name
 from ..simulators import in_series
-from .arguments import check_laws, matched
+from .arguments import check_laws, match_recordings
 from .detectability import Excitation, LawRow, assess_laws, excitations, group_alike
 from .floor import ABOVE_NOISE, noise_floor
 from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters, helpful_sensors
 from .linearise import linearised
-from .preparation import said_hold
+from .preparation import stated_hold
 from .workbench import Fitted, Workbench
 
 FINEST = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
@@ -237,9 +237,9 @@ def check(
     InputError
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
-    simulator, recordings = matched(simulator, train, hold, excited=False)
+    simulator, recordings = match_recordings(simulator, train, hold, excited=False)
     check_laws(laws)
-    stated = said_hold(simulator, recordings, hold)
+    stated = stated_hold(simulator, recordings, hold)
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
     fitted = bench.fit(simulator)
     bench.check_followed(fitted)

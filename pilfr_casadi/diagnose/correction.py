@@ -22,8 +22,8 @@ from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
 from .cross_validation import HeldOut
-from .learned import Learned, LearnedForce, candidates, described
-from .posterior import Posterior, unfollowed
+from .learned import Learned, LearnedForce, candidates, describe_learned
+from .posterior import Posterior, explainable_remainder
 from .search import FORMULA, Search
 from .trials import Trial
 from .verdict import SURE
@@ -116,56 +116,60 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     correction omits them. Learned elements at their own ports would only imitate them, and are not tried.
     """
     best_laws = answer.best
-    if named and answer.sure > SURE and unfollowed(search, best_laws) < FORMULA:
-        return as_named(search, best_laws.fitted), best_laws.fitted
+    if named and answer.sure > SURE and explainable_remainder(search, best_laws) < FORMULA:
+        return named_correction(search, best_laws.fitted), best_laws.fitted
     found: list[_Hypothesis] = []
-    for fitted, named_only, predict in _competing(search, best_laws if named else None):
+    for fitted, named_only, predict in _competitors(search, best_laws if named else None):
         least = min((h.held_out.mean_square for h in found), default=np.inf)
         if fitted.cost < least:  # held-out error is never below the fit error
             found.append(_Hypothesis(fitted, named_only, predict()))
         if time.perf_counter() > search.deadline:
             break
     if not found:
-        return as_named(search, best_laws.fitted), best_laws.fitted
+        return named_correction(search, best_laws.fitted), best_laws.fitted
     best = min(found, key=lambda h: h.held_out.expected)
     shares = _shares(search, best.named, best.fitted)
     learned: tuple[Learned, ...] = ()
     if best.fitted is not best.named:
-        learned = (described(search.bench, best.fitted, shares["learned"], dict.fromkeys((*CATALOGUE, *search.laws))),)
+        learned = (
+            describe_learned(search.bench, best.fitted, shares["learned"], dict.fromkeys((*CATALOGUE, *search.laws))),
+        )
     refit = next((h.held_out.error for h in found if h.fitted is search.root.fitted), np.inf)
     return Correction(_elements(search, best.fitted), shares, learned, refit, best.held_out.error), best.fitted
 
 
-def _competing(search: Search, named: Trial | None) -> Iterator[_Competitor]:
+def _competitors(search: Search, named: Trial | None) -> Iterator[_Competitor]:
     """Generate the candidates: the refit, the named or likeliest laws, other laws, and learned elements."""
-    ranked = sorted((t for t in search.memo.values() if _recurs(search, t)), key=search.promise, reverse=True)
+    ranked = sorted(
+        (t for t in search.memo.values() if _may_recur(search, t)), key=search.optimistic_evidence, reverse=True
+    )
     others = [t for i, t in enumerate(t for t in ranked if t.laws) if i < TRIED or t.key in search.held_out]
     first = named or next(iter(others), search.root)
     for trial in {t.key: t for t in (search.root, first, *others)}.values():
-        yield from _of_trial(search, trial)
+        yield from _trial_competitor(search, trial)
     if first.laws:
-        yield from _with_learned(search, search.memo[first.key])
-    yield from _with_learned(search, search.root, {e.port for e in named.laws} if named else set())
+        yield from _learned_competitors(search, search.memo[first.key])
+    yield from _learned_competitors(search, search.root, {e.port for e in named.laws} if named else set())
 
 
-def as_named(search: Search, fitted: Fitted) -> Correction:
+def named_correction(search: Search, fitted: Fitted) -> Correction:
     """Describe a simulator without a learned element, which was not compared with others."""
     return Correction(_elements(search, fitted), _shares(search, fitted, fitted))
 
 
-def _of_trial(search: Search, trial: Trial) -> Iterator[_Competitor]:
+def _trial_competitor(search: Search, trial: Trial) -> Iterator[_Competitor]:
     """Generate the candidate of a trial, if it can be simulated."""
     with suppress(InputError):
         trial = search.thorough(trial)
         yield trial.fitted, trial.fitted, partial(search.predicts, trial)
 
 
-def _recurs(search: Search, trial: Trial) -> bool:
+def _may_recur(search: Search, trial: Trial) -> bool:
     """Tell whether a hypothesis may hold for another recording; a trend in time within one recording may not."""
     return len(search.bench.recordings) > 1 or not any("t" in e.law.reads() for e in trial.laws)
 
 
-def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Competitor]:
+def _learned_competitors(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Competitor]:
     """Generate learned elements beside a trial, at the free ports where a flexible force explains most."""
     shares = search.flexible(base)
     ports = [name for name in sorted(shares, key=lambda name: -shares[name]) if name not in taken][:PORTS]

@@ -21,7 +21,7 @@ import numpy as np
 from .._base import InputError, side_by_side
 from ..identify import solve_within_bounds
 from ..optimise import GaussNewton, Problem
-from .workbench import ENDLESS, Fitted, Workbench
+from .workbench import DIVERGED, Fitted, Workbench
 
 FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
 # share of a block at the start of a recording that is never held out: it determines the unknown initial state
@@ -89,7 +89,7 @@ def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]
     with np.errstate(over="ignore", invalid="ignore"):
         pairs = zip(_errors_without(bench, fitted, left), left, strict=True)
         value = float(sum(np.sum(e[here] ** 2) for e, here in pairs))
-    return value if value < ENDLESS else np.inf
+    return value if value < DIVERGED else np.inf
 
 
 def _errors_without(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> list[np.ndarray]:

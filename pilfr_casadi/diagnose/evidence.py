@@ -31,12 +31,14 @@ from .workbench import Fitted, Workbench
 
 EXACT = 8.0  # effective samples of a model whose whole error is model error (n_0)
 LEAST_WRONG = 0.05  # least share of the error that counts as model error
-MORE = np.log(0.5)  # log prior probability of each further effect
+EFFECT_PRIOR = np.log(0.5)  # log prior probability of each further effect
 FLEXIBLE = ("hysteresis", "static_curve", "extra_mode", "stribeck_friction", "periodic_force", "drift")
-IMITATES = np.log(0.2)  # log prior probability of a flexible law, which can imitate others, relative to other laws
-SMALLER = 0.7  # factor on the inputs for which the spread is computed: well inside the recorded range
-ALMOST_NOTHING = 1e-9  # precision of the prior of initial states, relative to the information of a sample
-DOUBTFUL = np.log(0.01)  # log prior probability of parameter values at which a law degenerates
+FLEXIBLE_PRIOR = np.log(
+    0.2
+)  # log prior probability of a flexible law, which can imitate others, relative to other laws
+INPUT_FACTOR = 0.7  # factor on the inputs for which the spread is computed: well inside the recorded range
+STATE_PRIOR = 1e-9  # precision of the prior of initial states, relative to the information of a sample
+DOUBTFUL_PRIOR = np.log(0.01)  # log prior probability of parameter values at which a law degenerates
 
 
 @dataclass(frozen=True)
@@ -78,14 +80,14 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
 def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
     """Compute the mean square uncertainty of predictions for other inputs, in units of the outputs' variance.
 
-    The other inputs are the recorded ones times SMALLER. The parameters have the covariance (n H / v + P)^-1 of
+    The other inputs are the recorded ones times INPUT_FACTOR. The parameters have the covariance (n H / v + P)^-1 of
     Laplace's approximation, with H the Fisher information of a sample and P the precision of the prior. With H' the
     information of a sample for the other inputs, the spread is tr(H' (n H / v + P)^-1). It reveals parameters that the
     recordings hardly determine, such as a curve of a pressure that had two levels; a cross-validation on the same
     recordings cannot.
     """
     problem, told = _hessian(bench, fitted)
-    _, asked = _hessian(bench.on([r.with_(u=SMALLER * r.u) for r in bench.recordings]), fitted)
+    _, asked = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
     free = int(problem.free.sum())
     if not free:
         return 0.0
@@ -93,7 +95,7 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
         return np.inf
     own = _widths(fitted, laws, problem.free, np.diag(told)[:free])
     width = np.concatenate([own, 1 / np.sqrt(np.maximum(np.diag(told)[free:], 1e-300))])
-    prior = np.concatenate([np.ones(free), np.full(len(width) - free, ALMOST_NOTHING)])
+    prior = np.concatenate([np.ones(free), np.full(len(width) - free, STATE_PRIOR)])
     precision = n / v * told * np.outer(width, width) + np.diag(prior)
     covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)[:free, :free]
     found = float(np.sum(covariance * asked[:free, :free] * np.outer(own, own)))
@@ -160,7 +162,7 @@ def log_prior(laws: Sequence[Placed], alternatives: Mapping[str, Sequence[Law]],
     One law in several sensors, such as a logger's filters, counts once. `alternatives` are the laws allowed in each
     port; `doubtful` tells that a law degenerates at its fitted values.
     """
-    total = DOUBTFUL if doubtful else 0.0
+    total = DOUBTFUL_PRIOR if doubtful else 0.0
     in_sensors = set[type[Law]]()
     for e in laws:
         if e.port.startswith("sensor:"):
@@ -169,9 +171,9 @@ def log_prior(laws: Sequence[Placed], alternatives: Mapping[str, Sequence[Law]],
             in_sensors.add(type(e.law))
         there = alternatives.get(e.port, ())
         forms = sum(law.id == e.law.id for law in there)
-        total += MORE - np.log(max(len(alternatives), 1)) - np.log(max(len({law.id for law in there}), 1))
+        total += EFFECT_PRIOR - np.log(max(len(alternatives), 1)) - np.log(max(len({law.id for law in there}), 1))
         total -= np.log(max(forms, 1))
-        total += IMITATES if e.law.id in FLEXIBLE else 0.0
+        total += FLEXIBLE_PRIOR if e.law.id in FLEXIBLE else 0.0
     return float(total)
 
 

@@ -36,10 +36,13 @@ Change = Callable[[Recording], Recording]
 CURED, EXPLAINED = 0.12, 0.3
 CLEARLY = 0.8  # the same for an edit that is clearly better than another edit, or than none
 AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong; faults are sought from ABOVE_NOISE on
-ASTRAY, LOST = 0.04, 0.25  # mean square error from which a refit may be in a wrong minimum; from which it says nothing
+POOR_FIT, USELESS_FIT = (
+    0.04,
+    0.25,
+)  # mean square error from which a refit may be in a wrong minimum; from which it says nothing
 SAME = 1.02  # ratio of errors that count as equal
-ROOM = 12.0  # least gain of an edit's parameters beyond their BIC cost, in nats: odds of about 1e5
-CERTAIN = (2 * ROOM) ** 0.5  # the same in standard errors of one parameter
+LEAST_GAIN = 12.0  # least gain of an edit's parameters beyond their BIC cost, in nats: odds of about 1e5
+CERTAIN = (2 * LEAST_GAIN) ** 0.5  # the same in standard errors of one parameter
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
@@ -116,7 +119,7 @@ class Checked:
         return Checked(bench, fitted, (*self.gates, *gates))
 
 
-def fall(before: float, after: float) -> str:
+def describe_fall(before: float, after: float) -> str:
     """Describe by how much an edit reduces the mean square error."""
     return f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
 
@@ -246,7 +249,7 @@ def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engin
             except InputError:
                 continue
             found = refit(bench)
-            if found is not None and found.cost < LOST:
+            if found is not None and found.cost < USELESS_FIT:
                 words = (
                     f"The time of the recordings is off by a factor of {1 / factor:.4g}, as from a wrong unit: as "
                     f"given, the simulator cannot follow at all; corrected, its error is {found.cost**0.5:.3g} of the "
@@ -278,11 +281,11 @@ def find_slips(now: Checked, workers: int, beside: str = "") -> Checked:
     for f in FACTORS if len(outputs) > 1 else ():
         if all(near(f * size) for size in sizes):
             trials.append(Gate(", ".join(outputs), "unit", f, change=scale_channels("y", list(range(len(outputs))), f)))
-    for kind, names in (("y", outputs), ("u", inputs)) if plain.cost > ASTRAY else ():
+    for kind, names in (("y", outputs), ("u", inputs)) if plain.cost > POOR_FIT else ():
         for i, j in combinations(range(len(names)), 2):
             both = [names[i], names[j]]
             trials.append(Gate(", ".join(both), "exchange", both, change=exchange_channels(kind, i, j)))
-    for f in TIME_UNITS if plain.cost > ASTRAY else ():
+    for f in TIME_UNITS if plain.cost > POOR_FIT else ():
         trials.append(Gate("time", "time-unit", f, change=scale_time(f)))
     return _take_best_slip(now, trials, workers)
 
@@ -315,7 +318,7 @@ def _take_best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: st
         joint = found is not None and found.gates[-1].finding == "unit" and found.gates[-1].channel not in channels
         if found is not None and found.cost < (CLEARLY if joint else 1 - 1e-6) * best.cost:
             best = found
-    if best is now or best.cost > min(CURED * plain.cost, LOST):
+    if best is now or best.cost > min(CURED * plain.cost, USELESS_FIT):
         return now
     gate = best.gates[-1]
     factor = 1 / gate.value if isinstance(gate.value, float) else 1.0
@@ -325,7 +328,7 @@ def _take_best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: st
         "sign": f"{gate.channel} has the wrong sign{more}",
         "exchange": f"{gate.channel.replace(', ', ' and ')} are exchanged",
     }.get(gate.finding, f"{what} off by a factor of {factor:.4g}{more}, as from a wrong unit")
-    sentence = f"In the recordings {words}: with it corrected {fall(plain.cost, best.cost)}."
+    sentence = f"In the recordings {words}: with it corrected {describe_fall(plain.cost, best.cost)}."
     return now.then(best.bench, best.fitted, replace(gate, sentence=sentence, fault=True, left=best.cost / plain.cost))
 
 
@@ -374,7 +377,7 @@ def find_slip_beside_offset(now: Checked, slipped: Checked, workers: int) -> Che
     `find_offsets` reports the offset and keeps it.
     """
     bench = now.bench
-    for name in bench.simulator.output_names if slipped.cost > ASTRAY else ():
+    for name in bench.simulator.output_names if slipped.cost > POOR_FIT else ():
         placed = replace(bench, simulator=bench.simulator.with_element(f"sensor:{name}", Offset()))
         level = refit(placed, [{}, now.fitted.values], states=now.fitted.begin)
         if level is None:
@@ -404,10 +407,10 @@ def find_offsets(now: Checked) -> Checked:
         other = replace(bench, simulator=bench.simulator.with_element(port, Offset()))
         parameter = f"{other.simulator.elements[-1].prefix}w_0"
         found = refit(other, [plain.values], states=plain.initial, solver=THOROUGH)
-        if found is None or gain(plain.cost, found.cost, found.residual) < ROOM:
+        if found is None or gain(plain.cost, found.cost, found.residual) < LEAST_GAIN:
             break
         value = float(found.values[parameter])
-        sentence = f"{_constant(port, value)}; with it as a parameter {fall(plain.cost, found.cost)}."
+        sentence = f"{_constant(port, value)}; with it as a parameter {describe_fall(plain.cost, found.cost)}."
         now = now.then(other, found, Gate(port.split(":", 1)[1], "offset", value, sentence, parameter=parameter))
         ports.remove(port)
     fault = now.cost < CURED * begin.cost
@@ -455,12 +458,12 @@ def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
         simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: held})
         start = {k: v for k, v in fitted.values.items() if k != name}
         found = refit(bench, [start], simulator, states=fitted.initial, solver=THOROUGH)
-        if found is not None and gain(found.cost, fitted.cost, fitted.residual) <= ROOM:
+        if found is not None and gain(found.cost, fitted.cost, fitted.residual) <= LEAST_GAIN:
             fitted = found
     return fitted
 
 
-def as_it_came_out(
+def final_gates(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:
     """Return the findings with the offsets that remain, at their fitted values beside the effects, if any."""

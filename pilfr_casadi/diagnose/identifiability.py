@@ -80,14 +80,14 @@ class Sensitivity:
     ----------
     rows : tuple of ParameterRow
         Free entries of the simulator's parameters, not assessed yet.
-    room : array, shape (n,)
+    span : array, shape (n,)
         Prior standard deviation of each value, from its bounds alone.
     raw, start : array, shapes (R, n) and (R, k)
         Changes of all outputs, in units of the noise, by a unit change of each parameter and unknown initial state.
     """
 
     rows: tuple[ParameterRow, ...]
-    room: np.ndarray
+    span: np.ndarray
     raw: np.ndarray
     start: np.ndarray
 
@@ -121,12 +121,12 @@ class Sensitivity:
     @cached_property
     def scaled(self) -> np.ndarray:
         """Triangular factor (n, n) of J D, with the same singular values."""
-        return np.asarray(np.linalg.qr(project_off(self.raw * self.room, self.base), mode="r"))
+        return np.asarray(np.linalg.qr(project_off(self.raw * self.span, self.base), mode="r"))
 
     @property
     def reach(self) -> np.ndarray:
         """Change of the outputs over each parameter's range, in standard deviations of the noise, shape (n,)."""
-        return lengths(self.raw * self.room)
+        return lengths(self.raw * self.span)
 
 
 def _changes(bench: Workbench, runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray]:
@@ -156,7 +156,7 @@ def assess_parameters(
         status[group] = "tied"
     _, s, v = np.linalg.svd(scaled[:, rest])
     errors = lengths((v[: len(s)] / np.maximum(s, 1.0)[:, None])[s >= 1])  # standard errors in units of the range
-    std = dict(zip(rest, (response.room[rest] * errors).tolist(), strict=True))
+    std = dict(zip(rest, (response.span[rest] * errors).tolist(), strict=True))
     rows = tuple(
         replace(row, std=std[i] if status[i] == "identifiable" else None, status=status[i])
         for i, row in enumerate(response.rows)
@@ -203,19 +203,19 @@ def _only_as(response: Sensitivity, group: np.ndarray, bench: Workbench, fitted:
     names, values = [response.names[i] for i in group], np.array([response.rows[i].value for i in group])
     found = []
     for unit, write in ((values, _monomial), (np.ones(len(group)), _sum)):
-        if np.all(unit != 0) and (rows := _whole(response.scaled[:, group], response.room[group] / unit)) is not None:
+        if np.all(unit != 0) and (rows := _whole(response.scaled[:, group], response.span[group] / unit)) is not None:
             change = _finite_change(rows, write is _monomial, group, response, bench, fitted)
             found.append((change, tuple(write(names, row) for row in rows)))
     change, best = min(found, default=(np.inf, ()))
     return best if change < SAME else ()
 
 
-def _whole(columns: np.ndarray, room: np.ndarray) -> np.ndarray | None:
+def _whole(columns: np.ndarray, span: np.ndarray) -> np.ndarray | None:
     """Find rows of small integers that are constant along a group's undetermined directions, or None.
 
-    `columns` are those of J D; `room` is D in the wanted coordinates, with sign.
+    `columns` are those of J D; `span` is D in the wanted coordinates, with sign.
     """
-    free = _undetermined(columns) * room
+    free = _undetermined(columns) * span
     if not len(free):  # the direction of these is undetermined only because of other parameters
         return None
     rows = _reduced(_complement(free))
@@ -223,7 +223,7 @@ def _whole(columns: np.ndarray, room: np.ndarray) -> np.ndarray | None:
         whole = np.round(rows * factor)
         if np.any(np.abs(whole) > LARGEST_EXPONENT) or not np.all(np.any(whole, axis=1)):
             continue
-        test = _complement(whole) / room  # directions that leave these rows constant
+        test = _complement(whole) / span  # directions that leave these rows constant
         test /= lengths(test.T)[:, None]
         if len(test) == len(free) and np.all(lengths(columns @ test.T) < 1):
             return np.asarray(whole)

@@ -32,7 +32,7 @@ from ..models import Parameter, play
 from .force_recovery import law_signals
 from .linearise import linearised
 from .remainder import Remainder, Task, lengths, usable
-from .workbench import QUICK, Fitted, Workbench, started
+from .workbench import QUICK, Fitted, Workbench, start_vector
 
 STOPS = 8
 # thresholds over half the range of z: from presliding to a stop that slips in every large motion and so forgets its
@@ -41,8 +41,8 @@ THRESHOLDS = np.geomspace(0.02, 0.7, STOPS)
 POWERS = 3  # highest power of each stop: odd ones for symmetric loops, the even one for one-sided forces
 KNEES = (0.01, 0.05, 0.25)  # of the curves v / (|v| + knee), over the largest speed: from dry friction to a smooth bend
 FEATURES = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)
-ROOM = 0.5  # largest extension of a signal beyond its range, over half the range
-FREE = 5.0  # the same during the fit, because the refit's run may be a poor guess of the range
+EXTENSION = 0.5  # largest extension of a signal beyond its range, over half the range
+FIT_EXTENSION = 5.0  # the same during the fit, because the refit's run may be a poor guess of the range
 # ridge strengths tried, relative to the mean square response to a force of unit size
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 SHARES = (1.0, 0.3, 0.0)  # fractions of the linear solution from which a fit may start
@@ -79,8 +79,8 @@ class LearnedForce(Law):
 
     def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0, u: Any = None) -> tuple[Any, Any]:
         """Compute the force and the next memory."""
-        z = _saturated(z, p["z_low"], p["z_high"], p["z_room"])
-        v = _saturated(dz, p["v_low"], p["v_high"], p["v_room"]) / p["v_s"]
+        z = _saturate(z, p["z_low"], p["z_high"], p["z_room"])
+        v = _saturate(dz, p["v_low"], p["v_high"], p["v_room"]) / p["v_s"]
         x = (z - p["z_0"]) / p["z_s"]
         following = [play(z, s[i], r * p["z_h"]) for i, r in enumerate(THRESHOLDS)]
         phi = [1.0, x, ca.fabs(x), x**2, x**3]
@@ -92,7 +92,7 @@ class LearnedForce(Law):
             phi += [curve, x * curve]
         w = sum(p["c"][j] * f for j, f in enumerate(phi))
         if self.factor and u is not None:
-            scale = (_saturated(u[self.factor], p["u_low"], p["u_high"], p["u_room"]) - p["u_0"]) / p["u_s"]
+            scale = (_saturate(u[self.factor], p["u_low"], p["u_high"], p["u_room"]) - p["u_0"]) / p["u_s"]
             w += scale * sum(p["c"][len(phi) + j] * f for j, f in enumerate(phi))
         return w, ca.vertcat(*following)
 
@@ -114,16 +114,16 @@ class LearnedForce(Law):
         centre = 0.0 if both else local.middle
         speed = local.speed if np.any(local.dz) else 1.0
         scales = {"z_0": centre, "z_s": max(local.high - centre, centre - local.low), "z_h": local.half, "v_s": speed}
-        yield {**scales, **_limits(FREE, z=local.z, v=local.dz)}
+        yield {**scales, **_ranges(FIT_EXTENSION, z=local.z, v=local.dz)}
 
 
-def _saturated(x: Any, low: Any, high: Any, room: Any) -> Any:
+def _saturate(x: Any, low: Any, high: Any, room: Any) -> Any:
     """Follow x from low to high; outside, approach low - room and high + room with a nonzero slope."""
     above, below = ca.fmax(x - high, 0), ca.fmax(low - x, 0)
     return ca.fmin(ca.fmax(x, low), high) + room * above / (room + above) - room * below / (room + below)
 
 
-def _limits(room: float, **signals: np.ndarray) -> dict[str, float]:
+def _ranges(room: float, **signals: np.ndarray) -> dict[str, float]:
     """Return the range of each signal, and its extension beyond the range."""
     out: dict[str, float] = {}
     for name, values in signals.items():
@@ -170,12 +170,12 @@ def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str], inp
             continue
         shape = task.pairs[0][1][0]
         forces = unit_forces(LearnedForce(), task.part, [shape]).reshape(len(task.part.z), -1)
-        for factor in ("", *(name for name in inputs if _scales(task, name))):
-            out.append(_solved(rest, task, forces, shape, factor, samples / len(rest.left)))
+        for factor in ("", *(name for name in inputs if _may_scale(task, name))):
+            out.append(_solve_weights(rest, task, forces, shape, factor, samples / len(rest.left)))
     return sorted(out, key=lambda s: -s.share)
 
 
-def _scales(task: Task, name: str) -> bool:
+def _may_scale(task: Task, name: str) -> bool:
     """Tell whether an input may scale the force at a port: it varies, and is not one of the port's own signals."""
     u, local = task.local.inputs[name], task.local
     if task.port.series or not np.ptp(u) > 0:
@@ -184,7 +184,7 @@ def _scales(task: Task, name: str) -> bool:
     return not any(abs(np.corrcoef(u, v)[0, 1]) > SAME_SIGNAL for v in own)
 
 
-def _solved(
+def _solve_weights(
     rest: Remainder, task: Task, forces: np.ndarray, shape: Mapping[str, Any], factor: str, repeated: float
 ) -> Start:
     """Fit the weights to the projected residual by ridge regression; its strength is chosen on held-out blocks.
@@ -194,14 +194,14 @@ def _solved(
     scales, columns = dict(shape), forces.copy()
     if factor:
         u, whole = task.part.inputs[factor], task.local.inputs[factor]
-        scales |= {"u_0": float(np.mean(whole)), "u_s": float(np.std(whole)), **_limits(ROOM, u=whole)}
+        scales |= {"u_0": float(np.mean(whole)), "u_s": float(np.std(whole)), **_ranges(EXTENSION, u=whole)}
         columns = np.hstack([forces, forces * ((u - scales["u_0"]) / scales["u_s"])[:, None]])
     phi, size = rest.response(task.index, columns)
     felt, weights, std = lengths(phi) > 0, np.zeros(len(size)), np.zeros(len(size))
     if not np.any(felt):
         return Start(task.port.name, learned_force(factor)({**scales, "std": 0.0}), 0.0)
     phi, unit = phi[:, felt], float(np.mean(lengths(phi[:, felt]) ** 2))
-    wrong, ridge = min((_error_unseen(phi, rest.left, rest.odd, unit * ridge), ridge) for ridge in RIDGES)
+    wrong, ridge = min((_held_out_squares(phi, rest.left, rest.odd, unit * ridge), ridge) for ridge in RIDGES)
     weights[felt] = -_ridge(phi, rest.left, unit * ridge) / size[felt]
     std[felt] = 1 / (size[felt] * np.sqrt(unit * ridge * repeated))
     law = learned_force(factor)({**scales, "c": weights, "std": std})
@@ -213,7 +213,7 @@ def _ridge(a: np.ndarray, b: np.ndarray, ridge: float) -> np.ndarray:
     return np.asarray(np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ b))
 
 
-def _error_unseen(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> float:
+def _held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> float:
     """Compute the sum of squares on every second block by weights fitted to the others, and vice versa."""
     parts = ((fold, ~fold) for fold in (odd, ~odd))
     return sum(float(np.sum((left[b] - phi[b] @ _ridge(phi[a], left[a], ridge)) ** 2)) for a, b in parts)
@@ -246,21 +246,21 @@ def candidates(
         Smallest error first; the learned element is the last of each. Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names, inputs) if s.share > 0]
-    found = side_by_side(lambda start: _fitted(bench, part, base, start), starts[:FITS], workers)
+    found = side_by_side(lambda start: _fit_element(bench, part, base, start), starts[:FITS], workers)
     return sorted((f for f in found if f is not None), key=lambda f: f.cost)
 
 
-def _fitted(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fitted | None:
+def _fit_element(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fitted | None:
     """Fit a learned element together with the simulator's own parameters; None if every start diverges."""
     placed = base.simulator.with_element(start.port, start.law)
     model = bench.model(placed)
     engine = make_engine(model, bench.engine)
     name = f"{placed.elements[-1].prefix}c"
     starts = [{**base.values, name: share * np.asarray(start.law.values["c"])} for share in SHARES]
-    first = bench.begun(placed, model, started(model, starts[0]), base.initial)
+    first = bench.initial_states(placed, model, start_vector(model, starts[0]), base.initial)
 
     def cost(values: Mapping[str, Any]) -> float:
-        found = bench.result(placed, model.parameters.unpack(started(model, values)), first, engine, model).cost
+        found = bench.result(placed, model.parameters.unpack(start_vector(model, values)), first, engine, model).cost
         return found if np.isfinite(found) else np.inf
 
     try:
@@ -271,7 +271,7 @@ def _fitted(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fi
     except InputError:
         return None
     z, dz, _ = signals_along(bench, fitted)
-    seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _limits(ROOM, z=z, v=dz).items()}
+    seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _ranges(EXTENSION, z=z, v=dz).items()}
     return bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
 
 
@@ -345,7 +345,7 @@ class Learned:
         }
 
 
-def described(bench: Workbench, fitted: Fitted, share: float, laws: Collection[type[Law]]) -> Learned:
+def describe_learned(bench: Workbench, fitted: Fitted, share: float, laws: Collection[type[Law]]) -> Learned:
     """Describe the last element of a fitted simulator, a learned one, with the nearest laws."""
     element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)

@@ -109,7 +109,7 @@ def modes(a: Array, b: Array, c: Array) -> list[Mode]:
         poor = np.linalg.cond(right[:, pair]) > POOR
         part = np.eye(len(a)) - right[:, others] @ left[others] if poor else right[:, pair] @ left[pair]
         out.append(_pair(np.real(part), complex(value), a, b, c))
-    return sorted(_together(out), key=lambda mode: abs(mode.value))
+    return sorted(_combine_real_modes(out), key=lambda mode: abs(mode.value))
 
 
 def _pair(part: Array, value: complex, a: Array, b: Array, c: Array) -> Mode:
@@ -128,7 +128,7 @@ def _pair(part: Array, value: complex, a: Array, b: Array, c: Array) -> Mode:
     return Mode(value, entering / scale, c @ basis * scale)
 
 
-def _together(found: list[Mode]) -> list[Mode]:
+def _combine_real_modes(found: list[Mode]) -> list[Mode]:
     """Combine two real modes with equal inputs and cancelling jumps to a mass: `q'' = -a b q - (a + b) q' + u`."""
     real = [mode for mode in found if not mode.second_order]
     if len(real) != 2 or not np.allclose(real[0].into, real[1].into, rtol=0.0, atol=0.02):

@@ -19,7 +19,7 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import display_name
 from ..simulators import states_along
-from .gates import CERTAIN, EXPLAINED, LOST, ROOM, SAME, Gate, fall, gain, open_start, refit
+from .gates import CERTAIN, EXPLAINED, LEAST_GAIN, SAME, USELESS_FIT, Gate, describe_fall, gain, open_start, refit
 from .posterior import Posterior, posterior
 from .proof import deviations
 from .search import Search
@@ -34,7 +34,7 @@ NAMED = 3  # values reported at most
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class PinnedParameter:
     """A pinned parameter, its better value, the simulator fitted with it, and the sentence for the report."""
 
     name: str
@@ -43,7 +43,7 @@ class Held:
     sentence: str
 
 
-def held_value(search: Search, answer: Posterior) -> Held | None:
+def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter | None:
     """Find the pinned parameter that explains as much, once freed, as the named laws; None if there is none.
 
     Fixed parameters are tried only if a linear law was named, because that law is equivalent to another value.
@@ -51,7 +51,7 @@ def held_value(search: Search, answer: Posterior) -> Held | None:
     named = [e.element for e in answer.effects]
     linear = len(named) == 1 and named[0].law.id in LINEAR
     bench, without = search.bench, search.root.fitted
-    if not linear and without.cost < LOST:
+    if not linear and without.cost < USELESS_FIT:
         return None
     as_well = SAME**2 * answer.best.whole if named else np.inf
     # a larger error means that something else is missing
@@ -69,7 +69,7 @@ def held_value(search: Search, answer: Posterior) -> Held | None:
             found = refit(bench, starts, simulator, states=without.initial, solver=THOROUGH)
         except KeyboardInterrupt:
             found, search.interrupted = None, True
-        search.interrupted = search.interrupted or bool(bench.struck)
+        search.interrupted = search.interrupted or bool(bench.interrupted_fits)
         if search.interrupted:
             return None
         if found is None:
@@ -88,13 +88,13 @@ def held_value(search: Search, answer: Posterior) -> Held | None:
     like = f", no further off than with {words}" if named else ""
     sentence = (
         f"Nothing is missing but a value: with {name} = {value:.5g}{unit}, which is {kept} "
-        f"{float(without.values[name]):.4g}{unit}, {fall(without.cost, found.cost)}{like}; let it go there, or say "
-        "what takes its place."
+        f"{float(without.values[name]):.4g}{unit}, {describe_fall(without.cost, found.cost)}{like}; let it go there, "
+        "or say what takes its place."
     )
-    return Held(name, value, found, sentence)
+    return PinnedParameter(name, value, found, sentence)
 
 
-def beyond_the_ports(search: Search) -> Sequence[Gate]:
+def find_undeclared_port(search: Search) -> Sequence[Gate]:
     """Note a mismatch that no declared port explains but that has a sure name in the equation of a state."""
     ports = search.bench.simulator.ports
     if not ports or search.interrupted:
@@ -123,13 +123,13 @@ def beyond_the_ports(search: Search) -> Sequence[Gate]:
 Group = tuple[str, Sequence[Recording], Sequence[np.ndarray]]  # name, recordings, and initial states
 
 
-def varying(search: Search) -> tuple[Gate, ...]:
+def find_varying_values(search: Search) -> tuple[Gate, ...]:
     """Note values that differ between the recordings, or else between the halves of each recording."""
     bench, whole = search.bench, search.root.fitted
     if search.interrupted or not np.any(whole.model.parameters.free):
         return ()
     try:
-        for groups, where in ((_each(bench, whole), "the recordings"), (_halves(bench, whole), "the halves")):
+        for groups, where in ((_by_recording(bench, whole), "the recordings"), (_by_half(bench, whole), "the halves")):
             found = _compare_groups(search, groups, where) if len(groups) > 1 else None
             if found is not None:
                 return (found,)
@@ -138,12 +138,12 @@ def varying(search: Search) -> tuple[Gate, ...]:
     return ()
 
 
-def _each(bench: Workbench, whole: Fitted) -> list[Group]:
+def _by_recording(bench: Workbench, whole: Fitted) -> list[Group]:
     names = [r.name or f"recording {i + 1}" for i, r in enumerate(bench.recordings)]
     return [(n, (r,), (x,)) for n, r, x in zip(names, bench.recordings, whole.initial, strict=True)]
 
 
-def _halves(bench: Workbench, whole: Fitted) -> list[Group]:
+def _by_half(bench: Workbench, whole: Fitted) -> list[Group]:
     first, second, middle = list[Recording](), list[Recording](), list[np.ndarray]()
     for r, x in zip(bench.recordings, whole.initial, strict=True):
         cut = (r.skip + len(r)) // 2
@@ -165,10 +165,10 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
         benches.append(part)
     sizes = [sum(len(r) - r.skip for r in part.recordings) for part in benches]
     cost = float(np.average([f.cost for f in fits], weights=sizes))
-    begun = sum(len(part.recordings) for part in benches) - len(bench.recordings)
-    more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * begun
+    more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
+    more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * more_starts
     residual = [e for f in fits for e in f.residual]
-    if cost > EXPLAINED * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < ROOM:
+    if cost > EXPLAINED * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
         return None
     values = _clearest_differences(whole, fits, benches)
     if not values:

@@ -18,7 +18,7 @@ import numpy as np
 
 from .remainder import Dose, Remainder, held_out, orthonormal
 from .screen import Scored, start_values
-from .trials import BRIEF, Trial, Trials, put_in
+from .trials import BRIEF, Trial, Trials, place_law
 from .workbench import Fitted
 
 SHAPES = 5  # shapes of each law at each port: the best alone
@@ -45,7 +45,7 @@ def _blocks(rest: Remainder) -> Iterator[_Block]:
                 yield _Block(scored, replace(felt[k], phi=felt[k].phi.copy()))
 
 
-def together(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
+def pair_shares(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
     """Compute the share of `left` that each two parts explain together, shape (n, n); parts are orthonormal columns."""
     q, width = np.hstack(parts), [p.shape[1] for p in parts]
     begin = np.cumsum([0, *width])
@@ -64,12 +64,12 @@ def together(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
     return np.asarray(out / max(float(left @ left), 1e-300))
 
 
-def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
+def choose_pairs(rest: Remainder) -> list[tuple[_Block, _Block]]:
     """Choose the pairs worth a fit, best first: a few of each of the best pairs of ports."""
     blocks = list(_blocks(rest))
     if len(blocks) < 2:
         return []
-    left = 1 - together([orthonormal(b.dose.phi) for b in blocks], rest.left)
+    left = 1 - pair_shares([orthonormal(b.dose.phi) for b in blocks], rest.left)
     ports = np.array([b.scored.port for b in blocks])
     worth = np.maximum(left, 0.0)
     worth[ports[:, None] == ports] = np.inf
@@ -106,12 +106,12 @@ def _opposes(pair: tuple[_Block, _Block], left: np.ndarray) -> bool:
     return True
 
 
-def fitted_together(trials: Trials, root: Fitted, rest: Remainder, pair: tuple[_Block, _Block]) -> Trial | None:
+def fit_pair(trials: Trials, root: Fitted, rest: Remainder, pair: tuple[_Block, _Block]) -> Trial | None:
     """Fit a pair from its screened start values, with the simulator's parameters as refitted and as given."""
     simulator, named = root.simulator, dict[str, Any]()
     for block, strength in zip(pair, _strengths(pair, rest.left), strict=True):
         start = start_values(block.scored.law, block.dose.shape, strength)
-        simulator, own = put_in(simulator, block.scored, start)
+        simulator, own = place_law(simulator, block.scored, start)
         named |= own
     nominal = {k: p.value for k, p in root.simulator.parameters.items()}
     starts = [{**root.values, **named}, {**nominal, **named}]

@@ -14,21 +14,21 @@ from .._base import InputError, Progress, Stages, one_blas_thread, processors, w
 from ..data import Recording
 from ..laws import Law, readable_unit
 from ..simulators import Simulator
-from .arguments import check_laws, check_limits, matched, matched_tests, with_scaled
+from .arguments import add_scaled_laws, check_laws, check_limits, match_recordings, match_tests
 from .checkup import BlindSpot, assess
-from .correction import Correction, as_named, find_correction
+from .correction import Correction, find_correction, named_correction
 from .detectability import port_units
 from .experiment import next_experiment, placebo
-from .gates import Gate, Offset, as_it_came_out, offset_gates, without_idle_offsets
+from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .mismatch_map import mismatch
-from .other_explanations import beyond_the_ports, held_value, varying
+from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
 from .posterior import Named, Posterior, names, posterior
-from .preparation import CHECKS, Prepared, hold_note, prepare, said_hold
+from .preparation import CHECKS, Prepared, hold_note, prepare, stated_hold
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .recording_faults import clipped_input, tones
 from .result import Diagnosis, Effect
 from .search import Search
-from .surrogates import told_of_surrogate
+from .surrogates import surrogate_gates
 from .trials import Trial
 from .verdict import SURE, Verdict, judge
 from .workbench import Fitted
@@ -55,7 +55,7 @@ class Request:
     @property
     def hold_said(self) -> bool:
         """Whether somebody said what inputs do between samples."""
-        return said_hold(self.simulator, self.recordings, self.hold) is not None
+        return stated_hold(self.simulator, self.recordings, self.hold) is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,51 +112,51 @@ def diagnose_in_steps(
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
     say = Stages(progress or (lambda stage, done, total, best: None))
-    simulator, recordings = matched(simulator, train, hold)
-    tests = matched_tests(simulator, test, recordings)
+    simulator, recordings = match_recordings(simulator, train, hold)
+    tests = match_tests(simulator, test, recordings)
     check_limits(simulator, limits)
-    tried = with_scaled(check_laws(laws), simulator)
+    tried = add_scaled_laws(check_laws(laws), simulator)
     deadline = np.inf if time_limit is None else began + float(time_limit)
     request = Request(simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say)
-    ready, search = _searched_both_holds(request)
+    ready, search = _search_both_holds(request)
     concluding = search.begin("conclusion")
     found = conclude(search, (*ready.gates, *search.gates))
     search.timed("conclusion", concluding)
     return _build_diagnosis(request, ready, search, found, tests, limits, began)
 
 
-def _searched_both_holds(request: Request) -> tuple[Prepared, Search]:
+def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
     """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
-    ready, search = _searched(request)
-    if search.interrupted or not search.misheld():
+    ready, search = _search(request)
+    if search.interrupted or not search.other_hold_fits_better():
         return ready, search
-    hold = search.bench.otherwise_held().hold
+    hold = search.bench.with_other_hold().hold
     try:
-        other, again = _searched(replace(request, hold=hold, say=request.say.under("other hold: ")))
+        other, again = _search(replace(request, hold=hold, say=request.say.under("other hold: ")))
     except InputError:  # the simulator cannot be run with this hold
-        return ready, search.settled(request.most_effects)
+        return ready, search.resume(request.most_effects)
     only_refitted = again.interrupted and len(again.memo) < 2
     if again.best.whole > search.best.whole or only_refitted:
         search.interrupted = again.interrupted
-        return ready, search.settled(request.most_effects)
+        return ready, search.resume(request.most_effects)
     ratio = float(np.sqrt(search.best.whole / max(again.best.whole, 1e-300)))
     return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
 
 
-def _searched(request: Request) -> tuple[Prepared, Search]:
+def _search(request: Request) -> tuple[Prepared, Search]:
     """Prepare and search; repeat without shifting early channels if these were shifted, and keep the better search."""
-    ready, search = _searched_once(request, shift_early=True)
+    ready, search = _search_once(request, shift_early=True)
     seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
-    if not seemed_early or search.interrupted or search.out_of_time or not search.room(search.best):
+    if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
-    other, again = _searched_once(request, shift_early=False)
+    other, again = _search_once(request, shift_early=False)
     if again.best.whole < AS_GIVEN * search.best.whole:
         return other, again
     search.interrupted = again.interrupted
     return ready, search
 
 
-def _searched_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
+def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
     """Check and correct the recordings, refit the simulator, measure the noise, and search from there."""
     began = time.perf_counter()
     ready = prepare(
@@ -214,7 +214,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
             zeros = offset_gates(answer.best.laws, answer.best.fitted.values)
             return Conclusion(Verdict(verdict.kind, said), (*gates, *zeros), fitted, correction, answer.effects)
     if verdict.kind == "unexplained" and finished:
-        gates = (*gates, *beyond_the_ports(search), *varying(search))
+        gates = (*gates, *find_undeclared_port(search), *find_varying_values(search))
     refitted = search.root.fitted
     if interrupted and verdict.kind != "recording-fault":
         sentence = (
@@ -226,14 +226,14 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         correction, fitted = corrected or find_correction(search, answer)
         verdict = Verdict(verdict.kind, f"{verdict.sentence} {correction.sentence}")
         return Conclusion(verdict, gates, fitted, correction)
-    return Conclusion(verdict, gates, refitted, as_named(search, refitted))
+    return Conclusion(verdict, gates, refitted, named_correction(search, refitted))
 
 
 def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: Sequence[Gate]) -> Conclusion | None:
     """Conclude that a parameter has a wrong pinned value, or an input was clipped, if that explains as much as laws."""
-    held = held_value(search, answer)
+    held = find_pinned_parameter(search, answer)
     if held is not None:
-        corrected = as_named(search, held.fitted)
+        corrected = named_correction(search, held.fitted)
         return Conclusion(Verdict("complete", held.sentence), tuple(gates), held.fitted, corrected, (), held.name)
     named = verdict.kind == "missing-physics"
     if named and answer.sure >= SURE:
@@ -244,7 +244,7 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
     if clipping is None:
         return None
     fault = Verdict("recording-fault", clipping.sentence)
-    return Conclusion(fault, (*gates, clipping), refitted, as_named(search, refitted))
+    return Conclusion(fault, (*gates, clipping), refitted, named_correction(search, refitted))
 
 
 def _build_diagnosis(
@@ -282,8 +282,8 @@ def _build_diagnosis(
             _row(search, search.memo.get(t.key, t), step.parent) for step in search.steps for t in step.trials
         ),
         gates=(
-            *told_of_surrogate(request.stand_in_error),
-            *as_it_came_out(found.gates, after, std, bool(effects), settled),
+            *surrogate_gates(request.stand_in_error),
+            *final_gates(found.gates, after, std, bool(effects), settled),
         ),
         mismatch=mismatch(
             bench.recordings,

@@ -1,7 +1,7 @@
 """The probability of every answer, from the log evidences of all fitted hypotheses.
 
 A hypothesis with laws has a probability in proportion to its evidence. The simulator alone claims that its whole error
-is noise; so it is weighed with samples that count in full (`search.Search.promise`).
+is noise; so it is weighed with samples that count in full (`search.Search.optimistic_evidence`).
 
 The right law leaves little of the mismatch for a flexible force to explain. Let s be the share of the mismatch that the
 law leaves and that a flexible force at some port would explain. The density of s is
@@ -97,7 +97,7 @@ def names(trial: Trial) -> frozenset[Name]:
     return frozenset((e.port, e.law.id) for e in trial.laws if e.law.id != "offset")
 
 
-def unfollowed(search: Search, trial: Trial) -> float:
+def explainable_remainder(search: Search, trial: Trial) -> float:
     """Compute the share s of the mismatch that a hypothesis leaves and that a flexible force would explain.
 
     A remainder that no force at a port explains counts little: it may be a disturbance that acts beside the law.
@@ -127,23 +127,23 @@ def posterior(search: Search) -> Posterior:
         best = max((t for t in trials if names(t) == said), key=search.evidence)
         if not said:
             return Posterior(best, 0.0, (), by_names[said])
-        found = [_named(search, best, e, by_names) for e in best.laws if e.law.id != "offset"]
+        found = [_make_effect(search, best, e, by_names) for e in best.laws if e.law.id != "offset"]
         least = min(found, key=lambda e: e.confidence)
         fewer = said - {least.name}
         if least.confidence > HALF or fewer not in by_names or not fewer:
             break
         said = fewer
-    named = share_named(unfollowed(search, best))
+    named = share_named(explainable_remainder(search, best))
     effects = tuple(replace(e, confidence=named * e.confidence) for e in found)
     return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
 
 
-def _named(search: Search, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]) -> Named:
+def _make_effect(search: Search, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]) -> Named:
     """Make an effect, with its inclusion probability given that the physics is in the catalogue."""
-    twins = _twins(search, best, element)
+    twins = _indistinguishable(search, best, element)
     same = {
         (element.port, element.law.id),
-        *(n for name in twins if name[1] == element.law.id for n in _each(name)),
+        *(n for name in twins if name[1] == element.law.id for n in _single_effects(name)),
     }
     return Named(element, sum(w for n, w in by_names.items() if n & same), twins)
 
@@ -154,7 +154,7 @@ def _weights(search: Search, trials: Sequence[Trial]) -> np.ndarray:
     The simulator alone claims that its whole error is noise, so samples count in full against it. Laws claim only to be
     near the physics; they are weighed by samples that count as far as their error is noise.
     """
-    full, tempered = (np.array([of(t) for t in trials]) for of in (search.promise, search.evidence))
+    full, tempered = (np.array([of(t) for t in trials]) for of in (search.optimistic_evidence, search.evidence))
     alone = np.array([not names(t) for t in trials])
     nothing = float(np.sum(_shares(full)[alone]))
     weights = np.empty(len(trials))
@@ -169,7 +169,7 @@ def _shares(logs: np.ndarray) -> np.ndarray:
     return np.asarray(found / max(found.sum(), 1e-300))
 
 
-def _twins(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:
+def _indistinguishable(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:
     """Find hypotheses, about as likely as the best, that have another effect in place of one of its effects.
 
     The same law in every sensor is one effect, at "sensor:a + sensor:b".
@@ -189,6 +189,6 @@ def _twins(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:
     return out
 
 
-def _each(name: Name) -> list[Name]:
+def _single_effects(name: Name) -> list[Name]:
     """Split an effect in several places into single effects."""
     return [(port, name[1]) for port in name[0].split(" + ")]

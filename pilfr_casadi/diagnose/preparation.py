@@ -17,9 +17,9 @@ from ..data import Recording
 from ..simulators import Simulator
 from .floor import Floor, white_part
 from .gates import (
-    ASTRAY,
     AT_NOISE,
     CURED,
+    POOR_FIT,
     SAME,
     Checked,
     Gate,
@@ -32,13 +32,13 @@ from .gates import (
 from .linearise import along, linearised, observer_gain
 from .proof import errors_of
 from .recording_faults import find_stale_samples, open_unsettled, remove_glitches, unclip
-from .step_refinement import on_steps_as_fine
+from .step_refinement import refine_steps
 from .timing import AVERAGED, find_gaps, find_time_shift, in_steps, run_as_given
 from .workbench import THOROUGH, Fitted, Workbench
 
 SMALL = 4e-4  # mean square error up to which signs and units are not checked
 CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported
-LED = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
+OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +80,12 @@ def prepare(
     say(CHECKS, 0, CHECKED)
     recordings, spikes = remove_glitches(recordings)
     recordings, transients = open_unsettled(recordings)
-    said = said_hold(simulator, recordings, hold)
+    said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
     gates = (*spikes, *transients, *find_stale_samples(recordings), *times)
     held: Sequence[Gate] = ()
     if not said:
-        bench, held = _better_held(bench)
+        bench, held = _choose_hold(bench)
     nominal = errors_of(bench, bench.model(simulator))
     say(CHECKS, 1, CHECKED)
     checks = _Checks(gates, workers, starts, early, say)
@@ -123,7 +123,7 @@ class _Checks:
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found
         now = find_gaps(unclip(self._report(3, now)))
-        now = now.then(*on_steps_as_fine(now.bench, self._report(4, now).fitted))
+        now = now.then(*refine_steps(now.bench, self._report(4, now).fitted))
         return find_offsets(self._report(5, find_time_shift(now, part, self.early)))
 
     def _report(self, done: int, now: Checked) -> Checked:
@@ -133,7 +133,7 @@ class _Checks:
     def _slips(self, now: Checked, part: float) -> Checked:
         """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
         found = find_slip_beside_offset(now, find_slips(now, self.workers), self.workers)
-        if len(found.gates) == len(now.gates) or found.cost <= ASTRAY:
+        if len(found.gates) == len(now.gates) or found.cost <= POOR_FIT:
             return found
         late = find_time_shift(now, part, self.early)
         return late if late.cost < CURED * found.cost else found
@@ -147,10 +147,10 @@ def _with_better_hold(
     If inputs are taken as held but were interpolated, a late channel is late by half a sample more or less.
     """
     try:
-        both = now, checks.run(bench.otherwise_held(), 0.5)
+        both = now, checks.run(bench.with_other_hold(), 0.5)
     except InputError:
         return now, held
-    costs = [_honest(found) for found in both]
+    costs = [_comparable_cost(found) for found in both]
     now = both[int(costs[1] < costs[0])]
     ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
     held = [hold_note(now.bench.simulator, now.bench.hold, ratio)] if ratio > SAME else []
@@ -163,7 +163,7 @@ def _shifts(found: Checked) -> list[float]:
     return [g.value for g in found.gates if g.finding == "alignment"]
 
 
-def _honest(found: Checked) -> float:
+def _comparable_cost(found: Checked) -> float:
     """Compute the mean square error without the noise reduction by interpolating a channel between its samples."""
     between = any(not in_steps(v, found.bench.dt) for v in _shifts(found))
     return found.cost / (AVERAGED if between else 1)
@@ -172,14 +172,14 @@ def _honest(found: Checked) -> float:
 def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitted:
     """Fit the simulator from the user's values and from others; if the error stays large, use an observer as well."""
     plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
-    if plain.cost < ASTRAY:
+    if plain.cost < POOR_FIT:
         return plain
     probe, runs = linearised(bench, run_as_given(bench, plain))
     gain = observer_gain(probe, runs, white_part(plain.residual))
     if not gain.any():
         return plain
     try:
-        led = bench.fit(bench.simulator, anneal=LED, model=bench.model(bench.simulator, gain))
+        led = bench.fit(bench.simulator, anneal=OBSERVER_GAINS, model=bench.model(bench.simulator, gain))
         found = bench.fit(bench.simulator, [led.values], states=led.begin, solver=THOROUGH)
     except (InputError, np.linalg.LinAlgError):
         return plain
@@ -189,14 +189,14 @@ def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitt
 # hold of the inputs between samples
 
 
-def said_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
+def stated_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
     """Return the hold that the user, the simulator or a recording states; None if none of them does."""
     return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
 
 
-def _better_held(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
+def _choose_hold(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
     """Choose the hold whose refit has the smaller error, and note it; keep the bench's own if the errors are equal."""
-    both = bench, bench.otherwise_held()
+    both = bench, bench.with_other_hold()
     costs = [np.inf if (found := refit(b)) is None else found.cost for b in both]
     ratio = float(np.sqrt(max(costs) / max(min(costs), 1e-300)))
     if not ratio >= SAME:

@@ -26,7 +26,7 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
-from .gates import CURED, LOST, ROOM, Checked, FirstOrder, Gate, fall, gain, open_start, refit
+from .gates import CURED, LEAST_GAIN, USELESS_FIT, Checked, FirstOrder, Gate, describe_fall, gain, open_start, refit
 from .linearise import linearised
 from .remainder import folds, held_out
 from .workbench import Fitted, Workbench
@@ -181,9 +181,11 @@ def unclip(now: Checked) -> Checked:
         held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
         other = replace(bench, simulator=placed.with_parameters(held))
         after = refit(other, [{}, plain.values], states=plain.begin)
-        if after is None or after.cost > LOST or gain(plain.cost, after.cost, after.residual, 0) < ROOM:
+        if after is None or after.cost > USELESS_FIT or gain(plain.cost, after.cost, after.residual, 0) < LEAST_GAIN:
             continue
-        sentence = f"{name} is {found}; with the simulator's output clipped alike {fall(plain.cost, after.cost)}."
+        sentence = (
+            f"{name} is {found}; with the simulator's output clipped alike {describe_fall(plain.cost, after.cost)}."
+        )
         gate = Gate(name, "clipping", found.limits, sentence, fault=True, left=after.cost / plain.cost)
         now = now.then(other, after, gate)
     return now

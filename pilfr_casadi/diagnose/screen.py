@@ -66,7 +66,7 @@ def screen(
     probe, runs = linearised(bench, fitted)
     gain = observer_gain(probe, runs, noise)
     led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
-    if not all(_holds(r, bench.scale) for r in led):
+    if not all(_stays_bounded(r, bench.scale) for r in led):
         led = []
     ways = [("simulation", Remainder.of(bench, probe, runs, laws))]
     if led:
@@ -77,7 +77,7 @@ def screen(
     return sorted(found, key=lambda s: -s.share), gain if seen else None
 
 
-def _holds(r: Run, scale: np.ndarray) -> bool:
+def _stays_bounded(r: Run, scale: np.ndarray) -> bool:
     """Tell whether an observer has kept the simulator in its range and bounded."""
     finite = all(np.all(np.isfinite(values)) for values in (r.a, r.b, r.z, r.dz))
     return finite and bool(np.all(np.abs(r.error) < HUGE * scale))
@@ -181,7 +181,7 @@ class Surface(Law):
 FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
 
 
-def explainable(bench: Workbench, fitted: Fitted) -> dict[str, float]:
+def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     """Compute the held-out share of the residual's power that any force at a port explains, by port."""
     most = max(MOST // max(fitted.model.n_state, 1) ** 2, LEAST) // len(bench.recordings)
     if any(len(r) > most for r in bench.recordings):

@@ -21,16 +21,16 @@ from ..engine import make_engine
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
 from .cross_validation import HeldOut, held_out_errors
-from .evidence import EXACT, MORE, Sample, information, log_evidence, log_prior, spread
+from .evidence import EFFECT_PRIOR, EXACT, Sample, information, log_evidence, log_prior, spread
 from .floor import Floor, effective_size, white_part
 from .gates import Gate, Offset
 from .linearise import linearised
-from .pairs import fitted_together, promising
+from .pairs import choose_pairs, fit_pair
 from .relatives import complements, relatives
 from .remainder import Remainder
-from .screen import Scored, explainable, screen
+from .screen import Scored, flexible_shares, screen
 from .trials import Key, Trial, Trials
-from .workbench import THOROUGH, Fitted, Workbench, started
+from .workbench import THOROUGH, Fitted, Workbench, start_vector
 
 POLISHED, BEHIND = 5, 1.5  # trials of a step fitted to convergence at most, and their largest ratio to the best error
 REACH = 8.0  # nats of log evidence below the best within which a hypothesis may still win
@@ -41,8 +41,8 @@ FEWEST = 30.0  # least effective samples of the recordings
 WRONG = 0.2  # share of model error in the error above which models are judged on held-out blocks
 PREDICTED = 6  # hypotheses judged on held-out blocks at most
 LOUDEST = 0.05  # share of an output's deviation; larger slow errors are not sensor noise
-MISHELD = 1.05  # least ratio of rms errors for which the other hold is better
-LED_OUT = 0.8  # largest share of the mean square left by a refit in a better minimum
+HOLD_RATIO = 1.05  # least ratio of rms errors for which the other hold is better
+BETTER_MINIMUM = 0.8  # largest share of the mean square left by a refit in a better minimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,9 +134,9 @@ class Search:
     @property
     def best(self) -> Trial:
         """The most promising hypothesis, from which the search goes on."""
-        return max(self.memo.values(), key=self.promise)
+        return max(self.memo.values(), key=self.optimistic_evidence)
 
-    def promise(self, trial: Trial) -> float:
+    def optimistic_evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis as if the missing rest were found: samples count as at the noise."""
         return self._log_evidence(trial, trial.whole, self.sample.effective(0.0))
 
@@ -195,7 +195,7 @@ class Search:
         """Compute the share of a trial's residual that a flexible force explains, by port."""
         if trial.key not in self.open:
             began = self.begin("flexible")
-            self.open[trial.key] = explainable(self.bench, trial.fitted)
+            self.open[trial.key] = flexible_shares(self.bench, trial.fitted)
             self.timed("flexible", began)
         return self.open[trial.key]
 
@@ -218,7 +218,7 @@ class Search:
         """
         self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - began
         self.say(stage, 1, 1, self.best.error)
-        if self.bench.struck:
+        if self.bench.interrupted_fits:
             raise KeyboardInterrupt
 
     def run(self, effects: float) -> Search:
@@ -233,24 +233,29 @@ class Search:
             self.interrupted = True
         return self
 
-    def settled(self, effects: float) -> Search:
+    def resume(self, effects: float) -> Search:
         """Continue with the present hold because the other is no better, unless the search was interrupted."""
         self.hold_said = True
         return self if self.interrupted else self.run(effects)
 
     def _grow(self, effects: float) -> bool:
         """Add effects while that pays; return False as soon as the other hold proves better."""
-        while self.room(parent := self.best) and _count(parent) < effects and self._pays(parent) and self._in_time():
+        while (
+            self.can_improve(parent := self.best)
+            and _count(parent) < effects
+            and self._pays(parent)
+            and self._in_time()
+        ):
             self.add(parent)
-            if not parent.laws and self._in_time() and self._led_out():
+            if not parent.laws and self._in_time() and self._escape_local_minimum():
                 self.add(self.root)
-            if self.misheld():
+            if self.other_hold_fits_better():
                 return False
             if _count(self.best) > _count(parent) >= 1:
                 self.exchange()
             if len(self.best.laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        if effects > 1 and _count(self.best) < 2 and self.room(self.best) and self._in_time():
+        if effects > 1 and _count(self.best) < 2 and self.can_improve(self.best) and self._in_time():
             self.add_two()
         return True
 
@@ -259,22 +264,24 @@ class Search:
         fewer = [t for t in self.memo.values() if t.laws and _count(t) < _count(trial)]
         return _count(trial) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
-    def misheld(self) -> bool:
+    def other_hold_fits_better(self) -> bool:
         """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
         best = self.best.fitted
         if self.hold_said or not self._in_time():
             return False
         try:
-            other = self.bench.otherwise_held().fit(best.simulator, [best.values], states=best.initial, solver=THOROUGH)
+            other = self.bench.with_other_hold().fit(
+                best.simulator, [best.values], states=best.initial, solver=THOROUGH
+            )
         except InputError:
             return False
-        return other.cost * MISHELD**2 < best.cost
+        return other.cost * HOLD_RATIO**2 < best.cost
 
-    def room(self, trial: Trial) -> bool:
+    def can_improve(self, trial: Trial) -> bool:
         """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""
         left, noise = (v + self.tolerance for v in (trial.whole, self.floor2))
         most = 0.5 * self.sample.effective(0.0) * np.log(max(left / noise, 1.0))
-        return bool(most > np.log(max(len(self.alternatives), 1)) - MORE)
+        return bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
 
     def _in_time(self) -> bool:
         """Tell whether there is time for more; if not, note that in the result."""
@@ -335,25 +342,25 @@ class Search:
             parent, scored, gain, enough, lambda done, total, error: self.say(stage, done, total, error), again
         )
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
-        if self.bench.struck:
+        if self.bench.interrupted_fits:
             raise KeyboardInterrupt
         return trials
 
     def _polish(self, trials: Sequence[Trial]) -> None:
         """Fit the trials that may win to convergence."""
         kept = [self.memo[t.key] for t in trials if t.key in self.memo]
-        ranked = sorted({t.key: t for t in kept}.values(), key=self.promise, reverse=True)
+        ranked = sorted({t.key: t for t in kept}.values(), key=self.optimistic_evidence, reverse=True)
         near = [t for t in ranked[:POLISHED] if not t.thorough and t.error < BEHIND * ranked[0].error]
         fits = self.fits
         with ThreadPoolExecutor(self.workers) as pool:
-            done = list(pool.map(fits.polished, near))
+            done = list(pool.map(fits.polish, near))
         for trial in done:
             self.keep(trial)
 
     def thorough(self, trial: Trial) -> Trial:
         """Return the same hypothesis fitted to convergence and to all samples."""
         if not self.memo[trial.key].thorough:
-            self.keep(self.fits.polished(trial))
+            self.keep(self.fits.polish(trial))
         return self.memo[trial.key]
 
     def _estimate_noise(self) -> None:
@@ -412,7 +419,7 @@ class Search:
         rest = Remainder.of(self.bench, *linearised(self.bench, self.root.fitted), self.laws)
         fits, before = self.fits, self.best
         found = side_by_side(
-            lambda pair: fitted_together(fits, self.root.fitted, rest, pair), promising(rest), self.workers
+            lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest), self.workers
         )
         tried = [t for t in found if t is not None]
         for trial in tried:
@@ -439,10 +446,10 @@ class Search:
             named |= simulator.elements[-1].named(source.own(best.fitted.values))
         found = self.fits.fitted(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
         if found is not None:
-            self.keep(self.fits.polished(found))
+            self.keep(self.fits.polish(found))
         self.timed("every sensor", began)
 
-    def _led_out(self) -> bool:
+    def _escape_local_minimum(self) -> bool:
         """Refit the simulator alone from the best law's parameters; if far better, restart the search and return True.
 
         The first refit was in a local minimum, and the law has compensated for that.
@@ -457,7 +464,7 @@ class Search:
             return False
         finally:
             self.timed("look back", began)
-        if alone.cost > LED_OUT * self.root.whole:
+        if alone.cost > BETTER_MINIMUM * self.root.whole:
             return False
         self.without, self.memo, self.open, self.held_out, self.screens, self.steps = alone, {}, {}, {}, {}, []
         self.keep(Trial((), alone, alone.cost, alone.cost, True))
@@ -472,8 +479,8 @@ class Search:
             named |= simulator.elements[-1].named(e.own(joint.fitted.values))
         model = self.bench.model(simulator)
         engine = make_engine(model, self.bench.engine)
-        vector = started(model, named)
-        initial = self.bench.begun(simulator, model, vector, joint.fitted.begin)
+        vector = start_vector(model, named)
+        initial = self.bench.initial_states(simulator, model, vector, joint.fitted.begin)
         fitted = self.bench.result(simulator, model.parameters.unpack(vector), initial, engine, model)
         return Trial(
             simulator.elements[len(simulator.elements) - len(laws) :] if laws else (), fitted, fitted.cost, fitted.cost

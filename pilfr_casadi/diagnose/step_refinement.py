@@ -30,7 +30,7 @@ KNEES = (0.25, 4.0)  # factors on the knee width from which a law is fitted agai
 FINEST, SAME = 16, 0.1  # largest factor on the sub-steps; share by which finer steps may change the mean square
 
 
-def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
+def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
     """Refine the steps until their error is less than the noise; return the bench and the fit there."""
     noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), QUIET**2)
     most, steps = min(FINEST * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
@@ -39,7 +39,7 @@ def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitte
         tried = replace(bench, substeps=steps)
         try:
             there = tried.rerun(fitted)
-            if _apart2(bench, there, fitted) < DEPENDS**2 * noise2:
+            if _difference2(bench, there, fitted) < DEPENDS**2 * noise2:
                 break
             fitted = tried.fit(
                 fitted.simulator,
@@ -55,13 +55,13 @@ def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitte
     return bench, fitted
 
 
-def _apart2(bench: Workbench, one: Fitted, other: Fitted) -> float:
+def _difference2(bench: Workbench, one: Fitted, other: Fitted) -> float:
     """Compute the mean square of the difference of two runs."""
     both = zip(one.residual, other.residual, bench.recordings, strict=True)
     return float(np.mean(np.concatenate([((a - b) / bench.scale)[r.skip :] for a, b, r in both]) ** 2))
 
 
-def knees(candidate: Trial) -> list[dict[str, Any]]:
+def knee_starts(candidate: Trial) -> list[dict[str, Any]]:
     """Return the fitted values, and if the knee is sharp also those with a sharper and a wider one."""
     values, knee = candidate.fitted.values, candidate.knee
     if not knee or values[knee] > NARROW * candidate.fitted.model.parameters[knee].bounds[1]:
@@ -69,7 +69,7 @@ def knees(candidate: Trial) -> list[dict[str, Any]]:
     return [values, *({**values, knee: times * values[knee]} for times in KNEES)]
 
 
-def on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
+def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
     """Refit on finer steps if the simulation depends on them, or if the present steps limit the knee.
 
     The knee may be sharper there, as far as these steps can follow it at rest.

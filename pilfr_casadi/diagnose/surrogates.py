@@ -67,7 +67,7 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     records = tuple(r if r.period else r.with_(initial="estimate") for r in records)
     found: list[tuple[float, Simulator]] = []
     for n in range(HIGHEST + 1) if nx is None else (nx,):  # a simulation has no noise, so its order is evident
-        one = _identified(records, n, hold)
+        one = _identify(records, n, hold)
         found += [one] if one is not None else []
         if found and found[-1][0] < EXACT:
             break
@@ -81,7 +81,7 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     return simulator, error
 
 
-def told_of_surrogate(error: float) -> tuple[Gate, ...]:
+def surrogate_gates(error: float) -> tuple[Gate, ...]:
     """Note that a surrogate misses its simulation by an NRMSE of `error`; no note if that is zero."""
     if not error:
         return ()
@@ -90,7 +90,7 @@ def told_of_surrogate(error: float) -> tuple[Gate, ...]:
     return (Gate("simulation", "surrogate", error, words, False),)
 
 
-def _identified(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:
+def _identify(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:
     try:
         found = fit(PILFR(n), records)
     except InputError:
@@ -114,7 +114,7 @@ def _identified(records: Sequence[Recording], n: int, hold: str | None) -> tuple
     return float(np.mean(errors)), simulator
 
 
-def _free(mode: Mode, slow: float) -> Mode:
+def _as_mass(mode: Mode, slow: float) -> Mode:
     """Turn a mode that is too slow to oscillate in a recording into a mass with almost no spring."""
     if not mode.second_order or mode.spring or abs(mode.value) > slow:
         return mode
@@ -132,7 +132,7 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
         Constants of the outputs.
     """
     slow = 0.05 / (len(like) * like.dt)
-    found = [_free(mode, slow) for mode in modes(*matrices[:3])]
+    found = [_as_mass(mode, slow) for mode in modes(*matrices[:3])]
     names = _distinct([mode.label(slow) for mode in found])
     parameters: dict[str, Parameter] = {}
     states: list[str] = []

@@ -28,17 +28,17 @@ from ..data import Recording
 from ..simulators import states_along
 from .floor import ABOVE_NOISE
 from .gates import (
-    ASTRAY,
     AT_NOISE,
     CLEARLY,
     EXPLAINED,
+    POOR_FIT,
     SAME,
     Change,
     Checked,
     FirstOrder,
     Gate,
     change_recordings,
-    fall,
+    describe_fall,
     refit,
 )
 from .linearise import Run
@@ -154,7 +154,7 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Chec
     samples = value / bench.dt
     if step.finding == "alignment" and samples > -WHOLE and not (in_steps(value, bench.dt, part) and samples > LONG):
         return now  # late by a fraction of a sample or by little: a delay is physics
-    sentence = f"{_shift_in_words(step, value, bench.dt)}; with it corrected {fall(plain.cost, left)}"
+    sentence = f"{_shift_in_words(step, value, bench.dt)}; with it corrected {describe_fall(plain.cost, left)}"
     if left > AT_NOISE**2 * noise2:
         sentence += (
             f", still {(left / max(noise2, 1e-300)) ** 0.5:.2g} times the noise: more is wrong, with the time "
@@ -194,7 +194,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[tuple[TimeShift, flo
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
     steps = [TimeShift(name, finding, kind, i) for kind, i, name in channels for finding in ("alignment", "clock")]
     found = list[tuple[float, TimeShift, float]]()
-    for reference in [plain] if plain.cost < ASTRAY else [plain, run_as_given(bench, plain)]:
+    for reference in [plain] if plain.cost < POOR_FIT else [plain, run_as_given(bench, plain)]:
         first = FirstOrder.of(bench, reference)
         for step in steps:
             left = _remainder_of(first, reference, step)
@@ -443,6 +443,6 @@ def _describe_gaps(now: Checked, places: Sequence[Origin], after: float) -> Gate
     names = ", ".join([*bench.simulator.inputs, *bench.simulator.output_names])
     sentence = (
         f"Samples are missing just before {at}: the state jumps there as no force and no shock could make it, as where "
-        f"a logger lost some and counted on. With the recording cut there {fall(before, after)}."
+        f"a logger lost some and counted on. With the recording cut there {describe_fall(before, after)}."
     )
     return Gate(names, "gap", [k * dt for _, k in ordered], sentence, fault=True, left=after / before)

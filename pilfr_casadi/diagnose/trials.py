@@ -25,8 +25,8 @@ from ..optimise import GaussNewton
 from ..simulators import Placed, Simulator
 from .gates import open_start
 from .screen import Scored
-from .step_refinement import knees, on_finer_steps
-from .workbench import QUICK, THOROUGH, Fitted, Workbench, started
+from .step_refinement import knee_starts, refit_on_finer_steps
+from .workbench import QUICK, THOROUGH, Fitted, Workbench, start_vector
 
 LONG = 8000  # samples used by brief fits
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
@@ -37,7 +37,7 @@ REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them 
 AGAIN = 3  # starts from which a pair is fitted again
 SAME = 1.02  # ratio of mean square errors within which fits count as equal
 BEHIND = 3.0  # ratio to the best error above which a pair gets no more starts
-FAINT = 0.01  # ratio to the larger share of the two runs below which a run's start values are not used
+LEAST_SHARE = 0.01  # ratio to the larger share of the two runs below which a run's start values are not used
 Key = frozenset[tuple[str, type[Law]]]
 
 
@@ -150,9 +150,9 @@ class Trials:
             found = part.fit(simulator, starts, **{"solver": QUICK, **options})
         except InputError:
             return None
-        return self.judged(found, count)
+        return self.make_trial(found, count)
 
-    def judged(self, found: Fitted, count: int) -> Trial:
+    def make_trial(self, found: Fitted, count: int) -> Trial:
         """Make a trial of a fit to a part of the recordings."""
         laws = found.simulator.elements[len(found.simulator.elements) - count :] if count else ()
         whole = found.cost
@@ -160,13 +160,13 @@ class Trials:
             whole = self.bench.result(found.simulator, found.values, found.initial, found.engine, found.model).cost
         return Trial(laws, found, found.cost, whole if np.isfinite(whole) else np.inf)
 
-    def polished(self, trial: Trial) -> Trial:
+    def polish(self, trial: Trial) -> Trial:
         """Fit a trial to convergence and to all samples."""
         bench = replace(self.bench, at_least=max(self.bench.at_least, trial.fitted.model.substeps))
         placed = trial.fitted.corrected()  # choose sub-steps for the fitted laws
         model = bench.model(placed)
         engine = make_engine(model, bench.engine)
-        starts, states = knees(trial), trial.fitted.initial
+        starts, states = knee_starts(trial), trial.fitted.initial
         try:
             if len(starts) > 1:
                 quick = bench.fit(placed, starts, states=states, model=model, engine=engine)
@@ -174,7 +174,7 @@ class Trials:
             fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
         except InputError:
             return replace(trial, whole=np.inf, thorough=True)
-        fitted = on_finer_steps(bench, fitted, trial.knee) if trial.knee else fitted
+        fitted = refit_on_finer_steps(bench, fitted, trial.knee) if trial.knee else fitted
         laws = fitted.simulator.elements[len(fitted.simulator.elements) - len(trial.laws) :]
         return Trial(laws, fitted, fitted.cost, fitted.cost, thorough=True)
 
@@ -192,7 +192,7 @@ class Trials:
         If one of the first comes below the error `enough`, those far behind it are not refined. With `again`, in place
         of a known law, fewer pairs are fitted.
         """
-        pairs = survivors(scored, FEW if again else BEST)
+        pairs = select_pairs(scored, FEW if again else BEST)
         most = FIRST if again else REFINED
         done, total = 0, len(pairs) + min(len(pairs), most)
 
@@ -203,8 +203,8 @@ class Trials:
 
         pool = ThreadPoolExecutor(self.workers)
         try:
-            tasks = [pool.submit(self._begun, parent, entries, gain) for entries in pairs]
-            prepared: list[_Begun] = []
+            tasks = [pool.submit(self._fit_briefly, parent, entries, gain) for entries in pairs]
+            prepared: list[_BriefFit] = []
             for task in tasks:
                 if self.over and prepared:
                     break
@@ -217,7 +217,7 @@ class Trials:
                 near = [p for p in group if best > enough or (p.trial and p.trial.error < BEHIND * best)]
                 near = [] if self.over else near
                 found += [p.trial for p in group if p not in near]
-                for refined in self._refined(near, gain is not None, pool):
+                for refined in self._refine(near, gain is not None, pool):
                     found.append(refined)
                     step(found)
             found += [p.trial for p in prepared[most:]]
@@ -226,10 +226,10 @@ class Trials:
             pool.shutdown(cancel_futures=True)
         return sorted((t for t in found if t is not None), key=lambda t: t.error)
 
-    def _begun(self, parent: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> _Begun:
+    def _fit_briefly(self, parent: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> _BriefFit:
         """Compile a pair and fit it briefly from its best start."""
         first, base = entries[0], parent.fitted
-        placed, _ = put_in(base.simulator, first, first.starts[0])
+        placed, _ = place_law(base.simulator, first, first.starts[0])
         model = self.bench.model(placed, gain)
         engine = make_engine(model, self.bench.engine)
         nominal = {k: p.value for k, p in base.simulator.parameters.items()}
@@ -238,25 +238,25 @@ class Trials:
         led: list[Mapping[str, Any]] = []
         for entry in entries:
             for i, own in enumerate(entry.starts):
-                _, named = put_in(base.simulator, entry, own)
+                _, named = place_law(base.simulator, entry, own)
                 starts.append({**base.values, **named})
                 if i == 0:
                     led += [starts[-1]] if entry.source == "observer" else []
                     starts.append({**nominal, **named})
         if set(first.law.parameters()) == set(first.law.strength):  # at zero strength the simulator is unchanged
-            _, named = put_in(base.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
+            _, named = place_law(base.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
             starts.append({**base.values, **named})
         best, *rest = self._by_cost(placed, model, engine, starts, base)
         ranked = [best, *(s for s in led if s is not best), *(s for s in rest if not any(s is o for o in led))]
         count = len(parent.laws) + 1
         options = {"states": base.begin, "model": model, "engine": engine}
         brief = self.fitted(placed, ranked[:1], count, solver=BRIEF, **options)
-        return _Begun(placed, model, engine, ranked, base.begin, count, brief)
+        return _BriefFit(placed, model, engine, ranked, base.begin, count, brief)
 
-    def _refined(self, pairs: Sequence[_Begun], led: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
+    def _refine(self, pairs: Sequence[_BriefFit], led: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
         """Fit pairs from several starts, and if `led` by the observer as well; three that agree are enough."""
 
-        def submit(pair: _Begun, some: slice) -> list[Future[Trial | None]]:
+        def submit(pair: _BriefFit, some: slice) -> list[Future[Trial | None]]:
             options = {"states": pair.states, "model": pair.model, "engine": pair.engine}
             return [
                 pool.submit(self.fitted, pair.placed, [start], pair.count, anneal=anneal, **options)
@@ -264,11 +264,11 @@ class Trials:
             ]
 
         first = [submit(pair, slice(0, 3)) for pair in pairs]
-        begun = []
+        running = []
         for pair, tasks in zip(pairs, first, strict=True):
             found = [task.result() for task in tasks]
-            begun.append((pair, found, [] if _agree(found) else submit(pair, slice(3, None))))
-        for pair, found, tasks in begun:
+            running.append((pair, found, [] if _agree(found) else submit(pair, slice(3, None))))
+        for pair, found, tasks in running:
             every = [pair.trial, *found, *(task.result() for task in tasks)]
             yield min((t for t in every if t is not None), key=lambda t: t.part, default=None)
 
@@ -282,10 +282,10 @@ class Trials:
     ) -> list[Mapping[str, Any]]:
         """Order starts by their error before a fit, from the initial states of a fit."""
         part = self.part
-        initial = part.begun(placed, model, started(model, starts[0]), base.begin)
+        initial = part.initial_states(placed, model, start_vector(model, starts[0]), base.begin)
 
         def cost(start: Mapping[str, Any]) -> float:
-            values = model.parameters.unpack(started(model, start))
+            values = model.parameters.unpack(start_vector(model, start))
             found = part.result(placed, values, initial, engine, model).cost
             return found if np.isfinite(found) else np.inf
 
@@ -293,7 +293,7 @@ class Trials:
 
 
 @dataclass(frozen=True, eq=False)
-class _Begun:
+class _BriefFit:
     """A pair with its compiled model, its starts, best first, and its brief fit."""
 
     placed: Simulator
@@ -324,7 +324,7 @@ def _head(r: Recording, share: float) -> Recording:
     return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 
-def survivors(scored: Sequence[Scored], best: int = BEST) -> list[list[Scored]]:
+def select_pairs(scored: Sequence[Scored], best: int = BEST) -> list[list[Scored]]:
     """Select the pairs worth a full fit: the best of both lists and the best of each port."""
     chosen: dict[tuple[str, type[Law]], list[Scored]] = {}
     for source in ("simulation", "observer"):
@@ -332,22 +332,22 @@ def survivors(scored: Sequence[Scored], best: int = BEST) -> list[list[Scored]]:
         for s in (s for s in scored if s.source == source):
             if len(passed) < best or s.port not in ports:
                 chosen.setdefault((s.port, type(s.law)), [])
-            if not any(_adds_nothing(s, other) for other in passed):  # two forms of one law are one hypothesis
+            if not any(_is_redundant(s, other) for other in passed):  # two forms of one law are one hypothesis
                 passed.append(s)
             ports.add(s.port)
     for s in scored:
         if (s.port, type(s.law)) in chosen:
             chosen[s.port, type(s.law)].append(s)
-    return [[s for s in found if s.share > FAINT * found[0].share] or found for found in chosen.values()]
+    return [[s for s in found if s.share > LEAST_SHARE * found[0].share] or found for found in chosen.values()]
 
 
-def _adds_nothing(one: Scored, other: Scored) -> bool:
+def _is_redundant(one: Scored, other: Scored) -> bool:
     """Tell whether, of two laws at a port, one refines the other and they score the same."""
     a, b = type(one.law), type(other.law)
     return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < EQUAL
 
 
-def put_in(simulator: Simulator, entry: Scored, start: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:
+def place_law(simulator: Simulator, entry: Scored, start: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:
     """Put a law into its port; return the simulator and the law's start values by full name."""
     law = entry.law
     limits: dict[str, tuple[Any, Any]] = dict(law.at(start).bounds(entry.local))

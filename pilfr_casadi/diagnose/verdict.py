@@ -49,12 +49,12 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate]) -> Verdict:
     if cured and search.root.whole < HALVED**2 * found.best.whole:  # beside the fault, an effect is negligible
         return Verdict("recording-fault", faults[0].sentence)
     if found.effects and found.named > 0.5:
-        return Verdict("missing-physics", _named(search, found))
+        return Verdict("missing-physics", _describe_effects(search, found))
     opened = search.flexible(search.root)
     still = max(opened.values(), default=0.0)
     hum = [g for g in gates if g.finding == "tone" and not found.effects]
     own = ringing(search.bench, search.root.fitted)
-    noise = not found.effects and _noise(search, hum, still, own)
+    noise = not found.effects and _is_noise(search, hum, still, own)
     if faults and (noise or cured or (still < HINT and not found.effects)):
         return Verdict("recording-fault", faults[0].sentence)
     if noise and still < HINT:
@@ -64,10 +64,10 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate]) -> Verdict:
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
             "outputs' deviation, and no force at any port explains any of the rest.",
         )
-    return Verdict("unexplained", _unnamed(search, found, opened, own))
+    return Verdict("unexplained", _describe_unexplained(search, found, opened, own))
 
 
-def _noise(search: Search, hum: Sequence[Gate], still: float, own: float | None) -> bool:
+def _is_noise(search: Search, hum: Sequence[Gate], still: float, own: float | None) -> bool:
     """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady."""
     root = search.root
     quiet = root.error * max(1 - sum(1 - g.left for g in hum), 0.0) ** 0.5
@@ -91,16 +91,16 @@ def _swells(search: Search) -> bool:
     return swells_with(rest, signals)
 
 
-def _named(search: Search, found: Posterior) -> str:
+def _describe_effects(search: Search, found: Posterior) -> str:
     words = " and ".join(f"{display_name(e.name[1])} at {e.name[0]}" for e in found.effects)
     if found.sure > SURE:
         said = f"The simulator leaves out {words}."
     else:
         said = f"The simulator most likely leaves out {words}; the name is not certain."
-    return said + _gone(search, found)
+    return said + _describe_vanished(search, found)
 
 
-def _gone(search: Search, found: Posterior) -> str:
+def _describe_vanished(search: Search, found: Posterior) -> str:
     """Describe the simulator's own parameters that vanish beside the effects, which may replace them."""
     simulator = search.bench.simulator
     offsets = tuple(e.prefix for e in simulator.elements if e.law.id == "offset")
@@ -111,7 +111,7 @@ def _gone(search: Search, found: Posterior) -> str:
     return f" Beside {beside}, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
 
 
-def _unnamed(search: Search, found: Posterior, opened: dict[str, float], own: float | None) -> str:
+def _describe_unexplained(search: Search, found: Posterior, opened: dict[str, float], own: float | None) -> str:
     root, still = search.root, max(opened.values(), default=0.0)
     where = max(opened, key=lambda k: opened[k], default="")
     if not found.effects:

@@ -30,9 +30,11 @@ from ..simulators import (
 )
 
 QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
-HUGE, ENDLESS = 1e6, 1e20  # bounds on a diverging run: output over the largest measured value, and mean square error
-AWAY = 10.0  # over the outputs' deviation; a bounded oscillation about another point is off by less
-BEYOND = 20.0  # growth within a recording, in e-folds, above which no estimated initial state can keep the run bounded
+HUGE, DIVERGED = 1e6, 1e20  # bounds on a diverging run: output over the largest measured value, and mean square error
+RUNAWAY = 10.0  # over the outputs' deviation; a bounded oscillation about another point is off by less
+MOST_GROWTH = (
+    20.0  # growth within a recording, in e-folds, above which no estimated initial state can keep the run bounded
+)
 FINER = 4  # largest factor on the sub-steps for a law
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
 
@@ -102,7 +104,7 @@ class Workbench:
     at_least: int = 1  # sub-steps of simulators with laws
     typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
     chosen: int = 1  # sub-steps first chosen for the simulator, on which limits are based
-    struck: list[Status] = field(default_factory=list)  # one entry for each fit that an interrupt has ended
+    interrupted_fits: list[Status] = field(default_factory=list)  # one entry for each fit that an interrupt has ended
 
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
@@ -121,7 +123,7 @@ class Workbench:
         """Sampling interval, s."""
         return self.recordings[0].dt
 
-    def otherwise_held(self) -> Workbench:
+    def with_other_hold(self) -> Workbench:
         """Return the bench with the other hold of the inputs between samples."""
         return replace(self, hold="linear" if self.hold == "zero" else "zero")
 
@@ -187,7 +189,7 @@ class Workbench:
         engine = engine or make_engine(model, self.engine)
         estimated = any(r.begins == "estimate" for r in self.recordings)
         if not np.any(model.parameters.free) and not (estimated and model.n_state):
-            return self._as_it_is(simulator, model, engine)
+            return self._run_fixed(simulator, model, engine)
         best: tuple[float, np.ndarray, Problem] | None = None
         for start in starts:
             found = self._run(simulator, model, engine, start, states, tuple(anneal), solver)
@@ -195,17 +197,17 @@ class Workbench:
                 best = found
         if best is None:
             raise InputError(
-                f"The simulation diverges at the start values{self._lost(model, engine, starts[0])}; "
-                + (self._unstable(simulator) or "check the parameters' values and units, and the hold.")
+                f"The simulation diverges at the start values{self._describe_divergence(model, engine, starts[0])}; "
+                + (self._describe_instability(simulator) or "check the parameters' values and units, and the hold.")
             )
         _, theta, problem = best
         values = model.parameters.unpack(problem.parameters(theta))
         values.pop(INJECTION, None)
         return self.result(simulator, values, problem.first_states(theta), engine, model)
 
-    def _lost(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
+    def _describe_divergence(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
         """Describe where a run from rest exceeds every bound."""
-        vector = started(model, start)
+        vector = start_vector(model, start)
         for r in self.recordings:
             with np.errstate(all="ignore"):
                 y = engine.simulate(model.drive(r), vector, np.zeros(model.n_state))[0]
@@ -218,21 +220,21 @@ class Workbench:
 
     def check_followed(self, fitted: Fitted) -> None:
         """Refuse a fit that is far beyond what was recorded because the simulator is unstable."""
-        if fitted.cost > AWAY**2 and (why := self._unstable(self.simulator)):
+        if fitted.cost > RUNAWAY**2 and (why := self._describe_instability(self.simulator)):
             off = f"{fitted.cost**0.5:.3g} times the outputs' deviation"
             raise InputError(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
 
-    def _unstable(self, simulator: Simulator) -> str:
+    def _describe_instability(self, simulator: Simulator) -> str:
         """Say what to do about a simulator too unstable to follow a controlled machine; empty if it is not."""
         rate = growth_rate(simulator, self.recordings[0])
-        if rate * max(len(r) for r in self.recordings) * self.dt < BEYOND:
+        if rate * max(len(r) for r in self.recordings) * self.dt < MOST_GROWTH:
             return ""
         return (
             f"it is unstable (it grows e-fold in {1 / rate:.2g} s) and cannot be run by its own inputs alone: put the "
             "controller into the simulator, with its reference as the input."
         )
 
-    def _as_it_is(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
+    def _run_fixed(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
         """Run the simulator as it stands, because there is nothing to estimate."""
         freed = model.parameters.change(**{name: {"fixed": False} for name in model.parameters})
         problem = self.problem(model.with_parameters(freed), engine)
@@ -253,10 +255,10 @@ class Workbench:
         solver: GaussNewton,
     ) -> tuple[float, np.ndarray, Problem] | None:
         parameters = model.parameters
-        vector = started(model, start)
+        vector = start_vector(model, start)
         states = None
         if len(guess):
-            unknown = zip(self.recordings, self.begun(simulator, model, vector, guess), strict=True)
+            unknown = zip(self.recordings, self.initial_states(simulator, model, vector, guess), strict=True)
             states = np.concatenate([np.zeros(0), *(state for r, state in unknown if r.begins == "estimate")])
         problem: Problem | None = None
         for gamma in (*path, 0.0):
@@ -278,16 +280,16 @@ class Workbench:
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 continue
             if solution.status is Status.INTERRUPTED:
-                self.struck.append(solution.status)
+                self.interrupted_fits.append(solution.status)
             if np.all(np.isfinite(solution.theta)):
                 vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
         if problem is None:
             return None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
         cost = problem.cost(theta)
-        return (cost, theta, problem) if cost < ENDLESS else None
+        return (cost, theta, problem) if cost < DIVERGED else None
 
-    def begun(
+    def initial_states(
         self, simulator: Simulator, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]
     ) -> list[np.ndarray]:
         """Complete initial states (n_state,) from their first entries; laws begin at rest at the first inputs."""
@@ -305,7 +307,7 @@ class Workbench:
         simulator = simulator or fitted.simulator
         model = self.model(simulator)
         engine = make_engine(model, self.engine)
-        states = self.begun(simulator, model, model.parameters.pack(fitted.values), fitted.begin)
+        states = self.initial_states(simulator, model, model.parameters.pack(fitted.values), fitted.begin)
         return self.result(simulator, fitted.values, states, engine, model)
 
     def result(
@@ -326,7 +328,7 @@ class Workbench:
         return Fitted(simulator, model, engine, values, initial, residual, cost)
 
 
-def started(model: Model, start: Mapping[str, Any]) -> np.ndarray:
+def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
     """Return the parameter vector at start values by name, clipped to the bounds; unknown names are ignored."""
     p = model.parameters
     return np.asarray(np.clip(p.pack({k: v for k, v in start.items() if k in p}), p.lower, p.upper))
