@@ -46,12 +46,15 @@ MOTION = {  # by kind of blind spot: the record that mends it
     "no-reversal": "A slow triangle of {} with reversals, at two amplitudes.",
     "one-amplitude": "A second amplitude of {}, such as half of it.",
 }
+# by stated hold: its name in the printed result
 HOLD_WORDS = {
     "zero": "held",
     "linear": "interpolated",
     "": "not stated, here taken as held; say hold='zero' or hold='linear' if you know",
 }
+# by kind of initial state: its name in the printed result
 START_WORDS = {"zero": "at zero", "estimate": "estimated", "periodic": "periodic", "given": "as given"}
+# by source of the noise floor: its name in the printed result
 SOURCES = {
     "periods": "from the periods",
     "repeats": "from repeated recordings",

@@ -32,10 +32,10 @@ from .workbench import Fitted, Workbench
 EXACT = 8.0  # effective samples of a model whose whole error is model error (n_0)
 LEAST_WRONG = 0.05  # least share of the error that counts as model error
 EFFECT_PRIOR = np.log(0.5)  # log prior probability of each further effect
+# laws that can imitate others
 FLEXIBLE = ("hysteresis", "static_curve", "extra_mode", "stribeck_friction", "periodic_force", "drift")
-FLEXIBLE_PRIOR = np.log(
-    0.2
-)  # log prior probability of a flexible law, which can imitate others, relative to other laws
+# log prior probability of a flexible law, which can imitate others, relative to other laws
+FLEXIBLE_PRIOR = np.log(0.2)
 INPUT_FACTOR = 0.7  # factor on the inputs for which the spread is computed: well inside the recorded range
 STATE_PRIOR = 1e-9  # precision of the prior of initial states, relative to the information of a sample
 DOUBTFUL_PRIOR = np.log(0.01)  # log prior probability of parameter values at which a law degenerates

@@ -15,7 +15,7 @@ from .workbench import Fitted, Workbench
 
 SHARES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
 SINES = 12  # frequencies of sines that are tried
-SECONDS = 3000  # longest simulated experiment, in samples
+MOST_SAMPLES = 3000  # longest simulated experiment, in samples
 
 
 def next_experiment(
@@ -37,7 +37,7 @@ def next_experiment(
         (the separation in the recordings) and `sentence`; None if nothing within the limits separates them.
     """
     u = np.concatenate([r.u for r in bench.recordings])
-    m, dt = min(max(map(len, bench.recordings)), SECONDS), bench.dt
+    m, dt = min(max(map(len, bench.recordings)), MOST_SAMPLES), bench.dt
     t, rest = np.arange(m) * dt, np.median(u, axis=0)
     best: dict[str, Any] | None = None
 

@@ -36,21 +36,21 @@ Change = Callable[[Recording], Recording]
 CURED, EXPLAINED = 0.12, 0.3
 CLEARLY = 0.8  # the same for an edit that is clearly better than another edit, or than none
 AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong; faults are sought from ABOVE_NOISE on
-POOR_FIT, USELESS_FIT = (
-    0.04,
-    0.25,
-)  # mean square error from which a refit may be in a wrong minimum; from which it says nothing
+# mean square error from which a refit may be in a wrong minimum; from which it says nothing
+POOR_FIT, USELESS_FIT = 0.04, 0.25
 SAME = 1.02  # ratio of errors that count as equal
 LEAST_GAIN = 12.0  # least gain of an edit's parameters beyond their BIC cost, in nats: odds of about 1e5
 CERTAIN = (2 * LEAST_GAIN) ** 0.5  # the same in standard errors of one parameter
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
-FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))
+FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))  # each unit by mistake in either direction
 FAHRENHEIT = (1.8, 1 / 1.8)  # Fahrenheit's zero differs as well: this unit comes with an offset
+# factors on the time: ms, minutes, µs, hours, and the reverse of the first two
 TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600, 60.0, 1e3)
 NEAR = 6.0  # a factor is tried if it brings the simulated size within this ratio of the measured one
 BENT = 0.3  # share of the parameters at their bounds above which a refit does not confirm a unit of time
+# first refit of each trial, only to discard hopeless ones
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 
 LEAST = 0.01  # least share of the mean square that an offset must remove, to first order

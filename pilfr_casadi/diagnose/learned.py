@@ -34,13 +34,13 @@ from .linearise import linearised
 from .remainder import Remainder, Task, lengths, usable
 from .workbench import QUICK, Fitted, Workbench, start_vector
 
-STOPS = 8
+STOPS = 8  # number of stops
 # thresholds over half the range of z: from presliding to a stop that slips in every large motion and so forgets its
 # start
 THRESHOLDS = np.geomspace(0.02, 0.7, STOPS)
 POWERS = 3  # highest power of each stop: odd ones for symmetric loops, the even one for one-sided forces
 KNEES = (0.01, 0.05, 0.25)  # of the curves v / (|v| + knee), over the largest speed: from dry friction to a smooth bend
-FEATURES = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)
+FEATURES = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)  # number of features in `LearnedForce.step`
 EXTENSION = 0.5  # largest extension of a signal beyond its range, over half the range
 FIT_EXTENSION = 5.0  # the same during the fit, because the refit's run may be a poor guess of the range
 # ridge strengths tried, relative to the mean square response to a force of unit size

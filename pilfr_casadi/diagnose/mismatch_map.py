@@ -18,7 +18,7 @@ from .._base import in_words
 from ..data import Recording
 
 BINS = 6  # bins of amplitude, rate and level
-MOST_BANDS = 24
+MOST_BANDS = 24  # frequency bands at most, so that the map stays readable
 STRETCHES = 24  # pieces of a recording in the picture over time
 EXCITED = 1e-3  # share of the largest line below which an input line counts as omitted
 CLEAR = 1.5  # ratio that the sentence mentions

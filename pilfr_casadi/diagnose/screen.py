@@ -28,6 +28,7 @@ from .workbench import Fitted, Workbench
 KEPT = 3  # start values kept for each pair of port and law
 
 DEGREE = 4  # of the flexible surface
+# degrees in z and dz/dt of the surface's terms
 TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
 MOST, LEAST = 600_000, 2500  # largest product of samples and squared number of states; least number of samples
 
@@ -178,6 +179,7 @@ class Surface(Law):
         }
 
 
+# forces that together follow any force at a port
 FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
 
 

@@ -26,13 +26,14 @@ from .gates import Gate
 from .modes import Mode, modes, to_continuous
 
 POOR = 0.02  # NRMSE above which a simulation is too nonlinear for a surrogate
+# the note about a surrogate above POOR
 TOO_POOR = (
     "The linear model is poor: the simulation is not linear there, and what the model misses may show up as missing "
     "physics. Give the simulator itself where it can be had."
 )
 FREE = 0.3  # range of the parameters, as a share of their values
 EXACT = 1e-3  # NRMSE below which no higher order is tried
-HIGHEST = 8
+HIGHEST = 8  # highest order that is tried
 SMALL = 1e-3  # share of an output below which a coefficient is fixed
 # names of the inputs' gains on a mode's displacement and rate, and of these in the outputs
 GAINS, SEEN = ("gain on the displacement of", "gain of"), ("seen in", "rate seen in")

@@ -29,7 +29,7 @@ from .step_refinement import knee_starts, refit_on_finer_steps
 from .workbench import QUICK, THOROUGH, Fitted, Workbench, start_vector
 
 LONG = 8000  # samples used by brief fits
-BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
+BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)  # first fit of each pair, to rank the pairs
 # pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
 BEST, FEW = 10, 4
 EQUAL = 1e-3  # difference of shares that counts as zero

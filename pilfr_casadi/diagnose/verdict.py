@@ -16,7 +16,7 @@ from .recording_faults import ringing
 from .search import Search
 
 AT_FLOOR = 1.15  # ratio to the noise that counts as at the noise
-# largest ratio of noise to a measured floor, and to an estimated one (twice: for any noise, and for coloured noise)
+# largest ratio of noise to a measured floor; to an estimated floor; to that if no force explains the noise
 QUANTISED, SOMEWHAT, COLOURED = 2.0, 4.0, 9.0
 LOUD, SILENT = 0.05, 0.01  # largest coloured noise over the deviation, and the share of it that a force may explain
 QUIET, CHANCE = 0.01, 0.05  # the same for noise too small to matter: a force explains that much by chance

@@ -29,14 +29,13 @@ from ..simulators import (
     resting_elements,
 )
 
-QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
+QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)  # default solver of a fit
 HUGE, DIVERGED = 1e6, 1e20  # bounds on a diverging run: output over the largest measured value, and mean square error
 RUNAWAY = 10.0  # over the outputs' deviation; a bounded oscillation about another point is off by less
-MOST_GROWTH = (
-    20.0  # growth within a recording, in e-folds, above which no estimated initial state can keep the run bounded
-)
+# growth within a recording, in e-folds, above which no estimated initial state can keep the run bounded
+MOST_GROWTH = 20.0
 FINER = 4  # largest factor on the sub-steps for a law
-THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
+THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)  # solver of the fits that results are based on
 
 
 @dataclass(frozen=True, eq=False)

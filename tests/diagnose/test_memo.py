@@ -61,7 +61,7 @@ def test_what_two_effects_are_exchanged_for_is_not_fitted_twice(fits):
 
 
 def test_an_interrupt_of_a_fit_keeps_what_there_is(monkeypatch):
-    seen, whole = [], Trials.judged
+    seen, whole = [], Trials.make_trial
 
     def struck(self, found, count):
         seen.append(count)
