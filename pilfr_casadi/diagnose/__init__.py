@@ -6,19 +6,20 @@ about. The files by stage:
 
 - The whole: `pipeline` (the steps in their order), `arguments` (their checks), `workbench` (what all steps share).
 - Preparation: `preparation` calls the checks of recordings, each an edit that puts a fault right: `gates` (the edit
-  and its acceptance; sign, unit, exchange, offset), `recording_faults` (glitches, stale and clipped samples, unsettled
-  periods, tones) and `timing` (shift, clock, gap). `step_refinement` chooses the integration steps, `floor` the noise.
-- Search: `search` moves from hypothesis to hypothesis; `linearise`, `remainder`, `screen`, `pairs` and `relatives` say
-  which are worth a fit, `trials` fits them.
-- Evidence: `evidence` (log evidence), `cross_validation` (held-out
-  blocks), `posterior`, `verdict`.
-- Correction: `correction` chooses the simulator to hand back, with a `learned` element where names do not reach.
-- Other readings: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
+- Preparation: `preparation` calls the checks of recordings. Each check makes an edit that corrects a fault: `gates`
+  (the edit and its acceptance; sign, unit, exchange, offset), `recording_faults` (glitches, stale and clipped samples,
+  unsettled periods, tones) and `timing` (shift, clock, gap). `step_refinement` chooses the integration steps, `floor`
+  estimates the noise.
+- Search: `search` moves from hypothesis to hypothesis. `linearise`, `remainder`, `screen`, `pairs` and `relatives`
+  select the hypotheses that are worth a fit, `trials` fits them.
+- Evidence: `evidence` (log evidence), `cross_validation` (held-out blocks), `posterior`, `verdict`.
+- Correction: `correction` chooses the corrected simulator, with a `learned` element where named laws do not suffice.
+- Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
 - Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
-- Before any of it: `checkup` (what the recordings can reveal), by `identifiability` (of parameters) and
+- Before a diagnosis: `checkup` (what the recordings can reveal), based on `identifiability` (of parameters) and
   `detectability` (of laws).
-- In place of a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
+- Without a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
 """
 
 from __future__ import annotations

@@ -13,10 +13,10 @@ from ..identify import match_channels
 from ..laws import CATALOGUE, SCALABLE, Law, scaled
 from ..simulators import Simulator, as_simulator
 
-FEWEST_SAMPLES = 20  # of all training recordings together
+FEWEST_SAMPLES = 20  # samples in all training recordings together; fewer cannot determine a model
 
 
-def matched(
+def match_recordings(
     simulator: Any, train: Recording | Sequence[Recording], hold: str | None, excited: bool = True
 ) -> tuple[Simulator, tuple[Recording, ...]]:
     """Return the simulator, and the recordings with its channels in its order.
@@ -36,7 +36,7 @@ def matched(
     return simulator, check_for_identification(recordings, FEWEST_SAMPLES, excited)
 
 
-def matched_tests(
+def match_tests(
     simulator: Simulator, test: Recording | Sequence[Recording] | None, train: Sequence[Recording]
 ) -> tuple[Recording, ...]:
     """Return the test recordings with the simulator's channels; refuse training data and other steps."""
@@ -50,20 +50,20 @@ def matched_tests(
 
 
 def check_laws(laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
-    """Return the laws as a tuple, by default the catalogue; refuse what is no class of laws."""
+    """Return the laws as a tuple, by default the catalogue; refuse anything that is not a class of laws."""
     for law in laws or ():
         if not (isinstance(law, type) and issubclass(law, Law)):
             raise InputError(f"laws holds {law!r}; give classes of laws, such as pilfr.laws.CoulombFriction.")
     return CATALOGUE if laws is None else tuple(laws)
 
 
-def with_scaled(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
-    """Return the laws, and some of them scaled by each input that the equations do not read."""
+def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[type[Law], ...]:
+    """Return the laws, and scaled versions of some of them for each input that the equations do not read."""
     return (*laws, *(scaled(law, by) for law in SCALABLE if law in laws for by in simulator.idle_inputs))
 
 
 def check_limits(simulator: Simulator, limits: Mapping[str, float] | None) -> None:
-    """Refuse a largest amplitude of something that is no input, and one that is not positive."""
+    """Refuse a limit on a name that is not an input, and a limit that is not positive."""
     for name, most in (limits or {}).items():
         if name not in simulator.inputs:
             raise InputError(

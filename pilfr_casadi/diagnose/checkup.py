@@ -1,8 +1,9 @@
 """Assess recordings before a diagnosis: what they and the sensors can reveal of a simulator, without fitting a law.
 
-The simulator's own parameters are refitted once; everything else follows from the simulator linearised along that run:
-`identifiability` says which parameters are identifiable, `detectability` which laws at which ports are detectable. What
-is neither is a blind spot, and the gravest one that another recording can mend says what to record next.
+The simulator's own parameters are refitted once. Everything else follows from the simulator linearised along that run:
+`identifiability` tells which parameters are identifiable, `detectability` which laws are detectable at which ports. A
+parameter or law that is neither is a blind spot. The gravest blind spot that another recording can mend decides what to
+record next.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ from .._base import in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import Law, display_name
 from ..simulators import in_series
-from .arguments import check_laws, matched
+from .arguments import check_laws, match_recordings
 from .detectability import Excitation, LawRow, assess_laws, excitations, group_alike
 from .floor import ABOVE_NOISE, noise_floor
 from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters, helpful_sensors
 from .linearise import linearised
-from .preparation import said_hold
+from .preparation import stated_hold
 from .workbench import Fitted, Workbench
 
-FINEST = 1e-6  # noise over an output's deviation that is counted on at least: a sensor of 20 bits
-HALF = 0.5  # mean square error over the outputs' power, above which the linearisation may be that of another machine
-LINEAR = ("linear_stiffness", "viscous_damping")  # what a simulator's own parameters are for
+FINEST = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
+HALF = 0.5  # mean square error over the outputs' power above which the linearisation may be far from the machine
+LINEAR = ("linear_stiffness", "viscous_damping")  # laws that the simulator's own parameters usually cover
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
     "identifiable": ("yes", ""),
@@ -41,16 +42,19 @@ IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the bl
     "tied": ("no: traded off, see above", ""),
     "port": ("only with a law at its port", ""),
 }
-MOTION = {  # the record that mends the blind spot
+MOTION = {  # by kind of blind spot: the record that mends it
     "no-reversal": "A slow triangle of {} with reversals, at two amplitudes.",
     "one-amplitude": "A second amplitude of {}, such as half of it.",
 }
+# by stated hold: its name in the printed result
 HOLD_WORDS = {
     "zero": "held",
     "linear": "interpolated",
     "": "not stated, here taken as held; say hold='zero' or hold='linear' if you know",
 }
+# by kind of initial state: its name in the printed result
 START_WORDS = {"zero": "at zero", "estimate": "estimated", "periodic": "periodic", "given": "as given"}
+# by source of the noise floor: its name in the printed result
 SOURCES = {
     "periods": "from the periods",
     "repeats": "from repeated recordings",
@@ -60,7 +64,7 @@ SOURCES = {
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """Something that the recordings cannot reveal: its kind, the names that it concerns, and a sentence."""
+    """A fact that the recordings cannot reveal: its kind, the names concerned, and a sentence."""
 
     kind: str
     names: tuple[str, ...]
@@ -69,28 +73,28 @@ class BlindSpot:
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """Answer of `check`: the power of recordings to reveal parameters and missing laws.
+    """Answer of `check`: which parameters and missing laws the recordings can reveal.
 
     Attributes
     ----------
     blind_spots : tuple of BlindSpot
         Facts that the recordings cannot reveal, the gravest first.
     parameters, ties : tuple of ParameterRow, tuple of Tie
-        Free parameters as refitted, and groups that are traded off.
+        Refitted free parameters, and groups of parameters that trade off.
     laws : tuple of LawRow
-        Every law at every port, and from what strength on it is detectable.
+        Every law at every port, with the strength from which it is detectable.
     classes : tuple of tuple of (port, law)
-        Laws that look the same.
+        Groups of laws that look the same.
     excitation : tuple of Excitation
         Motion at each port.
     noise : dict
-        `source`, and `deviation` and `share` of the output's deviation by output.
+        `source`; `deviation` and its `share` of the output's deviation, both by output.
     error : float
         NRMSE of the refitted simulator.
     hold, starts : str, tuple of str
-        Course of the inputs between samples as it was stated ("" where it was not), and the start of each recording.
+        Stated course of the inputs between samples ("" if not stated), and the start of each recording.
     next_record : str
-        The further record that would help most.
+        The recording that would help most.
     seconds : float
     """
 
@@ -167,7 +171,7 @@ class Check:
         yield from _table(columns, rows) if rows else ["No law is detectable at any port."]
 
     def _group_lines(self) -> Iterator[str]:
-        """List groups of laws that look the same, beyond those at ports that all look the same."""
+        """List groups of laws that look the same, except at ports that all look the same."""
         for group in self.classes:
             names = dict.fromkeys(f"{display_name(law)} at {self._label(port)}" for port, law in group)
             if len(names) > 1:
@@ -212,7 +216,7 @@ def check(
     laws: Sequence[type[Law]] | None = None,
     engine: str = "auto",
 ) -> Check:
-    """Find what recordings can reveal about a simulator and about what it leaves out, before a law is fitted.
+    """Find what recordings can reveal about a simulator and its missing physics, without fitting a law.
 
     Parameters
     ----------
@@ -236,9 +240,9 @@ def check(
     InputError
         If simulator and recordings do not fit each other, or the simulation diverges or runs away from them.
     """
-    simulator, recordings = matched(simulator, train, hold, excited=False)
+    simulator, recordings = match_recordings(simulator, train, hold, excited=False)
     check_laws(laws)
-    stated = said_hold(simulator, recordings, hold)
+    stated = stated_hold(simulator, recordings, hold)
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
     fitted = bench.fit(simulator)
     bench.check_followed(fitted)
@@ -246,11 +250,11 @@ def check(
 
 
 def assess(bench: Workbench, fitted: Fitted, stated: str, laws: Sequence[type[Law]] | None = None) -> Check:
-    """Assess the recordings of a bench along a refitted run; `stated` is the hold that somebody stated, if any."""
+    """Assess the recordings of a bench along a refitted run; `stated` is the stated hold, "" if none was stated."""
     began, inputs, outputs = time.perf_counter(), bench.simulator.inputs, bench.simulator.output_names
     floor = noise_floor(bench.recordings, fitted.residual)
     noise = np.maximum(floor.deviation, FINEST * bench.scale)
-    quiet = replace(bench, scale=noise)  # everything from here on is counted in units of the noise
+    quiet = replace(bench, scale=noise)  # from here on, the noise is the unit of all outputs
     probe, runs = linearised(quiet, fitted)
     response = Sensitivity.of(quiet, probe, runs)
     parameters, ties = assess_parameters(response, quiet, fitted)
@@ -281,7 +285,7 @@ def assess(bench: Workbench, fitted: Fitted, stated: str, laws: Sequence[type[La
 
 
 def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
-    """Find parameters that are dead or flat as refitted and move the outputs at the given values."""
+    """Find parameters that are dead or flat after the refit but move the outputs at the given values."""
     doubtful = [p.name for p in parameters if p.status in ("dead", "flat")]
     if not doubtful:
         return ()
@@ -295,9 +299,9 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
 
 
 def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) -> Iterator[BlindSpot]:
-    """Put everything that the recordings cannot reveal into sentences, the gravest first.
+    """Describe everything that the recordings cannot reveal, the gravest first.
 
-    `still` are inputs that never change, `alive` dead or flat parameters that move the outputs at the given values.
+    `still` are inputs that never change; `alive` are dead or flat parameters that move the outputs at the given values.
     """
 
     def spot(kind: str, names: Sequence[str], sentence: str) -> Iterator[BlindSpot]:
@@ -334,7 +338,7 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
 
 
 def _followed_laws(found: Check, port: str) -> Iterator[BlindSpot]:
-    """Find the laws of a port that own parameters follow, by the parameter that does."""
+    """Find the laws of a port that the simulator's own parameters imitate, grouped by parameter."""
     followed = [r for r in found.laws if r.port == port and r.status == "followed" and r.law not in LINEAR]
     for why in dict.fromkeys(r.why for r in followed):
         own = tuple(r.law for r in followed if r.why == why)
@@ -345,7 +349,7 @@ def _followed_laws(found: Check, port: str) -> Iterator[BlindSpot]:
 
 
 def _alike_ports(found: Check) -> list[list[str]]:
-    """Find groups of ports at which every law that is detectable at both looks the same."""
+    """Find groups of ports at which all commonly detectable laws look the same."""
     laws: dict[str, set[str]] = {}
     for r in found.detectable:
         laws.setdefault(r.port, set()).add(r.law)
@@ -359,7 +363,7 @@ def _alike_ports(found: Check) -> list[list[str]]:
 
 
 def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) -> str:
-    """Say what to record next, by the gravest blind spot that a record can mend."""
+    """Say what to record next, from the gravest blind spot that a recording can mend."""
     names = {b.kind: b.names for b in reversed(found.blind_spots)}
     if "rough" in names:
         return "None before the simulator follows these better: check its values and units, the start and the hold."

@@ -1,10 +1,10 @@
-"""The corrected simulator: the one that predicts best what it was not fitted to, with or without a name.
+"""The corrected simulator: the candidate that best predicts data it was not fitted to, with or without a named law.
 
-Where the named answer is not sure, or leaves error above the noise, these compete on held-out parts of the training
-recordings (`cross_validation`): the refitted simulator, the laws that the search has fitted, and a learned force alone
-or beside them. To the error on what was held out comes the spread of predictions for other inputs (`evidence.spread`),
-which is large where many parameters are hardly determined. The smallest sum is taken. Test recordings are never looked
-at.
+If the named answer is not sure, or leaves error above the noise, several candidates compete on held-out parts of the
+training recordings (`cross_validation`): the refitted simulator, the laws that the search has fitted, and a learned
+force alone or beside them. The score is the held-out error plus the spread of predictions for other inputs
+(`evidence.spread`), which is large if many parameters are hardly determined. The smallest score wins. Test recordings
+are never used.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
 from .cross_validation import HeldOut
-from .learned import Learned, LearnedForce, candidates, described
-from .posterior import Posterior, unfollowed
+from .learned import Learned, LearnedForce, candidates, describe_learned
+from .posterior import Posterior, explainable_remainder
 from .search import FORMULA, Search
 from .trials import Trial
 from .verdict import SURE
 from .workbench import Fitted
 
-TRIED = 3  # hypotheses with laws that are looked at where none is named
+TRIED = 3  # hypotheses with laws that compete if no law is named
 PORTS = 3  # ports at which an element is learned: those where a flexible force explains most
-JUDGED = 2  # learned elements that are compared on held-out blocks: those that follow all blocks best
-_Competitor = tuple[Fitted, Fitted, Callable[[], HeldOut]]  # as in `_Hypothesis`, the errors still to be computed
+JUDGED = 2  # learned elements that are compared on held-out blocks: those with the smallest fit error
+# fitted, without its learned element, and a function that computes the held-out errors
+_Competitor = tuple[Fitted, Fitted, Callable[[], HeldOut]]
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What the corrected simulator consists of beside the refit, and how well it predicts.
+    """The elements of the corrected simulator that the refit does not have, and its prediction errors.
 
     Attributes
     ----------
     elements : tuple of (port, law, form)
-        The elements closed in; empty where the refit predicts as well.
+        The added elements; empty if the refit predicts as well.
     shares : dict
-        `named`, `learned`, `left`: of the mean square error that the refit leaves above the noise on the training
-        recordings, the share that named laws take away, the one that the learned element takes away beside them, and
-        the rest.
+        `named`, `learned`, `left`: shares of the refit's mean square error above the noise on the training recordings.
+        Named laws remove the first, the learned element beside them the second; the third remains.
     learned : tuple of Learned
         The learned elements.
     before, after : float
         Rms error on held-out blocks of the refit and of the corrected simulator, in units of the outputs' deviation;
-        nan where nothing was compared.
+        nan if nothing was compared.
     """
 
     elements: tuple[tuple[str, str, str], ...]
@@ -90,7 +90,7 @@ class Correction:
         )
 
     def to_dict(self) -> dict[str, Any] | None:
-        """The key "description" of diagnosis.json; None where nothing was compared or nothing is better."""
+        """Return the key "description" of diagnosis.json; None if nothing was compared or nothing is better."""
         if not self.elements or not np.isfinite(self.after):
             return None
         return {
@@ -110,62 +110,66 @@ class _Hypothesis:
 
 
 def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:
-    """Choose the simulator to hand back, from what there is time to try.
+    """Choose the corrected simulator from the candidates that can be tried before the deadline.
 
-    With `named` the effects of the answer have been named; where a learned element at another port predicts as well
-    without them, the correction is without them. At their own ports it would only learn what they say.
+    With `named`, the answer names its effects. If a learned element at another port predicts as well without them, the
+    correction omits them. Learned elements at their own ports would only imitate them, and are not tried.
     """
     best_laws = answer.best
-    if named and answer.sure > SURE and unfollowed(search, best_laws) < FORMULA:
-        return as_named(search, best_laws.fitted), best_laws.fitted
+    if named and answer.sure > SURE and explainable_remainder(search, best_laws) < FORMULA:
+        return named_correction(search, best_laws.fitted), best_laws.fitted
     found: list[_Hypothesis] = []
-    for fitted, named_only, predict in _competing(search, best_laws if named else None):
+    for fitted, named_only, predict in _competitors(search, best_laws if named else None):
         least = min((h.held_out.mean_square for h in found), default=np.inf)
-        if fitted.cost < least:  # nothing is predicted better than what it is fitted to
+        if fitted.cost < least:  # held-out error is never below the fit error
             found.append(_Hypothesis(fitted, named_only, predict()))
         if time.perf_counter() > search.deadline:
             break
     if not found:
-        return as_named(search, best_laws.fitted), best_laws.fitted
+        return named_correction(search, best_laws.fitted), best_laws.fitted
     best = min(found, key=lambda h: h.held_out.expected)
     shares = _shares(search, best.named, best.fitted)
     learned: tuple[Learned, ...] = ()
     if best.fitted is not best.named:
-        learned = (described(search.bench, best.fitted, shares["learned"], dict.fromkeys((*CATALOGUE, *search.laws))),)
+        learned = (
+            describe_learned(search.bench, best.fitted, shares["learned"], dict.fromkeys((*CATALOGUE, *search.laws))),
+        )
     refit = next((h.held_out.error for h in found if h.fitted is search.root.fitted), np.inf)
     return Correction(_elements(search, best.fitted), shares, learned, refit, best.held_out.error), best.fitted
 
 
-def _competing(search: Search, named: Trial | None) -> Iterator[_Competitor]:
-    """Generate what competes: the refit, the named laws or the likeliest, other laws, and a learned element."""
-    ranked = sorted((t for t in search.memo.values() if _recurs(search, t)), key=search.promise, reverse=True)
+def _competitors(search: Search, named: Trial | None) -> Iterator[_Competitor]:
+    """Generate the candidates: the refit, the named or likeliest laws, other laws, and learned elements."""
+    ranked = sorted(
+        (t for t in search.memo.values() if _may_recur(search, t)), key=search.optimistic_evidence, reverse=True
+    )
     others = [t for i, t in enumerate(t for t in ranked if t.laws) if i < TRIED or t.key in search.held_out]
     first = named or next(iter(others), search.root)
     for trial in {t.key: t for t in (search.root, first, *others)}.values():
-        yield from _of_trial(search, trial)
+        yield from _trial_competitor(search, trial)
     if first.laws:
-        yield from _with_learned(search, search.memo[first.key])
-    yield from _with_learned(search, search.root, {e.port for e in named.laws} if named else set())
+        yield from _learned_competitors(search, search.memo[first.key])
+    yield from _learned_competitors(search, search.root, {e.port for e in named.laws} if named else set())
 
 
-def as_named(search: Search, fitted: Fitted) -> Correction:
-    """Describe a simulator without a learned element, which was compared with nothing."""
+def named_correction(search: Search, fitted: Fitted) -> Correction:
+    """Describe a simulator without a learned element, which was not compared with others."""
     return Correction(_elements(search, fitted), _shares(search, fitted, fitted))
 
 
-def _of_trial(search: Search, trial: Trial) -> Iterator[_Competitor]:
-    """Generate a hypothesis of the search, if it can be simulated."""
+def _trial_competitor(search: Search, trial: Trial) -> Iterator[_Competitor]:
+    """Generate the candidate of a trial, if it can be simulated."""
     with suppress(InputError):
         trial = search.thorough(trial)
         yield trial.fitted, trial.fitted, partial(search.predicts, trial)
 
 
-def _recurs(search: Search, trial: Trial) -> bool:
-    """Tell whether a hypothesis may hold for another recording: one recording's trend in time is its own."""
+def _may_recur(search: Search, trial: Trial) -> bool:
+    """Tell whether a hypothesis may hold for another recording; a trend in time within one recording may not."""
     return len(search.bench.recordings) > 1 or not any("t" in e.law.reads() for e in trial.laws)
 
 
-def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Competitor]:
+def _learned_competitors(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Competitor]:
     """Generate learned elements beside a trial, at the free ports where a flexible force explains most."""
     shares = search.flexible(base)
     ports = [name for name in sorted(shares, key=lambda name: -shares[name]) if name not in taken][:PORTS]
@@ -176,7 +180,7 @@ def _with_learned(search: Search, base: Trial, taken: Collection[str] = ()) -> I
 
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
-    """Shares of the refit's mean square error above the noise; all of it is left where there is none."""
+    """Compute the shares of the refit's mean square error above the noise; all are zero if there is none."""
     excess = search.root.whole - search.floor2
     if not excess > 0:
         return {"named": 0.0, "learned": 0.0, "left": 0.0}
@@ -186,10 +190,10 @@ def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
 
 
 def _elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:
-    """Port, law and form of the elements that the diagnosis has put in."""
+    """Return port, law and form of the elements that the diagnosis has added."""
     return tuple((e.port, e.law.id, e.law.form) for e in _own_elements(search, fitted))
 
 
 def _own_elements(search: Search, fitted: Fitted) -> Sequence[Placed]:
-    """Give the elements that the diagnosis has put in."""
+    """Return the elements that the diagnosis has added."""
     return fitted.simulator.elements[len(search.bench.simulator.elements) :]

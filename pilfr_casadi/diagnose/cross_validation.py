@@ -1,14 +1,14 @@
 """Cross-validation of fitted simulators: the error on parts of the recordings that are excluded from the fit.
 
-Every recording is cut into blocks, and the blocks are dealt to a few folds in turn. For each fold a simulator is fitted
-again to the other folds, starting at its fitted values. It is simulated through the held-out blocks, whose samples are
-not scored. So the state at the beginning of a block needs no estimate: a block is predicted from its inputs and the
-time before it. Neighbouring samples say the same thing, and so whole blocks are held out (Burman, Chow & Nolan 1994,
+Every recording is cut into blocks, and the blocks are dealt to a few folds in turn. For each fold, a simulator is
+refitted to the other folds, starting at its fitted values. It is simulated through the held-out blocks, whose samples
+are not scored. The state at the beginning of a block therefore needs no estimate: it follows from the inputs and the
+time before. Neighbouring samples are correlated, and so whole blocks are held out (Burman, Chow & Nolan 1994,
 Biometrika 81(2)).
 
-Samples after a block still constrain a simulation that drifts, as behind a free integrator. So the second half of every
-recording is predicted as well, from a fit to the first half (Tashman 2000, Int. J. Forecasting 16(4)). The larger of
-both errors counts.
+Samples after a block still constrain a simulation that drifts, for example behind a free integrator. Therefore the
+second half of every recording is also predicted, from a fit to the first half (Tashman 2000, Int. J. Forecasting
+16(4)). The larger of both errors counts.
 """
 
 from __future__ import annotations
@@ -21,24 +21,25 @@ import numpy as np
 from .._base import InputError, side_by_side
 from ..identify import solve_within_bounds
 from ..optimise import GaussNewton, Problem
-from .workbench import ENDLESS, Fitted, Workbench
+from .workbench import DIVERGED, Fitted, Workbench
 
-FOLDS, ROUNDS = 4, 2  # fits, and blocks of a recording in each: eight blocks, spread over the recording
-LEAD = 0.5  # of a block, at the start of a recording with an unknown initial state, which only these samples tell
-# the fit to all blocks is near each of these; what has not settled after so many steps is judged as it stands
+FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
+# share of a block at the start of a recording that is never held out: it determines the unknown initial state
+LEAD = 0.5
+# The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
 AGAIN = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Mean square errors of a simulator on what it was not fitted to, outputs in units of their deviation.
+    """Mean square errors of a simulator on data that it was not fitted to, outputs in units of their deviation.
 
     Attributes
     ----------
     blocks, ahead : float
-        On blocks of the recordings, and on their second halves; infinite where the simulation diverges.
+        On held-out blocks, and on the second halves; infinite if the simulation diverges.
     spread : float
-        Mean square by which predictions for other inputs are uncertain; see `evidence.spread`.
+        Mean square uncertainty of predictions for other inputs; see `evidence.spread`.
     """
 
     blocks: float
@@ -47,7 +48,7 @@ class HeldOut:
 
     @property
     def mean_square(self) -> float:
-        """The larger error of the two, and what other inputs add to it."""
+        """The larger of the two errors plus the spread for other inputs."""
         return max(self.blocks, self.ahead) + self.spread
 
     @property
@@ -57,12 +58,12 @@ class HeldOut:
 
     @property
     def error(self) -> float:
-        """Root of the larger error of the two."""
+        """Root of the larger of the two errors."""
         return float(np.sqrt(max(self.blocks, self.ahead)))
 
 
 def blocks_of(bench: Workbench) -> list[np.ndarray]:
-    """Number of each sample's block in its recording, (M,) for each recording; -1 where samples are in no block."""
+    """Return the number of each sample's block, (M,) for each recording; -1 for samples in no block."""
     out = []
     for r in bench.recordings:
         lead = int(LEAD * (len(r) - r.skip) / (FOLDS * ROUNDS)) if r.begins == "estimate" else 0
@@ -73,7 +74,7 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
 
 
 def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldOut:
-    """Fit a simulator again to all but every fold of blocks, and to the first halves; errors on what was left out."""
+    """Refit without each fold of blocks and without the second halves; return the errors on the omitted parts."""
     blocks = blocks_of(bench)
     folds = [[(b >= 0) & (b % FOLDS == fold) for b in blocks] for fold in range(FOLDS)]
     later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
@@ -84,15 +85,15 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
 
 
 def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> float:
-    """Sum of squares over the samples that were left out; infinite where the simulation diverges."""
+    """Compute the sum of squares over the omitted samples; infinite if the simulation diverges."""
     with np.errstate(over="ignore", invalid="ignore"):
         pairs = zip(_errors_without(bench, fitted, left), left, strict=True)
         value = float(sum(np.sum(e[here] ** 2) for e, here in pairs))
-    return value if value < ENDLESS else np.inf
+    return value if value < DIVERGED else np.inf
 
 
 def _errors_without(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Scaled errors (M, n_y) of each recording, by a fit that does not score the samples `left` out."""
+    """Compute the scaled errors (M, n_y) of each recording from a fit that does not score the samples in `left`."""
     model = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
     states = [s for s, r in zip(fitted.initial, bench.recordings, strict=True) if r.begins == "estimate"]
     if not np.any(model.parameters.free) and not states:

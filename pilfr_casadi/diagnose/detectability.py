@@ -1,8 +1,8 @@
-"""Detectability of laws at ports: motion there, the smallest force that recordings reveal, and laws that look the same.
+"""Detectability of laws at ports: excitation, the smallest force that recordings reveal, and laws that look the same.
 
-With φ the outputs' changes by a law's force of unit size and φ' what own parameters and unknown initial states leave of
-them, both in units of the noise (`remainder`), a force of the size 3.29 / |φ'| is detected: 5 % false alarms and 5 % of
-forces missed (Currie 1968, Anal. Chem. 40(3)). Laws whose φ' point the same way look the same.
+Let φ be the change of the outputs by a law's force of unit size, and φ' its part that own parameters and unknown
+initial states cannot imitate, both in units of the noise (`remainder`). A force of size 3.29 / |φ'| is detected with 5
+% false alarms and 5 % misses (Currie 1968, Anal. Chem. 40(3)). Laws whose φ' are parallel look the same.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from .linearise import Probe, Run, along
 from .remainder import Remainder, Task, lengths, orthonormal, own_changes, project_off
 from .workbench import Fitted, Workbench
 
-DETECTED = 3.29  # standard errors
-TENTH = 0.1  # of an effect: no machine follows a catalogue formula more closely, and no smaller difference has a name
-FOLLOWED = TENTH**2  # share of a response: what is left below it comes from forces that are held over samples here
-SMALLEST_SWING = 0.05  # of a reversal, over the travel; smaller ones are ripple on the way
+DETECTED = 3.29  # standard errors: 5 % false alarms and 5 % misses (Currie 1968)
+TENTH = 0.1  # share of an effect; real machines follow a catalogue formula no more closely than this
+FOLLOWED = TENTH**2  # share of a response below which a remainder comes from holding forces over samples
+SMALLEST_SWING = 0.05  # of a reversal, as a share of the travel; smaller swings are ripple
 
 
 @dataclass(frozen=True)
@@ -37,17 +37,17 @@ class LawRow:
     Attributes
     ----------
     status : str
-        "detectable", "followed" (own parameters follow it), "weak" (it moves no output by more than the noise), or
+        "detectable", "followed" (own parameters imitate it), "weak" (it moves no output by more than the noise), or
         "no data" (with the reason in `why`).
     force : float or None
-        Smallest rms force (in series: deviation of the signal) that would be detected, in `unit`.
+        Smallest detectable rms force (in series: deviation of the signal), in `unit`.
     share : float or None
-        That force over the largest force of the simulator's own at the port, in series over the signal; None where it
-        is unknown.
+        That force relative to the largest own force of the simulator at the port, in series to the signal; None if
+        unknown.
     strength : tuple or None
-        Name, value and unit of the law's strength at that force, for laws of one strength.
+        Name, value and unit of the law's strength at that force, for laws with one strength.
     why : str
-        The parameter that follows it, or why there is no data.
+        The parameter that imitates it, or the reason why there is no data.
     """
 
     port: str
@@ -70,10 +70,9 @@ class Excitation:
         Largest minus smallest value, in `unit`.
     reversals : int
         Turning points with swings of at least a twentieth of the travel on both sides.
-    amplitudes : int
-        Distinct amplitudes, a tenth of the largest apart, of nine tenths of the swings.
+        Distinct amplitudes of nine tenths of the swings; amplitudes closer than a tenth of the largest count once.
     rests : int
-        Stretches longer than two usual swings in which it stays within a twentieth of the travel.
+        Stretches longer than two typical swings in which the coordinate stays within a twentieth of the travel.
     """
 
     port: str
@@ -86,12 +85,12 @@ class Excitation:
 
 @dataclass(frozen=True, eq=False)
 class _Response:
-    """Response to a law in its middle shape, without what own parameters follow, and a basis of each of its shapes."""
+    """Response to a law in its middle shape that own parameters cannot imitate, and a basis for each shape."""
 
     name: tuple[str, str]
     left: np.ndarray
     spans: list[np.ndarray]
-    most: float  # deviations from the noise at the full local force
+    most: float  # response to the full local force, in standard deviations of the noise
 
 
 def assess_laws(
@@ -102,7 +101,7 @@ def assess_laws(
     laws: Sequence[type[Law]] | None,
     names: Sequence[str],
 ) -> tuple[tuple[LawRow, ...], tuple[tuple[tuple[str, str], ...], ...]]:
-    """Assess every law at every port, and group those that look the same; the bench's scale is the noise.
+    """Assess every law at every port, and group laws that look the same; the bench's scale is the noise.
 
     Without `laws`, take the plainest form of each law of the catalogue. `names` are those of the free parameters.
     """
@@ -130,7 +129,7 @@ def assess_laws(
 
 
 def _laws_at(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
-    """Return the laws that may stand at a port; of the catalogue, the first form of each: finer ones are as visible."""
+    """Return the laws allowed at a port; from the catalogue only the first form of each, since finer ones are alike."""
     placed = [law for law in (CATALOGUE if laws is None else laws) if port.kinds & set(law.places)]
     first = {law.id: law for law in reversed(placed)}
     return tuple(law for law in placed if laws is not None or law is first[law.id])
@@ -139,7 +138,7 @@ def _laws_at(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law], .
 def _at_port(
     rest: Remainder, task: Task, base: np.ndarray, own: np.ndarray, level: float | None, names: Sequence[str]
 ) -> Iterator[tuple[LawRow, _Response | None]]:
-    """Assess the laws of one port; yield the row of each, and its response where it is detectable."""
+    """Assess the laws of one port; yield the row of each law, and its response if it is detectable."""
     w_unit, z_unit = port_units(task.port, rest.bench.recordings[0])
     most = level or np.inf
     for law, doses in rest.doses(task):
@@ -164,7 +163,7 @@ def _at_port(
 
 
 def _undetectable(row: LawRow, phi: np.ndarray, most: float, own: np.ndarray, names: Sequence[str]) -> LawRow:
-    """Say why a law is not detectable: it is weak at the largest local force, or follows what own parameters do."""
+    """Say why a law is not detectable: it is weak at the largest local force, or own parameters imitate it."""
     response = phi[:, np.argmax(lengths(phi))]
     size = float(np.linalg.norm(response))
     if size == 0 or size * most < DETECTED:
@@ -175,7 +174,7 @@ def _undetectable(row: LawRow, phi: np.ndarray, most: float, own: np.ndarray, na
 
 
 def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], ...]:
-    """Group responses: each member explains the most visible one, and is explained by it, to a tenth."""
+    """Group responses: each member explains the most visible one within a tenth, and vice versa."""
     order = sorted(responses, key=lambda r: -r.most)
     if not order:
         return ()
@@ -188,7 +187,7 @@ def _classes(responses: list[_Response]) -> tuple[tuple[tuple[str, str], ...], .
 
 
 def group_alike(items: Iterable[Any], alike: Callable[[Any, Any], bool]) -> list[list[Any]]:
-    """Group items: each joins the first group whose first member it is like."""
+    """Group items: each joins the first group whose first member is like it."""
     groups: list[list[Any]] = []
     for item in items:
         group = next((g for g in groups if alike(g[0], item)), None)
@@ -200,16 +199,16 @@ def group_alike(items: Iterable[Any], alike: Callable[[Any, Any], bool]) -> list
 
 
 def _live_ports(simulator: Simulator) -> list[Port]:
-    """List the ports at which something can be missing.
+    """List the ports at which physics can be missing.
 
-    Nothing is missing at inputs that no equation reads, and in equations that define a speed.
+    Inputs that no equation reads, and equations that define a speed, are left out.
     """
     idle = {f"actuator:{name}" for name in simulator.idle_inputs} | {f"equation:{name}" for name in simulator.kinematic}
     return [port for port in simulator.all_ports() if port.name not in idle]
 
 
 def port_units(port: Port, recording: Recording) -> tuple[str, str]:
-    """Return the units of a port's force and coordinate, in series those of the signal; empty where unknown."""
+    """Return the units of a port's force and coordinate, in series both those of the signal; empty if unknown."""
     if not port.series:
         return port.unit, port.across_unit
     unit = port.unit or recording.units.get(port.name.partition(":")[2], "")
@@ -220,8 +219,8 @@ def port_units(port: Port, recording: Recording) -> tuple[str, str]:
 def _local_levels(bench: Workbench, fitted: Fitted, runs: list[Run]) -> list[float | None]:
     """Compute the largest rms of the simulator's own terms in the equation of each port of `all_ports`.
 
-    A term is the equation's derivative with respect to a state or input times that signal's swing about its mean. In
-    series it is the signal's own deviation. None where nothing moves.
+    A term is the equation's derivative with respect to a state or input, times that signal's deviation from its mean.
+    For a port in series it is the signal's own deviation. Ports where nothing moves have None.
     """
     simulator, z, at = bench.simulator, np.concatenate([r.z for r in runs]), along(bench, fitted)
     swing = np.hstack([v - v.mean(axis=0) for v in at])
@@ -263,7 +262,7 @@ def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator
 
 
 def _turning_points(z: np.ndarray, least: float) -> list[int]:
-    """Find the samples at which z turns round between swings of at least `least`, the first and the last included."""
+    """Find the turning points of z between swings of at least `least`, the first and the last included."""
     turns, extreme, way = [0], 0, 0.0
     for k, value in enumerate(z.tolist()):
         if way == 0:
@@ -278,7 +277,7 @@ def _turning_points(z: np.ndarray, least: float) -> list[int]:
 
 
 def _distinct(swings: np.ndarray) -> int:
-    """Count the sizes, a tenth of the largest apart, that nine tenths of the swings have."""
+    """Count the distinct sizes of nine tenths of the swings; sizes within a tenth of the largest count once."""
     if not len(swings):
         return 0
     left, counts = np.sort(swings)[::-1], list[int]()
@@ -292,7 +291,7 @@ def _distinct(swings: np.ndarray) -> int:
 
 
 def _rests(z: np.ndarray, least: float, samples: float) -> int:
-    """Count the stretches of more than some samples in which z stays within `least`."""
+    """Count the stretches of more than `samples` samples in which z stays within `least`."""
     count, begin, low, high = 0, 0, z[0], z[0]
     for k, value in enumerate(z):
         low, high = min(low, value), max(high, value)

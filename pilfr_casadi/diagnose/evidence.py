@@ -1,15 +1,15 @@
 """The one scale on which all hypotheses of a diagnosis are compared: log evidence.
 
-With v the mean square error of a fitted hypothesis, in units of the outputs' variance, n effective samples, λ the
-eigenvalues of the Fisher information of one sample on the laws' parameters, these in units of their prior widths, and p
-the prior probability,
+Let v be the mean square error of a fitted hypothesis in units of the outputs' variance, n the effective samples, λ the
+eigenvalues of the Fisher information of one sample on the laws' parameters (in units of their prior widths), and p the
+prior probability. Then
 
     log Z = -n/2 log v - 1/2 Σ log(1 + n λ / v) + log p.
 
 This is Laplace's approximation (MacKay 1992) with unknown noise variance. The simulator's own parameters and the
-initial states are projected out of the information first. A model of a machine is never exact, and its error is not
-independent from sample to sample; so samples do not count in full. With m the share of the error that is model error,
-N samples, and n_0 the samples that a wholly wrong model is worth,
+initial states are projected out of the information first. A model of a machine is never exact, and its error is
+correlated from sample to sample; so samples do not count in full. With m the share of the error that is model error, N
+samples, and n_0 the number of samples that a wholly wrong model is worth,
 
     n = n_0 N / (n_0 + m N)
 
@@ -29,31 +29,33 @@ from ..optimise import Problem
 from ..simulators import Placed
 from .workbench import Fitted, Workbench
 
-EXACT = 8.0  # samples that a model whose error is no noise at all is worth
-LEAST_WRONG = 0.05  # share of the error that is never taken for noise
-MORE = np.log(0.5)  # log prior probability of one effect more
+EXACT = 8.0  # effective samples of a model whose whole error is model error (n_0)
+LEAST_WRONG = 0.05  # least share of the error that counts as model error
+EFFECT_PRIOR = np.log(0.5)  # log prior probability of each further effect
+# laws that can imitate others
 FLEXIBLE = ("hysteresis", "static_curve", "extra_mode", "stribeck_friction", "periodic_force", "drift")
-IMITATES = np.log(0.2)  # log prior probability of a flexible law, which can imitate others, beside that of another
-SMALLER = 0.7  # factor on the inputs for which the spread of predictions is computed: well inside what was recorded
-ALMOST_NOTHING = 1e-9  # precision of the prior of initial states, over what a sample tells of them
-DOUBTFUL = np.log(0.01)  # log prior probability of values at which a law is hardly what its name says
+# log prior probability of a flexible law, which can imitate others, relative to other laws
+FLEXIBLE_PRIOR = np.log(0.2)
+INPUT_FACTOR = 0.7  # factor on the inputs for which the spread is computed: well inside the recorded range
+STATE_PRIOR = 1e-9  # precision of the prior of initial states, relative to the information of a sample
+DOUBTFUL_PRIOR = np.log(0.01)  # log prior probability of parameter values at which a law degenerates
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What the recordings are worth: the mean square of the noise, in the outputs' variance, and their samples."""
+    """The recordings' mean square noise in units of the outputs' variance, and their number of samples."""
 
     noise2: float
     count: float
 
     def effective(self, v: float) -> float:
-        """Effective samples n, where the best hypothesis leaves the mean square error v."""
+        """Compute the effective samples n if the best hypothesis leaves the mean square error v."""
         wrong = float(np.clip(1 - self.noise2 / max(v, 1e-300), LEAST_WRONG, 1.0))
         return EXACT * self.count / (EXACT + wrong * self.count)
 
 
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
-    """Compute the eigenvalues λ of what a sample tells of the laws' parameters, in units of their prior widths."""
+    """Compute the eigenvalues λ of a sample's information on the laws' parameters, in units of their prior widths."""
     own = _of_laws(fitted, laws)
     problem, hessian = _hessian(bench, fitted)
     own = own[problem.free]
@@ -76,16 +78,16 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
 
 
 def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n: float) -> float:
-    """Compute the mean square by which predictions for other inputs are uncertain, in units of the outputs' variance.
+    """Compute the mean square uncertainty of predictions for other inputs, in units of the outputs' variance.
 
-    The other inputs are the recorded ones at SMALLER times their size. The parameters have the
-    covariance (n H / v + P)^-1 of Laplace's approximation, with H the Fisher information of a sample and P the
-    precision of the prior; with H' the information of a sample for the other inputs, it is tr(H' (n H / v + P)^-1).
-    Parameters that the recordings hardly determine show here, and nowhere in a cross-validation on the same recordings:
-    a curve of a pressure that had two levels, say.
+    The other inputs are the recorded ones times INPUT_FACTOR. The parameters have the covariance (n H / v + P)^-1 of
+    Laplace's approximation, with H the Fisher information of a sample and P the precision of the prior. With H' the
+    information of a sample for the other inputs, the spread is tr(H' (n H / v + P)^-1). It reveals parameters that the
+    recordings hardly determine, such as a curve of a pressure that had two levels; a cross-validation on the same
+    recordings cannot.
     """
     problem, told = _hessian(bench, fitted)
-    _, asked = _hessian(bench.on([r.with_(u=SMALLER * r.u) for r in bench.recordings]), fitted)
+    _, asked = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
     free = int(problem.free.sum())
     if not free:
         return 0.0
@@ -93,7 +95,7 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
         return np.inf
     own = _widths(fitted, laws, problem.free, np.diag(told)[:free])
     width = np.concatenate([own, 1 / np.sqrt(np.maximum(np.diag(told)[free:], 1e-300))])
-    prior = np.concatenate([np.ones(free), np.full(len(width) - free, ALMOST_NOTHING)])
+    prior = np.concatenate([np.ones(free), np.full(len(width) - free, STATE_PRIOR)])
     precision = n / v * told * np.outer(width, width) + np.diag(prior)
     covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)[:free, :free]
     found = float(np.sum(covariance * asked[:free, :free] * np.outer(own, own)))
@@ -101,7 +103,7 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
 
 
 def _of_laws(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
-    """Tell which parameters belong to the laws."""
+    """Mark the parameters that belong to the laws."""
     parameters = fitted.model.parameters
     own = np.zeros(parameters.size, dtype=bool)
     for e in laws:
@@ -127,8 +129,8 @@ def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray]:
 def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np.ndarray) -> np.ndarray:
     """Compute the prior width of each free parameter.
 
-    The width of a strength is its own prior's, or else what moves the outputs by their deviation; that of other
-    parameters comes from their bounds, logarithmic where these span more than a decade.
+    The width of a strength is that of its own prior, or else the value that moves the outputs by their deviation. The
+    width of any other parameter comes from its bounds, in logarithms if these span more than a decade.
     """
     parameters, values = fitted.model.parameters, fitted.vector
     width = prior_width(np.maximum(np.abs(values), 1e-300), parameters.lower, parameters.upper)
@@ -143,9 +145,10 @@ def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np
 
 
 def prior_width(size: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Compute the standard deviations of values (n,) of a size of which only the bounds are known.
+    """Compute the prior standard deviations of values (n,) of a given size, of which only the bounds are known.
 
-    Between bounds they are uniform, in logarithms where these span more than a decade; without bounds it is the size.
+    The prior is uniform between the bounds, in logarithms if these span more than a decade. Without bounds the
+    deviation is the size.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         decades = ((lower > 0) & (upper > 10 * lower)) | ((upper < 0) & (lower < 10 * upper))
@@ -154,12 +157,12 @@ def prior_width(size: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.nd
 
 
 def log_prior(laws: Sequence[Placed], alternatives: Mapping[str, Sequence[Law]], doubtful: bool = False) -> float:
-    """Log prior probability of laws in ports: all ports are alike, in a port all laws, and in a law all its forms.
+    """Compute the log prior probability of laws: all ports are alike, in a port all laws, and in a law all its forms.
 
-    One law in several sensors, as of a logger's filters, counts once. `alternatives` are the laws that may stand in
-    each port; `doubtful` says that a law is hardly what its name says.
+    One law in several sensors, such as a logger's filters, counts once. `alternatives` are the laws allowed in each
+    port; `doubtful` tells that a law degenerates at its fitted values.
     """
-    total = DOUBTFUL if doubtful else 0.0
+    total = DOUBTFUL_PRIOR if doubtful else 0.0
     in_sensors = set[type[Law]]()
     for e in laws:
         if e.port.startswith("sensor:"):
@@ -168,14 +171,14 @@ def log_prior(laws: Sequence[Placed], alternatives: Mapping[str, Sequence[Law]],
             in_sensors.add(type(e.law))
         there = alternatives.get(e.port, ())
         forms = sum(law.id == e.law.id for law in there)
-        total += MORE - np.log(max(len(alternatives), 1)) - np.log(max(len({law.id for law in there}), 1))
+        total += EFFECT_PRIOR - np.log(max(len(alternatives), 1)) - np.log(max(len({law.id for law in there}), 1))
         total -= np.log(max(forms, 1))
-        total += IMITATES if e.law.id in FLEXIBLE else 0.0
+        total += FLEXIBLE_PRIOR if e.law.id in FLEXIBLE else 0.0
     return float(total)
 
 
 def log_evidence(v: float, information: np.ndarray, prior: float, n: float) -> float:
-    """Compute log Z from the mean square error v; see the head of this file."""
+    """Compute log Z from the mean square error v; see the module docstring."""
     if not np.isfinite(v):
         return -np.inf
     return float(-0.5 * n * np.log(v) - 0.5 * np.sum(np.log1p(n * information / v)) + prior)

@@ -1,4 +1,4 @@
-"""What to measure next where two explanations tie, and the placebo that a named law has to beat."""
+"""The experiment that separates two tied explanations, and the placebo test of a named law."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from .linearise import linearised
 from .remainder import Remainder, held_out
 from .workbench import Fitted, Workbench
 
-SHARES = (0.1, 0.3, 1.0)  # of the largest amplitude
-SINES = 12  # frequencies tried
-SECONDS = 3000  # samples of a tried experiment
+SHARES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
+SINES = 12  # frequencies of sines that are tried
+MOST_SAMPLES = 3000  # longest simulated experiment, in samples
 
 
 def next_experiment(
     bench: Workbench, one: Fitted, other: Fitted, noise: np.ndarray, limits: Mapping[str, float] | None = None
 ) -> dict[str, Any] | None:
-    """The input that separates two fitted explanations best.
+    """Find the input that separates two fitted explanations best.
 
     Parameters
     ----------
@@ -34,10 +34,10 @@ def next_experiment(
     -------
     dict or None
         `input`, `waveform`, `amplitude`, `frequency` (Hz), `separation` (rms difference over the noise), `recorded`
-        (that of the recordings) and `sentence`; None where nothing within the limits separates them.
+        (the separation in the recordings) and `sentence`; None if nothing within the limits separates them.
     """
     u = np.concatenate([r.u for r in bench.recordings])
-    m, dt = min(max(map(len, bench.recordings)), SECONDS), bench.dt
+    m, dt = min(max(map(len, bench.recordings)), MOST_SAMPLES), bench.dt
     t, rest = np.arange(m) * dt, np.median(u, axis=0)
     best: dict[str, Any] | None = None
 
@@ -87,9 +87,10 @@ def next_experiment(
 
 
 def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[float, float]:
-    """Share of the residual that a small dose of a law explains, held out: driven by its own signal, and by another.
+    """Compute the held-out share of the residual that a law explains with its own signal, and with an unrelated one.
 
-    The other is the port's own signal half a recording later: alike in every statistic, but unrelated to the residual.
+    The unrelated signal is the port's own, shifted by half a recording: it has the same statistics but no relation to
+    the residual.
     """
     probe, runs = linearised(bench, fitted)
     shares = []

@@ -1,8 +1,8 @@
 """The noise floor: from repeated periods, from repeated recordings, or estimated from a residual.
 
-The estimate takes third differences of the residual (normalised by √20): slow model error drops out, white noise stays.
-Coloured noise is underestimated by it; where a fit's residual cannot be told from noise (no local signal explains any
-of it on data held out) the residual itself is the floor.
+The estimate takes third differences of the residual (normalised by √20): they remove slow model error and keep white
+noise. They underestimate coloured noise. If a fit's residual cannot be told from noise (no local signal explains any of
+it on held-out data), the residual itself is the floor.
 """
 
 from __future__ import annotations
@@ -14,34 +14,34 @@ import numpy as np
 
 from ..data import Recording
 
-ALIKE, CHANCE = 0.5, 1e-4  # rank correlation, and its chance in noise, of a residual that swells with a signal
-ABOVE_NOISE = 2.0  # ratio of an error to the noise from which the answers say that more is missing
-LONGEST = 400  # samples over which a residual may be correlated
+ALIKE, CHANCE = 0.5, 1e-4  # rank correlation, and its p-value, from which a residual's power depends on a signal
+ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that more is missing
+LONGEST = 400  # longest correlation of a residual, in samples
 
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """Standard deviation of each output's noise (n_y,), and where it comes from."""
+    """Standard deviation of each output's noise (n_y,), and its source."""
 
     deviation: np.ndarray
     source: str
 
     def beside(self, deviation: np.ndarray) -> Floor:
-        """With another error that is nobody's fault."""
+        """Return the floor with another independent error added, such as a surrogate's."""
         return Floor(np.hypot(self.deviation, deviation), self.source)
 
     def nrmse(self, scale: np.ndarray) -> float:
-        """Averaged over outputs, in units of their deviation."""
+        """Compute the noise over the outputs' deviation, averaged over outputs."""
         return float(np.mean(self.deviation / scale))
 
 
 def noise_floor(recordings: Sequence[Recording], residuals: Sequence[np.ndarray]) -> Floor:
-    """Measure the floor on recordings, or estimate it from residuals where they repeat nothing."""
+    """Measure the floor on repeated data, or estimate it from residuals if nothing repeats."""
     return measured_floor(recordings) or Floor(white_part(residuals), "estimated")
 
 
 def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
-    """From periods, else from recordings with the same input; None where there are neither."""
+    """Measure the floor on periods, else on recordings with the same input; None if there are neither."""
     found = [d for d in map(_from_periods, recordings) if d is not None]
     if found:
         return Floor(np.sqrt(np.mean(np.square(found), axis=0)), "periods")
@@ -55,7 +55,7 @@ def measured_floor(recordings: Sequence[Recording]) -> Floor | None:
 
 
 def _settled(group: Sequence[Recording]) -> int:
-    """Sample from which recordings of one input are compared: late, where they may have begun in different states."""
+    """Return the first compared sample of recordings of one input: late if their initial states may differ."""
     first = max(r.skip for r in group)
     alike = all(r.begins in ("zero", "periodic") for r in group)
     return first if alike else max(first, len(group[0]) // 2)
@@ -74,12 +74,12 @@ def _from_periods(r: Recording) -> np.ndarray | None:
 
 
 def white_part(residuals: Sequence[np.ndarray]) -> np.ndarray:
-    """White noise inside residuals, (n_y,): third differences, the smallest over recordings."""
+    """Estimate the white noise inside residuals, (n_y,): third differences, the smallest over recordings."""
     return np.asarray(np.min([np.sqrt(np.mean(np.diff(e, 3, axis=0) ** 2, axis=0) / 20) for e in residuals], axis=0))
 
 
 def effective_size(residuals: Sequence[np.ndarray]) -> float:
-    """Samples that count: all of them over the residuals' correlation time `1 + 2 Σ ρ²`."""
+    """Count the independent samples: all samples over the residuals' correlation time `1 + 2 Σ ρ²`."""
     total = 0.0
     for e in residuals:
         for column in (e - e.mean(axis=0)).T:
@@ -92,9 +92,9 @@ def effective_size(residuals: Sequence[np.ndarray]) -> float:
 
 
 def swells_with(residuals: Sequence[np.ndarray], signals: Sequence[np.ndarray]) -> bool:
-    """Whether a residual swells and fades with any column of signals of the same length: noise does not.
+    """Tell whether a residual's power follows any column of signals of the same length; that of noise does not.
 
-    Rank correlation (Spearman 1904) of their powers over blocks longer than the residual remembers.
+    Test the rank correlation (Spearman 1904) of their powers over blocks longer than the residual's correlation time.
     """
     from scipy.stats import spearmanr
 

@@ -1,13 +1,13 @@
-"""The hidden force in a port, recovered from recordings without the help of a law.
+"""The hidden force in a port, recovered from recordings without assuming a law.
 
-The corrected simulator without the law, linearised along the corrected run, is driven by an unknown force that may
-change by a random step each sample,
+The corrected simulator without the law, linearised along the corrected run, is driven by an unknown force that changes
+by a random step each sample,
 
-    Δx⁺ = A Δx + B Δw,   w⁺ = w + ε,   y_measured - y = C Δx + D Δw + noise,
+    Δx⁺ = A Δx + B Δw,   w⁺ = w + ε,   y_measured - y = C Δx + D Δw + noise.
 
-and everything is estimated from all outputs, past and future (Rauch, Tung & Striebel 1965, AIAA J. 3(8)). The
-variances of ε and of the noise (the given one or more) are the likeliest of a few. A nonlinear simulator is linearised
-again along the result.
+All of it is estimated from all outputs, past and future (Rauch, Tung & Striebel 1965, AIAA J. 3(8)). The variances of ε
+and of the noise (at least the given one) are chosen from a few by maximum likelihood. A nonlinear simulator is
+linearised again along the result.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ from ..simulators import (
 from .linearise import Constant, over_samples
 from .workbench import Fitted, Workbench
 
-LOUDER = (1.0, 3.0, 9.0)  # factors on the noise
-MOST_SAMPLES = 4000  # samples of a recording that are smoothed: the stretch with the most to see
+LOUDER = (1.0, 3.0, 9.0)  # factors on the given noise that are tried
+MOST_SAMPLES = 4000  # longest stretch of a recording that is smoothed: the one with the most energy
 PASSES = 3  # linearisations at most
-TRIED = np.logspace(-4.0, 0.5, 10)  # random steps of the force, in units of what the residual calls for
+# random steps of the force that are tried, in units of the force that explains the residual
+TRIED = np.logspace(-4.0, 0.5, 10)
 
 
 @dataclass(frozen=True, eq=False)
 class _Smoother:
-    """The linear system that is smoothed, state [Δx; Δw] in units of its own size.
+    """The linear system that is smoothed, with state [Δx; Δw] scaled to unit size.
 
-    f (M, n, n), h (M, n_y, n), outputs e (M, n_y) in units of the noise; w's known change `steps` (M,); `unit` (n,).
+    f (M, n, n), h (M, n_y, n), outputs e (M, n_y) in units of the noise; known change `steps` (M,) of w; `unit` (n,).
     """
 
     f: np.ndarray
@@ -63,14 +64,14 @@ class _Smoother:
         states: np.ndarray,
         n: int,
     ) -> _Smoother:
-        """Compose the sub-steps of each sample, the force held over it."""
+        """Compose the sub-steps of each sample, with the force held over it."""
         m, n_x, n_y = len(error), states.shape[1], error.shape[1]
         a, b, c, d = blocks
         constant = np.allclose(a, a[0], rtol=1e-9, atol=1e-12)
         f, g = over_samples(a, b, n)
         g, c, d = g[:, :, 0], c[::n], d[::n, :, 0]
         noise = np.maximum(noise, 1e-6 * np.std(error, axis=0) + 1e-300)
-        x, total = np.zeros(n_x), 0.0  # how strongly a lasting unit force shows
+        x, total = np.zeros(n_x), 0.0  # response of the outputs to a lasting unit force
         for _ in range(min(m, 500)):
             total += float(np.sum(((c[0] @ x + d[0]) / noise) ** 2))
             x = f[0] @ x + g[0]
@@ -93,7 +94,7 @@ class _Smoother:
         )
 
     def likeliest(self) -> tuple[float, float] | None:
-        """Random step of the force and factor on the noise that make the errors likeliest; None where it is unseen."""
+        """Find the likeliest random step of the force and factor on the noise; None if the force is not observable."""
         if not self.unit[-1] > 0:
             return None
         length = min(len(self.e), 1200)
@@ -102,7 +103,7 @@ class _Smoother:
         return min(usable)[1] if usable else None
 
     def _filter(self, q: float, r: float, length: int) -> tuple[float, list[tuple[Any, ...]]]:
-        """Minus twice the log likelihood, and predicted and filtered means and covariances."""
+        """Compute minus twice the log likelihood, and the predicted and filtered means and covariances."""
         n = len(self.unit)
         s, p = np.zeros(n), np.diag(np.append(np.full(n - 1, 0.01), 25.0))
         cost = 0.0
@@ -122,7 +123,7 @@ class _Smoother:
         return cost, kept
 
     def smooth(self, q: float, r: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Changes of states (M, n_x) and force (M,), and the force's standard deviation (M,)."""
+        """Compute the changes of states (M, n_x) and force (M,), and the force's standard deviation (M,)."""
         kept = self._filter(q, r, len(self.e))[1]
         m, n = len(kept), len(self.unit)
         mean, variance = np.empty((m, n)), np.empty(m)
@@ -147,11 +148,11 @@ class HiddenForce:
     z: np.ndarray  # local coordinate
     dz: np.ndarray  # its rate
     force: np.ndarray
-    std: np.ndarray  # of the force, due to noise
-    law_z: np.ndarray  # of the law along the corrected run, at the samples; empty without a law
+    std: np.ndarray  # standard deviation of the force due to noise
+    law_z: np.ndarray  # local coordinate of the law along the corrected run, at the samples; empty without a law
     law_dz: np.ndarray
     law: np.ndarray
-    instant: bool  # whether the force holds at a sample, or is the mean from one sample to the next
+    instant: bool  # whether the force holds at a sample (True), or is the mean from one sample to the next (False)
 
     @property
     def law_held(self) -> np.ndarray:
@@ -162,10 +163,10 @@ class HiddenForce:
 def hidden_force(
     bench: Workbench, fitted: Fitted, port: str, number: int | None, noise: np.ndarray, i: int = 0
 ) -> HiddenForce | None:
-    """Recover the force in a port along one recording; None where the outputs do not show it.
+    """Recover the force in a port along one recording; None if the outputs do not show it.
 
-    The force is that of the element `number` of the corrected simulator, or without a number one at `port` beside all
-    elements; `noise` (n_y,) is the standard deviation of the outputs' noise.
+    The force is that of element `number` of the corrected simulator; with None it is one at `port` beside all elements.
+    `noise` (n_y,) is the standard deviation of the outputs' noise.
     """
     r, n = bench.recordings[i], fitted.model.substeps
     drive, start = fitted.model.drive(r), np.asarray(fitted.initial[i], dtype=float)
@@ -244,7 +245,7 @@ def _window(weight: np.ndarray, skip: int) -> slice:
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """The simulator without the law, and the port and the stretch of a recording where the force is sought."""
+    """The simulator without the law, with the port and the stretch of a recording where the force is sought."""
 
     simulator: Simulator
     port: str
@@ -258,7 +259,7 @@ class _Target:
 def _recover(
     bench: Workbench, fitted: Fitted, target: _Target
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """Smooth the force in passes; return local coordinate and rate (M,), force and deviation (M - 1,)."""
+    """Smooth the force in passes; return local coordinate and rate (M,), force and standard deviation (M - 1,)."""
     n, window, r = fitted.model.substeps, target.window, target.recording
     probed = target.simulator.with_element(target.port, Constant())
     model = discretise(probed, bench.dt, bench.hold, n)
@@ -301,7 +302,7 @@ def _recover(
 
 
 def _linearised_step(model: Model, row: int) -> ca.Function:
-    """Make a step that also returns the derivatives of next state and output by state and by parameter `row`."""
+    """Make a step that also returns the derivatives of next state and output by the state and by parameter `row`."""
     x, u, q = ca.SX.sym("x", model.n_state), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.parameters.size)
     following, y = model.closed(x, u, q)
     blocks = [ca.densify(ca.jacobian(e, v)) for e, v in ((following, x), (following, q[row]), (y, x), (y, q[row]))]

@@ -1,9 +1,9 @@
-"""Faults of recordings as edits, and the faults of whole channels: sign, unit, exchange, unit of time, another zero.
+"""Faults of recordings as edits, and the faults of whole channels: sign, unit, exchange, unit of time, offset.
 
-Every fault is looked for in one way. An edit of the recordings (`Gate.change`), or an element at a sensor, puts the
-fault right; the simulator is refitted with it; and the edit is accepted by the share of the mean square error that it
-leaves of the refit's (`CURED`, `EXPLAINED`), and against the noise (`AT_NOISE`). Parameters that an edit adds have to
-gain more than they cost (`gain`; Schwarz 1978). Each check takes a `Checked` and returns one.
+All faults are found in the same way. An edit of the recordings (`Gate.change`), or an element at a sensor, corrects the
+fault, and the simulator is refitted with it. The edit is accepted if it leaves a small share of the refit's mean square
+error (`CURED`, `EXPLAINED`), and by comparison with the noise (`AT_NOISE`). Parameters that an edit adds must gain more
+evidence than they cost (`gain`; Schwarz 1978). Each check takes a `Checked` and returns one.
 
 Edits are screened to first order (`FirstOrder`): with base the orthonormal directions that parameters and initial
 states can follow, an error e leaves `e - base baseᵀ e`.
@@ -31,44 +31,48 @@ from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]
 
-# share of the mean square left at most: by a fault of a whole channel, which other physics hardly mimics; by others
+# largest share of the mean square error left: by an edit of a whole channel, which other physics hardly mimics; by
+# others
 CURED, EXPLAINED = 0.12, 0.3
-CLEARLY = 0.8  # the same by an edit that is clearly better than another, or than none
-AT_NOISE = 5.0  # times the noise (rms) up to which nothing else is wrong; faults are looked for from ABOVE_NOISE on
-ASTRAY, LOST = 0.04, 0.25  # mean square error of a refit that may have gone astray, and that says nothing
-SAME = 1.02  # ratio of errors that say the same
-ROOM = 12.0  # nats that parameters of an edit have to gain beyond their number's cost: odds of about 1e5
-CERTAIN = (2 * ROOM) ** 0.5  # the same in standard errors of one parameter
+CLEARLY = 0.8  # the same for an edit that is clearly better than another edit, or than none
+AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong; faults are sought from ABOVE_NOISE on
+# mean square error from which a refit may be in a wrong minimum; from which it says nothing
+POOR_FIT, USELESS_FIT = 0.04, 0.25
+SAME = 1.02  # ratio of errors that count as equal
+LEAST_GAIN = 12.0  # least gain of an edit's parameters beyond their BIC cost, in nats: odds of about 1e5
+CERTAIN = (2 * LEAST_GAIN) ** 0.5  # the same in standard errors of one parameter
 
 # metric prefixes, degrees, standard gravity, revolutions a minute, km/h, bar, minutes, pounds, inches to mm and m, psi
 UNITS = (1e3, 1e6, 1e2, 180 / np.pi, 9.80665, 30 / np.pi, 3.6, 1e5, 60.0, 4.4482216, 25.4, 1 / 0.0254, 6894.757)
-FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))
-FAHRENHEIT = (1.8, 1 / 1.8)  # its zero is another one: it comes with an offset
+FACTORS = tuple(f for unit in UNITS for f in (unit, 1 / unit))  # each unit by mistake in either direction
+FAHRENHEIT = (1.8, 1 / 1.8)  # Fahrenheit's zero differs as well: this unit comes with an offset
+# factors on the time: ms, minutes, µs, hours, and the reverse of the first two
 TIME_UNITS = (1e-3, 1 / 60, 1e-6, 1 / 3600, 60.0, 1e3)
-NEAR = 6.0  # a factor is tried where it brings the simulated and the measured size this near
-BENT = 0.3  # share of the parameters at their bounds, beyond which a unit of time has bent the simulator
+NEAR = 6.0  # a factor is tried if it brings the simulated size within this ratio of the measured one
+BENT = 0.3  # share of the parameters at their bounds above which a refit does not confirm a unit of time
+# first refit of each trial, only to discard hopeless ones
 GLANCE = GaussNewton(max_iterations=20, tolerance=1e-2, patience=3)
 
-LEAST = 0.01  # share of the mean square that an offset has to take away, to first order
-STILL = 0.1  # of the value it was found with, that an offset has to keep beside effects to be told
+LEAST = 0.01  # least share of the mean square that an offset must remove, to first order
+STILL = 0.1  # share of its first value that an offset must keep beside effects to be reported
 
 
 @dataclass(frozen=True)
 class Gate:
-    """One finding about a channel, and the edit that puts it right.
+    """A finding about a channel, and the edit that corrects it.
 
     Attributes
     ----------
     corrected : bool
-        Whether the diagnosis goes on with it put right.
+        Whether the diagnosis goes on with the corrected recordings.
     fault : bool
         Whether it is a fault of the recording rather than a note.
     change : callable
-        Edit of a recording, where one puts it right.
+        Edit of a recording that corrects it, if there is one.
     parameter : str
-        Parameter of the simulator that stands for it.
+        Parameter of the simulator that represents it.
     left : float
-        Share of the mean square error that is left once it is put right.
+        Share of the mean square error that is left after the correction.
     """
 
     channel: str
@@ -89,7 +93,7 @@ class Gate:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """Recordings as far as they are checked, the simulator refitted to them, and what was found so far."""
+    """The recordings as checked so far, the simulator refitted to them, and the findings."""
 
     bench: Workbench
     fitted: Fitted
@@ -111,12 +115,12 @@ class Checked:
         return float(np.mean((self.floor.deviation / self.bench.scale) ** 2))
 
     def then(self, bench: Workbench, fitted: Fitted, *gates: Gate) -> Checked:
-        """Go on with another bench and refit, and further findings."""
+        """Return the next state: another bench and refit, with further findings added."""
         return Checked(bench, fitted, (*self.gates, *gates))
 
 
-def fall(before: float, after: float) -> str:
-    """Say how far an edit lets the mean square error fall."""
+def describe_fall(before: float, after: float) -> str:
+    """Describe by how much an edit reduces the mean square error."""
     return f"the refitted error falls from {before**0.5:.3g} to {after**0.5:.3g} of the outputs' deviation"
 
 
@@ -128,7 +132,7 @@ def gain(before: float, after: float, residual: Sequence[np.ndarray], parameters
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """The refitted simulator linearised along its runs, for edits to first order.
+    """The refitted simulator linearised along its runs, to screen edits to first order.
 
     Attributes
     ----------
@@ -196,12 +200,12 @@ def scale_time(factor: float) -> Change:
 
 
 def open_start(r: Recording) -> Recording:
-    """Leave the initial state of a periodic recording that is not on its steady cycle to be estimated."""
+    """Estimate the initial state of a periodic recording, because it is not on its steady cycle."""
     return r.with_(initial="estimate", period=None) if r.begins == "periodic" else r
 
 
 def change_recordings(bench: Workbench, change: Change) -> Workbench:
-    """Return the bench with changed recordings, errors in units of their own deviation."""
+    """Return the bench with changed recordings; the errors are in units of their new deviation."""
     recordings = tuple(change(r) for r in bench.recordings)
     scale = np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
     return replace(bench, recordings=recordings, scale=scale)
@@ -216,7 +220,7 @@ def refit(
     solver: GaussNewton = QUICK,
     like: Fitted | None = None,
 ) -> Fitted | None:
-    """Fit a simulator, by default the bench's; None where it diverges. `like` lends its compiled model."""
+    """Fit a simulator, by default the bench's; None if it diverges. The compiled model of `like` is reused."""
     model, engine = (like.model, like.engine) if like else (None, None)
     simulator = simulator or bench.simulator
     try:
@@ -229,7 +233,7 @@ def refit(
 
 
 def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Workbench, list[Gate]]:
-    """Make the bench; if the simulator is too fast for the recordings' step, with the time in another unit.
+    """Make the bench; if the simulator is too fast for the recordings' step, try other units of time.
 
     Raises
     ------
@@ -245,7 +249,7 @@ def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engin
             except InputError:
                 continue
             found = refit(bench)
-            if found is not None and found.cost < LOST:
+            if found is not None and found.cost < USELESS_FIT:
                 words = (
                     f"The time of the recordings is off by a factor of {1 / factor:.4g}, as from a wrong unit: as "
                     f"given, the simulator cannot follow at all; corrected, its error is {found.cost**0.5:.3g} of the "
@@ -258,12 +262,12 @@ def open_bench(simulator: Any, recordings: Sequence[Recording], hold: str, engin
 def find_slips(now: Checked, workers: int, beside: str = "") -> Checked:
     """Try sign and unit of each channel, of all outputs and of the time, and exchanged channels, `workers` at a time.
 
-    With `beside`, only slips of that channel are tried, beside the offset that it has already.
+    With `beside`, try that channel alone, in addition to the offset that it has already.
     """
     bench, plain = now.bench, now.fitted
-    # beside an offset there is a working point, which a run from rest would first have to come to
+    # with an offset there is a working point, which a run from rest would have to reach first
     sizes = _sizes(bench, plain.residual if beside else _from_rest(bench))
-    near = (lambda ratio: True) if plain.cost > 1 else _near  # a size says nothing of a run that left its range
+    near = (lambda ratio: True) if plain.cost > 1 else _near  # if the run diverged, its size says nothing
     outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
     trials = list[Gate]()
     for kind, names in (("y", outputs), ("u", inputs)):
@@ -277,17 +281,17 @@ def find_slips(now: Checked, workers: int, beside: str = "") -> Checked:
     for f in FACTORS if len(outputs) > 1 else ():
         if all(near(f * size) for size in sizes):
             trials.append(Gate(", ".join(outputs), "unit", f, change=scale_channels("y", list(range(len(outputs))), f)))
-    for kind, names in (("y", outputs), ("u", inputs)) if plain.cost > ASTRAY else ():
+    for kind, names in (("y", outputs), ("u", inputs)) if plain.cost > POOR_FIT else ():
         for i, j in combinations(range(len(names)), 2):
             both = [names[i], names[j]]
             trials.append(Gate(", ".join(both), "exchange", both, change=exchange_channels(kind, i, j)))
-    for f in TIME_UNITS if plain.cost > ASTRAY else ():
+    for f in TIME_UNITS if plain.cost > POOR_FIT else ():
         trials.append(Gate("time", "time-unit", f, change=scale_time(f)))
     return _take_best_slip(now, trials, workers)
 
 
 def _take_best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: str = "") -> Checked:
-    """Take the trial after which the simulator follows best, if that is far better than without."""
+    """Take the trial with the smallest error, if it is far smaller than the error without it."""
     bench, plain = now.bench, now.fitted
     channels = (*bench.simulator.inputs, *bench.simulator.output_names)
 
@@ -310,11 +314,11 @@ def _take_best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: st
 
     best = now
     for found in side_by_side(tried, trials, workers):
-        # for a linear simulator, a unit of all outputs is one of its input, and one of its output that of its input
+        # for a linear simulator, a unit of all outputs is equivalent to a unit of its input, or of its only output
         joint = found is not None and found.gates[-1].finding == "unit" and found.gates[-1].channel not in channels
         if found is not None and found.cost < (CLEARLY if joint else 1 - 1e-6) * best.cost:
             best = found
-    if best is now or best.cost > min(CURED * plain.cost, LOST):
+    if best is now or best.cost > min(CURED * plain.cost, USELESS_FIT):
         return now
     gate = best.gates[-1]
     factor = 1 / gate.value if isinstance(gate.value, float) else 1.0
@@ -324,12 +328,12 @@ def _take_best_slip(now: Checked, trials: Sequence[Gate], workers: int, more: st
         "sign": f"{gate.channel} has the wrong sign{more}",
         "exchange": f"{gate.channel.replace(', ', ' and ')} are exchanged",
     }.get(gate.finding, f"{what} off by a factor of {factor:.4g}{more}, as from a wrong unit")
-    sentence = f"In the recordings {words}: with it corrected {fall(plain.cost, best.cost)}."
+    sentence = f"In the recordings {words}: with it corrected {describe_fall(plain.cost, best.cost)}."
     return now.then(best.bench, best.fitted, replace(gate, sentence=sentence, fault=True, left=best.cost / plain.cost))
 
 
 def _sizes(bench: Workbench, errors: Sequence[np.ndarray]) -> np.ndarray:
-    """Compute the size of each measured output over the simulated one's; nan where the simulation diverges."""
+    """Compute the ratio of the measured to the simulated size of each output; nan if the simulation diverges."""
     with np.errstate(all="ignore"):
         y = [e + r.y for e, r in zip(errors, bench.recordings, strict=True)]
         return np.asarray(bench.scale / np.std(np.concatenate(y), axis=0))
@@ -348,11 +352,11 @@ def _near(ratio: float) -> bool:
     return not np.isfinite(ratio) or ratio == 0 or 1 / NEAR < ratio < NEAR
 
 
-# another zero: a constant at an input or an output (a bias of an amplifier, the zero of a sensor, a constant load)
+# offset: a constant at an input or an output (a bias of an amplifier, the zero of a sensor, a constant load)
 
 
 class Offset(Law):
-    """A constant added to a signal; it stays a parameter of the simulator, so that laws are fitted together with it."""
+    """A constant added to a signal; it stays a parameter of the simulator and is fitted together with the laws."""
 
     id = "offset"
     equation = "w = w_0"
@@ -368,12 +372,12 @@ class Offset(Law):
 
 
 def find_slip_beside_offset(now: Checked, slipped: Checked, workers: int) -> Checked:
-    """Return what slips put right, or where far better, the slip of an output whose zero is another one as well.
+    """Return the corrected slips; try each output with a slip and an offset, and return that if it is far better.
 
-    The offset is told, and kept, by `offsets`.
+    `find_offsets` reports the offset and keeps it.
     """
     bench = now.bench
-    for name in bench.simulator.output_names if slipped.cost > ASTRAY else ():
+    for name in bench.simulator.output_names if slipped.cost > POOR_FIT else ():
         placed = replace(bench, simulator=bench.simulator.with_element(f"sensor:{name}", Offset()))
         level = refit(placed, [{}, now.fitted.values], states=now.fitted.begin)
         if level is None:
@@ -387,7 +391,7 @@ def find_slip_beside_offset(now: Checked, slipped: Checked, workers: int) -> Che
 def find_offsets(now: Checked) -> Checked:
     """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
 
-    They are a fault where they were the mismatch.
+    They count as a fault if they explain most of the mismatch.
     """
     begin = now
     ports = [f"actuator:{n}" for n in now.bench.simulator.inputs]
@@ -403,10 +407,10 @@ def find_offsets(now: Checked) -> Checked:
         other = replace(bench, simulator=bench.simulator.with_element(port, Offset()))
         parameter = f"{other.simulator.elements[-1].prefix}w_0"
         found = refit(other, [plain.values], states=plain.initial, solver=THOROUGH)
-        if found is None or gain(plain.cost, found.cost, found.residual) < ROOM:
+        if found is None or gain(plain.cost, found.cost, found.residual) < LEAST_GAIN:
             break
         value = float(found.values[parameter])
-        sentence = f"{_constant(port, value)}; with it as a parameter {fall(plain.cost, found.cost)}."
+        sentence = f"{_constant(port, value)}; with it as a parameter {describe_fall(plain.cost, found.cost)}."
         now = now.then(other, found, Gate(port.split(":", 1)[1], "offset", value, sentence, parameter=parameter))
         ports.remove(port)
     fault = now.cost < CURED * begin.cost
@@ -415,11 +419,11 @@ def find_offsets(now: Checked) -> Checked:
 
 
 def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -> dict[str, float]:
-    """Compute the share of the mean square that a constant at each port takes away, to first order."""
+    """Compute the share of the mean square that a constant at each port removes, to first order."""
     first = FirstOrder.of(bench, fitted)
     columns = first.response(ports, [np.ones((len(r), 1)) for r in bench.recordings])
     rest = first.left(columns)
-    seen = lengths(rest) > 1e-6 * lengths(columns)  # a constant that the initial state can follow is not
+    seen = lengths(rest) > 1e-6 * lengths(columns)  # exclude constants that the initial state can follow
     along = np.where(seen, rest.T @ first.error / np.maximum(lengths(rest), 1e-150), 0.0)
     return dict(zip(ports, (along**2 / max(first.error @ first.error, 1e-300)).tolist(), strict=True))
 
@@ -443,7 +447,7 @@ def offset_gates(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Gat
 
 
 def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
-    """Hold offsets that gain nothing beside effects at zero: an effect may have looked like one."""
+    """Fix offsets at zero that gain nothing beside effects: an effect may have looked like an offset."""
     before = len(bench.simulator.elements)
     placed = fitted.simulator.elements
     for element in placed[:before] if len(placed) > before else ():
@@ -454,15 +458,15 @@ def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
         simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: held})
         start = {k: v for k, v in fitted.values.items() if k != name}
         found = refit(bench, [start], simulator, states=fitted.initial, solver=THOROUGH)
-        if found is not None and gain(found.cost, fitted.cost, fitted.residual) <= ROOM:
+        if found is not None and gain(found.cost, fitted.cost, fitted.residual) <= LEAST_GAIN:
             fitted = found
     return fitted
 
 
-def as_it_came_out(
+def final_gates(
     gates: Sequence[Gate], after: Fitted, std: Mapping[str, np.ndarray], effects: bool, sure: bool
 ) -> tuple[Gate, ...]:
-    """Return the findings with the offsets that are still there, at their fitted values, beside effects or none."""
+    """Return the findings with the offsets that remain, at their fitted values beside the effects, if any."""
     out = []
     for gate in gates:
         if not gate.parameter:
@@ -472,7 +476,7 @@ def as_it_came_out(
         if not (abs(value) > CERTAIN * error and abs(value) > STILL * abs(gate.value)):
             continue
         sentence = gate.sentence
-        if effects:  # what it came to without them says little
+        if effects:  # an offset fitted without the effects says little
             element = next(e for e in after.simulator.elements if gate.parameter.startswith(e.prefix))
             sentence = offset_gates([element], after.values)[0].sentence
         if not sure:

@@ -1,10 +1,10 @@
 """Identifiability of a simulator's parameters: which ones recordings determine, and which are dead, flat or traded off.
 
-With J the outputs' changes by the parameters in units of the noise, initial states projected off, and D the room that
-the bounds leave each parameter, the singular values s of J D say how well each direction is determined. Where s < 1
-the standard error is larger than the room: the recordings add nothing to the bounds. Parameters that share such a
-direction are traded off. A direction with whole exponents, in logarithms of the parameters, leaves only a ratio or a
-product identifiable (Bellman & Åström 1970; Brun, Reichert & Künsch 2001).
+Let J be the outputs' changes by the parameters in units of the noise, with initial states projected off, and D the
+range that the bounds allow each parameter. The singular values s of J D tell how well each direction is determined. If
+s < 1, the standard error exceeds the range: the recordings add nothing to the bounds. Parameters that share such a
+direction are traded off. If the direction has integer exponents in the logarithms of the parameters, only a ratio or a
+product is identifiable (Bellman & Åström 1970; Brun, Reichert & Künsch 2001).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from .linearise import Probe, Run, along
 from .remainder import lengths, orthonormal, own_changes, project_off
 from .workbench import Fitted, Workbench
 
-LARGEST_EXPONENT = 3  # in numerators and denominators: physical laws have small ones
-STEP = 1.1  # factor of a trial step that tells a product from a sum; they differ by a twentieth of it
-SAME = 0.01  # share of a change that counts as none: steps along another curve leave more
+LARGEST_EXPONENT = 3  # in numerators and denominators; physical laws have small exponents
+STEP = 1.1  # factor of a trial step that tells a product from a sum; they differ by a twentieth of the step
+SAME = 0.01  # share of a change that counts as zero: steps along any other curve leave more
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class ParameterRow:
     std : float or None
         Standard error due to the noise alone; None where the parameter is not identifiable.
     status : str
-        "identifiable", "dead" (no output reacts), "flat" (the standard error is as large as the room of the bounds),
-        "tied" (traded off with others), "start" (traded off with the unknown initial state), or "port" (only the
-        ports read it, so it acts with a law alone).
+        "identifiable", "dead" (no output reacts), "flat" (the standard error is as large as the range of the bounds),
+        "tied" (traded off with others), "start" (traded off with the unknown initial state), or "port" (read by the
+        ports alone, so that it acts only through a law).
     at_bound : bool
         Whether the refit ended at one of its bounds.
     """
@@ -54,7 +54,7 @@ class ParameterRow:
 
 @dataclass(frozen=True)
 class Tie:
-    """Parameters that are traded off, and the only combinations that are identifiable, such as ("k/m",)."""
+    """Parameters that trade off, and their only identifiable combinations, such as ("k/m",)."""
 
     names: tuple[str, ...]
     only_as: tuple[str, ...]
@@ -74,26 +74,26 @@ class Tie:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Sensitivity of the outputs along whole recordings to free parameters and unknown initial states.
+    """Sensitivity of the outputs, along whole recordings, to free parameters and unknown initial states.
 
     Attributes
     ----------
     rows : tuple of ParameterRow
         Free entries of the simulator's parameters, not assessed yet.
-    room : array, shape (n,)
-        Standard deviation of each value if only its bounds are known.
+    span : array, shape (n,)
+        Prior standard deviation of each value, from its bounds alone.
     raw, start : array, shapes (R, n) and (R, k)
         Changes of all outputs, in units of the noise, by a unit change of each parameter and unknown initial state.
     """
 
     rows: tuple[ParameterRow, ...]
-    room: np.ndarray
+    span: np.ndarray
     raw: np.ndarray
     start: np.ndarray
 
     @classmethod
     def of(cls, bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Sensitivity:
-        """Compute it along the runs of a bench whose scale is the noise."""
+        """Compute the sensitivity along the runs of a bench whose scale is the noise."""
         own = bench.simulator.parameter_set
         places = np.flatnonzero(own.free)
         units = [p.unit for p in own.values() for _ in range(p.size)]
@@ -104,7 +104,7 @@ class Sensitivity:
         )
         raw, start = _changes(bench, runs)
         signal = np.concatenate([r.y[r.skip :] for r in bench.recordings]) / bench.scale
-        # without bounds, the room is the given value; of zero, the change that moves the outputs as they have moved
+        # without bounds the range is the given value, or for zero the change that moves the outputs by their deviation
         unit = np.linalg.norm(signal - signal.mean(axis=0)) / np.where(lengths(raw) > 0, lengths(raw), 1.0)
         return cls(rows, prior_width(np.where(given != 0, np.abs(given), unit), lower, upper), raw, start)
 
@@ -115,18 +115,18 @@ class Sensitivity:
 
     @cached_property
     def base(self) -> np.ndarray:
-        """Orthonormal changes that unknown initial states can follow, shape (R, k)."""
+        """Orthonormal basis of the changes by unknown initial states, shape (R, k)."""
         return orthonormal(self.start)
 
     @cached_property
     def scaled(self) -> np.ndarray:
-        """J D as a triangle (n, n) with the same singular values."""
-        return np.asarray(np.linalg.qr(project_off(self.raw * self.room, self.base), mode="r"))
+        """Triangular factor (n, n) of J D, with the same singular values."""
+        return np.asarray(np.linalg.qr(project_off(self.raw * self.span, self.base), mode="r"))
 
     @property
     def reach(self) -> np.ndarray:
-        """Change of the outputs within each parameter's room, in standard deviations of the noise, shape (n,)."""
-        return lengths(self.raw * self.room)
+        """Change of the outputs over each parameter's range, in standard deviations of the noise, shape (n,)."""
+        return lengths(self.raw * self.span)
 
 
 def _changes(bench: Workbench, runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray]:
@@ -135,7 +135,7 @@ def _changes(bench: Workbench, runs: Sequence[Run]) -> tuple[np.ndarray, np.ndar
 
 
 def _undetermined(scaled: np.ndarray) -> np.ndarray:
-    """Find the orthonormal directions (k, n) along which the standard error is larger than the room."""
+    """Find the orthonormal directions (k, n) along which the standard error exceeds the range."""
     _, s, v = np.linalg.svd(scaled)
     return np.asarray(v[np.append(s, np.zeros(len(v) - len(s))) < 1])
 
@@ -155,8 +155,8 @@ def assess_parameters(
     for group in groups:
         status[group] = "tied"
     _, s, v = np.linalg.svd(scaled[:, rest])
-    errors = lengths((v[: len(s)] / np.maximum(s, 1.0)[:, None])[s >= 1])  # in units of the room
-    std = dict(zip(rest, (response.room[rest] * errors).tolist(), strict=True))
+    errors = lengths((v[: len(s)] / np.maximum(s, 1.0)[:, None])[s >= 1])  # standard errors in units of the range
+    std = dict(zip(rest, (response.span[rest] * errors).tolist(), strict=True))
     rows = tuple(
         replace(row, std=std[i] if status[i] == "identifiable" else None, status=status[i])
         for i, row in enumerate(response.rows)
@@ -165,7 +165,7 @@ def assess_parameters(
 
 
 def _read_by_ports_alone(simulator: Simulator) -> np.ndarray:
-    """Mark the free entries of the parameters that the ports read and no equation does, shape (n,), bool."""
+    """Mark the free entries of parameters that ports read and no equation does, shape (n,), bool."""
     symbols = simulator.symbols()
     parameters = stacked(symbols[2])
     equations = ca.vertcat(simulator.derivatives(*symbols), *simulator.measured(*symbols).values())
@@ -182,8 +182,8 @@ def stacked(symbols: Named) -> ca.SX:
 def _groups(scaled: np.ndarray) -> list[list[int]]:
     """Find the groups of columns that trade off.
 
-    Columns that the undetermined directions can do without are dropped, those that take part least first; the others
-    are one group where a direction links them.
+    Columns that the undetermined directions do not need are dropped, starting with those of the smallest components.
+    The remaining columns are one group if a direction links them.
     """
     from scipy.sparse.csgraph import connected_components
 
@@ -199,31 +199,31 @@ def _groups(scaled: np.ndarray) -> list[list[int]]:
 
 
 def _only_as(response: Sensitivity, group: np.ndarray, bench: Workbench, fitted: Fitted) -> tuple[str, ...]:
-    """Write what is identifiable of a group: monomials or sums with small whole numbers, or nothing."""
+    """Write the identifiable combinations of a group: monomials or sums with small integers, or nothing."""
     names, values = [response.names[i] for i in group], np.array([response.rows[i].value for i in group])
     found = []
     for unit, write in ((values, _monomial), (np.ones(len(group)), _sum)):
-        if np.all(unit != 0) and (rows := _whole(response.scaled[:, group], response.room[group] / unit)) is not None:
+        if np.all(unit != 0) and (rows := _whole(response.scaled[:, group], response.span[group] / unit)) is not None:
             change = _finite_change(rows, write is _monomial, group, response, bench, fitted)
             found.append((change, tuple(write(names, row) for row in rows)))
     change, best = min(found, default=(np.inf, ()))
     return best if change < SAME else ()
 
 
-def _whole(columns: np.ndarray, room: np.ndarray) -> np.ndarray | None:
-    """Find rows of small whole numbers that are constant along a group's undetermined directions, or None.
+def _whole(columns: np.ndarray, span: np.ndarray) -> np.ndarray | None:
+    """Find rows of small integers that are constant along a group's undetermined directions, or None.
 
-    `columns` are those of J D, and `room` is D in the coordinates wanted, with their sign.
+    `columns` are those of J D; `span` is D in the wanted coordinates, with sign.
     """
-    free = _undetermined(columns) * room
-    if not len(free):  # only other parameters leave a direction of these undetermined
+    free = _undetermined(columns) * span
+    if not len(free):  # the direction of these is undetermined only because of other parameters
         return None
     rows = _reduced(_complement(free))
     for factor in range(1, LARGEST_EXPONENT + 1):
         whole = np.round(rows * factor)
         if np.any(np.abs(whole) > LARGEST_EXPONENT) or not np.all(np.any(whole, axis=1)):
             continue
-        test = _complement(whole) / room  # directions that leave these rows as they are
+        test = _complement(whole) / span  # directions that leave these rows constant
         test /= lengths(test.T)[:, None]
         if len(test) == len(free) and np.all(lengths(columns @ test.T) < 1):
             return np.asarray(whole)
@@ -236,7 +236,7 @@ def _complement(rows: np.ndarray) -> np.ndarray:
 
 
 def _reduced(rows: np.ndarray) -> np.ndarray:
-    """Combine orthonormal rows so that the last independent columns hold the identity; the first are divided by."""
+    """Combine orthonormal rows so that the last independent columns hold the identity."""
     pivots: list[int] = []
     for j in reversed(range(rows.shape[1])):
         if np.linalg.matrix_rank(rows[:, [j, *pivots]], tol=1e-6) > len(pivots):
@@ -245,7 +245,7 @@ def _reduced(rows: np.ndarray) -> np.ndarray:
 
 
 def _monomial(names: Sequence[str], exponents: np.ndarray) -> str:
-    """Write a product of powers, "k/m" or "gain*k_sensor"; its sign is chosen so that more is above the line."""
+    """Write a product of powers, "k/m" or "gain*k_sensor"; its sign is chosen to put more factors in the numerator."""
     total = np.sum(exponents) or exponents[np.flatnonzero(exponents)[-1]]
     e = exponents if total > 0 else -exponents
 
@@ -274,8 +274,8 @@ def _finite_change(
 ) -> float:
     """Compute the change of the outputs by a step of a tenth along which the rows are constant.
 
-    It is a share of the change by the first parameter alone, and zero where it is below the noise; unknown initial
-    states follow both.
+    The result is relative to the change by the first parameter alone, and zero if it is below the noise. Unknown
+    initial states are projected off both.
     """
     direction, alone = _complement(rows)[0], np.eye(len(group))[0]
     places = np.flatnonzero(bench.simulator.parameter_set.free)[group]
@@ -296,7 +296,7 @@ def _finite_change(
 
 
 def helpful_sensors(bench: Workbench, fitted: Fitted, runs: Sequence[Run], response: Sensitivity) -> tuple[str, ...]:
-    """Find states whose sensor, as quiet as the present ones, would determine more of the parameters; best first."""
+    """Find the states whose sensor, as quiet as the present ones, would determine more parameters; best first."""
     signal = np.std(np.concatenate([r.y for r in bench.recordings]), axis=0)
     noise = np.mean(bench.scale / signal) * np.std(along(bench, fitted)[0], axis=0)
     count, found = len(_undetermined(response.scaled)), list[tuple[int, str]]()

@@ -6,11 +6,11 @@ The features phi_j are stops of z with fixed thresholds and their powers (loops)
 curves of dz/dt (friction), some of them times z. u~ is an input of the simulator, standardised, where one scales the
 force. The force is linear in its weights c and d, which are fitted together with the simulator's own parameters in
 simulation error. They start from the linear solution of the projected sensitivities (`remainder`), with a ridge prior
-on the size of the force whose strength is chosen on held-out blocks. It is the discrepancy of Kennedy & O'Hagan (2001,
-J. R. Statist. Soc. B 63), inside the loop.
+on the size of the force, whose strength is chosen on held-out blocks. This is the discrepancy of Kennedy & O'Hagan
+(2001, J. R. Statist. Soc. B 63), placed inside the loop.
 
-Beyond the range of z, dz/dt and u that the training recordings visit, the signals are saturated: the force goes on a
-little way and then stays as it is. The saturation keeps a slope everywhere, so an unknown initial state can be
+Outside the range of z, dz/dt and u in the training recordings, the signals are saturated: the force changes a little
+further and then stays constant. The saturation has a nonzero slope everywhere, so an unknown initial state can be
 estimated from outside the range.
 """
 
@@ -32,33 +32,35 @@ from ..models import Parameter, play
 from .force_recovery import law_signals
 from .linearise import linearised
 from .remainder import Remainder, Task, lengths, usable
-from .workbench import QUICK, Fitted, Workbench, started
+from .workbench import QUICK, Fitted, Workbench, start_vector
 
-STOPS = 8
-# over half the range of z: from presliding to a stop that slips in every loud motion, which so forgets how it began
+STOPS = 8  # number of stops
+# thresholds over half the range of z: from presliding to a stop that slips in every large motion and so forgets its
+# start
 THRESHOLDS = np.geomspace(0.02, 0.7, STOPS)
-POWERS = 3  # of each stop: odd ones for symmetric loops, the even one for one-sided forces
-KNEES = (0.01, 0.05, 0.25)  # of the curves v / (|v| + knee), over the largest speed: from dry friction to a soft bend
-FEATURES = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)
-ROOM = 0.5  # of half the range, by which the signals go on at most beyond the range seen
-FREE = 5.0  # times the same while it is fitted: the refit's run may be a poor guess of the range
-RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)  # tried, over the mean square response to a force of unit size
-SHARES = (1.0, 0.3, 0.0)  # of the linear solution that a fit may start from
+POWERS = 3  # highest power of each stop: odd ones for symmetric loops, the even one for one-sided forces
+KNEES = (0.01, 0.05, 0.25)  # of the curves v / (|v| + knee), over the largest speed: from dry friction to a smooth bend
+FEATURES = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)  # number of features in `LearnedForce.step`
+EXTENSION = 0.5  # largest extension of a signal beyond its range, over half the range
+FIT_EXTENSION = 5.0  # the same during the fit, because the refit's run may be a poor guess of the range
+# ridge strengths tried, relative to the mean square response to a force of unit size
+RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+SHARES = (1.0, 0.3, 0.0)  # fractions of the linear solution from which a fit may start
 FITS = 3  # elements that are fitted at most: the best by the linear solution
-SAME_SIGNAL = 0.99  # correlation of an input with z or dz/dt from which it is that signal and scales nothing
-SHOWN = 3  # nearest laws that are told
-LONGEST = 8000  # samples along which laws are compared with the learned force
+SAME_SIGNAL = 0.99  # correlation with z or dz/dt above which an input counts as that signal and scales nothing
+SHOWN = 3  # nearest laws that are reported
+LONGEST = 8000  # samples on which laws are compared with the learned force
 
 
 class LearnedForce(Law):
-    """A force of z, dz/dt and memory, linear in its weights; the scales of its features are held."""
+    """A force of z, dz/dt and memory, linear in its weights; the scales of its features are fixed."""
 
     id = "learned"
     equation = "w = sum_j c_j phi_j(z, dz/dt, stops of z)"
     source = "Kennedy & O'Hagan (2001), J. R. Statist. Soc. B 63(3)"
     sentence = "a learned force of the local coordinate, its rate and its turning points"
     # weights with their prior deviations; centre, reach and half the range of z, largest speed, mean and deviation of
-    # the input that scales it; ends of the ranges seen, and the room beyond them
+    # the scaling input; ends of the ranges seen, and the extension beyond them
     units: ClassVar[Mapping[str, str]] = {
         "c": "w", "std": "w", "z_0": "z", "z_s": "z", "z_h": "z", "v_s": "z/s", "u_0": "", "u_s": "",
         "z_low": "z", "z_high": "z", "v_low": "z/s", "v_high": "z/s", "u_low": "", "u_high": "",
@@ -72,13 +74,13 @@ class LearnedForce(Law):
 
     @classmethod
     def reads(cls) -> set[str]:
-        """It reads z; where dz/dt is always zero its curves of dz/dt are silent."""
+        """Return {"z"}; the curves of dz/dt vanish if dz/dt is always zero."""
         return {"z"}
 
     def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0, u: Any = None) -> tuple[Any, Any]:
-        """Force and next memory."""
-        z = _saturated(z, p["z_low"], p["z_high"], p["z_room"])
-        v = _saturated(dz, p["v_low"], p["v_high"], p["v_room"]) / p["v_s"]
+        """Compute the force and the next memory."""
+        z = _saturate(z, p["z_low"], p["z_high"], p["z_room"])
+        v = _saturate(dz, p["v_low"], p["v_high"], p["v_room"]) / p["v_s"]
         x = (z - p["z_0"]) / p["z_s"]
         following = [play(z, s[i], r * p["z_h"]) for i, r in enumerate(THRESHOLDS)]
         phi = [1.0, x, ca.fabs(x), x**2, x**3]
@@ -90,12 +92,12 @@ class LearnedForce(Law):
             phi += [curve, x * curve]
         w = sum(p["c"][j] * f for j, f in enumerate(phi))
         if self.factor and u is not None:
-            scale = (_saturated(u[self.factor], p["u_low"], p["u_high"], p["u_room"]) - p["u_0"]) / p["u_s"]
+            scale = (_saturate(u[self.factor], p["u_low"], p["u_high"], p["u_room"]) - p["u_0"]) / p["u_s"]
             w += scale * sum(p["c"][len(phi) + j] * f for j, f in enumerate(phi))
         return w, ca.vertcat(*following)
 
     def parameters(self) -> dict[str, Parameter]:
-        """Weights with their prior, free where the recordings move them, and the scales, fixed."""
+        """Return the weights with their prior, free if the recordings move them, and the fixed scales."""
         given = {**dict.fromkeys(self.units, 1.0), **self.defaults, "c": 0.0, **self.values}
         shape = (FEATURES * (2 if self.factor else 1),)
         c, std = (np.broadcast_to(np.asarray(given[name], dtype=float), shape) for name in ("c", "std"))
@@ -107,22 +109,22 @@ class LearnedForce(Law):
         return {"c": weights, **held}
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        """Generate the scales of the signals along recordings; |z| bends at zero where z is on both sides of it."""
+        """Generate the scales of the signals along recordings; |z| bends at zero if z takes both signs."""
         both = min(-local.low, local.high) > 0.1 * local.half
         centre = 0.0 if both else local.middle
         speed = local.speed if np.any(local.dz) else 1.0
         scales = {"z_0": centre, "z_s": max(local.high - centre, centre - local.low), "z_h": local.half, "v_s": speed}
-        yield {**scales, **_limits(FREE, z=local.z, v=local.dz)}
+        yield {**scales, **_ranges(FIT_EXTENSION, z=local.z, v=local.dz)}
 
 
-def _saturated(x: Any, low: Any, high: Any, room: Any) -> Any:
-    """Follow x from low to high, and beyond them approach low - room and high + room, with a slope all the way."""
+def _saturate(x: Any, low: Any, high: Any, room: Any) -> Any:
+    """Follow x from low to high; outside, approach low - room and high + room with a nonzero slope."""
     above, below = ca.fmax(x - high, 0), ca.fmax(low - x, 0)
     return ca.fmin(ca.fmax(x, low), high) + room * above / (room + above) - room * below / (room + below)
 
 
-def _limits(room: float, **signals: np.ndarray) -> dict[str, float]:
-    """Give the range of each signal, and the room beyond it."""
+def _ranges(room: float, **signals: np.ndarray) -> dict[str, float]:
+    """Return the range of each signal, and its extension beyond the range."""
     out: dict[str, float] = {}
     for name, values in signals.items():
         low, high = float(np.min(values)), float(np.max(values))
@@ -132,7 +134,7 @@ def _limits(room: float, **signals: np.ndarray) -> dict[str, float]:
 
 @functools.cache  # the same class for the same input
 def learned_force(factor: str = "") -> type[LearnedForce]:
-    """Make the class of learned forces, with an input that scales a part of the force where one is named."""
+    """Make the class of learned forces; the input `factor`, if any, scales a part of the force."""
     if not factor:
         return LearnedForce
     own = {
@@ -147,7 +149,7 @@ def learned_force(factor: str = "") -> type[LearnedForce]:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A learned element as the linear problem gives it: the law at its start values, and the share it explains.
+    """A learned element from the linear problem: the law at its start values, and the share that it explains.
 
     The share is that of the residual's power on blocks that the weights were not fitted to.
     """
@@ -158,7 +160,7 @@ class Start:
 
 
 def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str], inputs: Sequence[str]) -> list[Start]:
-    """Solve the linear problem at each port, without and with each input that scales the force, best first."""
+    """Solve the linear problem at each port, without and with each input that may scale the force, best first."""
     probe, runs = linearised(bench, base)
     rest = Remainder.of(bench, probe, runs, (LearnedForce,))
     samples = sum(len(r) - r.skip for r in bench.recordings) * len(bench.scale)
@@ -168,13 +170,13 @@ def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str], inp
             continue
         shape = task.pairs[0][1][0]
         forces = unit_forces(LearnedForce(), task.part, [shape]).reshape(len(task.part.z), -1)
-        for factor in ("", *(name for name in inputs if _scales(task, name))):
-            out.append(_solved(rest, task, forces, shape, factor, samples / len(rest.left)))
+        for factor in ("", *(name for name in inputs if _may_scale(task, name))):
+            out.append(_solve_weights(rest, task, forces, shape, factor, samples / len(rest.left)))
     return sorted(out, key=lambda s: -s.share)
 
 
-def _scales(task: Task, name: str) -> bool:
-    """Whether an input may scale the force at a port: it varies, and is not one of the port's own signals."""
+def _may_scale(task: Task, name: str) -> bool:
+    """Tell whether an input may scale the force at a port: it varies, and is not one of the port's own signals."""
     u, local = task.local.inputs[name], task.local
     if task.port.series or not np.ptp(u) > 0:
         return False
@@ -182,24 +184,24 @@ def _scales(task: Task, name: str) -> bool:
     return not any(abs(np.corrcoef(u, v)[0, 1]) > SAME_SIGNAL for v in own)
 
 
-def _solved(
+def _solve_weights(
     rest: Remainder, task: Task, forces: np.ndarray, shape: Mapping[str, Any], factor: str, repeated: float
 ) -> Start:
-    """Fit the weights to the projected residual by ridge regression, its strength chosen on held-out blocks.
+    """Fit the weights to the projected residual by ridge regression; its strength is chosen on held-out blocks.
 
-    `repeated` is the number of scored samples for each that is looked at: the prior counts once.
+    `repeated` is the number of scored samples per fitted sample; the prior counts once.
     """
     scales, columns = dict(shape), forces.copy()
     if factor:
         u, whole = task.part.inputs[factor], task.local.inputs[factor]
-        scales |= {"u_0": float(np.mean(whole)), "u_s": float(np.std(whole)), **_limits(ROOM, u=whole)}
+        scales |= {"u_0": float(np.mean(whole)), "u_s": float(np.std(whole)), **_ranges(EXTENSION, u=whole)}
         columns = np.hstack([forces, forces * ((u - scales["u_0"]) / scales["u_s"])[:, None]])
     phi, size = rest.response(task.index, columns)
     felt, weights, std = lengths(phi) > 0, np.zeros(len(size)), np.zeros(len(size))
     if not np.any(felt):
         return Start(task.port.name, learned_force(factor)({**scales, "std": 0.0}), 0.0)
     phi, unit = phi[:, felt], float(np.mean(lengths(phi[:, felt]) ** 2))
-    wrong, ridge = min((_error_unseen(phi, rest.left, rest.odd, unit * ridge), ridge) for ridge in RIDGES)
+    wrong, ridge = min((_held_out_squares(phi, rest.left, rest.odd, unit * ridge), ridge) for ridge in RIDGES)
     weights[felt] = -_ridge(phi, rest.left, unit * ridge) / size[felt]
     std[felt] = 1 / (size[felt] * np.sqrt(unit * ridge * repeated))
     law = learned_force(factor)({**scales, "c": weights, "std": std})
@@ -211,8 +213,8 @@ def _ridge(a: np.ndarray, b: np.ndarray, ridge: float) -> np.ndarray:
     return np.asarray(np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ b))
 
 
-def _error_unseen(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> float:
-    """Sum of squares on every second block by weights fitted to the others, and the other way round."""
+def _held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> float:
+    """Compute the sum of squares on every second block by weights fitted to the others, and vice versa."""
     parts = ((fold, ~fold) for fold in (odd, ~odd))
     return sum(float(np.sum((left[b] - phi[b] @ _ridge(phi[a], left[a], ridge)) ** 2)) for a, b in parts)
 
@@ -225,40 +227,40 @@ def candidates(
     inputs: Sequence[str] = (),
     workers: int = 1,
 ) -> list[Fitted]:
-    """Fit a learned element on top of a fitted simulator, which may have elements already, at each of some ports.
+    """Fit a learned element at each of some ports, on top of a fitted simulator, which may already have elements.
 
     Parameters
     ----------
     part : Workbench
-        The bench with as much of the recordings as is enough to choose by; the chosen elements are fitted to all.
+        The bench with as much of the recordings as is needed to choose; the chosen elements are fitted to all.
     port_names : sequence of str
         Ports to try.
     inputs : sequence of str
-        Inputs that may scale the force, each tried besides the force alone.
+        Inputs that may scale the force; each is tried in addition to the force alone.
     workers : int
-        Threads; the best few by the linear solution are fitted.
+        Threads; the best few elements by the linear solution are fitted.
 
     Returns
     -------
     list of Fitted
-        The learned element is the last; smallest error first. Fits that diverge are left out.
+        Smallest error first; the learned element is the last of each. Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names, inputs) if s.share > 0]
-    found = side_by_side(lambda start: _fitted(bench, part, base, start), starts[:FITS], workers)
+    found = side_by_side(lambda start: _fit_element(bench, part, base, start), starts[:FITS], workers)
     return sorted((f for f in found if f is not None), key=lambda f: f.cost)
 
 
-def _fitted(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fitted | None:
-    """Fit a learned element with the simulator's own parameters; None where every start diverges."""
+def _fit_element(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fitted | None:
+    """Fit a learned element together with the simulator's own parameters; None if every start diverges."""
     placed = base.simulator.with_element(start.port, start.law)
     model = bench.model(placed)
     engine = make_engine(model, bench.engine)
     name = f"{placed.elements[-1].prefix}c"
     starts = [{**base.values, name: share * np.asarray(start.law.values["c"])} for share in SHARES]
-    first = bench.begun(placed, model, started(model, starts[0]), base.initial)
+    first = bench.initial_states(placed, model, start_vector(model, starts[0]), base.initial)
 
     def cost(values: Mapping[str, Any]) -> float:
-        found = bench.result(placed, model.parameters.unpack(started(model, values)), first, engine, model).cost
+        found = bench.result(placed, model.parameters.unpack(start_vector(model, values)), first, engine, model).cost
         return found if np.isfinite(found) else np.inf
 
     try:
@@ -269,12 +271,12 @@ def _fitted(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fi
     except InputError:
         return None
     z, dz, _ = signals_along(bench, fitted)
-    seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _limits(ROOM, z=z, v=dz).items()}
+    seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _ranges(EXTENSION, z=z, v=dz).items()}
     return bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
 
 
 def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Local coordinate, rate and force of an element along the fitted runs of all recordings, (M,) each."""
+    """Compute local coordinate, rate and force of an element along the fitted runs of all recordings, (M,) each."""
     number %= len(fitted.simulator.elements)
     found = [law_signals(bench, fitted, number, i) for i in range(len(bench.recordings))]
     z, dz, w = (np.concatenate(part) for part in zip(*found, strict=True))
@@ -283,7 +285,7 @@ def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[n
 
 @dataclass(frozen=True, eq=False)
 class NearLaw:
-    """A named law that follows the learned force: its rms error over the force's deviation, and its force (M,)."""
+    """A named law close to the learned force: its rms error over the force's deviation, and its force (M,)."""
 
     law: str
     form: str
@@ -291,7 +293,7 @@ class NearLaw:
     force: np.ndarray
 
     def to_dict(self) -> dict[str, Any]:
-        """As in diagnosis.json."""
+        """Return the content for diagnosis.json."""
         return {"law": self.law, "form": self.form, "error": self.error}
 
 
@@ -302,13 +304,13 @@ class Learned:
     Attributes
     ----------
     port, factor : str
-        Where it acts, and the input that scales a part of it, if any.
+        Its port, and the input that scales a part of it, if any.
     share : float
-        Share of what the refit leaves above the noise that it follows beyond the named laws.
+        Share of the refit's error above the noise that it explains in addition to the named laws.
     z, dz, force : array, shape (M,)
         Local coordinate, rate and force along the training recordings.
     nearest : tuple of NearLaw
-        Laws of the catalogue that come nearest to the force, best first.
+        Laws of the catalogue closest to the force, best first.
     """
 
     port: str
@@ -321,7 +323,7 @@ class Learned:
 
     @property
     def sentence(self) -> str:
-        """Say where it acts, on which range it holds, and which laws are near."""
+        """Describe its port, the range on which it holds, and the nearest laws."""
         by = f", a part of it scaled by {self.factor}" if self.factor else ""
         names = ", ".join(f"{display_name(n.law)} (off by {100 * n.error:.2g} %)" for n in self.nearest)
         near = f" The nearest laws are {names}." if names else ""
@@ -332,7 +334,7 @@ class Learned:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As in diagnosis.json."""
+        """Return the content for diagnosis.json."""
         return {
             "port": self.port,
             "factor": self.factor,
@@ -343,8 +345,8 @@ class Learned:
         }
 
 
-def described(bench: Workbench, fitted: Fitted, share: float, laws: Collection[type[Law]]) -> Learned:
-    """Describe the learned element that is the last of a fitted simulator, with the laws that come nearest."""
+def describe_learned(bench: Workbench, fitted: Fitted, share: float, laws: Collection[type[Law]]) -> Learned:
+    """Describe the last element of a fitted simulator, a learned one, with the nearest laws."""
     element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)
     inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in bench.recordings]).T, strict=True))
@@ -360,9 +362,9 @@ def described(bench: Workbench, fitted: Fitted, share: float, laws: Collection[t
 
 
 def nearest_laws(local: Local, force: np.ndarray, laws: Sequence[type[Law]]) -> tuple[NearLaw, ...]:
-    """Find the laws that come nearest to a force along z and dz/dt, linear in strengths, shapes on their grids.
+    """Find the laws nearest to a force along z and dz/dt: strengths by least squares, shapes on their grids.
 
-    A constant is free, since offsets are a matter of where z is zero. Of several forms of a law the best one counts.
+    A constant is free, because the zero of z is arbitrary. Of several forms of a law, the best one counts.
     """
     most = max(LONGEST // len(local.lengths), 1)
     ends = np.cumsum((0, *local.lengths))

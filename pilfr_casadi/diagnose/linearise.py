@@ -1,11 +1,10 @@
-"""The simulator linearised along its own run: how a small force at a port, a parameter or the start moves the outputs.
+"""The simulator linearised along its own run: outputs' responses to forces at ports, parameters and initial states.
 
 With a force held over each sample,
 
-    X⁺ = A_k X + B_k [dθ, w_k],    Y = C_k X + D_k [dθ, w_k],
+    X⁺ = A_k X + B_k [dθ, w_k],    Y = C_k X + D_k [dθ, w_k].
 
-and along an observer with gain K, whose innovations are then looked at instead of the residual, `A - K C` and
-`B - K D` take the place of A and B.
+Along an observer with gain K, the innovations replace the residual, and `A - K C` and `B - K D` replace A and B.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
 BLOCK = 256  # samples propagated at a time
 CHUNK = 300  # samples linearised at a time
-FEW = 60  # samples of a run at which the user's equations are looked at
+FEW = 60  # samples of a run at which the user's equations are evaluated
 
 
 class Constant(Law):
-    """A constant force: the probe that a port's response is measured with."""
+    """A constant force, the probe that measures a port's response."""
 
     id = "probe"
     equation = "w = w"
@@ -43,12 +42,12 @@ class Constant(Law):
     places: ClassVar[tuple[str, ...]] = ("parallel", "series")
 
     def force(self, p: Any) -> Any:
-        """The parameter itself."""
+        """Return the parameter."""
         return p.w
 
 
 def probed(simulator: Simulator) -> Simulator:
-    """The simulator with a constant force at every port, in the order of `all_ports`."""
+    """Return the simulator with a constant force at every port, in the order of `all_ports`."""
     for port in simulator.all_ports():
         simulator = simulator.with_element(port.name, Constant())
     return simulator
@@ -56,14 +55,14 @@ def probed(simulator: Simulator) -> Simulator:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """One step of the probed simulator at fitted values, with its derivatives, and the local signals of its ports.
+    """One step of the probed simulator at fitted values, its derivatives, and the local signals of its ports.
 
     Attributes
     ----------
     step : casadi.Function
         `(x, u) -> (y, A, B, C, D)`; B and D have a column for each free parameter, then each port.
     local : casadi.Function
-        `(x, u, slope, t, p) -> (z, dz)`, a row a port; p without the probes.
+        `(x, u, slope, t, p) -> (z, dz)`, one row a port; p excludes the probes.
     values : array
         Parameter vector of the probed model.
     """
@@ -90,19 +89,19 @@ class Probe:
         free = np.flatnonzero(parameters.free)
         picked = p[free.tolist()]
         blocks = [ca.jacobian(e, v) for e, v in ((following, x), (following, picked), (y, x), (y, picked))]
-        at = ca.substitute([y, *map(ca.densify, blocks)], [p], [ca.SX(values)])  # constants are folded
+        at = ca.substitute([y, *map(ca.densify, blocks)], [p], [ca.SX(values)])  # fold constants
         step = ca.Function("probe", [x, u], ca.cse(at))
         return cls(model, step, signals(simulator), values, free, names, len(simulator.states))
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A recording's run: what is needed to propagate small changes along it.
+    """A recording's run, with the matrices that propagate small changes along it.
 
     Attributes
     ----------
     a, b, c, d : array, shapes (M, n_x, n_x), (M, n_x, n_c), (M, n_y, n_x), (M, n_y, n_c)
-        One a sample.
+        One per sample.
     mean : tuple of array
         Mean a, b, c of a sub-step.
     error : array, shape (M, n_y)
@@ -112,13 +111,13 @@ class Run:
     u : array, shape (M, n_u)
         Inputs.
     sign : array, shape (n_ports,)
-        +1 where a positive force opposes the port's motion, -1 where it drives it, 0 where there is no such sense.
+        +1 if a positive force opposes the port's motion, -1 if it drives it, 0 if neither.
     back : array, shape (n_ports,)
         The same for a positive force that pushes the port back.
     lift, push : array, shape (n_ports,)
         Largest effect of a unit force on the local coordinate's first and second derivative.
     from_zero : bool
-        Whether it begins with everything at zero.
+        Whether all states begin at zero.
     """
 
     a: np.ndarray
@@ -138,20 +137,20 @@ class Run:
 
     @property
     def n_free(self) -> int:
-        """Columns of b and d that belong to free parameters; those of the ports follow."""
+        """Number of columns of b and d for free parameters; the columns of the ports follow."""
         return int(self.b.shape[2] - len(self.sign))
 
     def sense(self, law: Law, port: int) -> int:
-        """Sign that the law's strengths must have at a port: where it opposes motion, or pushes back; else 0."""
+        """Return the sign of the law's strengths at a port if the law opposes motion or pushes back; else 0."""
         side = self.sign if law.dissipative else self.back
         return int(side[port]) if law.dissipative or law.restoring else 0
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray | None = None) -> Run:
-    """Run recording i at fitted values from its fitted state, led by an observer where a gain is given.
+    """Run recording i at fitted values from its fitted state, corrected by an observer if a gain is given.
 
-    An observer may lead a simulator out of its range: then the run is not finite.
+    An observer may push a simulator out of its range; then the run is not finite.
     """
     r, model = bench.recordings[i], probe.model
     n = model.substeps
@@ -171,7 +170,7 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
         if gain is not None:
             a, b = a - gain @ c, b - gain @ d
         part = (*over_samples(a, b, n), c[::n], d[::n], y[::n, :, 0])
-        kept = kept or [np.empty((len(r), *v.shape[1:])) for v in part]  # with many states too large to hold twice
+        kept = kept or [np.empty((len(r), *v.shape[1:])) for v in part]  # with many states, too large to hold twice
         for whole, v in zip(kept, part, strict=True):
             whole[begin // n : begin // n + len(v)] = v
     a, b, c, d, y = kept
@@ -188,7 +187,7 @@ def run(bench: Workbench, probe: Probe, fitted: Fitted, i: int, gain: np.ndarray
 
 
 def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """State matrices of the sub-steps, (K, n_x, n_x) and (K, n_x, n_c), put together to those of samples of n each."""
+    """Compose the sub-steps' matrices (K, n_x, n_x) and (K, n_x, n_c) into those of samples of n sub-steps each."""
     total, moved = a[::n], b[::n]
     for j in range(1, n):
         moved = a[j::n] @ moved + b[j::n]
@@ -196,15 +195,15 @@ def over_samples(a: np.ndarray, b: np.ndarray, n: int) -> tuple[np.ndarray, np.n
     return total, moved
 
 
-@functools.lru_cache(maxsize=2)  # the screen and the flexible force look at the same fit
+@functools.lru_cache(maxsize=2)  # the screen and the flexible force use the same fit
 def linearised(bench: Workbench, fitted: Fitted) -> tuple[Probe, list[Run]]:
-    """The probe of a fitted simulator, and its run of every recording."""
+    """Return the probe of a fitted simulator, and its run of every recording."""
     probe = Probe.of(bench, fitted)
     return probe, [run(bench, probe, fitted, i) for i in range(len(bench.recordings))]
 
 
 def along(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
-    """Some states of the user's equations (n, n_x) and inputs (n, n_u) along the longest fitted run."""
+    """Return some states of the user's equations (n, n_x) and inputs (n, n_u) along the longest fitted run."""
     i = int(np.argmax([len(r) for r in bench.recordings]))
     r, model, n_x = bench.recordings[i], fitted.model, len(bench.simulator.states)
     short = r.slice(0, min(len(r), 3000))
@@ -214,7 +213,7 @@ def along(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
 
 
 def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarray:
-    """Gain of an observer with process noise at every port, each strong enough to explain the residual alone."""
+    """Compute the gain of an observer with process noise at every port, each able to explain the residual alone."""
     a, b, c = runs[0].mean
     ports = b[:, runs[0].n_free :]
     error = np.sqrt(np.mean(np.concatenate([r.error for r in runs]) ** 2, axis=0))
@@ -228,12 +227,12 @@ def observer_gain(probe: Probe, runs: list[Run], noise: np.ndarray) -> np.ndarra
         if total > 0 and np.isfinite(total):
             q += np.outer(column, column) / total
     gain = steady_state_gain(a, c, q, np.diag(np.maximum(noise, 0.05 * error) ** 2))
-    gain[probe.n_x :] = 0.0  # laws' own states follow
+    gain[probe.n_x :] = 0.0  # the laws' own states get no correction
     return gain
 
 
 def propagate(r: Run, forces: Sequence[tuple[int, np.ndarray]] = ()) -> np.ndarray:
-    """Output changes of free parameters, the initial state, and forces at ports.
+    """Compute the changes of the outputs by free parameters, the initial state, and forces at ports.
 
     Parameters
     ----------
@@ -253,7 +252,7 @@ def propagate(r: Run, forces: Sequence[tuple[int, np.ndarray]] = ()) -> np.ndarr
         for (port, f), span in zip(forces, spans, strict=True)
         if r.b[:, :, n_free + port].any()
     ]
-    # columns that reach no state are not carried along
+    # skip columns that reach no state
     end = max((span.stop for _, span, _ in moving), default=first)
     x = np.zeros((n_x, end))
     x[:, n_free:first] = np.eye(n_x)
@@ -277,7 +276,7 @@ def propagate(r: Run, forces: Sequence[tuple[int, np.ndarray]] = ()) -> np.ndarr
 
 
 def locals_of(bench: Workbench, runs: list[Run]) -> list[Local]:
-    """Local signals of every port over all recordings."""
+    """Return the local signals of every port over all recordings."""
     lengths = tuple(len(r.z) for r in runs)
     z, dz = np.concatenate([r.z for r in runs]), np.concatenate([r.dz for r in runs])
     rate = WALL * FINER * bench.substeps / bench.dt

@@ -1,9 +1,9 @@
 """Map of the refitted simulator's residual over frequency, amplitude, rate, level and time.
 
-Residuals are taken in units of each output's deviation. Power above the noise floor is the *excess*; shares are
-shares of it. Bands of frequency are half octaves; the amplitude is the envelope of the simulated output. Where the
-input is a multisine that leaves lines out, the residual there is distortion: at even lines from asymmetric laws, at odd
-ones from symmetric laws (Pintelon & Schoukens, System Identification, 2nd ed., 2012, ch. 4).
+Residuals are in units of each output's deviation. Power above the noise floor is the *excess*, and shares are shares of
+the excess. Frequency bands are half octaves; the amplitude is the envelope of the simulated output. If the input is a
+multisine with omitted lines, the residual at these lines is distortion: at even lines from asymmetric laws, at odd
+lines from symmetric laws (Pintelon & Schoukens, System Identification, 2nd ed., 2012, ch. 4).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import numpy as np
 from .._base import in_words
 from ..data import Recording
 
-BINS = 6  # of amplitude, rate and level
-MOST_BANDS = 24
-STRETCHES = 24  # of a recording, for the picture over time
-EXCITED = 1e-3  # share of the largest line below which an input line counts as left out
-CLEAR = 1.5  # factor that is worth a word
+BINS = 6  # bins of amplitude, rate and level
+MOST_BANDS = 24  # frequency bands at most, so that the map stays readable
+STRETCHES = 24  # pieces of a recording in the picture over time
+EXCITED = 1e-3  # share of the largest line below which an input line counts as omitted
+CLEAR = 1.5  # ratio that the sentence mentions
 
 
 def mismatch(
@@ -94,7 +94,7 @@ def mismatch(
 
 
 def _bands(samples: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the edges of the bands in Hz: half octaves up from four swings a recording, all below in the first."""
+    """Return the edges of the bands in Hz: half octaves from four periods a recording up; the first holds all below."""
     top, first = 0.5 / dt, min(4 / (samples * dt), 0.25 / dt)
     count = int(np.clip(np.ceil(2 * np.log2(top / first)), 1, MOST_BANDS - 1))
     edges = np.concatenate([[0.0], first * (top / first) ** (np.arange(count + 1) / count)])
@@ -123,7 +123,7 @@ def _by_frequency(
 
 
 def _envelope(v: np.ndarray) -> np.ndarray:
-    """Compute the size (M,) of a swing: modulus of the analytic signal about the mean, over all columns."""
+    """Compute the amplitude (M,): modulus of the analytic signal about the mean, over all columns."""
     centred = v - np.mean(v, axis=0)
     n = len(v)
     spectrum = np.fft.fft(centred, axis=0)
@@ -135,7 +135,7 @@ def _envelope(v: np.ndarray) -> np.ndarray:
 
 
 def _binned(x: np.ndarray, power: np.ndarray, from_zero: bool = False) -> dict[str, Any]:
-    """Compute the rms of the residual in bins of x; its outermost half percents join the outer bins."""
+    """Compute the rms of the residual in bins of x; the outermost half percents join the outer bins."""
     a, b = (0.0 if from_zero else float(np.quantile(x, 0.005))), float(np.quantile(x, 0.995))
     edges = np.linspace(a, b if b > a else a + 1.0, BINS + 1)
     index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, BINS - 1)
@@ -153,7 +153,7 @@ def _map(
     edges: np.ndarray,
     dt: float,
 ) -> dict[str, Any]:
-    """Compute the residual's rms by band where the output swings so much; None where it never does."""
+    """Compute the residual's rms by frequency band and amplitude bin; None for bins with few samples."""
     index = np.concatenate([np.clip(np.searchsorted(edges, v, side="right") - 1, 0, BINS - 1) for v in envelope])
     count = np.bincount(index, minlength=BINS)
     spectra = [(np.fft.rfft(v, axis=0), np.fft.rfftfreq(len(v), dt), len(v)) for v in e]
@@ -191,7 +191,7 @@ def _thirds(e: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> dict[str, list[
 
 
 def _distortion(recordings: Sequence[Recording], e: Sequence[np.ndarray]) -> dict[str, float | None] | None:
-    """Compute the residual's rms a line at even and odd lines that the inputs leave out, up to the last excited one."""
+    """Compute the residual's rms per line at omitted even and odd lines, up to the last excited one."""
     even, odd, driven, noise = [], [], [], []
     for r, v in zip(recordings, e, strict=True):
         n = r.period
@@ -220,7 +220,7 @@ def _distortion(recordings: Sequence[Recording], e: Sequence[np.ndarray]) -> dic
 
 
 def sentence(found: dict[str, Any]) -> str:
-    """Say in a sentence or two what stands out in the map."""
+    """Describe in a sentence or two what the map shows most clearly."""
     rms, floor = found["rms"], found["floor"]
     if rms < 1.1 * floor:
         return "The residual is at the noise floor; no band, amplitude or stretch of time stands out."
@@ -259,7 +259,7 @@ def sentence(found: dict[str, Any]) -> str:
 
 
 def _where_in_frequency(found: dict[str, Any]) -> str:
-    """Find the narrowest run of bands with three quarters of the excess."""
+    """Find the narrowest range of bands with three quarters of the excess."""
     share = np.asarray(found["share"])
     total = np.concatenate([[0.0], np.cumsum(share)])
     best: tuple[int, float, int, int] | None = None
@@ -277,7 +277,7 @@ def _where_in_frequency(found: dict[str, Any]) -> str:
 
 
 def _growth(amplitude: dict[str, Any], floor: float) -> float | None:
-    """Fit the exponent of the residual's rms over the amplitude in bins above the floor; None if these are too few."""
+    """Fit the exponent of the residual's rms over the amplitude, in bins above the floor; None for too few bins."""
     edges = np.asarray(amplitude["edges"])
     middle = (edges[1:] + edges[:-1]) / 2
     use = [i for i, (v, n) in enumerate(zip(amplitude["rms"], amplitude["samples"], strict=True)) if v and n > 0.01]

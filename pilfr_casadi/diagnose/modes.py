@@ -1,4 +1,4 @@
-r"""From a sampled linear model to real modes in continuous time.
+r"""Convert a sampled linear model to real modes in continuous time.
 
 .. math:: A_c = \log(A) / \Delta t, \qquad B_c = \left(\int_0^{\Delta t} e^{A_c s} ds\right)^{-1} B
    \quad\text{(inputs held)},
@@ -15,8 +15,8 @@ import numpy as np
 
 from .._base import InputError
 
-FAST = 0.9  # eigenvalues closer to the Nyquist frequency than this share have no continuous counterpart to trust
-POOR = 1e5  # condition of a pair's eigenvectors
+FAST = 0.9  # over the Nyquist frequency; a faster eigenvalue has no reliable continuous counterpart
+POOR = 1e5  # condition number above which a pair's eigenvectors are not reliable
 Array = np.ndarray
 
 
@@ -27,13 +27,13 @@ class Mode:
     Attributes
     ----------
     value : complex
-        Eigenvalue in rad/s; of a pair the one with positive imaginary part, of two real ones the faster.
+        Eigenvalue in rad/s: of a pair the one with positive imaginary part, of two real ones the faster.
     into : array, shape (1 or 2, n_u)
-        How inputs enter q (and v).
+        Gains of the inputs on q (and v).
     out : array, shape (n_y, 1 or 2)
-        How q (and v) are seen.
+        Gains of q (and v) in the outputs.
     spring : (float, float), optional
-        For two real eigenvalues -a and -b taken together: a b and a + b.
+        For two real eigenvalues -a and -b combined: a b and a + b.
     """
 
     value: complex
@@ -47,13 +47,13 @@ class Mode:
         return bool(len(self.into) == 2)
 
     def label(self, slowest: float) -> str:
-        """Readable name: the frequency in Hz, of a pair the undamped natural one; zero below `slowest` rad/s."""
+        """Return the frequency in Hz as a name, for a pair the undamped natural one; zero below `slowest` rad/s."""
         rate = np.sqrt(abs(self.spring[0])) if self.spring else abs(self.value)
         return f"{rate / (2 * np.pi):.3g} Hz" if rate > slowest else "0 Hz"
 
 
 def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) -> tuple[Array, Array, Array, Array]:
-    """A discrete state space in continuous time, for inputs that are held or interpolated between the samples.
+    """Convert a discrete state space to continuous time, for held or interpolated inputs.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) 
     Raises
     ------
     InputError
-        Where an eigenvalue lies on the negative real axis, or too near the Nyquist frequency or zero.
+        If an eigenvalue lies on the negative real axis, or too near the Nyquist frequency or zero.
     """
     from scipy.linalg import expm, logm
 
@@ -91,7 +91,7 @@ def to_continuous(a: Array, b: Array, c: Array, d: Array, dt: float, hold: str) 
 
 
 def modes(a: Array, b: Array, c: Array) -> list[Mode]:
-    """Real modes of a state space, slowest first."""
+    """Split a state space into real modes, slowest first."""
     values, right = np.linalg.eig(a)
     left = np.linalg.inv(right)
     out: list[Mode] = []
@@ -105,17 +105,17 @@ def modes(a: Array, b: Array, c: Array) -> list[Mode]:
             continue
         pair = [k, int(np.argmin(np.abs(values - np.conj(value))))]
         others = np.setdiff1d(np.arange(len(values)), pair)
-        # a pair that is all but a double eigenvalue has no eigenvectors to trust; what the others leave it has
+        # a nearly double eigenvalue has no reliable eigenvectors; its part is the complement of the others
         poor = np.linalg.cond(right[:, pair]) > POOR
         part = np.eye(len(a)) - right[:, others] @ left[others] if poor else right[:, pair] @ left[pair]
         out.append(_pair(np.real(part), complex(value), a, b, c))
-    return sorted(_together(out), key=lambda mode: abs(mode.value))
+    return sorted(_combine_real_modes(out), key=lambda mode: abs(mode.value))
 
 
 def _pair(part: Array, value: complex, a: Array, b: Array, c: Array) -> Mode:
-    """A pair as displacement and rate, `q' = v`, `v' = -|value|² q + 2 Re(value) v + u`, in its part of the state.
+    """Write a pair as displacement and rate, `q' = v`, `v' = -|value|² q + 2 Re(value) v + u`, in its part of states.
 
-    The strongest input enters v alone: v stands for `b`, and q for `A b - 2 Re(value) b`, its part each.
+    The strongest input enters v alone: v belongs to `b`, and q to `A b - 2 Re(value) b`, each projected on the part.
     """
     force = part @ b
     size = np.linalg.norm(force, axis=0)
@@ -128,8 +128,8 @@ def _pair(part: Array, value: complex, a: Array, b: Array, c: Array) -> Mode:
     return Mode(value, entering / scale, c @ basis * scale)
 
 
-def _together(found: list[Mode]) -> list[Mode]:
-    """Two real modes that inputs enter alike and whose jumps cancel are one mass: `q'' = -a b q - (a + b) q' + u`."""
+def _combine_real_modes(found: list[Mode]) -> list[Mode]:
+    """Combine two real modes with equal inputs and cancelling jumps to a mass: `q'' = -a b q - (a + b) q' + u`."""
     real = [mode for mode in found if not mode.second_order]
     if len(real) != 2 or not np.allclose(real[0].into, real[1].into, rtol=0.0, atol=0.02):
         return found
@@ -143,6 +143,6 @@ def _together(found: list[Mode]) -> list[Mode]:
 
 
 def _unit(into: Array) -> float:
-    """A scale that leaves the largest gain of the inputs at one."""
+    """Return the scale that makes the largest gain of the inputs one."""
     largest = into.ravel()[np.argmax(np.abs(into))]
     return float(largest) if largest else 1.0

@@ -1,11 +1,11 @@
 """Explanations other than a law at a declared port: a pinned parameter, an undeclared port, a machine that changed.
 
-- A spring or a damper in a port where the simulator has one is the same as another value of that one. It comes out as
-  missing only where the value is fixed, or its bounds do not let it go there; then that is what has to be said. With a
-  value whose bounds are in another unit, no law says anything about the machine; values powers of ten away are tried.
+- A missing spring or damper in a port that already has one is equivalent to another value of the existing one. It comes
+  out as missing only if that value is fixed, or if its bounds exclude the new one; then the pinned value is reported.
+  If the bounds are in another unit, no law helps; values powers of ten away are tried.
 - A mismatch that no declared port explains may have a sure name in the equation of a state.
-- One set of values for all recordings is compared with one for each, or with one for the first halves and one for the
-  second. Where these follow far better, the values that differ are told; only the engineer can know why.
+- One set of values for all recordings is compared with one set for each, or with one for the first halves and one for
+  the second. If separate sets follow far better, the differing values are reported; the cause is left to the engineer.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import display_name
 from ..simulators import states_along
-from .gates import CERTAIN, EXPLAINED, LOST, ROOM, SAME, Gate, fall, gain, open_start, refit
+from .gates import CERTAIN, EXPLAINED, LEAST_GAIN, SAME, USELESS_FIT, Gate, describe_fall, gain, open_start, refit
 from .posterior import Posterior, posterior
 from .proof import deviations
 from .search import Search
 from .verdict import AT_FLOOR, SURE
 from .workbench import THOROUGH, Fitted, Workbench
 
-WELL_ABOVE = 3.0  # times the noise beyond which something else is missing
-FAR = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)  # times its start that a value may be, where the refit says nothing
-LINEAR = ("linear_stiffness", "viscous_damping")
-NAMED = 3  # values told
+WELL_ABOVE = 3.0  # error over the noise above which something else is missing
+# factors on a parameter's start value that are tried if the refit says nothing
+FAR = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)
+LINEAR = ("linear_stiffness", "viscous_damping")  # laws that are equivalent to other parameter values
+NAMED = 3  # values reported at most
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
-    """A parameter, the value it would take, the simulator fitted with it, and what is said of it."""
+class PinnedParameter:
+    """A pinned parameter, its better value, the simulator fitted with it, and the sentence for the report."""
 
     name: str
     value: float
@@ -42,22 +43,23 @@ class Held:
     sentence: str
 
 
-def held_value(search: Search, answer: Posterior) -> Held | None:
-    """Find the held parameter that, let go, does as well as what was named; None where there is none.
+def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter | None:
+    """Find the pinned parameter that explains as much, once freed, as the named laws; None if there is none.
 
-    One that is fixed is asked for only by a linear law, which is the same as another value of it.
+    Fixed parameters are tried only if a linear law was named, because that law is equivalent to another value.
     """
     named = [e.element for e in answer.effects]
     linear = len(named) == 1 and named[0].law.id in LINEAR
     bench, without = search.bench, search.root.fitted
-    if not linear and without.cost < LOST:
+    if not linear and without.cost < USELESS_FIT:
         return None
     as_well = SAME**2 * answer.best.whole if named else np.inf
-    enough = min(as_well, (WELL_ABOVE if named else AT_FLOOR) ** 2 * search.floor2)  # else something is missing
+    # a larger error means that something else is missing
+    enough = min(as_well, (WELL_ABOVE if named else AT_FLOOR) ** 2 * search.floor2)
     best: tuple[str, Fitted] | None = None
     for name, p in bench.simulator.parameters.items():
         stays = bool((linear and np.all(p.fixed)) or np.all(without.at_bound(name)))
-        if p.size != 1 or not stays or float(p.value) == 0:  # what is nothing is not there
+        if p.size != 1 or not stays or float(p.value) == 0:  # a zero parameter represents no physics
             continue
         free = replace(p, fixed=False, bounds=(0.0 if float(p.value) > 0 else -np.inf, np.inf))
         simulator = bench.simulator.with_parameters({**bench.simulator.parameters, name: free})
@@ -67,7 +69,7 @@ def held_value(search: Search, answer: Posterior) -> Held | None:
             found = refit(bench, starts, simulator, states=without.initial, solver=THOROUGH)
         except KeyboardInterrupt:
             found, search.interrupted = None, True
-        search.interrupted = search.interrupted or bool(bench.struck)
+        search.interrupted = search.interrupted or bool(bench.interrupted_fits)
         if search.interrupted:
             return None
         if found is None:
@@ -86,14 +88,14 @@ def held_value(search: Search, answer: Posterior) -> Held | None:
     like = f", no further off than with {words}" if named else ""
     sentence = (
         f"Nothing is missing but a value: with {name} = {value:.5g}{unit}, which is {kept} "
-        f"{float(without.values[name]):.4g}{unit}, {fall(without.cost, found.cost)}{like}; let it go there, or say "
-        "what takes its place."
+        f"{float(without.values[name]):.4g}{unit}, {describe_fall(without.cost, found.cost)}{like}; let it go there, "
+        "or say what takes its place."
     )
-    return Held(name, value, found, sentence)
+    return PinnedParameter(name, value, found, sentence)
 
 
-def beyond_the_ports(search: Search) -> Sequence[Gate]:
-    """Note a mismatch that no declared port explains and that has a sure name in the equation of a state."""
+def find_undeclared_port(search: Search) -> Sequence[Gate]:
+    """Note a mismatch that no declared port explains but that has a sure name in the equation of a state."""
     ports = search.bench.simulator.ports
     if not ports or search.interrupted:
         return ()
@@ -118,16 +120,16 @@ def beyond_the_ports(search: Search) -> Sequence[Gate]:
     return (Gate(state, "undeclared", law.replace("_", " "), sentence, corrected=False),)
 
 
-Group = tuple[str, Sequence[Recording], Sequence[np.ndarray]]  # what it is called, recordings, and first states
+Group = tuple[str, Sequence[Recording], Sequence[np.ndarray]]  # name, recordings, and initial states
 
 
-def varying(search: Search) -> tuple[Gate, ...]:
-    """Note values that differ between the recordings, or else between the halves of each."""
+def find_varying_values(search: Search) -> tuple[Gate, ...]:
+    """Note values that differ between the recordings, or else between the halves of each recording."""
     bench, whole = search.bench, search.root.fitted
     if search.interrupted or not np.any(whole.model.parameters.free):
         return ()
     try:
-        for groups, where in ((_each(bench, whole), "the recordings"), (_halves(bench, whole), "the halves")):
+        for groups, where in ((_by_recording(bench, whole), "the recordings"), (_by_half(bench, whole), "the halves")):
             found = _compare_groups(search, groups, where) if len(groups) > 1 else None
             if found is not None:
                 return (found,)
@@ -136,12 +138,12 @@ def varying(search: Search) -> tuple[Gate, ...]:
     return ()
 
 
-def _each(bench: Workbench, whole: Fitted) -> list[Group]:
+def _by_recording(bench: Workbench, whole: Fitted) -> list[Group]:
     names = [r.name or f"recording {i + 1}" for i, r in enumerate(bench.recordings)]
     return [(n, (r,), (x,)) for n, r, x in zip(names, bench.recordings, whole.initial, strict=True)]
 
 
-def _halves(bench: Workbench, whole: Fitted) -> list[Group]:
+def _by_half(bench: Workbench, whole: Fitted) -> list[Group]:
     first, second, middle = list[Recording](), list[Recording](), list[np.ndarray]()
     for r, x in zip(bench.recordings, whole.initial, strict=True):
         cut = (r.skip + len(r)) // 2
@@ -163,10 +165,10 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
         benches.append(part)
     sizes = [sum(len(r) - r.skip for r in part.recordings) for part in benches]
     cost = float(np.average([f.cost for f in fits], weights=sizes))
-    begun = sum(len(part.recordings) for part in benches) - len(bench.recordings)
-    more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * begun
+    more_starts = sum(len(part.recordings) for part in benches) - len(bench.recordings)
+    more = whole.model.parameters.free.sum() * (len(fits) - 1) + len(whole.initial[0]) * more_starts
     residual = [e for f in fits for e in f.residual]
-    if cost > EXPLAINED * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < ROOM:
+    if cost > EXPLAINED * whole.cost or gain(whole.cost, max(cost, search.floor2), residual, more) < LEAST_GAIN:
         return None
     values = _clearest_differences(whole, fits, benches)
     if not values:
@@ -184,7 +186,7 @@ def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate
 def _clearest_differences(
     whole: Fitted, fits: Sequence[Fitted], benches: Sequence[Workbench]
 ) -> list[tuple[str, list[float]]]:
-    """List the parameters whose values differ most clearly, the clearest first."""
+    """List the parameters with the most significant differences, the most significant first."""
     spreads = [deviations(part, f) for part, f in zip(benches, fits, strict=True)]
     out = list[tuple[float, str, list[float]]]()
     for name, p in whole.simulator.parameters.items():

@@ -1,11 +1,11 @@
-"""Two effects looked for at once, where one after the other explains too little or is not sure: each hides the other.
+"""Search for two effects at once, if one after the other explains too little or is not sure: each may hide the other.
 
-Every pair of laws at two ports is scored together along the refitted simulation. With orthonormal columns Q_a and Q_b
-of what small doses of the two change (`remainder`) and e' what is left of the error, the share that they explain is
+Every pair of laws at two ports is scored along the refitted simulation. Let Q_a and Q_b be orthonormal columns of the
+output changes by small doses of the two (`remainder`), and e' the remaining error. The pair explains the share
 
     |Q_aᵀ e'|² + rᵀ (I - W Wᵀ)⁻¹ r,    r = Q_bᵀ e' - W Q_aᵀ e',    W = Q_bᵀ Q_a
 
-The best pairs are fitted together.
+of it. The best pairs are fitted.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ import numpy as np
 
 from .remainder import Dose, Remainder, held_out, orthonormal
 from .screen import Scored, start_values
-from .trials import BRIEF, Trial, Trials, put_in
+from .trials import BRIEF, Trial, Trials, place_law
 from .workbench import Fitted
 
-SHAPES = 5  # of each law at each port, the best alone
-PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each
+SHAPES = 5  # shapes of each law at each port: the best alone
+PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each pair of ports
 LOOKED_AT = 60  # pairs of laws whose share is cross-validated
-RIDGE = 1e-4
+RIDGE = 1e-4  # on the gram matrix of orthonormal columns, against nearly parallel laws
 
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """A law of one shape at a port, and what it changes."""
+    """A law of one shape at a port, and its dose."""
 
     scored: Scored
     dose: Dose
@@ -45,8 +45,8 @@ def _blocks(rest: Remainder) -> Iterator[_Block]:
                 yield _Block(scored, replace(felt[k], phi=felt[k].phi.copy()))
 
 
-def together(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
-    """Share of `left` that each two parts explain together, shape (n, n); parts are orthonormal columns."""
+def pair_shares(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
+    """Compute the share of `left` that each two parts explain together, shape (n, n); parts are orthonormal columns."""
     q, width = np.hstack(parts), [p.shape[1] for p in parts]
     begin = np.cumsum([0, *width])
     gram, right = q.T @ q, q.T @ left
@@ -64,12 +64,12 @@ def together(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
     return np.asarray(out / max(float(left @ left), 1e-300))
 
 
-def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
-    """Pairs worth a fit, best first: a few of each of the best pairs of ports."""
+def choose_pairs(rest: Remainder) -> list[tuple[_Block, _Block]]:
+    """Choose the pairs worth a fit, best first: a few of each of the best pairs of ports."""
     blocks = list(_blocks(rest))
     if len(blocks) < 2:
         return []
-    left = 1 - together([orthonormal(b.dose.phi) for b in blocks], rest.left)
+    left = 1 - pair_shares([orthonormal(b.dose.phi) for b in blocks], rest.left)
     ports = np.array([b.scored.port for b in blocks])
     worth = np.maximum(left, 0.0)
     worth[ports[:, None] == ports] = np.inf
@@ -92,26 +92,26 @@ def promising(rest: Remainder) -> list[tuple[_Block, _Block]]:
 
 
 def _strengths(pair: tuple[_Block, _Block], left: np.ndarray) -> list[np.ndarray]:
-    """Strengths of both laws that explain most together."""
+    """Compute the strengths of both laws that explain most together."""
     phi = np.hstack([b.dose.phi for b in pair])
     found = -np.linalg.lstsq(phi, left, rcond=1e-8)[0] / np.concatenate([b.dose.size for b in pair])
     return np.split(found, [len(pair[0].dose.size)])
 
 
 def _opposes(pair: tuple[_Block, _Block], left: np.ndarray) -> bool:
-    """Whether the laws that must oppose motion, or push back, do."""
+    """Tell whether each law that must oppose motion, or push back, has the right sign."""
     for block, found in zip(pair, _strengths(pair, left), strict=True):
         if len(found) == 1 and block.scored.sense * found[0] < 0:
             return False
     return True
 
 
-def fitted_together(trials: Trials, root: Fitted, rest: Remainder, pair: tuple[_Block, _Block]) -> Trial | None:
-    """Fit a pair from what the screen says of it, and the simulator's parameters as refitted and as given."""
+def fit_pair(trials: Trials, root: Fitted, rest: Remainder, pair: tuple[_Block, _Block]) -> Trial | None:
+    """Fit a pair from its screened start values, with the simulator's parameters as refitted and as given."""
     simulator, named = root.simulator, dict[str, Any]()
     for block, strength in zip(pair, _strengths(pair, rest.left), strict=True):
         start = start_values(block.scored.law, block.dose.shape, strength)
-        simulator, own = put_in(simulator, block.scored, start)
+        simulator, own = place_law(simulator, block.scored, start)
         named |= own
     nominal = {k: p.value for k, p in root.simulator.parameters.items()}
     starts = [{**root.values, **named}, {**nominal, **named}]

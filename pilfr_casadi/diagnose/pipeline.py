@@ -1,4 +1,4 @@
-"""The diagnosis, step by step: how an answer comes about."""
+"""The steps of a diagnosis in their order."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from .._base import InputError, Progress, Stages, one_blas_thread, processors, w
 from ..data import Recording
 from ..laws import Law, readable_unit
 from ..simulators import Simulator
-from .arguments import check_laws, check_limits, matched, matched_tests, with_scaled
+from .arguments import add_scaled_laws, check_laws, check_limits, match_recordings, match_tests
 from .checkup import BlindSpot, assess
-from .correction import Correction, as_named, find_correction
+from .correction import Correction, find_correction, named_correction
 from .detectability import port_units
 from .experiment import next_experiment, placebo
-from .gates import Gate, Offset, as_it_came_out, offset_gates, without_idle_offsets
+from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .mismatch_map import mismatch
-from .other_explanations import beyond_the_ports, held_value, varying
+from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
 from .posterior import Named, Posterior, names, posterior
-from .preparation import CHECKS, Prepared, hold_note, prepare, said_hold
+from .preparation import CHECKS, Prepared, hold_note, prepare, stated_hold
 from .proof import deviations, mean_nrmse, parameter_table, test_errors
 from .recording_faults import clipped_input, tones
 from .result import Diagnosis, Effect
 from .search import Search
-from .surrogates import told_of_surrogate
+from .surrogates import surrogate_gates
 from .trials import Trial
 from .verdict import SURE, Verdict, judge
 from .workbench import Fitted
 
-AS_GIVEN = 0.5  # ratio of mean squares from which a search on channels that were not shifted replaces the first one
+AS_GIVEN = 0.5  # ratio of mean squares below which a search without shifted early channels replaces the first search
 SEARCHING = 0.7  # share of the remaining time for the search; the rest is for the correction
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What is diagnosed, and how; see `diagnose`."""
+    """Arguments of `diagnose`, checked; see there."""
 
     simulator: Simulator
     recordings: Sequence[Recording]
@@ -55,23 +55,23 @@ class Request:
     @property
     def hold_said(self) -> bool:
         """Whether somebody said what inputs do between samples."""
-        return said_hold(self.simulator, self.recordings, self.hold) is not None
+        return stated_hold(self.simulator, self.recordings, self.hold) is not None
 
 
 @dataclass(frozen=True, eq=False)
 class Conclusion:
-    """What a search came to.
+    """Answer of a search.
 
     Attributes
     ----------
     fitted : Fitted
-        The corrected simulator; the refitted one where there is nothing to correct.
+        The corrected simulator, or the refitted one if there is nothing to correct.
     correction : Correction
-        What `fitted` has beside the refitted simulator.
+        The elements that `fitted` has beside the refitted simulator.
     effects : tuple of Named
-        The effects that are named.
+        The named effects.
     let_go : str
-        The fixed parameter whose other value explains what a law was named for.
+        The pinned parameter whose other value explains as much as the named law.
     """
 
     verdict: Verdict
@@ -100,11 +100,11 @@ def diagnose_in_steps(
 ) -> Diagnosis:
     """Carry out `diagnose`, whose parameters these are.
 
-    1. The arguments are checked, and channels are matched by name.
-    2. The recordings are checked for faults, the simulator is refitted, and the noise is measured (`preparation`).
-    3. The search fits hypotheses, sets of laws in ports, and keeps all of them (`search`).
-    4. All hypotheses are weighed; verdict, effects and corrected simulator are chosen (`conclude`).
-    5. Test recordings, placebos and standard errors are the proof (`proof`); they change nothing above.
+    1. Check the arguments, and match channels by name.
+    2. Check the recordings for faults, refit the simulator, and measure the noise (`preparation`).
+    3. Fit hypotheses, which are sets of laws in ports, and keep all of them (`search`).
+    4. Weigh all hypotheses; choose verdict, effects and corrected simulator (`conclude`).
+    5. Compute the proof (`proof`): errors on test recordings, placebos, standard errors. It changes nothing above.
     """
     began = time.perf_counter()
     workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
@@ -112,51 +112,51 @@ def diagnose_in_steps(
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
     say = Stages(progress or (lambda stage, done, total, best: None))
-    simulator, recordings = matched(simulator, train, hold)
-    tests = matched_tests(simulator, test, recordings)
+    simulator, recordings = match_recordings(simulator, train, hold)
+    tests = match_tests(simulator, test, recordings)
     check_limits(simulator, limits)
-    tried = with_scaled(check_laws(laws), simulator)
+    tried = add_scaled_laws(check_laws(laws), simulator)
     deadline = np.inf if time_limit is None else began + float(time_limit)
     request = Request(simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say)
-    ready, search = _searched_both_holds(request)
+    ready, search = _search_both_holds(request)
     concluding = search.begin("conclusion")
     found = conclude(search, (*ready.gates, *search.gates))
     search.timed("conclusion", concluding)
     return _build_diagnosis(request, ready, search, found, tests, limits, began)
 
 
-def _searched_both_holds(request: Request) -> tuple[Prepared, Search]:
-    """Search; where nobody said what inputs do between samples and it matters, take the hold with the smaller error."""
-    ready, search = _searched(request)
-    if search.interrupted or not search.misheld():
+def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
+    """Search; if nobody stated the hold of the inputs and it matters, use the hold with the smaller error."""
+    ready, search = _search(request)
+    if search.interrupted or not search.other_hold_fits_better():
         return ready, search
-    hold = search.bench.otherwise_held().hold
+    hold = search.bench.with_other_hold().hold
     try:
-        other, again = _searched(replace(request, hold=hold, say=request.say.under("other hold: ")))
-    except InputError:  # it cannot be run so
-        return ready, search.settled(request.most_effects)
+        other, again = _search(replace(request, hold=hold, say=request.say.under("other hold: ")))
+    except InputError:  # the simulator cannot be run with this hold
+        return ready, search.resume(request.most_effects)
     only_refitted = again.interrupted and len(again.memo) < 2
     if again.best.whole > search.best.whole or only_refitted:
         search.interrupted = again.interrupted
-        return ready, search.settled(request.most_effects)
+        return ready, search.resume(request.most_effects)
     ratio = float(np.sqrt(search.best.whole / max(again.best.whole, 1e-300)))
     return replace(other, gates=(*other.gates, hold_note(request.simulator, hold, ratio))), again
 
 
-def _searched(request: Request) -> tuple[Prepared, Search]:
-    """Prepare and search; once more without shifting channels that seemed early, where that leaves far less."""
-    ready, search = _searched_once(request, shift_early=True)
+def _search(request: Request) -> tuple[Prepared, Search]:
+    """Prepare and search; repeat without shifting early channels if these were shifted, and keep the better search."""
+    ready, search = _search_once(request, shift_early=True)
     seemed_early = any(g.finding == "alignment" and g.value < 0 for g in ready.gates)
-    if not seemed_early or search.interrupted or search.out_of_time or not search.room(search.best):
+    if not seemed_early or search.interrupted or search.out_of_time or not search.can_improve(search.best):
         return ready, search
-    other, again = _searched_once(request, shift_early=False)
+    other, again = _search_once(request, shift_early=False)
     if again.best.whole < AS_GIVEN * search.best.whole:
         return other, again
     search.interrupted = again.interrupted
     return ready, search
 
 
-def _searched_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
+def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]:
     """Check and correct the recordings, refit the simulator, measure the noise, and search from there."""
     began = time.perf_counter()
     ready = prepare(
@@ -188,13 +188,13 @@ def _searched_once(request: Request, shift_early: bool) -> tuple[Prepared, Searc
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """Draw the conclusion from a search.
 
-    1. The posterior gives a verdict.
-    2. A parameter that is fixed at a wrong value, or an input that was clipped, may explain as much as a law.
-    3. Named laws compete with a learned force on held-out data. Where the force predicts better, the name is refuted.
-    4. For what has no name, undeclared ports and varying values are looked at, and the best predictor is handed back.
+    1. Compute the posterior, which gives a verdict.
+    2. Check whether a wrong fixed parameter, or a clipped input, explains as much as a law.
+    3. Compare named laws with a learned force on held-out data. If the force predicts better, the name is refuted.
+    4. If there is no name, check undeclared ports and varying values, and return the best predictor.
 
-    After Ctrl-C and at the time limit 2 and the first half of 4 are left out; after Ctrl-C a name that was found stays,
-    and else the refitted simulator is handed back.
+    After Ctrl-C and at the time limit, step 2 and the first half of step 4 are skipped. After Ctrl-C, a name that was
+    found stays; otherwise the refitted simulator is returned.
     """
     answer, interrupted = posterior(search), search.interrupted
     finished = not (interrupted or search.out_of_time)
@@ -214,7 +214,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
             zeros = offset_gates(answer.best.laws, answer.best.fitted.values)
             return Conclusion(Verdict(verdict.kind, said), (*gates, *zeros), fitted, correction, answer.effects)
     if verdict.kind == "unexplained" and finished:
-        gates = (*gates, *beyond_the_ports(search), *varying(search))
+        gates = (*gates, *find_undeclared_port(search), *find_varying_values(search))
     refitted = search.root.fitted
     if interrupted and verdict.kind != "recording-fault":
         sentence = (
@@ -226,14 +226,14 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         correction, fitted = corrected or find_correction(search, answer)
         verdict = Verdict(verdict.kind, f"{verdict.sentence} {correction.sentence}")
         return Conclusion(verdict, gates, fitted, correction)
-    return Conclusion(verdict, gates, refitted, as_named(search, refitted))
+    return Conclusion(verdict, gates, refitted, named_correction(search, refitted))
 
 
 def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: Sequence[Gate]) -> Conclusion | None:
-    """A parameter held at a wrong value, or an input that was clipped, where that explains as much as laws do."""
-    held = held_value(search, answer)
+    """Conclude that a parameter has a wrong pinned value, or an input was clipped, if that explains as much as laws."""
+    held = find_pinned_parameter(search, answer)
     if held is not None:
-        corrected = as_named(search, held.fitted)
+        corrected = named_correction(search, held.fitted)
         return Conclusion(Verdict("complete", held.sentence), tuple(gates), held.fitted, corrected, (), held.name)
     named = verdict.kind == "missing-physics"
     if named and answer.sure >= SURE:
@@ -244,7 +244,7 @@ def _without_a_law(search: Search, answer: Posterior, verdict: Verdict, gates: S
     if clipping is None:
         return None
     fault = Verdict("recording-fault", clipping.sentence)
-    return Conclusion(fault, (*gates, clipping), refitted, as_named(search, refitted))
+    return Conclusion(fault, (*gates, clipping), refitted, named_correction(search, refitted))
 
 
 def _build_diagnosis(
@@ -282,8 +282,8 @@ def _build_diagnosis(
             _row(search, search.memo.get(t.key, t), step.parent) for step in search.steps for t in step.trials
         ),
         gates=(
-            *told_of_surrogate(request.stand_in_error),
-            *as_it_came_out(found.gates, after, std, bool(effects), settled),
+            *surrogate_gates(request.stand_in_error),
+            *final_gates(found.gates, after, std, bool(effects), settled),
         ),
         mismatch=mismatch(
             bench.recordings,
@@ -314,7 +314,7 @@ def _build_diagnosis(
 
 
 def _blind_spots(request: Request, search: Search) -> tuple[BlindSpot, ...]:
-    """What the recordings cannot reveal of the refitted simulator; nothing where that cannot be told."""
+    """Find what the recordings cannot reveal of the refitted simulator; empty if that cannot be computed."""
     bench = search.bench
     with suppress(InputError, np.linalg.LinAlgError):
         return assess(bench, search.root.fitted, bench.hold if request.hold_said else "").blind_spots
@@ -323,7 +323,7 @@ def _blind_spots(request: Request, search: Search) -> tuple[BlindSpot, ...]:
 
 def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndarray]) -> Effect:
     bench = search.bench
-    element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # maybe in another form
+    element = next(e for e in fitted.simulator.elements if (e.port, e.law.id) == named.name)  # its form may differ
     law = element.law
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
@@ -353,7 +353,7 @@ def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndar
 
 
 def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
-    """The experiment that would separate the first tie, where there is one."""
+    """Design the experiment that would separate the first tie, if there is one."""
     for effect in effects:
         if effect.alike:
             name, other = next(iter(effect.alike.items()))
@@ -368,7 +368,7 @@ def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] 
 
 
 def _row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
-    """A candidate as in diagnosis.json."""
+    """Return a candidate's row for diagnosis.json."""
     held_out = search.held_out.get(t.key)
     gain = search.evidence(t) - search.evidence(parent)
     return {

@@ -1,18 +1,18 @@
-"""The probability of every answer, from the log evidences of all hypotheses that were fitted.
+"""The probability of every answer, from the log evidences of all fitted hypotheses.
 
-A hypothesis that has laws has the probability of its share of the sum of all evidences. The simulator alone says that
-all of its error is noise; so it is weighed with samples that count in full (`search.Search.promise`).
+A hypothesis with laws has a probability in proportion to its evidence. The simulator alone claims that its whole error
+is noise; so it is weighed with samples that count in full (`search.Search.optimistic_evidence`).
 
 The right law leaves little of the mismatch for a flexible force to explain. Let s be the share of the mismatch that the
-law leaves and that a flexible force at some port would follow. The density of s is
+law leaves and that a flexible force at some port would explain. The density of s is
 
-    1 / (s log(1 / s_0)) for s from s_0 to 1, where the physics has no name: log-uniform,
-    2 / (π s_0 (1 + (s / s_0)²)), where the law is the physics: half-Cauchy,
+    1 / (s log(1 / s_0)) for s from s_0 to 1, if the physics has no name: log-uniform,
+    2 / (π s_0 (1 + (s / s_0)²)), if the law is the physics: half-Cauchy,
 
-and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is what the
-formula of the right law may leave. The verdict is the likeliest of complete, missing physics and unexplained. The
-confidence of an effect is the probability that it is included; an effect beside others is named where that is above
-one half.
+and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is the share
+that the formula of the right law may leave. The verdict is the likeliest of complete, missing physics and unexplained.
+The confidence of an effect is the probability that it is included. An effect beside others is named if that exceeds one
+half.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from .search import FORMULA, Search
 from .trials import Trial
 
 OUTSIDE = 0.1  # prior probability that missing physics is in no law of the catalogue
-DISTURBED = 0.2  # weight of what a law leaves and no force at a port follows
-HALF = 0.5  # probability of being in that an effect has to have beside others (Barbieri & Berger 2004)
-ALIKE = 3.0  # nats within which two hypotheses are not told apart
+DISTURBED = 0.2  # weight of a law's remainder that no force at a port explains
+HALF = 0.5  # inclusion probability that an effect needs beside others (Barbieri & Berger 2004)
+ALIKE = 3.0  # nats within which two hypotheses are indistinguishable
 Name = tuple[str, str]  # port and law id
 
 
@@ -40,9 +40,9 @@ class Named:
     Attributes
     ----------
     confidence : float
-        Probability that it, or the same law where the recordings cannot tell the place, is in.
+        Probability that it is included, or the same law elsewhere if the recordings cannot tell the place.
     alike : dict
-        Port and law id of other effects in its place that are not told apart -> the hypothesis, the likeliest first.
+        Port and law id of indistinguishable effects in its place -> the hypothesis, the likeliest first.
     """
 
     element: Placed
@@ -64,7 +64,7 @@ class Posterior:
     best : Trial
         The likeliest hypothesis.
     named : float
-        Probability that the laws of the best hypothesis are the physics, given the hypothesis.
+        Probability that the laws of the best hypothesis are the physics, given this hypothesis.
     effects : tuple of Named
         Its laws, strongest first.
     nothing : float
@@ -82,9 +82,9 @@ class Posterior:
         return min((e.confidence for e in self.effects), default=0.0)
 
     def within(self, elements: Collection[Name], learned: float) -> Posterior:
-        """The same where the corrected simulator has some elements, and a learned force of a share of the mismatch.
+        """Restrict the effects to those in the corrected simulator, beside a learned force of a share of the mismatch.
 
-        Effects that predict other recordings worse than what stands in their place lose their names.
+        Effects that predict other recordings worse than their replacement lose their names.
         """
         effects = [e for e in self.effects if e.name in elements]
         named = min(self.named, share_named(learned if effects else 1.0))
@@ -93,14 +93,14 @@ class Posterior:
 
 
 def names(trial: Trial) -> frozenset[Name]:
-    """Ports and law ids of a hypothesis; an offset is a finding about the recording, not an effect."""
+    """Return ports and law ids of a hypothesis; an offset is a finding about the recording, not an effect."""
     return frozenset((e.port, e.law.id) for e in trial.laws if e.law.id != "offset")
 
 
-def unfollowed(search: Search, trial: Trial) -> float:
-    """Share s of the mismatch that a hypothesis leaves and that a flexible force would follow.
+def explainable_remainder(search: Search, trial: Trial) -> float:
+    """Compute the share s of the mismatch that a hypothesis leaves and that a flexible force would explain.
 
-    What no force at a port follows counts little: it may be a disturbance that acts beside the law.
+    A remainder that no force at a port explains counts little: it may be a disturbance that acts beside the law.
     """
     excess = max(search.root.whole - search.floor2, 1e-300)
     left = float(np.clip((trial.whole - search.floor2) / excess, 0.0, 1.0))
@@ -109,7 +109,7 @@ def unfollowed(search: Search, trial: Trial) -> float:
 
 
 def share_named(s: float) -> float:
-    """Probability that a law which leaves the share s is the physics."""
+    """Compute the probability that a law which leaves the share s is the physics."""
     law = (1 - OUTSIDE) * 2 / (np.pi * FORMULA * (1 + (s / FORMULA) ** 2))
     other = OUTSIDE / (max(s, FORMULA) * np.log(1 / FORMULA))
     return float(law / (law + other))
@@ -127,34 +127,34 @@ def posterior(search: Search) -> Posterior:
         best = max((t for t in trials if names(t) == said), key=search.evidence)
         if not said:
             return Posterior(best, 0.0, (), by_names[said])
-        found = [_named(search, best, e, by_names) for e in best.laws if e.law.id != "offset"]
+        found = [_make_effect(search, best, e, by_names) for e in best.laws if e.law.id != "offset"]
         least = min(found, key=lambda e: e.confidence)
         fewer = said - {least.name}
         if least.confidence > HALF or fewer not in by_names or not fewer:
             break
         said = fewer
-    named = share_named(unfollowed(search, best))
+    named = share_named(explainable_remainder(search, best))
     effects = tuple(replace(e, confidence=named * e.confidence) for e in found)
     return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
 
 
-def _named(search: Search, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]) -> Named:
-    """An effect of a hypothesis, with the probability that it is in if the physics is in the catalogue."""
-    twins = _twins(search, best, element)
+def _make_effect(search: Search, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]) -> Named:
+    """Make an effect, with its inclusion probability given that the physics is in the catalogue."""
+    twins = _indistinguishable(search, best, element)
     same = {
         (element.port, element.law.id),
-        *(n for name in twins if name[1] == element.law.id for n in _each(name)),
+        *(n for name in twins if name[1] == element.law.id for n in _single_effects(name)),
     }
     return Named(element, sum(w for n, w in by_names.items() if n & same), twins)
 
 
 def _weights(search: Search, trials: Sequence[Trial]) -> np.ndarray:
-    """Probability of each hypothesis.
+    """Compute the probability of each hypothesis.
 
-    The simulator alone says that all of its error is noise, so that samples count in full against it. Laws only say
-    that they are near the physics, and are weighed by samples that count as far as their error is noise.
+    The simulator alone claims that its whole error is noise, so samples count in full against it. Laws claim only to be
+    near the physics; they are weighed by samples that count as far as their error is noise.
     """
-    full, tempered = (np.array([of(t) for t in trials]) for of in (search.promise, search.evidence))
+    full, tempered = (np.array([of(t) for t in trials]) for of in (search.optimistic_evidence, search.evidence))
     alone = np.array([not names(t) for t in trials])
     nothing = float(np.sum(_shares(full)[alone]))
     weights = np.empty(len(trials))
@@ -164,13 +164,13 @@ def _weights(search: Search, trials: Sequence[Trial]) -> np.ndarray:
 
 
 def _shares(logs: np.ndarray) -> np.ndarray:
-    """Shares of the sum of numbers of which the logarithms are given."""
+    """Normalise numbers, given by their logarithms, to a sum of one."""
     found = np.exp(logs - logs.max(initial=-np.inf)) if len(logs) else logs
     return np.asarray(found / max(found.sum(), 1e-300))
 
 
-def _twins(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:
-    """Hypotheses with another effect in place of one of the best one's, as likely or nearly.
+def _indistinguishable(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:
+    """Find hypotheses, about as likely as the best, that have another effect in place of one of its effects.
 
     The same law in every sensor is one effect, at "sensor:a + sensor:b".
     """
@@ -189,6 +189,6 @@ def _twins(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:
     return out
 
 
-def _each(name: Name) -> list[Name]:
-    """The single effects of one that is in several places."""
+def _single_effects(name: Name) -> list[Name]:
+    """Split an effect in several places into single effects."""
     return [(port, name[1]) for port in name[0].split(" + ")]

@@ -1,7 +1,7 @@
 """The checks of the recordings in their order, from the user's simulator to a refitted one.
 
-Where nobody said what inputs do between samples, the hold with the smaller error is taken. Wrong data say nothing about
-the hold: where a fault was found, the other hold goes through all checks as well.
+If nobody stated what the inputs do between samples, the hold with the smaller error is used. Faulty data say nothing
+about the hold: if a fault was found, the other hold goes through all checks as well.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from ..data import Recording
 from ..simulators import Simulator
 from .floor import Floor, white_part
 from .gates import (
-    ASTRAY,
     AT_NOISE,
     CURED,
+    POOR_FIT,
     SAME,
     Checked,
     Gate,
@@ -32,13 +32,13 @@ from .gates import (
 from .linearise import along, linearised, observer_gain
 from .proof import errors_of
 from .recording_faults import find_stale_samples, open_unsettled, remove_glitches, unclip
-from .step_refinement import on_steps_as_fine
+from .step_refinement import refine_steps
 from .timing import AVERAGED, find_gaps, find_time_shift, in_steps, run_as_given
 from .workbench import THOROUGH, Fitted, Workbench
 
-SMALL = 4e-4  # mean square error up to which signs and units are not looked at
-CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the parts of it that are reported
-LED = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer in turn
+SMALL = 4e-4  # mean square error up to which signs and units are not checked
+CHECKS, CHECKED = "checks and refit", 6  # the stage's name, and the number of its parts that are reported
+OBSERVER_GAINS = (1.0, 0.3, 0.1, 0.03, 0.01)  # gains of the observer, in turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def prepare(
     early: bool = True,
     say: Stages | None = None,
 ) -> Prepared:
-    """Put faults of the recordings right, refit from the user's values and from `starts`, and measure the noise.
+    """Correct faults of the recordings, refit from the user's values and from `starts`, and measure the noise.
 
     Without `early`, an early channel counts as a fault only where nothing else is wrong.
     """
@@ -80,20 +80,20 @@ def prepare(
     say(CHECKS, 0, CHECKED)
     recordings, spikes = remove_glitches(recordings)
     recordings, transients = open_unsettled(recordings)
-    said = said_hold(simulator, recordings, hold)
+    said = stated_hold(simulator, recordings, hold)
     bench, times = open_bench(simulator, recordings, said or "zero", engine)
     gates = (*spikes, *transients, *find_stale_samples(recordings), *times)
     held: Sequence[Gate] = ()
     if not said:
-        bench, held = _better_held(bench)
+        bench, held = _choose_hold(bench)
     nominal = errors_of(bench, bench.model(simulator))
     say(CHECKS, 1, CHECKED)
     checks = _Checks(gates, workers, starts, early, say)
     now = checks.run(bench, 1.0 if said else 0.5)
-    if not said and any(g.fault for g in now.gates[len(gates) :]):  # on wrong data the better hold says nothing
+    if not said and any(g.fault for g in now.gates[len(gates) :]):  # on faulty data the better hold says nothing
         now, held = _with_better_hold(checks, now, bench, held)
     bench, without = now.bench, now.fitted
-    if now.gates or held:  # values and states that wrong data led to may be a dead end
+    if now.gates or held:  # values and states from faulty data may be in a wrong minimum
         led = bench.fit(bench.simulator, [without.values], states=without.initial, solver=THOROUGH)
         without = min(led, bench.fit(bench.simulator, [{}, led.values], solver=THOROUGH), key=lambda f: f.cost)
     bench.check_followed(without)
@@ -104,7 +104,7 @@ def prepare(
 
 @dataclass(frozen=True)
 class _Checks:
-    """The checks of recordings in their order, from a bench on."""
+    """The checks of recordings in their order."""
 
     gates: tuple[Gate, ...]
     workers: int
@@ -113,7 +113,7 @@ class _Checks:
     say: Stages
 
     def run(self, bench: Workbench, part: float) -> Checked:
-        """Refit, and put faults right one after the other; `part` is of a sample, see `timing`."""
+        """Refit, and correct one fault after the other; `part` is the unit of shifts in samples, see `timing`."""
         now = self._report(2, Checked(bench, refitted(bench, self.starts), self.gates))
         if now.cost > max(AT_NOISE**2 * now.noise2, SMALL):
             found = self._slips(now, part)
@@ -123,7 +123,7 @@ class _Checks:
                 found = found.then(bench, bench.fit(bench.simulator, starts, solver=THOROUGH))
             now = found
         now = find_gaps(unclip(self._report(3, now)))
-        now = now.then(*on_steps_as_fine(now.bench, self._report(4, now).fitted))
+        now = now.then(*refine_steps(now.bench, self._report(4, now).fitted))
         return find_offsets(self._report(5, find_time_shift(now, part, self.early)))
 
     def _report(self, done: int, now: Checked) -> Checked:
@@ -131,9 +131,9 @@ class _Checks:
         return now
 
     def _slips(self, now: Checked, part: float) -> Checked:
-        """Find signs, units and exchanged channels; or a shift, since late by half a swing looks like a sign."""
+        """Find wrong signs, units and exchanged channels; or a shift, because half a period late looks like a sign."""
         found = find_slip_beside_offset(now, find_slips(now, self.workers), self.workers)
-        if len(found.gates) == len(now.gates) or found.cost <= ASTRAY:
+        if len(found.gates) == len(now.gates) or found.cost <= POOR_FIT:
             return found
         late = find_time_shift(now, part, self.early)
         return late if late.cost < CURED * found.cost else found
@@ -142,15 +142,15 @@ class _Checks:
 def _with_better_hold(
     checks: _Checks, now: Checked, bench: Workbench, held: Sequence[Gate]
 ) -> tuple[Checked, Sequence[Gate]]:
-    """Repeat the checks with the other hold, and take the one with the smaller error; return the note about it.
+    """Repeat the checks with the other hold, and keep the one with the smaller error; return the note about it.
 
-    Where inputs are taken as held but are interpolated, a late channel is late by half a sample more or less.
+    If inputs are taken as held but were interpolated, a late channel is late by half a sample more or less.
     """
     try:
-        both = now, checks.run(bench.otherwise_held(), 0.5)
+        both = now, checks.run(bench.with_other_hold(), 0.5)
     except InputError:
         return now, held
-    costs = [_honest(found) for found in both]
+    costs = [_comparable_cost(found) for found in both]
     now = both[int(costs[1] < costs[0])]
     ratio = (max(costs) / max(min(costs), 1e-300)) ** 0.5
     held = [hold_note(now.bench.simulator, now.bench.hold, ratio)] if ratio > SAME else []
@@ -163,40 +163,40 @@ def _shifts(found: Checked) -> list[float]:
     return [g.value for g in found.gates if g.finding == "alignment"]
 
 
-def _honest(found: Checked) -> float:
-    """Compute the mean square error as if no channel read between its samples had its noise averaged away."""
+def _comparable_cost(found: Checked) -> float:
+    """Compute the mean square error without the noise reduction by interpolating a channel between its samples."""
     between = any(not in_steps(v, found.bench.dt) for v in _shifts(found))
     return found.cost / (AVERAGED if between else 1)
 
 
 def refitted(bench: Workbench, starts: Sequence[Mapping[str, Any]] = ()) -> Fitted:
-    """Fit the simulator from the user's values and from others; far off, lead it there by an observer as well."""
+    """Fit the simulator from the user's values and from others; if the error stays large, use an observer as well."""
     plain = bench.fit(bench.simulator, [{}, *starts], solver=THOROUGH)
-    if plain.cost < ASTRAY:
+    if plain.cost < POOR_FIT:
         return plain
     probe, runs = linearised(bench, run_as_given(bench, plain))
     gain = observer_gain(probe, runs, white_part(plain.residual))
     if not gain.any():
         return plain
     try:
-        led = bench.fit(bench.simulator, anneal=LED, model=bench.model(bench.simulator, gain))
+        led = bench.fit(bench.simulator, anneal=OBSERVER_GAINS, model=bench.model(bench.simulator, gain))
         found = bench.fit(bench.simulator, [led.values], states=led.begin, solver=THOROUGH)
     except (InputError, np.linalg.LinAlgError):
         return plain
     return found if found.cost < plain.cost else plain
 
 
-# what inputs do between samples
+# hold of the inputs between samples
 
 
-def said_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
-    """Return the hold that the user, the simulator or a recording states; None if none does."""
+def stated_hold(simulator: Any, recordings: Sequence[Recording], said: str | None) -> str | None:
+    """Return the hold that the user, the simulator or a recording states; None if none of them does."""
     return next((h for h in (said, simulator.hold, *(r.hold for r in recordings)) if h is not None), None)
 
 
-def _better_held(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
-    """Choose the hold with the smaller error of a refit, and note it; the bench's own where the errors are the same."""
-    both = bench, bench.otherwise_held()
+def _choose_hold(bench: Workbench) -> tuple[Workbench, Sequence[Gate]]:
+    """Choose the hold whose refit has the smaller error, and note it; keep the bench's own if the errors are equal."""
+    both = bench, bench.with_other_hold()
     costs = [np.inf if (found := refit(b)) is None else found.cost for b in both]
     ratio = float(np.sqrt(max(costs) / max(min(costs), 1e-300)))
     if not ratio >= SAME:

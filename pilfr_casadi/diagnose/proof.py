@@ -1,4 +1,4 @@
-"""Errors on training and test recordings, and the parameters, before and after."""
+"""Errors on training and test recordings, and parameters, before and after the correction."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .workbench import Fitted, Workbench
 
 
 def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
-    """NRMSE averaged over outputs and recordings."""
+    """Compute the NRMSE averaged over outputs and recordings."""
     pairs = zip(fitted.residual, bench.recordings, strict=True)
     return float(np.mean([nrmse(r.y, r.y + e, skip=r.skip) for e, r in pairs]))
 
@@ -26,16 +26,16 @@ def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
 def run_free(
     model: Model, engine: Engine, recording: Recording, starts: Sequence[np.ndarray] = ()
 ) -> tuple[np.ndarray, int]:
-    """Simulate a model as it stands along a recording.
+    """Simulate a model at its start values along a recording.
 
-    An initial state that is to be estimated is fitted to the first part of the recording, from rest and from `starts`.
+    An unknown initial state is fitted to the first part of the recording, starting from rest and from `starts`.
 
     Returns
     -------
     array, shape (M, n_y)
         Simulated outputs; not finite where the simulation diverges.
     int
-        First sample that is scored: the fitted part is left out.
+        First scored sample: the part that the state is fitted to is left out.
     """
     estimated = recording.begins == "estimate" and model.n_state > 0
     used = min(samples_for_state(model), len(recording) // 3) if estimated else 0
@@ -49,9 +49,9 @@ def run_free(
 
 
 def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = ()) -> float:
-    """NRMSE of a model as it stands, averaged over recordings; infinite where the simulation diverges.
+    """Compute the NRMSE of a model at its start values, averaged over recordings; infinite if the simulation diverges.
 
-    `starts` are where unknown initial states are looked for besides rest.
+    Unknown initial states are sought from rest and from `starts`.
     """
     engine = make_engine(model, bench.engine)
     errors = []
@@ -64,7 +64,7 @@ def errors_of(bench: Workbench, model: Model, starts: Sequence[np.ndarray] = ())
 
 
 def starts_of(fitted: Fitted) -> list[np.ndarray]:
-    """Initial states at which a recording may begin where a learned element is unsure at rest, out of its range."""
+    """Return further initial states to try, for learned elements that are uncertain at rest, out of their range."""
     learned = any(e.law.id == "learned" for e in fitted.simulator.elements)
     return fitted.initial if learned else []
 
@@ -77,7 +77,7 @@ def test_errors(
     without: Fitted,
     after: Fitted,
 ) -> dict[str, float]:
-    """As recorded for the nominal simulator; what the gates put right is put right here too for the others.
+    """Compute the NRMSE on test recordings: unedited for the nominal simulator, with the gates' edits for the others.
 
     Fits are judged on the sub-steps that they were fitted on.
     """
@@ -93,7 +93,7 @@ def test_errors(
 
 
 def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
-    """Standard errors of free parameters, from the residual and its correlation time; nan where held or at a bound."""
+    """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds."""
     return _by_name(fitted, *covariance(bench, fitted))
 
 
@@ -104,9 +104,9 @@ def _by_name(fitted: Fitted, where: np.ndarray, matrix: np.ndarray) -> dict[str,
 
 
 def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
-    """Free parameters inside their bounds, as places in the vector (k,), and the covariance of their estimates (k, k).
+    """Return the places (k,) of free parameters inside their bounds, and the covariance (k, k) of their estimates.
 
-    Initial states are estimated with them.
+    Initial states are estimated together with them.
     """
     free = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
     problem = bench.problem(free, fitted.engine)
@@ -128,7 +128,7 @@ def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray
 def parameter_table(
     simulator: Simulator, without: Fitted, after: Fitted, std: dict[str, np.ndarray]
 ) -> dict[str, dict[str, Any]]:
-    """Nominal, refitted without and with the effects, for diagnosis.json."""
+    """Make the table of values (nominal, refitted without and with the effects) for diagnosis.json."""
     out = {}
     for name, p in simulator.parameter_set.items():
         error = np.asarray(std.get(name, np.nan))

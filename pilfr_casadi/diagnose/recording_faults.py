@@ -1,19 +1,19 @@
-"""Faults that the recorded samples themselves show: glitches, stale, clipped and unsettled samples, and steady tones.
+"""Faults visible in the recorded samples themselves: glitches, stale, clipped and unsettled samples, and steady tones.
 
-- Glitches, as from a lost bit or a loose contact: a sample far off the cubic through its four neighbours, compared with
-  the distances nearby. With it replaced by that cubic nothing around it stands out; around a step or a shock it does.
-- Stale samples: a channel repeats its last value now and then, where it otherwise never does. A coarse converter
-  repeats values too, but has few of them, and so does an encoder that moves by no more than its step; a machine at rest
-  repeats one value for long, and a clipped channel its limit.
-- Clipped channels: extremes that are repeated exactly. A clipped output can be compared with a simulation that is
-  clipped alike; the part of a clipped input beyond its limit is lost.
-- Periods that have not settled: the rms differences of neighbouring periods are the same where only noise differs, and
-  larger at first where a transient dies away. Then the first sample is not on the steady cycle, and the periods'
-  differences are not the noise.
-- Tones, as from mains hum, a fan or an unbalanced motor: a line of the residual's spectrum far above those around it.
-  Its amplitude and phase stay over the record, and it is neither in an input nor a harmonic or a mixture of an input's
-  few lines. A residual that swings at one of the simulator's own frequencies is no noise either: a force that is not
-  recorded leaves such a residual, and no law at any port explains it.
+- Glitches, for example from a lost bit or a loose contact: a sample far off the cubic through its four neighbours,
+  relative to the distances nearby. Replacing it by that cubic makes its neighbours inconspicuous; this does not hold at
+  a step or a shock.
+- Stale samples: a channel sometimes repeats its last value, which it otherwise never does. Three other causes are told
+  apart: a coarse converter, or an encoder that moves by no more than its step, has few values; a machine at rest
+  repeats one value for long; a clipped channel repeats its limit.
+- Clipped channels: exactly repeated extremes. A clipped output can be compared with an equally clipped simulation; the
+  part of a clipped input beyond its limit is lost.
+- Unsettled periods: the rms differences of neighbouring periods are equal if only noise differs, and larger at first if
+  a transient decays. Then the first sample is not on the steady cycle, and the periods' differences are not the noise.
+- Tones, for example from mains hum, a fan or an unbalanced motor: a line of the residual's spectrum far above its
+  neighbours. Its amplitude and phase are constant over the record, and it is neither in an input nor a harmonic or a
+  mixture of an input's few lines. A residual at one of the simulator's own frequencies is not noise either: an
+  unrecorded force leaves such a residual, and no law at any port explains it.
 """
 
 from __future__ import annotations
@@ -26,40 +26,41 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
-from .gates import CURED, LOST, ROOM, Checked, FirstOrder, Gate, fall, gain, open_start, refit
+from .gates import CURED, LEAST_GAIN, USELESS_FIT, Checked, FirstOrder, Gate, describe_fall, gain, open_start, refit
 from .linearise import linearised
 from .remainder import folds, held_out
 from .workbench import Fitted, Workbench
 
 CUBIC = np.array([-1, 4, 0, 4, -1]) / 6  # through the neighbours at -2, -1, 1, 2
-GLITCH_REACH = 12  # samples on either side that a distance is compared with
-USUAL_QUANTILE = 0.75  # of the distances nearby, that a glitch is compared with
-GLITCH_FAR, GLITCH_SIZE = 12.0, 0.1  # times that quantile, and times the output's deviation
-MOST_GLITCHES = 0.02  # of the samples that may be glitches
+GLITCH_REACH = 12  # samples on either side with which a distance is compared
+USUAL_QUANTILE = 0.75  # quantile of the distances nearby with which a glitch is compared
+GLITCH_FAR, GLITCH_SIZE = 12.0, 0.1  # least distance of a glitch over that quantile, and over the output's deviation
+MOST_GLITCHES = 0.02  # largest share of the samples that may be glitches
 
-STALE_SHARE = 0.01  # of the samples that repeat
-CONTINUOUS = 0.5  # share of the samples with values of their own, above which a signal is not quantised
-STANDING = 5  # samples that an encoder or a machine may have stood, and steps of an encoder in a sample
-BY_CHANCE = 3.0  # times as many repeats as noise makes
+STALE_SHARE = 0.01  # least share of the samples that repeat
+CONTINUOUS = 0.5  # share of the samples with distinct values above which a signal is not quantised
+STANDING = 5  # longest rest of an encoder or a machine, in samples; largest motion of an encoder in a sample, in steps
+BY_CHANCE = 3.0  # factor on the number of repeats that noise causes
 
-MOST_LEFT = 0.5  # share of the mismatch that is left at most by the part of an input beyond its limit
+MOST_LEFT = 0.5  # largest share of the mismatch that remains after correcting an input beyond its limit
 
-DYING_RATIO = 1.5  # times the least difference of neighbouring periods that the first one is, where it dies away
+DYING_RATIO = 1.5  # least ratio of the first to the smallest difference of neighbouring periods, for a transient
 
-FAR, OVER = 50.0, 10.0  # times the lines around that a tone is; that a line of an input or a mode's is
-AROUND, OWN = 30, 3  # lines on either side that are compared with, and that belong to the tone
-FINE = 10  # lines of the spectrum up to a tone or a mode at least
-POWER = 0.05  # of the residual's power that a tone has at least, and of an input's strongest line that others have
-STEADY = 0.5  # of the amplitude by which a quarter's may differ
-LINES, ORDER, HARMONICS = 3, 7, 60  # of an input that is mixed: its lines at most, and orders of mixtures and harmonics
+FAR, OVER = 50.0, 10.0  # least ratio to the lines around: of a tone; of an input's line or a mode's
+AROUND, OWN = 30, 3  # lines on either side that are compared, and that belong to the tone
+FINE = 10  # least number of spectral lines up to a tone or a mode
+POWER = 0.05  # least power of a tone over the residual's, and of an input's further lines over its strongest
+STEADY = 0.5  # largest change of the amplitude in a quarter of the record, over the amplitude
+# for mixtures of an input's lines: most lines; highest order of mixtures, and of harmonics
+LINES, ORDER, HARMONICS = 3, 7, 60
 
 LIGHT = 0.15  # damping ratio below which a mode rings
-SEGMENTS = 4  # half-overlapping, that a mode's spectrum is averaged over
-BAND = 1.2, 1.8  # times a mode's frequency, above and below, where the spectrum is compared with
+SEGMENTS = 4  # half-overlapping segments over which a mode's spectrum is averaged
+BAND = 1.2, 1.8  # limits of the frequency ratio to a mode, above and below, in which the spectrum is compared
 
 
 def remove_glitches(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
-    """Replace glitches by what lies between their neighbours; return the recordings and the findings."""
+    """Replace glitches by interpolation between their neighbours; return the recordings and the findings."""
     gates = list[Gate]()
     for i, name in enumerate(recordings[0].outputs):
         places, clean = zip(*(find_glitches(r.y[:, i]) for r in recordings), strict=True)
@@ -105,7 +106,7 @@ def distances(y: np.ndarray) -> np.ndarray:
 
 
 def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
-    """Tell whether a sample stands out, and nothing around it does once it is replaced."""
+    """Tell whether a sample stands out, and its neighbours do not once it is replaced."""
     around = np.arange(max(k - GLITCH_REACH, 2), min(k + GLITCH_REACH + 1, len(y) - 2))
     near = np.abs(around - k) <= 2
     usual = float(np.quantile(d[around[~near]], USUAL_QUANTILE))
@@ -137,12 +138,12 @@ def find_stale_samples(recordings: Sequence[Recording]) -> list[Gate]:
 
 
 def find_stretches(mask: np.ndarray) -> np.ndarray:
-    """Find begin and end of each stretch of a mask (M,) that is true, shape (n, 2)."""
+    """Find begin and end of each stretch in which a mask (M,) is true, shape (n, 2)."""
     return np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]]))).reshape(-1, 2)
 
 
 def _find_repeats(y: np.ndarray, step: float) -> np.ndarray:
-    """Tell which samples repeat the one before, away from the limits, in short runs that a jump follows."""
+    """Mark samples that repeat the one before, away from the limits, in short runs followed by a jump."""
     same = np.append(False, y[1:] == y[:-1]) & (y > np.min(y)) & (y < np.max(y))
     for begin, end in find_stretches(same):
         if end - begin > STANDING or abs(y[min(end, len(y) - 1)] - y[begin]) < STANDING * step:
@@ -161,7 +162,7 @@ class Clipping:
 
     @property
     def limits(self) -> list[float]:
-        """Limits that there are."""
+        """Finite limits."""
         return [v for v in (self.low, self.high) if np.isfinite(v)]
 
     def __str__(self) -> str:
@@ -170,7 +171,7 @@ class Clipping:
 
 
 def unclip(now: Checked) -> Checked:
-    """Clip the simulator's outputs where the recorder clipped the machine's; the rest of these outputs still counts."""
+    """Clip the simulator's outputs like the recorded ones, so that the rest of these outputs still counts."""
     for found in find_clipping(now.bench.recordings, "y"):
         bench, plain = now.bench, now.fitted
         name = bench.simulator.output_names[found.column]
@@ -180,18 +181,20 @@ def unclip(now: Checked) -> Checked:
         held = {k: replace(p, fixed=True) if k.startswith(prefix) else p for k, p in placed.parameters.items()}
         other = replace(bench, simulator=placed.with_parameters(held))
         after = refit(other, [{}, plain.values], states=plain.begin)
-        if after is None or after.cost > LOST or gain(plain.cost, after.cost, after.residual, 0) < ROOM:
+        if after is None or after.cost > USELESS_FIT or gain(plain.cost, after.cost, after.residual, 0) < LEAST_GAIN:
             continue
-        sentence = f"{name} is {found}; with the simulator's output clipped alike {fall(plain.cost, after.cost)}."
+        sentence = (
+            f"{name} is {found}; with the simulator's output clipped alike {describe_fall(plain.cost, after.cost)}."
+        )
         gate = Gate(name, "clipping", found.limits, sentence, fault=True, left=after.cost / plain.cost)
         now = now.then(other, after, gate)
     return now
 
 
 def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | None:
-    """Find the clipped input beyond whose limits most of the mismatch lies, if no law leaves less (`remains`) of it.
+    """Find a clipped input that explains most of the mismatch, if no law leaves less (`remains`) of it.
 
-    The input to the machine there is not in the recording; what goes on as smoothly stands for it (`_beyond_limit`).
+    The true input beyond the limit is not recorded; a smooth continuation replaces it (`_beyond_limit`).
     """
     for found in find_clipping(bench.recordings, "u"):
         name = bench.simulator.inputs[found.column]
@@ -206,7 +209,7 @@ def clipped_input(bench: Workbench, without: Fitted, remains: float) -> Gate | N
 
 
 def _explained_beyond(bench: Workbench, without: Fitted, found: Clipping) -> float:
-    """Compute the share of the error that an input beyond its limits explains, on blocks that it was not fitted to."""
+    """Compute the held-out share of the error that an input's continuation beyond its limits explains."""
     first = FirstOrder.of(bench, without)
     signs = [(v, 1.0 if v == found.high else -1.0) for v in found.limits]
     beyond = [
@@ -214,15 +217,16 @@ def _explained_beyond(bench: Workbench, without: Fitted, found: Clipping) -> flo
     ]
     left = first.left(first.error)
     columns = first.left(first.response([f"actuator:{bench.simulator.inputs[found.column]}"], beyond))
-    if np.any(np.linalg.lstsq(columns, left, rcond=1e-8)[0] > 0):  # it would have been within the limit
+    # a positive coefficient would put the input inside its limit
+    if np.any(np.linalg.lstsq(columns, left, rcond=1e-8)[0] > 0):
         return 0.0
     return held_out(columns, left, folds(len(left), len(first.runs)))
 
 
 def _beyond_limit(u: np.ndarray, limit: float) -> np.ndarray:
-    """Estimate how far a signal was beyond a limit: the cubic that leaves and comes back with its slopes around it."""
+    """Estimate the part of a signal beyond a limit: the cubic with the slopes of the signal before and after."""
     out, rise = np.zeros(len(u)), np.abs(np.diff(u, prepend=u[0], append=u[-1]))
-    for begin, end in find_stretches(u == limit):  # the step to the limit is cut short, the one before it may be
+    for begin, end in find_stretches(u == limit):  # the step to the limit is cut short, and perhaps the step before it
         leaves, back = np.max(rise[max(begin - 1, 0) : begin + 1]), np.max(rise[end : end + 2])
         t = (np.arange(end - begin) + 0.5) / (end - begin)
         out[begin:end] = (end - begin) * t * (1 - t) * (leaves * (1 - t) + back * t)
@@ -256,7 +260,7 @@ def _share_at_level(y: np.ndarray) -> float:
 
 
 def open_unsettled(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ...], list[Gate]]:
-    """Leave the initial states of recordings that settle only within the record to be estimated, and note this."""
+    """Estimate the initial states of recordings that settle only within the record, and note this."""
     pairs = ((r, zip(r.outputs, _transient_ratios(r), strict=True)) for r in recordings)
     found = [(float(ratio), name, r) for r, ratios in pairs for name, ratio in ratios]
     ratio, name, r = max(found, key=lambda f: f[0])
@@ -270,7 +274,7 @@ def open_unsettled(recordings: Sequence[Recording]) -> tuple[tuple[Recording, ..
 
 
 def _transient_ratios(r: Recording) -> np.ndarray:
-    """Divide the first two periods' difference by the least of neighbours, by output; ones where there are none."""
+    """Divide the first two periods' difference by the smallest of neighbours, by output; ones if it is unknown."""
     count = (len(r) - r.skip) // r.period if r.period and r.begins == "periodic" else 0
     if count < 3 or not r.period:
         return np.ones(r.n_y)
@@ -280,7 +284,7 @@ def _transient_ratios(r: Recording) -> np.ndarray:
 
 
 def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
-    """Note each output in whose residual, in every recording, the same tone stands."""
+    """Note each output whose residual holds the same tone in every recording."""
     found = []
     for i, name in enumerate(bench.simulator.output_names):
         pairs = zip(fitted.residual, bench.recordings, strict=True)
@@ -301,7 +305,7 @@ def tones(bench: Workbench, fitted: Fitted) -> list[Gate]:
 
 
 def find_tone(e: np.ndarray, r: Recording) -> tuple[float, float] | None:
-    """Find frequency, Hz, and amplitude of the tone in the residual of one output; None where there is none."""
+    """Find frequency, Hz, and amplitude of the tone in the residual of one output; None if there is none."""
     n, e = len(e), e - np.mean(e)
     power = _power_lines(e)
     k = FINE + int(np.argmax(power[FINE:-OWN]))
@@ -327,7 +331,7 @@ def _lines_around(power: np.ndarray, k: int) -> float:
 
 
 def _fit_wave(e: np.ndarray, f: float, part: slice) -> complex:
-    """Fit amplitude and phase of the frequency f, a share of the sampling rate, in a part of e, by least squares."""
+    """Fit amplitude and phase of the frequency f, a share of the sampling rate, in a part of e."""
     angle = 2 * np.pi * f * np.arange(len(e))[part]
     a, b, _ = np.linalg.lstsq(np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))]), e[part])[0]
     return complex(a, -b)
@@ -343,7 +347,7 @@ def _refine_frequency(e: np.ndarray, k: int) -> float:
 
 
 def _comes_from_input(u: np.ndarray, f: float, r: Recording) -> bool:
-    """Tell whether an input holds the frequency, or its few lines or its period make it in something nonlinear."""
+    """Tell whether an input holds the frequency, or can make it by harmonics or mixtures of its few lines."""
     from scipy.signal import find_peaks
 
     n, power = len(u), _power_lines(u)
@@ -361,11 +365,12 @@ def _comes_from_input(u: np.ndarray, f: float, r: Recording) -> bool:
         return False
     orders = itertools.product(range(-order, order + 1), repeat=len(lines))
     made = np.array([np.dot(c, lines) for c in orders if sum(map(abs, c)) <= order])
-    return bool(np.any(np.abs(np.abs(made - np.round(made)) - f) * n < 2))  # above half the sampling rate they fold
+    # orders above half the sampling rate fold back
+    return bool(np.any(np.abs(np.abs(made - np.round(made)) - f) * n < 2))
 
 
 def ringing(bench: Workbench, fitted: Fitted) -> float | None:
-    """Find the frequency, Hz, of a lightly damped mode that stands out of a fit's residual, or None."""
+    """Find the frequency, Hz, of a lightly damped mode that is visible in a fit's residual, or None."""
     a = linearised(bench, fitted)[1][0].mean[0]
     with np.errstate(divide="ignore"):
         poles = np.log(np.linalg.eigvals(a).astype(complex)) * fitted.model.substeps / bench.dt
@@ -375,7 +380,7 @@ def ringing(bench: Workbench, fitted: Fitted) -> float | None:
 
 
 def _stands_out(e: np.ndarray, f: float) -> bool:
-    """Tell whether the spectrum of e at frequency f, a share of the sampling rate, is far above that around it."""
+    """Tell whether the spectrum of e at frequency f, a share of the sampling rate, is far above its surroundings."""
     from scipy.signal import welch
 
     length = int(np.ceil(FINE / f))

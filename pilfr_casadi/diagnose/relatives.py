@@ -1,13 +1,13 @@
-"""Further hypotheses that what came out best asks for, and that the screen did not let through.
+"""Further hypotheses that are related to the best ones, and that the screen did not select.
 
-Each is a pair of port and law with start values of its own:
+Each is a pair of port and law with its own start values:
 
 - a special case of the best law, and a law that the best one refines;
 - another form of a law that came near;
 - a law with one more term than one that came near, from its values;
-- a resonance whose frequency is known: as a mass carried along at another port, or in place of a delay or a lag;
-- a law of a signal that takes time, at the other end of a simulator that is nearly linear;
-- a simple law whose force is most like the one that a flexible law makes along its port's own signal.
+- a resonance of known frequency: as a mass attached at another port, or in place of a delay or a lag;
+- a law of a signal with its own time scale, at the other end of a nearly linear simulator;
+- a simple law whose force is most like that of a flexible law along its port's own signal.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from .screen import Scored, start_values
 from .trials import Trial
 from .workbench import Fitted, Workbench
 
-AHEAD = 1.5  # times the best error beyond which a relative is worth another start
-BEHIND = 3.0  # times the best error of a delay or a lag that may stand for a resonance
-DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in its place
-LIKEST = 3  # simple laws whose force is like that of a flexible one
-SEEN = 4000  # samples that forces are compared on, about
-HUGE = 1e60  # signals that a simulation which diverges comes to
-# a law -> laws that are special cases of it
+NEAR = 1.5  # ratio to the best error beyond which a related law gets another start
+BEHIND = 3.0  # largest ratio to the best error of a delay or a lag that may represent a resonance
+DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in place of a delay or a lag
+MATCHES = 3  # simple laws, with a force like that of a flexible law, that are tried
+SEEN = 4000  # approximate number of samples on which forces are compared
+HUGE = 1e60  # bound on signals, above which a simulation diverges
+# by law: the laws that are special cases of it
 CONTAINS = {
     "hysteresis": ("backlash", "coulomb_friction", "linear_stiffness"),
     "stribeck_friction": ("coulomb_friction",),
@@ -44,7 +44,7 @@ CONTAINS = {
 
 
 def complements(one: Law, other: Law) -> bool:
-    """Whether two laws of a port are different physics: one opposes motion, the other is a curve of position.
+    """Tell whether two laws of a port are different physics: one opposes motion, the other is a curve of position.
 
     A constant offset may stand beside any other law.
     """
@@ -56,33 +56,41 @@ def complements(one: Law, other: Law) -> bool:
 
 
 def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Pairs of port and law to be fitted as well; trials and what was scored are best first."""
+    """Select further pairs of port and law for a fit; trials and scored entries are best first."""
     if not trials:
         return []
     found = [
         entry
-        for some in (_special, _forms, _carried, _late, _other_end, _refined, _plainer)
+        for some in (
+            _special_cases,
+            _other_forms,
+            _attached_masses,
+            _damped_resonances,
+            _other_end,
+            _extended_laws,
+            _simpler_laws,
+        )
         for entry in some(trials, scored)
     ]
-    return [*found, *_imitated(bench, trials, scored)]
+    return [*found, *_matching_forces(bench, trials, scored)]
 
 
 def _near(trials: Sequence[Trial]) -> set[tuple[str, type[Law]]]:
-    """Pairs that came near."""
-    return {(t.port, type(t.law)) for t in trials if t.error < AHEAD * trials[0].error}
+    """Return the pairs of port and law that came near the best error."""
+    return {(t.port, type(t.law)) for t in trials if t.error < NEAR * trials[0].error}
 
 
-def _special(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Special cases of the best law at its port, which may have been left where a few steps led."""
+def _special_cases(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Select special cases of the best law at its port that did not come near, as from a wrong minimum."""
     best, near = trials[0], _near(trials)
     cases = CONTAINS.get(best.law.id, ())
     return [s for s in scored if s.port == best.port and s.law.id in cases and (s.port, type(s.law)) not in near]
 
 
-def _forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Other forms of the laws that came near, where they were not tried."""
+def _other_forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Select untried forms of the laws that came near."""
     tried = {(t.port, type(t.law)) for t in trials}
-    ids = {(t.port, t.law.id) for t in trials if t.error < AHEAD * trials[0].error}
+    ids = {(t.port, t.law.id) for t in trials if t.error < NEAR * trials[0].error}
     out: dict[tuple[str, type[Law]], Scored] = {}
     for s in scored:
         if (s.port, s.law.id) in ids and (s.port, type(s.law)) not in tried:
@@ -90,17 +98,19 @@ def _forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     return list(out.values())
 
 
-def _carried(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Carried masses at every port where none came near, from the frequency and damping of the best resonance."""
+def _attached_masses(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Select attached masses at every port where none came near, from frequency and damping of the best resonance."""
     best, near = trials[0], _near(trials)
     if not {"W", "D"} <= set(best.law.units) or isinstance(best.law, Attached):
         return []
     found = {k: float(np.ravel(best.own[k])[0]) for k in ("W", "D")}
-    return _started((s for s in scored if isinstance(s.law, Attached) and (s.port, type(s.law)) not in near), [found])
+    return _with_starts(
+        (s for s in scored if isinstance(s.law, Attached) and (s.port, type(s.law)) not in near), [found]
+    )
 
 
-def _late(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Damped resonances where a delay or a lag of T came near: at low frequencies they are 2 D / W late."""
+def _damped_resonances(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Select damped resonances in place of a delay or a lag T that came near: at low frequencies T = 2 D / W."""
     late: dict[str, float] = {}
     for t in trials:
         if isinstance(t.law, Delay | Lag) and t.error < BEHIND * trials[0].error and t.port not in late:
@@ -108,22 +118,22 @@ def _late(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     out = []
     for port, time in late.items():
         starts = [{"W": 2 * damping / time, "D": damping} for damping in DAMPED]
-        out += _started((s for s in scored if isinstance(s.law, Resonance) and s.port == port), starts)
+        out += _with_starts((s for s in scored if isinstance(s.law, Resonance) and s.port == port), starts)
     return out
 
 
 def _other_end(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """The best law of a signal that takes time, at every actuator and sensor where it did not come near."""
+    """Select the best law, if it has its own time scale, at every actuator and sensor where it did not come near."""
     best, near = trials[0], _near(trials)
     if not in_series(best.port) or not (best.law.order or best.law.shifts):
         return []
     times = {k: best.own[k] for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")}
     same = (s for s in scored if type(s.law) is type(best.law) and in_series(s.port))
-    return _started((s for s in same if (s.port, type(s.law)) not in near), [times])
+    return _with_starts((s for s in same if (s.port, type(s.law)) not in near), [times])
 
 
-def _started(entries: Iterator[Scored], starts: Sequence[dict[str, Any]]) -> list[Scored]:
-    """The first entry of each pair, started at some values besides its own."""
+def _with_starts(entries: Iterator[Scored], starts: Sequence[dict[str, Any]]) -> list[Scored]:
+    """Return the first entry of each pair, with starts at some given values added."""
     out: dict[tuple[str, type], Scored] = {}
     for s in entries:
         more = [{**own, **start} for own in s.starts for start in starts]
@@ -131,12 +141,12 @@ def _started(entries: Iterator[Scored], starts: Sequence[dict[str, Any]]) -> lis
     return list(out.values())
 
 
-def _refined(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Laws that came near with one more term, where that came out worse or was not tried: from their values."""
+def _extended_laws(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Select laws with one more term than one that came near, if worse or untried: from its values."""
     least = {(t.port, type(t.law)): t.error for t in reversed(trials)}
     out: dict[tuple[str, type], Scored] = {}
     for t in trials:
-        if t.error > AHEAD * trials[0].error:
+        if t.error > NEAR * trials[0].error:
             continue
         for s in scored:
             key = s.port, type(s.law)
@@ -147,13 +157,13 @@ def _refined(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     return list(out.values())
 
 
-def _plainer(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """The law that one which came near refines, where that was not tried or came out far worse: from its values."""
+def _simpler_laws(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Select the law that one which came near refines, if untried or far worse: from its values."""
     near, out = _near(trials), dict[tuple[str, type], Scored]()
     for t in trials:
         plain: Any = type(t.law).__base__
         key = t.port, plain
-        if key in near or t.error > AHEAD * trials[0].error or not getattr(plain, "units", {}):
+        if key in near or t.error > NEAR * trials[0].error or not getattr(plain, "units", {}):
             continue
         if set(plain.units) <= set(t.law.units) and key not in out:
             own = {k: t.own[k] for k in plain.units}
@@ -164,8 +174,8 @@ def _plainer(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     return list(out.values())
 
 
-def _imitated(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
-    """Simple laws at the best one's port whose force is most like its, started there; none where it is simple."""
+def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
+    """Select simple laws at the best law's port with the most similar force; none if the best law is simple."""
     best, near = trials[0], _near(trials)
     if best.law.id not in FLEXIBLE:
         return []
@@ -173,21 +183,22 @@ def _imitated(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored
     for s in scored:
         if s.port == best.port and s.law.id not in FLEXIBLE and (s.port, type(s.law)) not in near:
             entries.setdefault(type(s.law), s)
-    local = felt(bench, best.fitted, best.port)
-    if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):  # nor nan, as of a root below zero
+    local = port_signals(bench, best.fitted, best.port)
+    # also excludes nan, for example from the root of a negative number
+    if not entries or not np.all(np.abs([local.z, local.dz]) < HUGE):
         return []
     values, law = best.own, best.law
     shape = {k: v for k, v in values.items() if k not in law.strength}
     strengths = np.concatenate([np.ravel(values[k]) for k in law.strength]) if law.strength else np.ones(1)
     force = unit_forces(law.at(values), local, [shape])[:, 0] @ strengths
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [(*_likest(s.law, local, force), s) for s in entries.values()]
-    ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:LIKEST]
+        found = [(*_match_force(s.law, local, force), s) for s in entries.values()]
+    ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:MATCHES]
     return [replace(s, starts=(start, *s.starts)) for _, start, s in ranked]
 
 
-def felt(bench: Workbench, fitted: Fitted, port: str) -> Local:
-    """What a port feels along the fitted runs of all recordings."""
+def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
+    """Compute the local signals of a port along the fitted runs of all recordings."""
     simulator, model = fitted.simulator, fitted.model
     index = [p.name for p in simulator.all_ports()].index(port)
     own, parts = signals(simulator), []
@@ -204,8 +215,8 @@ def felt(bench: Workbench, fitted: Fitted, port: str) -> Local:
     return Local(z, dz, bench.dt, lengths, inputs=inputs, from_zero=rest)
 
 
-def _likest(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:
-    """Share of a force that a law leaves, beside what gains of the signal and its rate follow, and its start values."""
+def _match_force(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:
+    """Compute the share of a force that a law leaves, beside gains of the signal and its rate, and its start values."""
     shapes = list(law.shapes(local))
     every = max(len(force) // SEEN, 1)
     base = np.column_stack([np.ones_like(local.z), local.z, local.dz])[::every]
@@ -218,7 +229,7 @@ def _likest(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str,
         if not np.all(np.isfinite(columns)):
             continue
         found = np.linalg.lstsq(columns, target, rcond=1e-9)[0]
-        if not law.strength and found[0] <= 0:  # the simulator's gain may scale it, not turn it round
+        if not law.strength and found[0] <= 0:  # the simulator's gain may scale the force, but not change its sign
             continue
         left = float(np.sum((target - columns @ found) ** 2)) / max(total, 1e-300)
         if left < best:

@@ -1,11 +1,11 @@
-"""What is left of an error once the simulator's own parameters and initial states have followed it.
+"""The error that remains after the simulator's own parameters and initial states are projected off.
 
-With base the orthonormal directions in which these can change the stacked outputs, the error e leaves
+With base the orthonormal directions in which these can change the stacked outputs, the remainders are
 
-    e' = e - base baseᵀ e,    φ' = φ - base baseᵀ φ
+    e' = e - base baseᵀ e,    φ' = φ - base baseᵀ φ,
 
 where φ holds the outputs' changes by a small dose of each law at a port, a column for each of its shapes and strengths.
-Each port is looked at by itself: its columns are the largest arrays of a diagnosis.
+Each port is processed separately: its columns are the largest arrays of a diagnosis.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from ..simulators import Port
 from .linearise import Probe, Run, locals_of, propagate
 from .workbench import Workbench
 
-MOST = 6000  # samples looked at
-HUGE = 1e60  # times an output's deviation
-BLOCKS = 10  # a recording, odd and even ones in turn
+MOST = 6000  # samples used at most
+HUGE = 1e60  # ratio to an output's deviation above which a response diverges
+BLOCKS = 10  # blocks a recording; every second block is held out in turn
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A port, its local signals over the whole recordings, and each law that may stand there with its shapes."""
+    """A port, its local signals over the whole recordings, and each law allowed there with its shapes."""
 
     index: int
     port: Port
@@ -39,7 +39,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Dose:
-    """What a law of one shape changes: a column for each strength (R, n), and the forces' sizes (n,)."""
+    """Response to a law of one shape: a column for each strength (R, n), and the forces' sizes (n,)."""
 
     shape: dict[str, Any]
     phi: np.ndarray
@@ -48,12 +48,12 @@ class Dose:
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """The error along runs, and what the simulator's own parameters leave of it.
+    """The error along runs, and its part that the simulator's own parameters cannot imitate.
 
     Attributes
     ----------
     runs : list of Run
-        The stretches that are looked at.
+        The stretches that are used.
     base : array, shape (R, n)
         Orthonormal directions that parameters and initial states can follow.
     left : array, shape (R,)
@@ -73,7 +73,7 @@ class Remainder:
 
     @classmethod
     def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
-        """Along some runs, for the laws that the data can speak to; only `at` one port where it is named."""
+        """Project the error along some runs, for the laws that the data can determine; with `at`, for one port only."""
         signals = ("a", "b", "c", "d", "error", "z", "dz", "u")
         short = [
             replace(r, **{k: getattr(r, k)[w] for k in signals}, from_zero=r.from_zero and w.start == 0)
@@ -86,15 +86,15 @@ class Remainder:
         return cls(bench, short, base, left, tuple(tasks), folds(len(left), len(runs)))
 
     def columns(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
-        """What the forces of a port's laws, each of unit size, change beside the base, and what their sizes were.
+        """Compute the responses beyond the base to a port's laws, each with a force of unit size, and their sizes.
 
-        Shapes (R, n) and (n,), the shapes and strengths of one law after those of the other.
+        Shapes (R, n) and (n,); shapes and strengths of one law follow those of the other.
         """
         forces = [unit_forces(law, task.part, s).reshape(len(task.part.z), -1) for law, s in task.pairs]
         return self.response(task.index, np.hstack(forces))
 
     def response(self, port: int, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What forces (M, n) at a port, each made of unit size, change beside the base, and what their sizes were."""
+        """Compute the responses beyond the base to forces (M, n) at a port, scaled to unit size, and their sizes."""
         forces[~(np.abs(forces) < 1e100)] = 0.0
         size = lengths(forces) / np.sqrt(len(forces))
         size = np.where(size > 0, size, 1.0)
@@ -107,11 +107,11 @@ class Remainder:
         phi = np.concatenate(blocks) if len(blocks) > 1 else blocks[0]
         size_before = lengths(phi)
         phi -= self.base @ (self.base.T @ phi)
-        phi[:, lengths(phi) < 1e-6 * size_before] = 0.0  # what the simulator's own parameters follow entirely
+        phi[:, lengths(phi) < 1e-6 * size_before] = 0.0  # the simulator's own parameters imitate these entirely
         return phi, size
 
     def doses(self, task: Task) -> Iterator[tuple[Law, list[Dose]]]:
-        """Each law of a port with its shapes, and what a dose of each shape changes; see `columns`."""
+        """Generate each law of a port with a dose of each of its shapes; see `columns`."""
         phi, size = self.columns(task)
         at = 0
         for law, shapes in task.pairs:
@@ -122,7 +122,7 @@ class Remainder:
 
 
 def moved(bench: Workbench, r: Run, forces: Sequence[tuple[int, np.ndarray]] = (), skip: int = 0) -> np.ndarray:
-    """Changes of the stacked outputs in units of their deviation, by free parameters, initial state, and forces.
+    """Compute the stacked outputs' changes, over their deviation, by free parameters, initial state, and forces.
 
     The first `skip` samples are left out; see `propagate` for the forces.
     """
@@ -130,12 +130,12 @@ def moved(bench: Workbench, r: Run, forces: Sequence[tuple[int, np.ndarray]] = (
         y = propagate(r, forces)[skip:]
         y /= bench.scale[:, None]
     y = y.reshape(-1, y.shape[2])
-    y[:, ~((y.max(axis=0) < HUGE) & (y.min(axis=0) > -HUGE))] = 0.0  # what grows without end says nothing
+    y[:, ~((y.max(axis=0) < HUGE) & (y.min(axis=0) > -HUGE))] = 0.0  # a diverging response carries no information
     return y
 
 
 def followed(bench: Workbench, runs: Sequence[Run], skips: Sequence[int] = ()) -> np.ndarray:
-    """Orthonormal directions of the stacked outputs that parameters and initial states can follow, (R, n)."""
+    """Compute orthonormal directions of the stacked outputs that parameters and initial states can follow, (R, n)."""
     return orthonormal(np.hstack(own_changes(bench, runs, skips)))
 
 
@@ -153,7 +153,7 @@ def own_changes(
 
 
 def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
-    """The stretch of each recording that is looked at: where the error is largest."""
+    """Choose the stretch of each recording that is used: the one with the largest error."""
     share = max(MOST // len(runs) // len(bench.scale), 200)
     out = []
     for r, recording in zip(runs, bench.recordings, strict=True):
@@ -185,19 +185,19 @@ def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list
 
 
 def usable(law: Law, local: Local) -> bool:
-    """Whether the data can speak to a law at a port."""
+    """Tell whether the data can determine a law at a port."""
     if "dz" in law.reads() and not np.any(local.dz):
         return False
     return not law.why_not(local)
 
 
 def folds(length: int, recordings: int) -> np.ndarray:
-    """Every second block of the stacked record, as a mask."""
+    """Mark every second block of the stacked record."""
     return (np.arange(length) * BLOCKS * recordings // max(length, 1)) % 2 == 1
 
 
 def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float] = (1e-6,)) -> float:
-    """Share of `left` that the columns explain on blocks they were not fitted to."""
+    """Compute the share of `left` that the columns explain on blocks that they were not fitted to."""
     size = lengths(phi)
     if not np.any(size > 0):
         return 0.0
@@ -214,7 +214,7 @@ def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequenc
 
 
 def block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
-    """Parameters shared by all recordings, an initial state for each."""
+    """Arrange columns by parameters shared by all recordings, and by an initial state for each."""
     n_x = blocks[0].shape[1] - n_free
     out = np.zeros((sum(map(len, blocks)), n_free + n_x * len(blocks)))
     at = 0
@@ -227,17 +227,17 @@ def block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
 
 
 def lengths(columns: np.ndarray) -> np.ndarray:
-    """Length of each column."""
+    """Compute the length of each column."""
     return np.asarray(np.sqrt(np.einsum("ij,ij->j", columns, columns)))
 
 
 def project_off(columns: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Subtract what orthonormal directions can follow of one column (R,) or several (R, n)."""
+    """Subtract the projection on orthonormal directions from one column (R,) or several (R, n)."""
     return np.asarray(columns - base @ (base.T @ columns))
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:
-    """Orthonormal basis of the columns' span."""
+    """Compute an orthonormal basis of the columns' span."""
     size = lengths(columns)
     kept = columns[:, size > 0] / size[size > 0]
     u, s, _ = np.linalg.svd(kept, full_matrices=False)

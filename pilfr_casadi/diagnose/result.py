@@ -1,4 +1,4 @@
-"""The answer of a diagnosis: immutable, printable, and written as the contract's diagnosis.json."""
+"""The result of a diagnosis: immutable, printable, and written as diagnosis.json."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from .proof import run_free, starts_of
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
-MOST = 8  # parameters of the simulator that are printed
-WORSE = 1.05  # ratio of the test errors after and before from which a correction makes the test recordings worse
+MOST = 8  # parameters and blind spots that are printed at most
+WORSE = 1.05  # ratio of the test errors after and before above which a correction makes the test recordings worse
 SURE = 0.5  # confidence above which an effect is stated as found; below it is a guess
-CONSTANT = 0.9  # error from which a refitted simulator is hardly better than a constant
-FAR = 3.0  # ratio of the test error to the training error from which the answer warns
+CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
+FAR = 3.0  # ratio of the test error to the training error above which the result warns
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits made until then."
 
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """A piece of physics that was left out."""
+    """A piece of physics that the simulator leaves out."""
 
     port: str
     law: str
@@ -53,7 +53,7 @@ class Effect:
     placebo: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """As in diagnosis.json."""
+        """Return the content for diagnosis.json."""
         out: dict[str, Any] = {
             "port": self.port,
             "law": self.law,
@@ -77,10 +77,10 @@ class Comparison:
     Attributes
     ----------
     recording : Recording
-        With the corrections of the diagnosis (sign, unit, shift).
+        The recording with the corrections of the diagnosis (sign, unit, shift).
     before, after : array, shape (M, n_y), or None
-        Outputs of the refitted and of the corrected simulator. None where the simulation diverges; `after` is None
-        too where nothing was put into the simulator.
+        Outputs of the refitted and of the corrected simulator. None if the simulation diverges; `after` is also None
+        if nothing was added to the simulator.
     """
 
     recording: Recording
@@ -90,14 +90,14 @@ class Comparison:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Where the simulator is wrong, what it lacks, how sure that is, and the proof.
+    """Result of a diagnosis: the verdict, the missing physics, its confidence, the corrected simulator, and the proof.
 
     Attributes
     ----------
     verdict : str
         One of `VERDICTS`.
     corrected : Simulator
-        The simulator with the effects closed in, at the fitted values (without effects: refitted).
+        The simulator with the effects added, at the fitted values (without effects: refitted).
     errors : dict
         `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs.
     floor : dict
@@ -109,10 +109,10 @@ class Diagnosis:
     let_go : str
         Parameter that was fixed or at a bound and is free in the corrected simulator; see `other_explanations`.
     correction : Correction or None
-        What `corrected` consists of beside the refit: laws, a learned element, and their shares. Elements that are not
+        The elements of `corrected` beside the refit: laws, a learned element, and their shares. Elements that are not
         among `effects` predict unseen data better than the refit but have no sure name.
     blind_spots : tuple of BlindSpot
-        Facts that the recordings cannot reveal, the gravest first, as `check` finds them.
+        Facts that the recordings cannot reveal, the gravest first; see `check`.
     """
 
     verdict: str
@@ -147,9 +147,9 @@ class Diagnosis:
 
     @property
     def outcome(self) -> str:
-        """How the correction changes the error on the test recordings: "better", "same", "worse"; "" where unknown.
+        """Effect of the correction on the test error: "better", "same", "worse"; "" if unknown.
 
-        It is unknown without test recordings and where the corrected simulator is the refitted one.
+        It is unknown without test recordings, and if the corrected simulator is the refitted one.
         """
         errors = self.errors.get("test")
         if not errors or not self._changed:
@@ -161,7 +161,7 @@ class Diagnosis:
 
     @property
     def summary(self) -> str:
-        """The verdict's sentence, and a second one where the correction does not help on the test recordings."""
+        """The verdict's sentence, and a second one if the correction does not help on the test recordings."""
         errors = self.errors.get("test")
         if not errors or self.outcome not in ("worse", "same"):
             return self.sentence
@@ -174,7 +174,7 @@ class Diagnosis:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of diagnosis.json; numbers that are not finite are None."""
+        """Return the content of diagnosis.json; numbers that are not finite are None."""
         raw: dict[str, Any] = {
             "schema": 1,
             "verdict": self.verdict,
@@ -199,13 +199,13 @@ class Diagnosis:
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulate the corrected simulator along the inputs of a recording.
 
-        Recordings are corrected as the training recordings were (sign, unit, shift: see `gates`). An unknown initial
+        Recordings are corrected as the training recordings were (sign, unit, shift; see `gates`). An unknown initial
         state is estimated from the first samples.
 
         Parameters
         ----------
         recording : Recording
-            Has the simulator's inputs and outputs by name, in any order.
+            Must have the simulator's inputs and outputs by name, in any order.
 
         Returns
         -------
@@ -222,8 +222,8 @@ class Diagnosis:
     def nrmse(self, recordings: Recording | Sequence[Recording]) -> float:
         """Compute the NRMSE (Eq. 27) of the corrected simulator, averaged over outputs and recordings.
 
-        Samples that an initial state was estimated from are not scored; see `simulate` for everything else. The error
-        is infinite where the simulation diverges.
+        Samples from which an initial state was estimated are not scored; otherwise see `simulate`. The error is
+        infinite if the simulation diverges.
         """
         runs = [self._run(recording) for recording in as_recordings(recordings)]
         return float(np.mean([nrmse(r.y, y, skip=k) if np.all(np.isfinite(y)) else np.inf for r, y, k in runs]))
@@ -263,7 +263,7 @@ class Diagnosis:
 
     @property
     def shares(self) -> dict[str, float]:
-        """Of what the refit leaves above the noise: `named` by laws, followed by a `learned` element, `left`."""
+        """Shares of the refit's error above the noise: `named` by laws, `learned` by an element, and `left`."""
         return dict(self.correction.shares) if self.correction else {}
 
     @property
@@ -273,16 +273,16 @@ class Diagnosis:
 
     @property
     def nameless(self) -> Correction | None:
-        """The correction, where it holds elements and no effect is named."""
+        """The correction, if it has elements and no effect is named."""
         return self.correction if self.correction and self.correction.elements and not self.effects else None
 
     def _run(self, recording: Recording, simulator: Simulator | None = None) -> tuple[Recording, np.ndarray, int]:
-        """The recording as corrected, the outputs of a simulator along it, and the first scored sample."""
+        """Return the recording as corrected, a simulator's outputs along it, and the first scored sample."""
         simulator = simulator or self.corrected
         r, dt = match_channels(simulator, recording), self.train[0].dt
         if abs(r.dt / dt - 1) > SAME_STEP:
             raise InputError(f"The recording's step is {r.dt:g} s, the training's {dt:g} s; resample it.")
-        if not any(recording is known for known in self.train):  # those are corrected already
+        if not any(recording is known for known in self.train):  # training recordings are corrected already
             for gate in self.gates:
                 r = gate.change(r) if gate.change is not None else r
         fitted = self.evidence.get("after" if simulator is self.corrected else "without")
@@ -292,7 +292,7 @@ class Diagnosis:
         return r, y, skip
 
     def export(self, **options: Any) -> Any:
-        """Make the corrected simulator a step over one sample, with the hold and sub-steps of the fit.
+        """Export the corrected simulator as a step over one sample, with the hold and sub-steps of the fit.
 
         `options` are those of `pilfr.exported`; the result has `step`, `c_code` and the other exports.
         """
@@ -301,7 +301,7 @@ class Diagnosis:
         return exported(self.corrected, dt=self.train[0].dt, hold=self.hold, substeps=self.substeps, **options)
 
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
-        """Make the corrected simulator a `casadi.Function (x, u) -> (x_next, y)`; see `pilfr.to_casadi`."""
+        """Export the corrected simulator as a `casadi.Function (x, u) -> (x_next, y)`; see `pilfr.to_casadi`."""
         return self.export(name=name, smooth=smooth).step
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -348,9 +348,9 @@ class Diagnosis:
         return out
 
     def _at_bounds(self) -> list[str]:
-        """Free entries of parameters at a bound, each with its value.
+        """List the free entries of parameters at a bound, each with its value.
 
-        Zero is left out beside named effects: there an effect has replaced the parameter (friction a damper).
+        Zeros are left out if effects are named: there an effect has replaced the parameter (friction a damper).
         """
         own, out = self.corrected.parameters, []
         for name in self.parameters:
@@ -377,7 +377,7 @@ class Diagnosis:
     __repr__ = __str__
 
     def _error_lines(self) -> list[str]:
-        """The errors as a table, and the noise floor below it."""
+        """Format the errors as a table, with the noise floor below it."""
         lines = [f"{'NRMSE':<12}" + "".join(f"{name:>11}" for name in STEPS.values())]
         for kind in ("train", "test"):
             errors = self.errors[kind]
@@ -393,7 +393,7 @@ class Diagnosis:
         return ["blind spots of these recordings:", *told, *more] if told else []
 
     def _own(self) -> list[str]:
-        """The simulator's own estimated values, those that moved most first."""
+        """List the simulator's own estimated values, largest changes first."""
         own = self.corrected.parameters
         free = {k: p for k, p in self.parameters.items() if not own[k].fixed.all() and own[k].value.ndim == 0}
         moved = sorted(free, key=lambda k: -abs(_change(free[k])))
@@ -408,7 +408,7 @@ class Diagnosis:
 
 
 def _effect_lines(e: Effect) -> list[str]:
-    """An effect in words, with its equation, the numbers in it, and what cannot be told apart from it."""
+    """Describe an effect with its equation, its numbers, and the laws indistinguishable from it."""
     form = f" ({display_name(e.form)})" if e.form else ""
     symbols = (
         "where u or z is the signal, and w is added to it"
@@ -423,7 +423,7 @@ def _effect_lines(e: Effect) -> list[str]:
     for name, p in e.parameters.items():
         std = "" if p["std"] is None else f" ± {p['std']:.2g}"
         lines.append(f"  {name} = {p['value']:.5g}{std} {p['unit']}".rstrip())
-    defined = re.search(r",  (\w+) = (\w+) (\w+)$", e.equation)  # as the F_c = k_t r of friction with presliding
+    defined = re.search(r",  (\w+) = (\w+) (\w+)$", e.equation)  # such as F_c = k_t r for friction with presliding
     if defined and all(name in e.parameters for name in defined.groups()[1:]):
         name, (a, b) = defined[1], (e.parameters[key] for key in defined.groups()[1:])
         unit = a["unit"].removesuffix(f"/{b['unit']}") if a["unit"].endswith(f"/{b['unit']}") else ""
@@ -435,11 +435,11 @@ def _effect_lines(e: Effect) -> list[str]:
 
 
 def _percent(value: float) -> str:
-    """A relative error as text."""
+    """Format a relative error."""
     return f"{100 * value:.3g} %" if np.isfinite(value) else "infinite (the simulation diverges)"
 
 
 def _change(row: Mapping[str, Any]) -> float:
-    """Share by which a parameter has moved."""
+    """Compute the relative change of a parameter."""
     nominal = float(row["nominal"])
     return (float(row["refit_with"]) - nominal) / (abs(nominal) or 1e-300)

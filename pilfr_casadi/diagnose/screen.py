@@ -1,13 +1,13 @@
-"""A score test of every port and law: how much of the residual a small dose of a law would take away.
+"""A score test of every port and law: the share of the residual that a small dose of a law would remove.
 
 The outputs' sensitivity to a law at zero strength is projected off the simulator's own parameters and the initial
-states (Rao 1948); shape parameters lie on a grid. It is done twice: along the refitted simulation, and along an
+states (Rao 1948); shape parameters lie on a grid. The test is done twice: along the refitted simulation, and along an
 observer with process noise at every port, on its innovations.
 
-The same is asked of any force at a port: a flexible surface `w(z, ż)` of Chebyshev terms up to the fourth degree, with
-stops, plays and relaxations beside it. Its response is linear in its coefficients, which are fitted to every second
-block of the record by ridge regression and judged on the others: what is noise is not explained there. This tells noise
-from missing structure without knowing the floor, and a right name from one that only comes near.
+The same test is done for any force at a port: a flexible surface `w(z, ż)` of Chebyshev terms up to the fourth degree,
+with stops, plays and relaxations beside it. Its response is linear in its coefficients, which are fitted to every
+second block of the record by ridge regression and judged on the others, so that noise is not explained. This tells
+noise from missing structure without knowing the floor, and a right name from one that only comes near.
 """
 
 from __future__ import annotations
@@ -25,18 +25,20 @@ from .linearise import Run, linearised, observer_gain, run
 from .remainder import HUGE, Remainder, Task, held_out
 from .workbench import Fitted, Workbench
 
-KEPT = 3  # start values of each pair
+KEPT = 3  # start values kept for each pair of port and law
 
 DEGREE = 4  # of the flexible surface
+# degrees in z and dz/dt of the surface's terms
 TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
-MOST, LEAST = 600_000, 2500  # samples times states squared looked at, and samples at least
+MOST, LEAST = 600_000, 2500  # largest product of samples and squared number of states; least number of samples
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A port and law with the share of the residual that a small dose takes away, and start values, best first.
+    """A port and law with its score and start values, best first.
 
-    The share is judged on blocks it was not fitted to; `sense` is `linearise.Run.sense`.
+    The score is the share of the residual that a small dose removes on blocks that it was not fitted to; `sense` is
+    `linearise.Run.sense`.
     """
 
     port: str
@@ -51,7 +53,7 @@ class Scored:
 def screen(
     bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, workers: int = 1
 ) -> tuple[list[Scored], np.ndarray | None]:
-    """Every port and law with its score along the simulation and along the observer, best first.
+    """Score every port and law along the simulation and along the observer, best first.
 
     Also returns the observer's gain.
 
@@ -60,12 +62,12 @@ def screen(
     noise : array, shape (n_y,)
         Standard deviation of the outputs' noise.
     workers : int
-        Ports looked at side by side.
+        Ports processed in parallel.
     """
     probe, runs = linearised(bench, fitted)
     gain = observer_gain(probe, runs, noise)
     led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
-    if not all(_holds(r, bench.scale) for r in led):
+    if not all(_stays_bounded(r, bench.scale) for r in led):
         led = []
     ways = [("simulation", Remainder.of(bench, probe, runs, laws))]
     if led:
@@ -76,14 +78,14 @@ def screen(
     return sorted(found, key=lambda s: -s.share), gain if seen else None
 
 
-def _holds(r: Run, scale: np.ndarray) -> bool:
-    """Whether an observer has kept a simulator in its range, and has not let it grow without end."""
+def _stays_bounded(r: Run, scale: np.ndarray) -> bool:
+    """Tell whether an observer has kept the simulator in its range and bounded."""
     finite = all(np.all(np.isfinite(values)) for values in (r.a, r.b, r.z, r.dz))
     return finite and bool(np.all(np.abs(r.error) < HUGE * scale))
 
 
 def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
-    """Each law of one port."""
+    """Score each law of one port."""
     total, out = max(float(rest.left @ rest.left), 1e-300), []
     for law, doses in rest.doses(task):
         sense, scores = rest.runs[0].sense(law, task.index), []
@@ -92,14 +94,14 @@ def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
             scores.append((drop / total, dose, -strength / dose.size))
         scores.sort(key=lambda s: -s[0])
         starts = tuple(start_values(law, dose.shape, c) for _, dose, c in scores[:KEPT])
-        # a law that would have to drive the motion explains nothing
+        # a law with the sign of a drive explains nothing
         share = min(held_out(scores[0][1].phi, rest.left, rest.odd), scores[0][0])
         out.append(Scored(task.port.name, law, share, starts, task.local, sense, source))
     return out
 
 
 def start_values(law: Law, shape: dict[str, Any], strength: np.ndarray) -> dict[str, Any]:
-    """Start values of a law: its shape, and its strengths one entry a column."""
+    """Compute a law's start values: its shape, and its strengths from one entry a column."""
     values, at, p = dict(shape), 0, law.at(shape).parameters()
     for name in law.strength:
         size = p[name].size
@@ -109,13 +111,13 @@ def start_values(law: Law, shape: dict[str, Any], strength: np.ndarray) -> dict[
 
 
 def _signed(law: Law) -> np.ndarray:
-    """Which strengths (one entry a column) need not oppose motion."""
+    """Mark the strengths (one entry a column) that may have either sign."""
     p = law.parameters()
     return np.concatenate([np.full(p[name].size, name in law.signed) for name in law.strength])
 
 
 def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sense: int) -> tuple[float, np.ndarray]:
-    """Drop of the sum of squares by the columns of one shape, and their coefficients."""
+    """Compute the decrease of the sum of squares by the columns of one shape, and their coefficients."""
     gram, right = phi.T @ phi, phi.T @ left
     size = np.sqrt(np.diag(gram))
     if not np.any(size > 0):
@@ -128,7 +130,7 @@ def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sense: int) -> tuple[floa
 
         root = np.linalg.cholesky(ridge).T
         target = np.linalg.solve(root.T, -sense * right / size)
-        both = _signed(law)  # these may have either sign: their negatives are columns as well
+        both = _signed(law)  # strengths of either sign: their negatives are columns as well
         found = nnls(np.hstack([root, -root[:, both]]), target)[0]
         coefficients = found[:n]
         coefficients[both] -= found[n:]
@@ -142,7 +144,7 @@ def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sense: int) -> tuple[floa
 
 
 def chebyshev(x: Any, degree: int = DEGREE) -> list[Any]:
-    """Chebyshev polynomials of the first kind, from degree 0 on."""
+    """Compute the Chebyshev polynomials of the first kind, from degree 0 on."""
     out = [1.0, x]
     for _ in range(degree - 1):
         out.append(2 * x * out[-1] - out[-2])
@@ -159,17 +161,17 @@ class Surface(Law):
     places: ClassVar[tuple[str, ...]] = ("parallel", "series")
 
     def force(self, z: Any, dz: Any, p: Any) -> Any:
-        """Chebyshev terms."""
+        """Compute the sum of Chebyshev terms."""
         a, b = chebyshev((z - p.z_m) / p.z_s), chebyshev(dz / p.v_s)
         return sum(p.c[k] * a[i] * b[j] for k, (i, j) in enumerate(TERMS))
 
     def parameters(self) -> dict[str, Parameter]:
-        """Coefficients and scales."""
+        """Return coefficients and scales."""
         scales = {k: Parameter(float(self.values.get(k, 1.0))) for k in ("z_m", "z_s", "v_s")}
         return {"c": Parameter(np.zeros(len(TERMS))), **scales}
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
-        """One scale, that of the data."""
+        """Generate the scales of the data."""
         yield {
             "z_m": (local.low + local.high) / 2,
             "z_s": 1.1 * local.half,
@@ -177,11 +179,12 @@ class Surface(Law):
         }
 
 
+# forces that together follow any force at a port
 FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
 
 
-def explainable(bench: Workbench, fitted: Fitted) -> dict[str, float]:
-    """Compute the share of the residual's power that any force at a port explains on blocks it was not fitted to."""
+def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:
+    """Compute the held-out share of the residual's power that any force at a port explains, by port."""
     most = max(MOST // max(fitted.model.n_state, 1) ** 2, LEAST) // len(bench.recordings)
     if any(len(r) > most for r in bench.recordings):
         bench = bench.on([r.slice(0, max(most, r.skip + LEAST // 10)) for r in bench.recordings])

@@ -1,9 +1,9 @@
 """The search over hypotheses: sets of laws in ports, each fitted once and kept, all compared by one log evidence.
 
-Moves lead from one hypothesis to others: *add* a law, beside those that are there; *exchange* one of several for
-another, the others in place; *add two* at once, where neither helps alone. A move starts from the most promising
-hypothesis. The search ends when a move brings no better one, when the error is down at the noise, or at the time limit.
-All fits are kept in a memo and count in the posterior.
+Moves lead from one hypothesis to others: *add* a law to the present ones; *exchange* one of several laws for another,
+the others fixed in place; *add two* at once, if neither helps alone. A move starts from the most promising hypothesis.
+The search ends if a move brings no better one, if the error is at the noise, or at the time limit. All fits are kept in
+a memo and count in the posterior.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ from ..engine import make_engine
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
 from .cross_validation import HeldOut, held_out_errors
-from .evidence import EXACT, MORE, Sample, information, log_evidence, log_prior, spread
+from .evidence import EFFECT_PRIOR, EXACT, Sample, information, log_evidence, log_prior, spread
 from .floor import Floor, effective_size, white_part
 from .gates import Gate, Offset
 from .linearise import linearised
-from .pairs import fitted_together, promising
+from .pairs import choose_pairs, fit_pair
 from .relatives import complements, relatives
 from .remainder import Remainder
-from .screen import Scored, explainable, screen
+from .screen import Scored, flexible_shares, screen
 from .trials import Key, Trial, Trials
-from .workbench import THOROUGH, Fitted, Workbench, started
+from .workbench import THOROUGH, Fitted, Workbench, start_vector
 
-POLISHED, BEHIND = 5, 1.5  # trials of a step fitted thoroughly at most, and times the best one's error that they have
-REACH = 8.0  # nats of log evidence within which a hypothesis may still win
-NEARLY = 0.05  # share of the excess that a law leaves behind which others are not worth many starts
-ROUNDS = 3  # exchanges in turn
+POLISHED, BEHIND = 5, 1.5  # trials of a step fitted to convergence at most, and their largest ratio to the best error
+REACH = 8.0  # nats of log evidence below the best within which a hypothesis may still win
+NEARLY = 0.05  # share of the excess left by one law below which far worse laws are not refined
+ROUNDS = 3  # rounds of exchanges
 FORMULA = 1e-3  # share of a mismatch that the formula of the right law may leave: 3 % of its force
-FEWEST = 30.0  # samples that recordings are worth at least
-WRONG = 0.2  # share of the error that is no noise, from which models are judged on held-out blocks
-PREDICTED = 6  # hypotheses that are
-LOUDEST = 0.05  # of an output's deviation: slow errors that are larger are no noise of a sensor
-MISHELD = 1.05  # times the error that inputs held wrongly between samples leave
-LED_OUT = 0.8  # share of the mean square that is left at most by a simulator that a law has led out of a dead end
+FEWEST = 30.0  # least effective samples of the recordings
+WRONG = 0.2  # share of model error in the error above which models are judged on held-out blocks
+PREDICTED = 6  # hypotheses judged on held-out blocks at most
+LOUDEST = 0.05  # share of an output's deviation; larger slow errors are not sensor noise
+HOLD_RATIO = 1.05  # least ratio of rms errors for which the other hold is better
+BETTER_MINIMUM = 0.8  # largest share of the mean square left by a refit in a better minimum
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What was tried beside a hypothesis: its parent, the screen's scores, and the trials, best first."""
+    """One move of the search: its parent hypothesis, the screen's scores, and the trials, best first."""
 
     parent: Trial
     scored: tuple[Scored, ...]
@@ -56,28 +56,27 @@ class Step:
 
 @dataclass(eq=False)
 class Search:
-    """The state of a search; `run` fills it.
+    """The state of a search, filled by `run`.
 
     Attributes
     ----------
-    without : Fitted
-        The simulator refitted, with no law.
+        The refitted simulator, with no law.
     memo : dict
-        Every hypothesis that was fitted, its best trial by key.
+        The best trial of every fitted hypothesis, by key.
     steps : list of Step
-        In the order in which they were made.
+        The moves, in their order.
     hold_said : bool
-        Whether somebody said what inputs do between samples.
+        Whether somebody stated the hold of the inputs between samples.
     stand_in_error : float
-        NRMSE by which the simulator misses what it stands for; the floor holds it too.
+        NRMSE between a surrogate and its simulation; the floor contains it.
     count : float
         Samples of the best residual over its correlation time.
     until : float
-        Time (of `time.perf_counter`) at which the search answers from what it has.
+        Time (of `time.perf_counter`) at which the search ends.
     deadline : float
-        Time at which the diagnosis has to be over.
+        Time at which the diagnosis has to end.
     out_of_time : bool
-        Whether it did.
+        Whether the time limit ended the search.
     """
 
     bench: Workbench
@@ -104,12 +103,12 @@ class Search:
 
     @property
     def fits(self) -> Trials:
-        """What fits hypotheses."""
+        """Fits of hypotheses, with the bench, workers and time limit of the search."""
         return Trials(self.bench, self.workers, self.until)
 
     @property
     def samples(self) -> float:
-        """Effective samples, which all hypotheses share."""
+        """Effective samples, shared by all hypotheses."""
         return self.sample.effective(min(t.whole for t in self.memo.values()) + self.tolerance)
 
     @property
@@ -124,25 +123,25 @@ class Search:
 
     @property
     def sample(self) -> Sample:
-        """What the recordings are worth."""
+        """Noise and number of samples of the recordings."""
         return Sample(self.floor2 + self.tolerance, self.count)
 
     @property
     def root(self) -> Trial:
-        """The simulator alone."""
+        """The hypothesis without laws."""
         return self.memo[frozenset()]
 
     @property
     def best(self) -> Trial:
         """The most promising hypothesis, from which the search goes on."""
-        return max(self.memo.values(), key=self.promise)
+        return max(self.memo.values(), key=self.optimistic_evidence)
 
-    def promise(self, trial: Trial) -> float:
-        """Log evidence of a hypothesis if what is still missing were found beside it: samples count as at the noise."""
+    def optimistic_evidence(self, trial: Trial) -> float:
+        """Compute the log evidence of a hypothesis as if the missing rest were found: samples count as at the noise."""
         return self._log_evidence(trial, trial.whole, self.sample.effective(0.0))
 
     def evidence(self, trial: Trial) -> float:
-        """Log evidence of a hypothesis, from its error on blocks that it was not fitted to where that is known."""
+        """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known."""
         known, of_root = self.held_out.get(trial.key), self.held_out.get(self.root.key)
         worse = of_root.mean_square / self.root.whole if of_root else 1.0
         v = known.mean_square if known else trial.whole * (worse if np.isfinite(worse) else 1.0)
@@ -154,13 +153,13 @@ class Search:
         return log_evidence(v, told, log_prior(trial.laws, self.alternatives, trial.doubtful), n)
 
     def predicts(self, trial: Trial) -> HeldOut:
-        """Errors of a hypothesis on what it was not fitted to."""
+        """Compute the held-out errors of a hypothesis, once."""
         if trial.key not in self.held_out:
             self.held_out[trial.key] = self.predict(trial.fitted, trial.laws)
         return self.held_out[trial.key]
 
     def predict(self, fitted: Fitted, laws: Sequence[Placed]) -> HeldOut:
-        """Errors of a fitted simulator with some laws on what it was not fitted to."""
+        """Compute the held-out errors of a fitted simulator with some laws."""
         found = held_out_errors(self.bench, fitted, self.workers)
         if not np.isfinite(found.mean_square):
             return found
@@ -169,10 +168,10 @@ class Search:
         return replace(found, spread=spread(self.bench, fitted, laws, v, own.effective(0.0)))
 
     def _predict(self) -> None:
-        """Let the likeliest hypotheses predict what they are not fitted to.
+        """Compute the held-out errors of the likeliest hypotheses.
 
-        Where one is alone and its error is noise, the fit says the same. Where the model is wrong, it may have learned
-        by heart; and of several that follow the recordings as well, the right one predicts best.
+        If only one is likely and its error is noise, the fit error is enough. A wrong model may overfit; and of several
+        that follow the recordings equally well, the right one predicts best.
         """
         wrong = self.samples < EXACT / WRONG
         if not wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
@@ -188,20 +187,20 @@ class Search:
         self.timed("held-out blocks", began)
 
     def _likeliest(self) -> list[Trial]:
-        """Hypotheses that may be the likeliest."""
+        """List the hypotheses that may be the likeliest."""
         least = max(map(self.evidence, self.memo.values())) - REACH
         return [t for t in self.memo.values() if self.evidence(t) > least]
 
     def flexible(self, trial: Trial) -> dict[str, float]:
-        """Share of a trial's residual that a flexible force explains, by port."""
+        """Compute the share of a trial's residual that a flexible force explains, by port."""
         if trial.key not in self.open:
             began = self.begin("flexible")
-            self.open[trial.key] = explainable(self.bench, trial.fitted)
+            self.open[trial.key] = flexible_shares(self.bench, trial.fitted)
             self.timed("flexible", began)
         return self.open[trial.key]
 
     def _residual(self, trial: Trial) -> list[tuple[np.ndarray, Recording]]:
-        """Residual of each recording, and the recording."""
+        """Return each recording's residual with the recording."""
         return list(zip(trial.fitted.residual, self.bench.recordings, strict=True))
 
     def begin(self, stage: str) -> float:
@@ -215,15 +214,15 @@ class Search:
         Raises
         ------
         KeyboardInterrupt
-            If a fit was interrupted, which returns its best so far and goes no further with that.
+            If a fit was interrupted. Such a fit has returned its best result so far.
         """
         self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - began
         self.say(stage, 1, 1, self.best.error)
-        if self.bench.struck:
+        if self.bench.interrupted_fits:
             raise KeyboardInterrupt
 
     def run(self, effects: float) -> Search:
-        """Look for up to so many effects; an interrupt ends the search with what there is."""
+        """Search for up to `effects` effects; an interrupt ends the search with the present results."""
         self.keep(Trial((), self.without, self.without.cost, self.without.cost, True))
         try:
             self._estimate_noise()
@@ -234,51 +233,58 @@ class Search:
             self.interrupted = True
         return self
 
-    def settled(self, effects: float) -> Search:
-        """Go on where the other hold was no better, unless the search was interrupted."""
+    def resume(self, effects: float) -> Search:
+        """Continue with the present hold because the other is no better, unless the search was interrupted."""
         self.hold_said = True
         return self if self.interrupted else self.run(effects)
 
     def _grow(self, effects: float) -> bool:
-        """Add effects while that pays; False as soon as inputs prove to be held in the other way."""
-        while self.room(parent := self.best) and _count(parent) < effects and self._pays(parent) and self._in_time():
+        """Add effects while that pays; return False as soon as the other hold proves better."""
+        while (
+            self.can_improve(parent := self.best)
+            and _count(parent) < effects
+            and self._pays(parent)
+            and self._in_time()
+        ):
             self.add(parent)
-            if not parent.laws and self._in_time() and self._led_out():
+            if not parent.laws and self._in_time() and self._escape_local_minimum():
                 self.add(self.root)
-            if self.misheld():
+            if self.other_hold_fits_better():
                 return False
             if _count(self.best) > _count(parent) >= 1:
                 self.exchange()
-            if len(self.best.laws) <= len(parent.laws):  # nothing that was added is worth it
+            if len(self.best.laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        if effects > 1 and _count(self.best) < 2 and self.room(self.best) and self._in_time():
+        if effects > 1 and _count(self.best) < 2 and self.can_improve(self.best) and self._in_time():
             self.add_two()
         return True
 
     def _pays(self, trial: Trial) -> bool:
-        """Whether the last of several laws was worth it, of which a wrong model can always take one more."""
+        """Tell whether the last of several laws was worth it; a wrong model can always use one more."""
         fewer = [t for t in self.memo.values() if t.laws and _count(t) < _count(trial)]
         return _count(trial) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
-    def misheld(self) -> bool:
-        """Whether the best hypothesis follows the recordings better with inputs that do the other thing in between."""
+    def other_hold_fits_better(self) -> bool:
+        """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
         best = self.best.fitted
         if self.hold_said or not self._in_time():
             return False
         try:
-            other = self.bench.otherwise_held().fit(best.simulator, [best.values], states=best.initial, solver=THOROUGH)
+            other = self.bench.with_other_hold().fit(
+                best.simulator, [best.values], states=best.initial, solver=THOROUGH
+            )
         except InputError:
             return False
-        return other.cost * MISHELD**2 < best.cost
+        return other.cost * HOLD_RATIO**2 < best.cost
 
-    def room(self, trial: Trial) -> bool:
-        """Whether a law that left nothing but noise would be worth its prior beside a hypothesis."""
+    def can_improve(self, trial: Trial) -> bool:
+        """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""
         left, noise = (v + self.tolerance for v in (trial.whole, self.floor2))
         most = 0.5 * self.sample.effective(0.0) * np.log(max(left / noise, 1.0))
-        return bool(most > np.log(max(len(self.alternatives), 1)) - MORE)
+        return bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
 
     def _in_time(self) -> bool:
-        """Whether there is time for more; said in the result where there is none."""
+        """Tell whether there is time for more; if not, note that in the result."""
         self.out_of_time = self.out_of_time or time.perf_counter() > self.until
         return not self.out_of_time
 
@@ -294,7 +300,7 @@ class Search:
             self.screens.pop(trial.key, None)
 
     def add(self, parent: Trial, again: bool = False) -> Step:
-        """Fit what the screen lets through beside a hypothesis, a few to look `again`; what may win thoroughly."""
+        """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
         scored, gain = self.screened(parent)
         beside = parent.laws
         scored = [s for s in scored if all(e.port != s.port or complements(e.law, s.law) for e in beside)]
@@ -336,32 +342,32 @@ class Search:
             parent, scored, gain, enough, lambda done, total, error: self.say(stage, done, total, error), again
         )
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
-        if self.bench.struck:
+        if self.bench.interrupted_fits:
             raise KeyboardInterrupt
         return trials
 
     def _polish(self, trials: Sequence[Trial]) -> None:
-        """Fit the trials that may win thoroughly."""
+        """Fit the trials that may win to convergence."""
         kept = [self.memo[t.key] for t in trials if t.key in self.memo]
-        ranked = sorted({t.key: t for t in kept}.values(), key=self.promise, reverse=True)
+        ranked = sorted({t.key: t for t in kept}.values(), key=self.optimistic_evidence, reverse=True)
         near = [t for t in ranked[:POLISHED] if not t.thorough and t.error < BEHIND * ranked[0].error]
         fits = self.fits
         with ThreadPoolExecutor(self.workers) as pool:
-            done = list(pool.map(fits.polished, near))
+            done = list(pool.map(fits.polish, near))
         for trial in done:
             self.keep(trial)
 
     def thorough(self, trial: Trial) -> Trial:
-        """The same hypothesis fitted thoroughly and to everything."""
+        """Return the same hypothesis fitted to convergence and to all samples."""
         if not self.memo[trial.key].thorough:
-            self.keep(self.fits.polished(trial))
+            self.keep(self.fits.polish(trial))
         return self.memo[trial.key]
 
     def _estimate_noise(self) -> None:
-        """Take what no force and no law at any port explains of the best hypothesis' residual for noise.
+        """Estimate the noise: the part of the best hypothesis' residual that no force and no law at any port explains.
 
-        Where the noise was measured, that is it. Third differences tell how much is there at least: white noise inside
-        the residual. Samples count as far as that residual is not correlated.
+        A measured noise is kept. Third differences give a lower limit: the white noise inside the residual. The
+        effective samples follow from the residual's correlation.
         """
         self.count = _count_samples(self.best.fitted, self.bench)
         if self.floor.source != "estimated":
@@ -375,7 +381,7 @@ class Search:
         self.floor = Floor(np.hypot(np.maximum(white, rest), known), "estimated")
 
     def _finer(self, parent: Trial) -> None:
-        """The best law of a step in its finer forms."""
+        """Fit the best law of a step in its finer forms."""
         best = self.best
         if len(best.laws) != len(parent.laws) + 1:
             return
@@ -393,14 +399,14 @@ class Search:
                 self._polish([found])
 
     def exchange(self) -> None:
-        """Put each of several laws up against all others, the rest in place, until none gives way."""
+        """Try all other laws in place of each of several laws, the rest fixed in place, until none changes."""
         for _ in range(ROUNDS):
             best = self.best
             for element in (e for e in best.laws if not isinstance(e.law, Offset)):
                 if not self._in_time():
                     return
                 rest = self._beside([e for e in best.laws if e is not element], best)
-                if any(step.parent.key == rest.key for step in self.steps):  # its children are known
+                if any(step.parent.key == rest.key for step in self.steps):  # the laws beside it were tried already
                     continue
                 self.keep(rest)
                 self.add(rest, again=True)
@@ -408,12 +414,12 @@ class Search:
                 return
 
     def add_two(self) -> None:
-        """Two laws at once beside the simulator alone: one after the other, each may hide the other."""
+        """Fit two laws at once beside the simulator alone, because one after the other may hide each other."""
         began = self.begin("two at once")
         rest = Remainder.of(self.bench, *linearised(self.bench, self.root.fitted), self.laws)
         fits, before = self.fits, self.best
         found = side_by_side(
-            lambda pair: fitted_together(fits, self.root.fitted, rest, pair), promising(rest), self.workers
+            lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest), self.workers
         )
         tried = [t for t in found if t is not None]
         for trial in tried:
@@ -424,9 +430,9 @@ class Search:
             self.exchange()
 
     def _every_sensor(self) -> None:
-        """Put a filter that the best hypothesis has at an actuator into every sensor instead, as loggers have them.
+        """Move a filter of the best hypothesis from an actuator to every sensor, as data loggers have them.
 
-        What is linear and time-invariant commutes (Oppenheim & Willsky 1997, Signals and Systems, sec. 2.3).
+        Linear time-invariant systems commute (Oppenheim & Willsky 1997, Signals and Systems, sec. 2.3).
         """
         best, names = self.best, self.bench.simulator.output_names
         filters = [e for e in best.laws if e.port.startswith("actuator:") and (e.law.order or e.law.shifts)]
@@ -440,13 +446,13 @@ class Search:
             named |= simulator.elements[-1].named(source.own(best.fitted.values))
         found = self.fits.fitted(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
         if found is not None:
-            self.keep(self.fits.polished(found))
+            self.keep(self.fits.polish(found))
         self.timed("every sensor", began)
 
-    def _led_out(self) -> bool:
-        """Whether the simulator alone is far better from where the best law has led its parameters; then all is anew.
+    def _escape_local_minimum(self) -> bool:
+        """Refit the simulator alone from the best law's parameters; if far better, restart the search and return True.
 
-        The refit had stayed in a local minimum, and that is what the law has made up for.
+        The first refit was in a local minimum, and the law has compensated for that.
         """
         best = self.best
         began = self.begin("look back")
@@ -458,14 +464,14 @@ class Search:
             return False
         finally:
             self.timed("look back", began)
-        if alone.cost > LED_OUT * self.root.whole:
+        if alone.cost > BETTER_MINIMUM * self.root.whole:
             return False
         self.without, self.memo, self.open, self.held_out, self.screens, self.steps = alone, {}, {}, {}, {}, []
         self.keep(Trial((), alone, alone.cost, alone.cost, True))
         return True
 
     def _beside(self, laws: Sequence[Placed], joint: Trial) -> Trial:
-        """Some laws of a hypothesis at the values that they have beside the others."""
+        """Make a trial of some laws of a hypothesis, at the values that they have beside the others."""
         simulator: Simulator = self.bench.simulator
         named: dict[str, object] = {k: joint.fitted.values[k] for k in simulator.parameters}
         for e in laws:
@@ -473,8 +479,8 @@ class Search:
             named |= simulator.elements[-1].named(e.own(joint.fitted.values))
         model = self.bench.model(simulator)
         engine = make_engine(model, self.bench.engine)
-        vector = started(model, named)
-        initial = self.bench.begun(simulator, model, vector, joint.fitted.begin)
+        vector = start_vector(model, named)
+        initial = self.bench.initial_states(simulator, model, vector, joint.fitted.begin)
         fitted = self.bench.result(simulator, model.parameters.unpack(vector), initial, engine, model)
         return Trial(
             simulator.elements[len(simulator.elements) - len(laws) :] if laws else (), fitted, fitted.cost, fitted.cost
@@ -488,5 +494,5 @@ def _count_samples(fitted: Fitted, bench: Workbench) -> float:
 
 
 def _count(trial: Trial) -> int:
-    """Number of a hypothesis' effects; an offset is none."""
+    """Count the effects of a hypothesis; offsets are not effects."""
     return sum(not isinstance(e.law, Offset) for e in trial.laws)

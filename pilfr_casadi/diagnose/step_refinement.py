@@ -1,11 +1,11 @@
-"""Finer integration steps where the answer depends on them, and the width over which a friction turns round.
+"""Finer integration steps if the answer depends on them, and the knee width of a friction law.
 
-Steps are chosen from where a recording begins. A force that turns round at once, as friction that is in the simulator
-already, asks for finer ones later; what coarse steps make of it would look like missing physics.
+Steps are chosen at the start of a recording. A force with a sharp reversal, such as a friction already in the
+simulator, needs finer steps later; the error of coarse steps would look like missing physics.
 
-The knee of a friction is as sharp as the data say, not as the steps of the simulation would. A simulation that is stuck
-chatters on steps too long for its knee, and where it passes quickly each passage falls between two steps. Its error
-has minima of its own there, which no other term of a law is to make up for.
+The data decide how sharp the knee of a friction law is, not the steps of the simulation. On steps too long for its
+knee, a stuck simulation chatters, and in fast motion each passage falls between two steps. The cost then has spurious
+minima, and no other term of a law should make up for them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from .workbench import FINER, THOROUGH, Fitted, Workbench
 if TYPE_CHECKING:
     from .trials import Trial
 
-DEPENDS = 0.3  # of the noise: as much as finer steps may change at least, to be taken
-QUIET = 3e-4  # of the outputs' deviation: noise below which nothing is to be seen for steps either
-NARROW = 0.05  # of the widest that is tried, of a knee that is sharp
-KNEES = (0.25, 4.0)  # times the width of a knee that a law is started from again
-FINEST, SAME = 16, 0.1  # times the sub-steps at most, and the share by which finer ones may change the mean square
+DEPENDS = 0.3  # least change by finer steps, over the noise, for which they are used
+QUIET = 3e-4  # least noise, over the outputs' deviation, that the steps are compared with
+NARROW = 0.05  # share of the widest knee that is tried, below which a knee is sharp
+KNEES = (0.25, 4.0)  # factors on the knee width from which a law is fitted again
+FINEST, SAME = 16, 0.1  # largest factor on the sub-steps; share by which finer steps may change the mean square
 
 
-def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
+def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
     """Refine the steps until their error is less than the noise; return the bench and the fit there."""
     noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), QUIET**2)
     most, steps = min(FINEST * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
@@ -39,7 +39,7 @@ def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitte
         tried = replace(bench, substeps=steps)
         try:
             there = tried.rerun(fitted)
-            if _apart2(bench, there, fitted) < DEPENDS**2 * noise2:
+            if _difference2(bench, there, fitted) < DEPENDS**2 * noise2:
                 break
             fitted = tried.fit(
                 fitted.simulator,
@@ -55,22 +55,22 @@ def on_steps_as_fine(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitte
     return bench, fitted
 
 
-def _apart2(bench: Workbench, one: Fitted, other: Fitted) -> float:
+def _difference2(bench: Workbench, one: Fitted, other: Fitted) -> float:
     """Compute the mean square of the difference of two runs."""
     both = zip(one.residual, other.residual, bench.recordings, strict=True)
     return float(np.mean(np.concatenate([((a - b) / bench.scale)[r.skip :] for a, b, r in both]) ** 2))
 
 
-def knees(candidate: Trial) -> list[dict[str, Any]]:
-    """Return the fitted values, also with a sharper and a wider knee where it is sharp."""
+def knee_starts(candidate: Trial) -> list[dict[str, Any]]:
+    """Return the fitted values, and if the knee is sharp also those with a sharper and a wider one."""
     values, knee = candidate.fitted.values, candidate.knee
     if not knee or values[knee] > NARROW * candidate.fitted.model.parameters[knee].bounds[1]:
         return [values]
     return [values, *({**values, knee: times * values[knee]} for times in KNEES)]
 
 
-def on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
-    """Fit again on finer steps if the simulation depends on them or the present ones hold a sharper knee back.
+def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
+    """Refit on finer steps if the simulation depends on them, or if the present steps limit the knee.
 
     The knee may be sharper there, as far as these steps can follow it at rest.
     """

@@ -1,11 +1,11 @@
-r"""A linear stand-in for a simulation of which only inputs and outputs are known, in modes with names.
+r"""A linear surrogate, in named modes, for a simulation that is known only by its inputs and outputs.
 
-A discrete model identified from the simulation's own record is taken to continuous time and split into real modes (see
-`modes`). A pair of eigenvalues `-ζ ω ± j ω √(1 - ζ²)` becomes a displacement `q` and its rate `v`,
+A discrete model is identified from the simulation's record, converted to continuous time, and split into real modes
+(see `modes`). A pair of eigenvalues `-ζ ω ± j ω √(1 - ζ²)` becomes a displacement `q` and its rate `v`,
 
 .. math:: \dot q = v + b_q u, \qquad \dot v = -\omega^2 q - 2 ζ ω v + b_v u, \qquad y = c_q q + c_v v,
 
-a real eigenvalue `-r` the equation `q' = -r q + b u`. Frequencies, dampings and gains are parameters.
+and a real eigenvalue `-r` the equation `q' = -r q + b u`. Frequencies, dampings and gains are parameters.
 """
 
 from __future__ import annotations
@@ -25,34 +25,35 @@ from ..simulators import Named, Port, Simulator
 from .gates import Gate
 from .modes import Mode, modes, to_continuous
 
-POOR = 0.02  # NRMSE above which a simulation is not linear enough for a surrogate to stand for it
+POOR = 0.02  # NRMSE above which a simulation is too nonlinear for a surrogate
+# the note about a surrogate above POOR
 TOO_POOR = (
     "The linear model is poor: the simulation is not linear there, and what the model misses may show up as missing "
     "physics. Give the simulator itself where it can be had."
 )
-FREE = 0.3  # share by which parameters may move
-EXACT = 1e-3  # NRMSE at which no higher order is looked for
-HIGHEST = 8
-SMALL = 1e-3  # share of an output below which a coefficient is held
-# how inputs drive a mode's displacement and its rate, and how outputs see them
+FREE = 0.3  # range of the parameters, as a share of their values
+EXACT = 1e-3  # NRMSE below which no higher order is tried
+HIGHEST = 8  # highest order that is tried
+SMALL = 1e-3  # share of an output below which a coefficient is fixed
+# names of the inputs' gains on a mode's displacement and rate, and of these in the outputs
 GAINS, SEEN = ("gain on the displacement of", "gain of"), ("seen in", "rate seen in")
 Array = np.ndarray
 
 
 def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = None) -> tuple[Simulator, float]:
-    """Identify a linear simulator from what a simulation was given and what it answered.
+    """Identify a linear simulator from the inputs and outputs of a simulation.
 
     Parameters
     ----------
     recordings : Recording or sequence of Recording
         Inputs and outputs of the simulation.
     nx : int, optional
-        States; chosen on the recordings where left out.
+        Number of states; chosen from the recordings if left out.
 
     Returns
     -------
     Simulator
-        In modes, with the ports `mode:<frequency> Hz`; its parameters may move by 30 %.
+        The simulator in modes, with the ports `mode:<frequency> Hz`; its parameters may move by 30 %.
     float
         Its NRMSE on the recordings, in free-run simulation from the fitted initial state.
 
@@ -63,11 +64,11 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     """
     records = check_for_identification(as_recordings(recordings), 40)
     hold = next((r.hold for r in records if r.hold), None)
-    # the states of the sampled model are not those of the simulation: with interpolated inputs rest is not zero there
+    # the sampled model has other states: with interpolated inputs, rest is not zero there
     records = tuple(r if r.period else r.with_(initial="estimate") for r in records)
     found: list[tuple[float, Simulator]] = []
-    for n in range(HIGHEST + 1) if nx is None else (nx,):  # a simulation has no noise: its order shows by itself
-        one = _identified(records, n, hold)
+    for n in range(HIGHEST + 1) if nx is None else (nx,):  # a simulation has no noise, so its order is evident
+        one = _identify(records, n, hold)
         found += [one] if one is not None else []
         if found and found[-1][0] < EXACT:
             break
@@ -81,8 +82,8 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     return simulator, error
 
 
-def told_of_surrogate(error: float) -> tuple[Gate, ...]:
-    """A note on what misses its simulation by an NRMSE of `error`; none where that is zero."""
+def surrogate_gates(error: float) -> tuple[Gate, ...]:
+    """Note that a surrogate misses its simulation by an NRMSE of `error`; no note if that is zero."""
     if not error:
         return ()
     words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
@@ -90,7 +91,7 @@ def told_of_surrogate(error: float) -> tuple[Gate, ...]:
     return (Gate("simulation", "surrogate", error, words, False),)
 
 
-def _identified(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:
+def _identify(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:
     try:
         found = fit(PILFR(n), records)
     except InputError:
@@ -107,22 +108,22 @@ def _identified(records: Sequence[Recording], n: int, hold: str | None) -> tuple
         options.append((float(direct), between, continuous))
     if not options:
         return None
-    # a simulation without direct feed-through tells by it how its inputs went between the samples
+    # a simulation without direct feed-through reveals the course of its inputs between samples
     _, between, matrices = min(options, key=lambda o: o[0]) if not hold else options[0]
     simulator = replace(modal_simulator(matrices, np.ravel(p["y_0"]), records[0]), hold=between)
     errors = [nrmse(r.y, found.simulate(r), skip=r.skip) for r in records]
     return float(np.mean(errors)), simulator
 
 
-def _free(mode: Mode, slow: float) -> Mode:
-    """A mode, one too slow to swing in a recording as a mass with next to no spring."""
+def _as_mass(mode: Mode, slow: float) -> Mode:
+    """Turn a mode that is too slow to oscillate in a recording into a mass with almost no spring."""
     if not mode.second_order or mode.spring or abs(mode.value) > slow:
         return mode
     return replace(mode, spring=(abs(mode.value) ** 2, -2 * mode.value.real))
 
 
 def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, like: Recording) -> Simulator:
-    """A simulator in modes, with the names of a recording.
+    """Make a simulator in modes, with the names of a recording.
 
     Parameters
     ----------
@@ -132,7 +133,7 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
         Constants of the outputs.
     """
     slow = 0.05 / (len(like) * like.dt)
-    found = [_free(mode, slow) for mode in modes(*matrices[:3])]
+    found = [_as_mass(mode, slow) for mode in modes(*matrices[:3])]
     names = _distinct([mode.label(slow) for mode in found])
     parameters: dict[str, Parameter] = {}
     states: list[str] = []
@@ -145,7 +146,7 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
 
     for i, (name, mode) in enumerate(zip(names, found, strict=True), 1):
         of = f"mode {name}: "
-        # v is this much larger than q
+        # typical ratios of q and v to q
         speed = np.array([1.0, max(abs(mode.value), 1 / (len(like) * like.dt))])[: len(mode.into)]
         entering = float(np.max(np.abs(mode.into) * (speed[::-1])[:, None]))
         leaving = float(np.max(np.abs(mode.out) * speed))
@@ -164,7 +165,7 @@ def modal_simulator(matrices: tuple[Array, Array, Array, Array], offset: Array, 
             states.append(f"q{i}")
         for row, kind, faster in zip(mode.into, GAINS[-len(speed) :], speed[::-1], strict=True):
             for other, value in zip(inputs, row, strict=True):
-                if value == 1.0:  # the gain of the strongest input is one; what is seen of the mode has its size
+                if value == 1.0:  # the strongest input has gain one; the gains in the outputs hold the size of the mode
                     parameters[f"{of}{kind} {other}"] = Parameter(1.0, fixed=True)
                 else:
                     free(f"{of}{kind} {other}", float(value), size=entering / faster)
@@ -219,5 +220,5 @@ def _port(name: str, i: int, mode: Mode) -> Port:
 
 
 def _distinct(names: list[str]) -> list[str]:
-    """Equal names with a number behind."""
+    """Number equal names."""
     return [n if names.count(n) == 1 else f"{n} ({names[:k].count(n) + 1})" for k, n in enumerate(names)]

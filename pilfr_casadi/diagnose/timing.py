@@ -1,19 +1,20 @@
-"""Faults of time: a channel recorded too early or too late, or by another clock; samples that were lost.
+"""Faults of time: a channel recorded too early or too late, or by another clock; lost samples.
 
-Shifts and clocks. The error of the refitted simulator, with one channel read at another time, is projected off what
-parameters and initial states can follow; the shift (or clock rate) with the smallest remainder is confirmed by a
-refit. A late output may be physics (a delay); a shift of many whole samples is the mark of a recorder, and an output
-that comes before its cause is nothing else.
+Shifts and clocks. One channel is read at another time, and the error of the refitted simulator is projected off the
+directions that parameters and initial states can follow. The shift (or clock rate) with the smallest remainder is
+confirmed by a refit. A late output may be physics (a delay). A shift of many whole samples is typical of a recorder,
+and an output before its cause can be nothing else.
 
-Gaps. Where samples were lost and the time renumbered, every state jumps at once. Along the refitted run, a jump δ of
-the state at sample k changes what comes after by `Φ_k δ`. With e what parameters and initial states leave of the error,
-and base what they can follow, the best jump takes away
+Gaps. If samples were lost and the time was renumbered, every state jumps at once. Along the refitted run, a jump δ of
+the state at sample k changes the later outputs by `Φ_k δ`. With e the error that parameters and initial states leave,
+and base the directions that these can follow, the best jump removes
 
     s' (S - G G')⁻¹ s,    S = Φ_k'Φ_k,  G = Φ_k' base,  s = Φ_k' e
 
-of e'e; S, G and s follow from those of the next sample, so that every sample is tried at once. A shock or a stop moves
-no state that is the integral of another, and a step of a force or of a sensor moves none: where one of these does about
-as well, or where no state is such an integral, nothing is said. A jump is confirmed by a refit to the two pieces.
+of e'e. S, G and s follow from those of the next sample by recursion, so that every sample is tried. A shock or a stop
+moves no state that is the integral of another, and a step of a force or of a sensor moves none. If one of these
+explains about as much, or if no state is such an integral, no gap is reported. A jump is confirmed by a refit to the
+two pieces.
 """
 
 from __future__ import annotations
@@ -27,42 +28,43 @@ from ..data import Recording
 from ..simulators import states_along
 from .floor import ABOVE_NOISE
 from .gates import (
-    ASTRAY,
     AT_NOISE,
     CLEARLY,
     EXPLAINED,
+    POOR_FIT,
     SAME,
     Change,
     Checked,
     FirstOrder,
     Gate,
     change_recordings,
-    fall,
+    describe_fall,
     refit,
 )
 from .linearise import Run
 from .workbench import THOROUGH, Fitted, Workbench
 
-TURNS = 8  # of an edit and a refit, until the edit stays where it is
+TURNS = 8  # alternations of edit and refit at most, until the edit is constant
 
 SHIFTS = np.union1d(np.arange(-64.0, 65.0), np.linspace(-2.0, 2.0, 17))  # samples
+# clock rates tried, as relative errors: 0.01 % to 5 %
 RATES = np.concatenate([-np.geomspace(1e-4, 0.05, 28)[::-1], np.geomspace(1e-4, 0.05, 28)])
-WHOLE = 0.12  # samples within which a shift counts as whole
-LONG = 4.5  # samples beyond which a whole shift is a fault of the recording
-AVERAGED = 0.5  # of a channel's noise, which reading it between its samples takes away at most
+WHOLE = 0.12  # distance in samples within which a shift counts as whole
+LONG = 4.5  # shift in samples above which a whole shift is a fault of the recording
+AVERAGED = 0.5  # largest share of a channel's noise that interpolation between its samples removes
 
-MOST_GAPS = 3
-WORSE = 2.0  # times what a jump leaves that a shock or a step leaves at least
-SHARP = 1.1  # times what a jump leaves that one some samples beside it leaves at least
-SHORTEST = 40  # samples of a piece
-BESIDE = 5  # samples around a jump at which rivals are tried, and where a drift would do as well
-BETWEEN = (-0.5, 0.0, 0.5)  # samples, by which a shock may come later
-RIDGE = 1e-6  # of a jump that initial states can follow nothing is known
+MOST_GAPS = 3  # gaps that are sought at most
+WORSE = 2.0  # least ratio of the error left by a shock or a step to that left by a jump
+SHARP = 1.1  # least ratio of the error left by a jump some samples away to that left by the jump
+SHORTEST = 40  # samples of a piece at least
+BESIDE = 5  # samples around a jump at which rivals are tried, and at which a drift would explain as much
+BETWEEN = (-0.5, 0.0, 0.5)  # delays of a shock that are tried, in samples
+RIDGE = 1e-6  # on the normal equations, against jumps that initial states can follow
 
 
 @dataclass(frozen=True)
 class TimeShift:
-    """Channels (columns of "u" or "y") that are out of step: late by seconds, or by a clock that runs faster."""
+    """Channels (columns of "u" or "y") with wrong times: late by seconds, or from a clock that runs faster."""
 
     channel: str
     finding: str
@@ -84,8 +86,8 @@ class TimeShift:
 def shift_channels(kind: str, index: Sequence[int], seconds: float, rate: float = 0.0, cut: bool = True) -> Change:
     """Read some channels at `t + seconds + rate t`, interpolated.
 
-    Samples read from before the recording are skipped, samples from behind it are cut off; without `cut`, the ends are
-    held. A periodic recording goes round.
+    Samples from before the recording are skipped, samples from behind it are cut off. Without `cut`, the end values are
+    held. A periodic recording wraps around.
     """
 
     def change(r: Recording) -> Recording:
@@ -94,7 +96,7 @@ def shift_channels(kind: str, index: Sequence[int], seconds: float, rate: float 
         for i in index:
             values[:, i] = _read(r.t, values[:, i], at, end, smooth=kind == "y")
         other = r.with_(**{kind: values})
-        if kind == "y" and r.begins == "zero":  # at rest when it was said to be
+        if kind == "y" and r.begins == "zero":  # the recording was at rest at its stated start
             other = other.with_(initial="estimate")
         if end is not None or not cut:
             return other
@@ -118,10 +120,10 @@ def _read(t: np.ndarray, v: np.ndarray, at: np.ndarray, end: float | None, smoot
 
 
 def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Checked:
-    """Look for a shifted channel or clock, and put it right where it is a fault of the recording.
+    """Find a shifted channel or clock, and correct it if it is a fault of the recording.
 
-    A late channel counts as a fault where it is late by a multiple of `part` samples and nothing else is wrong. Without
-    `early`, an early channel counts as one only where nothing else is wrong, too.
+    A late channel counts as a fault if it is late by a multiple of `part` samples and nothing else is wrong. Without
+    `early`, an early channel also counts as a fault only if nothing else is wrong.
     """
     bench, plain, noise2 = now.bench, now.fitted, now.noise2
     if plain.cost < ABOVE_NOISE**2 * noise2:
@@ -144,16 +146,16 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Chec
         return now
     left, step, at, found = best
     back = refit(bench, [{}, found.fitted.values], states=found.fitted.begin)
-    if back is not None and left > EXPLAINED * back.cost:  # it only led the refit out of a local minimum
+    if back is not None and left > EXPLAINED * back.cost:  # the shift only led the refit out of a local minimum
         return now.then(bench, back)
     value = at if step.kind == "y" else -at
     late = step.finding == "clock" or value > 0
     if (late or not early) and left > AT_NOISE**2 * noise2:
-        return now  # what comes late or runs slow, next to something else that is wrong, may be physics
+        return now  # a late channel or a slow clock may be physics if something else is wrong
     samples = value / bench.dt
     if step.finding == "alignment" and samples > -WHOLE and not (in_steps(value, bench.dt, part) and samples > LONG):
-        return now  # late, and not by whole samples: a delay is physics
-    sentence = f"{_shift_in_words(step, value, bench.dt)}; with it corrected {fall(plain.cost, left)}"
+        return now  # late by a fraction of a sample or by little: a delay is physics
+    sentence = f"{_shift_in_words(step, value, bench.dt)}; with it corrected {describe_fall(plain.cost, left)}"
     if left > AT_NOISE**2 * noise2:
         sentence += (
             f", still {(left / max(noise2, 1e-300)) ** 0.5:.2g} times the noise: more is wrong, with the time "
@@ -171,7 +173,7 @@ def _shift_in_words(step: TimeShift, value: float, dt: float) -> str:
 
 
 def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:
-    """Run the simulator at the user's values: a refit to channels out of step may have gone astray."""
+    """Run the simulator at the user's values, because a refit to shifted channels may be in a wrong minimum."""
     values = {name: p.value for name, p in bench.simulator.parameters.items()}
     unknown = [r.begins == "estimate" for r in bench.recordings]
     initial = [0 * state if u else state for u, state in zip(unknown, plain.initial, strict=True)]
@@ -184,7 +186,7 @@ def in_steps(value: float, dt: float, part: float = 1.0) -> bool:
 
 
 def _screen_shifts(bench: Workbench, plain: Fitted) -> list[tuple[TimeShift, float]]:
-    """List the shifts and clock rates that make the remainder clearly smaller, best first, three at most."""
+    """List the shifts and clock rates that clearly reduce the remainder, best first, three at most."""
     outputs, inputs = bench.simulator.output_names, bench.simulator.inputs
     channels: list[tuple[str, tuple[int, ...], str]] = [("y", (i,), name) for i, name in enumerate(outputs)]
     if len(outputs) > 1:
@@ -193,7 +195,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[tuple[TimeShift, flo
         channels += [("u", (i,), name) for i, name in enumerate(inputs)]
     steps = [TimeShift(name, finding, kind, i) for kind, i, name in channels for finding in ("alignment", "clock")]
     found = list[tuple[float, TimeShift, float]]()
-    for reference in [plain] if plain.cost < ASTRAY else [plain, run_as_given(bench, plain)]:
+    for reference in [plain] if plain.cost < POOR_FIT else [plain, run_as_given(bench, plain)]:
         first = FirstOrder.of(bench, reference)
         for step in steps:
             left = _remainder_of(first, reference, step)
@@ -201,7 +203,7 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[tuple[TimeShift, flo
             shares = [left(float(v)) for v in values]
             k = int(np.argmin(shares))
             value, share = float(values[k]), shares[k]
-            if step.finding == "clock":  # over a whole record a small step of a rate is many samples
+            if step.finding == "clock":  # over a whole record, one step of a rate is many samples
                 value, share = _minimise(left, values[max(k - 1, 0)], values[min(k + 1, len(values) - 1)])
             if share < CLEARLY * left(0.0):
                 found.append((share / left(0.0), step, value))
@@ -212,13 +214,13 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[tuple[TimeShift, flo
 
 
 def _remainder_of(first: FirstOrder, fitted: Fitted, step: TimeShift) -> Callable[[float], float]:
-    """Return the mean square that parameters and initial states leave, as a function of a shift or a clock rate."""
+    """Return the mean square that parameters and initial states leave, as a function of shift or clock rate."""
     recordings = first.bench.recordings
 
     def simulated(r: Recording, state: np.ndarray) -> np.ndarray:
         return np.asarray(fitted.engine.simulate(fitted.model.drive(r), fitted.vector, state)[0])
 
-    @np.errstate(over="ignore", invalid="ignore")  # what diverges leaves everything
+    @np.errstate(over="ignore", invalid="ignore")  # a diverging run leaves everything
     def left(value: float) -> float:
         others = list(map(step.change(value, cut=False), recordings))
         y = as_recorded or map(simulated, others, fitted.initial)
@@ -231,7 +233,7 @@ def _remainder_of(first: FirstOrder, fitted: Fitted, step: TimeShift) -> Callabl
 
 
 def _minimise(left: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """Find where the remainder is smallest between two values, and the remainder there."""
+    """Find the minimum of the remainder between two values; return its place and its value."""
     from scipy.optimize import minimize_scalar
 
     found = minimize_scalar(left, bounds=(low, high), method="bounded", options={"maxiter": 20})
@@ -239,7 +241,7 @@ def _minimise(left: Callable[[float], float], low: float, high: float) -> tuple[
 
 
 def _settle_shift(now: Checked, step: TimeShift, at: float) -> tuple[float, Checked] | None:
-    """Refit parameters and shift in turn, until the shift stays where it is."""
+    """Refit parameters and shift in turn, until the shift is constant."""
     best: tuple[float, Checked] | None = None
     previous, width = now.fitted, now.bench.dt if step.finding == "alignment" else abs(at)
     for _ in range(TURNS):
@@ -257,22 +259,22 @@ def _settle_shift(now: Checked, step: TimeShift, at: float) -> tuple[float, Chec
     return best
 
 
-# samples that were lost
+# lost samples
 
 
-Origin = tuple[str, int]  # label of the recording as given, and its sample that a piece begins with
+Origin = tuple[str, int]  # label of the recording as given, and the sample at which a piece begins
 
 
 @dataclass(frozen=True)
 class Jump:
-    """A jump of the state at a sample of a recording; the shares are of the mean square that it takes away.
+    """A jump of the state at a sample of a recording; the shares are those of the mean square that it removes.
 
     Attributes
     ----------
     rival : float
-        Share that a shock nearby, or a step of one force or sensor there, takes away.
+        Share that a shock nearby, or a step of one force or sensor there, removes.
     beside : float
-        Share that a jump some samples away takes away.
+        Share that a jump some samples away removes.
     size : array, shape (n_x,)
         The jump.
     """
@@ -285,14 +287,14 @@ class Jump:
     size: np.ndarray
 
     def beats(self, other: float, times: float) -> bool:
-        """Tell whether another jump, which takes away the share `other`, leaves more than so many times as much."""
+        """Tell whether a rival that removes the share `other` leaves more than `times` this jump's error."""
         return 1 - other > times * max(1 - self.share, 0.0)
 
 
 def find_gaps(now: Checked) -> Checked:
-    """Look for lost samples; cut the recordings there if that cures most of the mismatch.
+    """Find lost samples; cut the recordings there if that removes most of the mismatch.
 
-    The state at the first sample of a later piece is estimated. Recordings in periodic steady state are left alone.
+    The state at the first sample of a later piece is estimated. Recordings in periodic steady state are not checked.
     """
     noise2 = min(now.noise2, _quiet_noise2(now) or np.inf)
     origins: list[Origin] = [(r.label, 0) for r in now.bench.recordings]
@@ -303,7 +305,7 @@ def find_gaps(now: Checked) -> Checked:
             break
         (jump, last), at = settled, settled[0].recording + 1
         origins = [*origins[:at], (origins[at - 1][0], origins[at - 1][1] + jump.sample), *origins[at:]]
-        # a drift is followed by jumps around it as well
+        # jumps around a drift also imitate it
         sharp = jump.beats(jump.beside, SHARP) or last.cost < AT_NOISE**2 * noise2
         if sharp and jump.beats(jump.rival, WORSE) and last.cost < EXPLAINED * now.cost:
             kept.append((last, origins))
@@ -321,12 +323,12 @@ def _name_piece(r: Recording, begin: int) -> Recording:
 
 
 def _run_at(bench: Workbench, fitted: Fitted, initial: list[np.ndarray]) -> Fitted:
-    """Run another bench's fit on this one's recordings at its values."""
+    """Run another bench's fit on this bench's recordings, at its values."""
     return bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model)
 
 
 def _settle_jump(now: Checked) -> tuple[Jump, Checked] | None:
-    """Repeat jump and fit to the pieces until the jump stays: a fit across a gap may have gone astray."""
+    """Repeat jump and fit to the pieces until the jump is constant: a fit across a gap may be in a wrong minimum."""
     bench, along = now.bench, now.fitted
     best: tuple[Jump, Checked] | None = None
     for _ in range(TURNS):
@@ -348,14 +350,14 @@ def _settle_jump(now: Checked) -> tuple[Jump, Checked] | None:
 
 
 def _quiet_noise2(now: Checked) -> float:
-    """Estimate the mean square of white noise from the median of third differences, which a few jumps do not move."""
+    """Estimate the mean square of white noise from the median of third differences, which is robust to a few jumps."""
     thirds = np.abs(np.concatenate([np.diff(e, 3, axis=0) for e in now.fitted.residual]))
     return float(np.mean((1.4826 * np.median(thirds, axis=0) / now.bench.scale) ** 2) / 20)
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
-    """Find the jump of the simulator's states that takes most away, to first order; None if gaps cannot be told."""
+    """Find the jump of the states that removes most error, to first order; None if gaps cannot be detected."""
     simulator = bench.simulator
     if not simulator.kinematic:
         return None
@@ -386,10 +388,10 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
 def _jump_shares(
     run: Run, scale: np.ndarray, base: np.ndarray, error: np.ndarray, skip: int, n_x: int, moved: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the share that the best jump of the state takes away at each sample, its best rival's, and that jump.
+    """Compute, at each sample, the share that the best jump of the state removes, its best rival's share, and the jump.
 
-    Shapes (M,), (M,) and (M, n_x); `moved` are the states that a shock moves. Forces that stay from a sample on count
-    as further states.
+    Shapes (M,), (M,) and (M, n_x); `moved` are the states that a shock moves. Forces that stay constant from a sample
+    on are further states.
     """
     m, n_y, n = run.c.shape
     forces = run.b[:, :, run.n_free :]
@@ -414,13 +416,13 @@ def _jump_shares(
 
 
 def _solve_jumps(left: np.ndarray, s: np.ndarray, e: np.ndarray, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the shares that jumps along some ways, (n, k) or (M, n, k), take away, and their lengths."""
+    """Compute the shares that jumps along some directions, (n, k) or (M, n, k), remove, and their lengths."""
     across = np.swapaxes(ways, -1, -2)
     size = np.sqrt(np.maximum(np.einsum("...ii->...i", across @ s @ ways), 0.0))
     size = np.where(size > 0, size, 1.0)
     matrix = across @ left @ ways / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(ways.shape[-1])
     wanted = (across @ e[:, :, None])[:, :, 0] / size
-    lost = ~(np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(wanted).all(axis=1))  # where a run grows without end
+    lost = ~(np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(wanted).all(axis=1))  # the run diverges
     matrix[lost], wanted[lost] = np.eye(ways.shape[-1]), 0.0
     found = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0]
     return np.sum(found * wanted, axis=1), found / size
@@ -434,7 +436,7 @@ def _state_after(fitted: Fitted, r: Recording, jump: Jump) -> np.ndarray:
 
 
 def _describe_gaps(now: Checked, places: Sequence[Origin], after: float) -> Gate:
-    """Describe the gaps before some samples."""
+    """Describe the gaps before some samples in a gate."""
     ordered = sorted(places)
     bench, before = now.bench, now.cost
     dt, several = bench.dt, len({label for label, _ in ordered}) > 1 or len(bench.recordings) > 1
@@ -442,6 +444,6 @@ def _describe_gaps(now: Checked, places: Sequence[Origin], after: float) -> Gate
     names = ", ".join([*bench.simulator.inputs, *bench.simulator.output_names])
     sentence = (
         f"Samples are missing just before {at}: the state jumps there as no force and no shock could make it, as where "
-        f"a logger lost some and counted on. With the recording cut there {fall(before, after)}."
+        f"a logger lost some and counted on. With the recording cut there {describe_fall(before, after)}."
     )
     return Gate(names, "gap", [k * dt for _, k in ordered], sentence, fault=True, left=after / before)

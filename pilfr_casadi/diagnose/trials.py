@@ -1,8 +1,8 @@
 """Fits of hypotheses: a simulator with laws put into its ports, all parameters estimated together.
 
-A pair of port and law is fitted briefly from its best initial values. The best pairs are fitted again from several.
-Those that may win are fitted to convergence and to all samples. A sharp knee, as of dry friction, is fitted on steps
-that are fine enough for it.
+A pair of port and law is fitted briefly from its best initial values. The best pairs are fitted again from several
+initial values. Those that may win are fitted to convergence and to all samples. A sharp knee, such as that of dry
+friction, is fitted on steps that are fine enough for it.
 """
 
 from __future__ import annotations
@@ -25,35 +25,36 @@ from ..optimise import GaussNewton
 from ..simulators import Placed, Simulator
 from .gates import open_start
 from .screen import Scored
-from .step_refinement import knees, on_finer_steps
-from .workbench import QUICK, THOROUGH, Fitted, Workbench, started
+from .step_refinement import knee_starts, refit_on_finer_steps
+from .workbench import QUICK, THOROUGH, Fitted, Workbench, start_vector
 
-LONG = 8000  # samples that brief fits look at
-BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
-BEST, FEW = 10, 4  # pairs of each list of the screen that are fitted besides the best of each port; to look again
-EQUAL = 1e-3  # difference of shares that is none
-REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first, or to look again
-AGAIN = 3  # starts that a pair is fitted from again
-SAME = 1.02  # times the mean square error of fits that came to the same place
-BEHIND = 3.0  # times the best error of a pair that is not worth more starts
-FAINT = 0.01  # of the share that the other run sees, below which one has seen nothing to start at
+LONG = 8000  # samples used by brief fits
+BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)  # first fit of each pair, to rank the pairs
+# pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
+BEST, FEW = 10, 4
+EQUAL = 1e-3  # difference of shares that counts as zero
+REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first, or if `again`
+AGAIN = 3  # starts from which a pair is fitted again
+SAME = 1.02  # ratio of mean square errors within which fits count as equal
+BEHIND = 3.0  # ratio to the best error above which a pair gets no more starts
+LEAST_SHARE = 0.01  # ratio to the larger share of the two runs below which a run's start values are not used
 Key = frozenset[tuple[str, type[Law]]]
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A hypothesis, fitted: laws in ports beside the simulator.
+    """A fitted hypothesis: laws in ports of the simulator.
 
     Attributes
     ----------
     laws : tuple of Placed
-        The laws put in, in the order in which they were.
+        The added laws, in their order.
     part : float
-        Mean square error on the part of the recordings that it was fitted to, in units of the outputs' variance.
+        Mean square error on the part of the recordings used by the fit, in units of the outputs' variance.
     whole : float
-        The same on everything.
+        The same on all recordings.
     thorough : bool
-        Whether it was fitted to everything.
+        Whether it was fitted to convergence and to all samples.
     information : array
         See `evidence.information`.
     """
@@ -67,38 +68,38 @@ class Trial:
 
     @property
     def key(self) -> Key:
-        """What makes two hypotheses the same."""
+        """Ports and classes of the laws; equal keys mean the same hypothesis."""
         return frozenset((e.port, type(e.law)) for e in self.laws)
 
     def supersedes(self, other: Trial) -> bool:
-        """Whether it is the better fit of the same hypothesis; a thorough one counts before a brief one."""
+        """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
         if self.thorough != other.thorough:
             return self.thorough or self.whole < other.whole / SAME
         return self.whole < other.whole
 
     @property
     def element(self) -> Placed:
-        """The law put in last."""
+        """The law added last."""
         return self.laws[-1]
 
     @property
     def port(self) -> str:
-        """Port of the law put in last."""
+        """Port of the law added last."""
         return self.element.port
 
     @property
     def law(self) -> Law:
-        """The law put in last."""
+        """The law added last."""
         return self.element.law
 
     @property
     def name(self) -> tuple[str, str]:
-        """Port and id of the law put in last."""
+        """Port and id of the law added last."""
         return self.port, self.law.id
 
     @property
     def own(self) -> dict[str, Any]:
-        """Fitted values of the law put in last, by its own names."""
+        """Fitted values of the law added last, by its own names."""
         return self.element.own(self.fitted.values)
 
     @property
@@ -108,19 +109,19 @@ class Trial:
 
     @property
     def knee(self) -> str:
-        """Full name of the speed within which the last law's force turns round, where it has one."""
+        """Full name of the knee, the speed within which the last law's force reverses, if it has one."""
         knee = getattr(self.law, "knee", "")
         return f"{self.element.prefix}{knee}" if knee else ""
 
     @functools.cached_property
     def doubtful(self) -> bool:
-        """Whether a law at its fitted values is hardly what its name says."""
+        """Whether a law degenerates at its fitted values."""
         return any(e.law.doubtful(e.own(self.fitted.values)) for e in self.laws)
 
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """Fits hypotheses on the recordings of a bench, some side by side, until a time (of `time.perf_counter`)."""
+    """Fits of hypotheses to the recordings of a bench, in parallel, until a time (of `time.perf_counter`)."""
 
     bench: Workbench
     workers: int
@@ -128,19 +129,19 @@ class Trials:
 
     @property
     def over(self) -> bool:
-        """Whether the time is over."""
+        """Whether the time limit has passed."""
         return time.perf_counter() > self.until
 
     @property
     def part(self) -> Workbench:
-        """The bench with as much of the recordings as brief fits look at."""
+        """The bench with the part of the recordings that brief fits use."""
         total = sum(map(len, self.bench.recordings))
         return self.bench.on([_head(r, LONG / total) for r in self.bench.recordings]) if total > LONG else self.bench
 
     def fitted(
         self, simulator: Simulator, starts: Sequence[Mapping[str, Any]], count: int, **options: Any
     ) -> Trial | None:
-        """Fit a simulator whose last `count` elements are the hypothesis' laws; None where every start diverges.
+        """Fit a simulator whose last `count` elements are the hypothesis' laws; None if every start diverges.
 
         `options` are those of `Workbench.fit`.
         """
@@ -149,9 +150,9 @@ class Trials:
             found = part.fit(simulator, starts, **{"solver": QUICK, **options})
         except InputError:
             return None
-        return self.judged(found, count)
+        return self.make_trial(found, count)
 
-    def judged(self, found: Fitted, count: int) -> Trial:
+    def make_trial(self, found: Fitted, count: int) -> Trial:
         """Make a trial of a fit to a part of the recordings."""
         laws = found.simulator.elements[len(found.simulator.elements) - count :] if count else ()
         whole = found.cost
@@ -159,13 +160,13 @@ class Trials:
             whole = self.bench.result(found.simulator, found.values, found.initial, found.engine, found.model).cost
         return Trial(laws, found, found.cost, whole if np.isfinite(whole) else np.inf)
 
-    def polished(self, trial: Trial) -> Trial:
-        """Fit a trial thoroughly and to everything."""
+    def polish(self, trial: Trial) -> Trial:
+        """Fit a trial to convergence and to all samples."""
         bench = replace(self.bench, at_least=max(self.bench.at_least, trial.fitted.model.substeps))
-        placed = trial.fitted.corrected()  # sub-steps for the laws as they were fitted
+        placed = trial.fitted.corrected()  # choose sub-steps for the fitted laws
         model = bench.model(placed)
         engine = make_engine(model, bench.engine)
-        starts, states = knees(trial), trial.fitted.initial
+        starts, states = knee_starts(trial), trial.fitted.initial
         try:
             if len(starts) > 1:
                 quick = bench.fit(placed, starts, states=states, model=model, engine=engine)
@@ -173,7 +174,7 @@ class Trials:
             fitted = bench.fit(placed, starts, states=states, solver=THOROUGH, model=model, engine=engine)
         except InputError:
             return replace(trial, whole=np.inf, thorough=True)
-        fitted = on_finer_steps(bench, fitted, trial.knee) if trial.knee else fitted
+        fitted = refit_on_finer_steps(bench, fitted, trial.knee) if trial.knee else fitted
         laws = fitted.simulator.elements[len(fitted.simulator.elements) - len(trial.laws) :]
         return Trial(laws, fitted, fitted.cost, fitted.cost, thorough=True)
 
@@ -186,12 +187,12 @@ class Trials:
         report: Callable[[int, int, float], None],
         again: bool = False,
     ) -> list[Trial]:
-        """Fit every pair of port and law that the screen lets through beside a parent's laws, smallest error first.
+        """Fit every pair of port and law that the screen selects beside a parent's laws, smallest error first.
 
-        Where one of the first comes below the error `enough`, those that are far behind it are not refined. To look
-        `again`, in place of a law that is known, a few are enough.
+        If one of the first comes below the error `enough`, those far behind it are not refined. With `again`, in place
+        of a known law, fewer pairs are fitted.
         """
-        pairs = survivors(scored, FEW if again else BEST)
+        pairs = select_pairs(scored, FEW if again else BEST)
         most = FIRST if again else REFINED
         done, total = 0, len(pairs) + min(len(pairs), most)
 
@@ -202,8 +203,8 @@ class Trials:
 
         pool = ThreadPoolExecutor(self.workers)
         try:
-            tasks = [pool.submit(self._begun, parent, entries, gain) for entries in pairs]
-            prepared: list[_Begun] = []
+            tasks = [pool.submit(self._fit_briefly, parent, entries, gain) for entries in pairs]
+            prepared: list[_BriefFit] = []
             for task in tasks:
                 if self.over and prepared:
                     break
@@ -216,7 +217,7 @@ class Trials:
                 near = [p for p in group if best > enough or (p.trial and p.trial.error < BEHIND * best)]
                 near = [] if self.over else near
                 found += [p.trial for p in group if p not in near]
-                for refined in self._refined(near, gain is not None, pool):
+                for refined in self._refine(near, gain is not None, pool):
                     found.append(refined)
                     step(found)
             found += [p.trial for p in prepared[most:]]
@@ -225,36 +226,37 @@ class Trials:
             pool.shutdown(cancel_futures=True)
         return sorted((t for t in found if t is not None), key=lambda t: t.error)
 
-    def _begun(self, parent: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> _Begun:
+    def _fit_briefly(self, parent: Trial, entries: Sequence[Scored], gain: np.ndarray | None) -> _BriefFit:
         """Compile a pair and fit it briefly from its best start."""
         first, base = entries[0], parent.fitted
-        placed, _ = put_in(base.simulator, first, first.starts[0])
+        placed, _ = place_law(base.simulator, first, first.starts[0])
         model = self.bench.model(placed, gain)
         engine = make_engine(model, self.bench.engine)
         nominal = {k: p.value for k, p in base.simulator.parameters.items()}
         starts: list[Mapping[str, Any]] = []
-        led: list[Mapping[str, Any]] = []  # the observer's run may be near the truth where the simulation is not
+        # values from the observer's run, which may be near the truth if the simulation is not
+        led: list[Mapping[str, Any]] = []
         for entry in entries:
             for i, own in enumerate(entry.starts):
-                _, named = put_in(base.simulator, entry, own)
+                _, named = place_law(base.simulator, entry, own)
                 starts.append({**base.values, **named})
                 if i == 0:
                     led += [starts[-1]] if entry.source == "observer" else []
                     starts.append({**nominal, **named})
-        if set(first.law.parameters()) == set(first.law.strength):  # with nothing of it the simulator is as it was
-            _, named = put_in(base.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
+        if set(first.law.parameters()) == set(first.law.strength):  # at zero strength the simulator is unchanged
+            _, named = place_law(base.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
             starts.append({**base.values, **named})
         best, *rest = self._by_cost(placed, model, engine, starts, base)
         ranked = [best, *(s for s in led if s is not best), *(s for s in rest if not any(s is o for o in led))]
         count = len(parent.laws) + 1
         options = {"states": base.begin, "model": model, "engine": engine}
         brief = self.fitted(placed, ranked[:1], count, solver=BRIEF, **options)
-        return _Begun(placed, model, engine, ranked, base.begin, count, brief)
+        return _BriefFit(placed, model, engine, ranked, base.begin, count, brief)
 
-    def _refined(self, pairs: Sequence[_Begun], led: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
-        """Fit pairs from several starts, and `led` by the observer as well; three that agree are enough."""
+    def _refine(self, pairs: Sequence[_BriefFit], led: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
+        """Fit pairs from several starts, and if `led` by the observer as well; three that agree are enough."""
 
-        def submit(pair: _Begun, some: slice) -> list[Future[Trial | None]]:
+        def submit(pair: _BriefFit, some: slice) -> list[Future[Trial | None]]:
             options = {"states": pair.states, "model": pair.model, "engine": pair.engine}
             return [
                 pool.submit(self.fitted, pair.placed, [start], pair.count, anneal=anneal, **options)
@@ -262,11 +264,11 @@ class Trials:
             ]
 
         first = [submit(pair, slice(0, 3)) for pair in pairs]
-        begun = []
+        running = []
         for pair, tasks in zip(pairs, first, strict=True):
             found = [task.result() for task in tasks]
-            begun.append((pair, found, [] if _agree(found) else submit(pair, slice(3, None))))
-        for pair, found, tasks in begun:
+            running.append((pair, found, [] if _agree(found) else submit(pair, slice(3, None))))
+        for pair, found, tasks in running:
             every = [pair.trial, *found, *(task.result() for task in tasks)]
             yield min((t for t in every if t is not None), key=lambda t: t.part, default=None)
 
@@ -278,12 +280,12 @@ class Trials:
         starts: Sequence[Mapping[str, Any]],
         base: Fitted,
     ) -> list[Mapping[str, Any]]:
-        """Order starts by their error as they stand, from the initial states of a fit."""
+        """Order starts by their error before a fit, from the initial states of a fit."""
         part = self.part
-        initial = part.begun(placed, model, started(model, starts[0]), base.begin)
+        initial = part.initial_states(placed, model, start_vector(model, starts[0]), base.begin)
 
         def cost(start: Mapping[str, Any]) -> float:
-            values = model.parameters.unpack(started(model, start))
+            values = model.parameters.unpack(start_vector(model, start))
             found = part.result(placed, values, initial, engine, model).cost
             return found if np.isfinite(found) else np.inf
 
@@ -291,8 +293,8 @@ class Trials:
 
 
 @dataclass(frozen=True, eq=False)
-class _Begun:
-    """A pair with its compiled model and its starts, best first."""
+class _BriefFit:
+    """A pair with its compiled model, its starts, best first, and its brief fit."""
 
     placed: Simulator
     model: Model
@@ -303,7 +305,7 @@ class _Begun:
     trial: Trial | None
 
     def starts_again(self, led: bool) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
-        """Starts to fit from again, each with the observer's gains on its way: led first, where it is."""
+        """Return the starts for further fits, each with the observer's gains; those with the observer come first."""
         starts = self.starts[:AGAIN]
         if self.trial is not None:
             starts = [self.trial.fitted.values, *starts[1:]]
@@ -311,41 +313,41 @@ class _Begun:
 
 
 def _agree(found: Sequence[Trial | None]) -> bool:
-    """Whether three fits came to the same place."""
+    """Tell whether three fits came to the same minimum."""
     costs = sorted(t.part for t in found if t)
     return len(costs) > 2 and costs[2] < SAME * costs[0]
 
 
 def _head(r: Recording, share: float) -> Recording:
-    """The first part of a recording."""
+    """Return the first part of a recording."""
     cut = max(int(share * len(r)), min(len(r), r.skip + 20))
     return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 
-def survivors(scored: Sequence[Scored], best: int = BEST) -> list[list[Scored]]:
-    """Pick the pairs worth a full fit: the best of both lists and the best of each port."""
+def select_pairs(scored: Sequence[Scored], best: int = BEST) -> list[list[Scored]]:
+    """Select the pairs worth a full fit: the best of both lists and the best of each port."""
     chosen: dict[tuple[str, type[Law]], list[Scored]] = {}
     for source in ("simulation", "observer"):
         ports, passed = set[str](), list[Scored]()
         for s in (s for s in scored if s.source == source):
             if len(passed) < best or s.port not in ports:
                 chosen.setdefault((s.port, type(s.law)), [])
-            if not any(_adds_nothing(s, other) for other in passed):  # two forms of one law are one hypothesis
+            if not any(_is_redundant(s, other) for other in passed):  # two forms of one law are one hypothesis
                 passed.append(s)
             ports.add(s.port)
     for s in scored:
         if (s.port, type(s.law)) in chosen:
             chosen[s.port, type(s.law)].append(s)
-    return [[s for s in found if s.share > FAINT * found[0].share] or found for found in chosen.values()]
+    return [[s for s in found if s.share > LEAST_SHARE * found[0].share] or found for found in chosen.values()]
 
 
-def _adds_nothing(one: Scored, other: Scored) -> bool:
-    """Whether of two laws at a port the one refines the other and scores the same."""
+def _is_redundant(one: Scored, other: Scored) -> bool:
+    """Tell whether, of two laws at a port, one refines the other and they score the same."""
     a, b = type(one.law), type(other.law)
     return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < EQUAL
 
 
-def put_in(simulator: Simulator, entry: Scored, start: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:
+def place_law(simulator: Simulator, entry: Scored, start: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:
     """Put a law into its port; return the simulator and the law's start values by full name."""
     law = entry.law
     limits: dict[str, tuple[Any, Any]] = dict(law.at(start).bounds(entry.local))

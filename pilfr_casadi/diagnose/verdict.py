@@ -1,4 +1,4 @@
-"""The verdict in words: what the posterior, the checks of the recordings, and the rest of the refit come to."""
+"""The verdict in words, from the posterior, the checks of the recordings, and the remainder of the refit."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from .proof import mean_nrmse
 from .recording_faults import ringing
 from .search import Search
 
-AT_FLOOR = 1.15  # times the noise that counts as being at it
-QUANTISED, SOMEWHAT, COLOURED = 2.0, 4.0, 9.0  # times a measured floor, and an estimated one, that noise may be
-LOUD, SILENT = 0.05, 0.01  # largest coloured noise, and what a force may explain of it
-QUIET, CHANCE = 0.01, 0.05  # the same for noise that nobody minds: by chance a force explains that much
-HINT = 0.1  # share of a residual that a flexible force has to explain to count
-CURES = 1e-3  # share of the mean square that a fault leaves which was the mismatch, whatever else there is
-HALVED = 3.0  # times the error of a fault put right that an effect has to take away to be named before the fault
-AS_NEAR = 1.5  # times what a surrogate misses of the simulation itself, within which nothing can be said
-SURE = 0.5  # confidence above which a name is stated without reserve
+AT_FLOOR = 1.15  # ratio to the noise that counts as at the noise
+# largest ratio of noise to a measured floor; to an estimated floor; to that if no force explains the noise
+QUANTISED, SOMEWHAT, COLOURED = 2.0, 4.0, 9.0
+LOUD, SILENT = 0.05, 0.01  # largest coloured noise over the deviation, and the share of it that a force may explain
+QUIET, CHANCE = 0.01, 0.05  # the same for noise too small to matter: a force explains that much by chance
+HINT = 0.1  # least share of a residual that a flexible force has to explain to count
+CURES = 1e-3  # share of the mean square left by a fault's correction below which the fault was the mismatch
+HALVED = 3.0  # least ratio of errors by which an effect improves on a corrected fault, to be named instead
+AS_NEAR = 1.5  # ratio to a surrogate's own error within which nothing can be said
+SURE = 0.5  # confidence above which a name is stated without reservation
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Verdict:
 
 
 def judge(search: Search, found: Posterior, gates: Sequence[Gate]) -> Verdict:
-    """Choose the verdict: a fault where it was the mismatch, else the likeliest answer of the posterior."""
+    """Choose the verdict: a fault if it was the mismatch, else the likeliest answer of the posterior."""
     off = mean_nrmse(search.bench, search.root.fitted)
     if search.stand_in_error and off < AS_NEAR * search.stand_in_error:
         return Verdict(
@@ -45,15 +46,15 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate]) -> Verdict:
         )
     faults = [g for g in gates if g.fault]
     cured = min((g.left for g in faults), default=1.0) < CURES
-    if cured and search.root.whole < HALVED**2 * found.best.whole:  # next to the fault an effect is nothing
+    if cured and search.root.whole < HALVED**2 * found.best.whole:  # beside the fault, an effect is negligible
         return Verdict("recording-fault", faults[0].sentence)
     if found.effects and found.named > 0.5:
-        return Verdict("missing-physics", _named(search, found))
+        return Verdict("missing-physics", _describe_effects(search, found))
     opened = search.flexible(search.root)
     still = max(opened.values(), default=0.0)
     hum = [g for g in gates if g.finding == "tone" and not found.effects]
     own = ringing(search.bench, search.root.fitted)
-    noise = not found.effects and _noise(search, hum, still, own)
+    noise = not found.effects and _is_noise(search, hum, still, own)
     if faults and (noise or cured or (still < HINT and not found.effects)):
         return Verdict("recording-fault", faults[0].sentence)
     if noise and still < HINT:
@@ -63,11 +64,11 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate]) -> Verdict:
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
             "outputs' deviation, and no force at any port explains any of the rest.",
         )
-    return Verdict("unexplained", _unnamed(search, found, opened, own))
+    return Verdict("unexplained", _describe_unexplained(search, found, opened, own))
 
 
-def _noise(search: Search, hum: Sequence[Gate], still: float, own: float | None) -> bool:
-    """Whether what the refit leaves can be noise: no force explains it, it rings at no mode, and it does not swell."""
+def _is_noise(search: Search, hum: Sequence[Gate], still: float, own: float | None) -> bool:
+    """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady."""
     root = search.root
     quiet = root.error * max(1 - sum(1 - g.left for g in hum), 0.0) ** 0.5
     white = white_part(root.fitted.residual) if search.floor.source == "estimated" else search.floor.deviation
@@ -83,24 +84,24 @@ def _noise(search: Search, hum: Sequence[Gate], still: float, own: float | None)
 
 
 def _swells(search: Search) -> bool:
-    """Whether the residual swells with the inputs, the outputs or their rates."""
+    """Tell whether the residual's power follows the inputs, the outputs or their rates."""
     records = search.bench.recordings
     signals = [np.column_stack([r.u, r.y, np.gradient(r.y, axis=0)])[r.skip :] for r in records]
     rest = [e[r.skip :] for e, r in zip(search.root.fitted.residual, records, strict=True)]
     return swells_with(rest, signals)
 
 
-def _named(search: Search, found: Posterior) -> str:
+def _describe_effects(search: Search, found: Posterior) -> str:
     words = " and ".join(f"{display_name(e.name[1])} at {e.name[0]}" for e in found.effects)
     if found.sure > SURE:
         said = f"The simulator leaves out {words}."
     else:
         said = f"The simulator most likely leaves out {words}; the name is not certain."
-    return said + _gone(search, found)
+    return said + _describe_vanished(search, found)
 
 
-def _gone(search: Search, found: Posterior) -> str:
-    """What of the simulator's own is nothing beside the effects, in a sentence: they may stand in its place."""
+def _describe_vanished(search: Search, found: Posterior) -> str:
+    """Describe the simulator's own parameters that vanish beside the effects, which may replace them."""
     simulator = search.bench.simulator
     offsets = tuple(e.prefix for e in simulator.elements if e.law.id == "offset")
     names = [k for k in simulator.parameters if not k.startswith(offsets)]
@@ -110,7 +111,7 @@ def _gone(search: Search, found: Posterior) -> str:
     return f" Beside {beside}, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
 
 
-def _unnamed(search: Search, found: Posterior, opened: dict[str, float], own: float | None) -> str:
+def _describe_unexplained(search: Search, found: Posterior, opened: dict[str, float], own: float | None) -> str:
     root, still = search.root, max(opened.values(), default=0.0)
     where = max(opened, key=lambda k: opened[k], default="")
     if not found.effects:

@@ -1,4 +1,4 @@
-"""What all steps of a diagnosis share: the simulator, its recordings, how it is integrated, and how it is fitted."""
+"""The data shared by all steps of a diagnosis: the simulator, its recordings, its integration and its fit."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ from ..simulators import (
     resting_elements,
 )
 
-QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
-HUGE, ENDLESS = 1e6, 1e20  # times the largest measured value, and mean square error, of what grows without end
-AWAY = 10.0  # times the outputs' deviation; what swings within bounds about another point is off by less
-BEYOND = 20.0  # e-folds within a recording that no estimate of a state survives
-FINER = 4  # times as many sub-steps for a law at most
-THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
+QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)  # default solver of a fit
+HUGE, DIVERGED = 1e6, 1e20  # bounds on a diverging run: output over the largest measured value, and mean square error
+RUNAWAY = 10.0  # over the outputs' deviation; a bounded oscillation about another point is off by less
+# growth within a recording, in e-folds, above which no estimated initial state can keep the run bounded
+MOST_GROWTH = 20.0
+FINER = 4  # largest factor on the sub-steps for a law
+THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)  # solver of the fits that results are based on
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +69,12 @@ class Fitted:
 
     @property
     def at_bounds(self) -> float:
-        """Share of the free parameters that came out at a bound."""
+        """Share of the free parameters at a bound."""
         p, at = self.model.parameters, self.vector
         return float(np.mean(((at <= p.lower) | (at >= p.upper))[p.free])) if np.any(p.free) else 0.0
 
     def at_bound(self, name: str) -> np.ndarray:
-        """Which entries of a parameter came out at one of its bounds."""
+        """Mark the entries of a parameter that are at one of its bounds."""
         (low, high), value = self.model.parameters[name].bounds, self.values[name]
         return np.asarray((value <= low) | (value >= high))
 
@@ -83,7 +84,7 @@ class Fitted:
         return [state[: len(self.simulator.states)] for state in self.initial]
 
     def corrected(self) -> Simulator:
-        """The simulator with the fitted values as start values."""
+        """Return the simulator with the fitted values as start values."""
         own = self.simulator.parameter_set
         vector = own.pack({k: v for k, v in self.values.items() if k in own})
         return self.simulator.with_parameters(own.at(vector))
@@ -91,7 +92,7 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class Workbench:
-    """The data of one diagnosis, and how simulators are run on it."""
+    """The data of one diagnosis, with the settings for running and fitting simulators on it."""
 
     simulator: Simulator
     recordings: tuple[Recording, ...]
@@ -101,8 +102,8 @@ class Workbench:
     engine: str = "auto"
     at_least: int = 1  # sub-steps of simulators with laws
     typical: tuple[np.ndarray, np.ndarray] | None = None  # states and inputs along the refitted run
-    chosen: int = 1  # sub-steps of the simulator as they were chosen first, which limits are counted from
-    struck: list[Status] = field(default_factory=list)  # by an interrupt: fits that it has ended
+    chosen: int = 1  # sub-steps first chosen for the simulator, on which limits are based
+    interrupted_fits: list[Status] = field(default_factory=list)  # one entry for each fit that an interrupt has ended
 
     @classmethod
     def of(cls, simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str = "auto") -> Workbench:
@@ -121,44 +122,45 @@ class Workbench:
         """Sampling interval, s."""
         return self.recordings[0].dt
 
-    def otherwise_held(self) -> Workbench:
-        """The same with inputs that do the other thing between samples."""
+    def with_other_hold(self) -> Workbench:
+        """Return the bench with the other hold of the inputs between samples."""
         return replace(self, hold="linear" if self.hold == "zero" else "zero")
 
     def on(self, recordings: Sequence[Recording]) -> Workbench:
-        """The same with other recordings, errors still in units of the training outputs' deviation."""
+        """Return the bench with other recordings; errors stay in units of the training outputs' deviation."""
         return replace(self, recordings=tuple(match_channels(self.simulator, r) for r in recordings))
 
     @one_at_a_time
     def model(self, simulator: Simulator, gain: np.ndarray | None = None) -> Model:
-        """The simulator as a model, with output injection where a gain is given."""
+        """Discretise a simulator, with output injection if a gain is given."""
         model = discretise(simulator, self.dt, self.hold, self._substeps(simulator))
         return model if gain is None else with_output_injection(model, gain)
 
     def _substeps(self, simulator: Simulator) -> int:
-        """More where a law is fast, up to a limit: a stiff start of a law is not worth a fine grid."""
+        """Choose more sub-steps for a fast law, up to a limit: a stiff start of a law is not worth a fine grid."""
         if not simulator.elements:
             return self.substeps
         wanted = needed_substeps(simulator, self.recordings)[0]
         wanted = wanted if wanted <= MOST_SUBSTEPS else 0
-        if any(getattr(e.law, "knee", "") for e in simulator.elements):  # passed at every reversal, if not stood on
+        # passed at every reversal, even if not at rest there
+        if any(getattr(e.law, "knee", "") for e in simulator.elements):
             wanted = max(wanted, int(np.ceil(rate_at_start(simulator, self.recordings[0]) * self.dt / LARGEST_STEP)))
-        if self.typical is not None:  # a contact is not felt at rest
+        if self.typical is not None:  # a contact is not active at rest
             p = simulator.parameter_set.start
             rates = fastest_rates(simulator, *self.typical, p)
             if np.any(np.isfinite(rates)):
                 wanted = max(wanted, int(np.ceil(float(np.nanquantile(rates, 0.95)) * self.dt / LARGEST_STEP)))
         least = max(self.substeps, self.at_least, *(getattr(e.law, "substeps", 1) for e in simulator.elements))
-        if any(getattr(e.law, "shifts", False) for e in simulator.elements):  # its memory has a place for every step
+        if any(getattr(e.law, "shifts", False) for e in simulator.elements):  # its memory has an entry for every step
             least = min(least, FINER * self.chosen)
         return int(np.clip(wanted, least, max(FINER * self.chosen, least)))
 
     def too_coarse(self, fitted: Fitted) -> bool:
-        """Whether a law came out faster than the sub-steps it was fitted on, which were chosen where it started."""
+        """Tell whether a law became faster than the sub-steps allow, which were chosen at its start values."""
         return self._substeps(fitted.corrected()) > fitted.model.substeps
 
     def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:
-        """The simulation-error problem of a model."""
+        """Make the simulation-error problem of a model."""
         context = FitContext(tuple(recordings or self.recordings), QUICK)
         return context.problem(model, engine=engine or self.engine, scale=self.scale)
 
@@ -173,9 +175,9 @@ class Workbench:
         model: Model | None = None,
         engine: Engine | None = None,
     ) -> Fitted:
-        """Fit from several starts (values by name), each led through the injection gains `anneal`.
+        """Fit from several starts (values by name), each through the sequence of injection gains `anneal`.
 
-        `states` are a first guess of each recording's initial state, without those of new laws at its end.
+        `states` are initial guesses of each recording's initial state, without the states of new laws at its end.
 
         Raises
         ------
@@ -186,7 +188,7 @@ class Workbench:
         engine = engine or make_engine(model, self.engine)
         estimated = any(r.begins == "estimate" for r in self.recordings)
         if not np.any(model.parameters.free) and not (estimated and model.n_state):
-            return self._as_it_is(simulator, model, engine)
+            return self._run_fixed(simulator, model, engine)
         best: tuple[float, np.ndarray, Problem] | None = None
         for start in starts:
             found = self._run(simulator, model, engine, start, states, tuple(anneal), solver)
@@ -194,17 +196,17 @@ class Workbench:
                 best = found
         if best is None:
             raise InputError(
-                f"The simulation diverges at the start values{self._lost(model, engine, starts[0])}; "
-                + (self._unstable(simulator) or "check the parameters' values and units, and the hold.")
+                f"The simulation diverges at the start values{self._describe_divergence(model, engine, starts[0])}; "
+                + (self._describe_instability(simulator) or "check the parameters' values and units, and the hold.")
             )
         _, theta, problem = best
         values = model.parameters.unpack(problem.parameters(theta))
         values.pop(INJECTION, None)
         return self.result(simulator, values, problem.first_states(theta), engine, model)
 
-    def _lost(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
-        """Where a run from rest leaves every bound, in words."""
-        vector = started(model, start)
+    def _describe_divergence(self, model: Model, engine: Engine, start: Mapping[str, Any]) -> str:
+        """Describe where a run from rest exceeds every bound."""
+        vector = start_vector(model, start)
         for r in self.recordings:
             with np.errstate(all="ignore"):
                 y = engine.simulate(model.drive(r), vector, np.zeros(model.n_state))[0]
@@ -217,22 +219,22 @@ class Workbench:
 
     def check_followed(self, fitted: Fitted) -> None:
         """Refuse a fit that is far beyond what was recorded because the simulator is unstable."""
-        if fitted.cost > AWAY**2 and (why := self._unstable(self.simulator)):
+        if fitted.cost > RUNAWAY**2 and (why := self._describe_instability(self.simulator)):
             off = f"{fitted.cost**0.5:.3g} times the outputs' deviation"
             raise InputError(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
 
-    def _unstable(self, simulator: Simulator) -> str:
-        """What to do about a simulator that no recording of a controlled machine can be followed with, or nothing."""
+    def _describe_instability(self, simulator: Simulator) -> str:
+        """Say what to do about a simulator too unstable to follow a controlled machine; empty if it is not."""
         rate = growth_rate(simulator, self.recordings[0])
-        if rate * max(len(r) for r in self.recordings) * self.dt < BEYOND:
+        if rate * max(len(r) for r in self.recordings) * self.dt < MOST_GROWTH:
             return ""
         return (
             f"it is unstable (it grows e-fold in {1 / rate:.2g} s) and cannot be run by its own inputs alone: put the "
             "controller into the simulator, with its reference as the input."
         )
 
-    def _as_it_is(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
-        """Nothing to estimate: the simulator as it stands."""
+    def _run_fixed(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:
+        """Run the simulator as it stands, because there is nothing to estimate."""
         freed = model.parameters.change(**{name: {"fixed": False} for name in model.parameters})
         problem = self.problem(model.with_parameters(freed), engine)
         values = {k: p.value for k, p in model.parameters.items()}
@@ -252,10 +254,10 @@ class Workbench:
         solver: GaussNewton,
     ) -> tuple[float, np.ndarray, Problem] | None:
         parameters = model.parameters
-        vector = started(model, start)
+        vector = start_vector(model, start)
         states = None
         if len(guess):
-            unknown = zip(self.recordings, self.begun(simulator, model, vector, guess), strict=True)
+            unknown = zip(self.recordings, self.initial_states(simulator, model, vector, guess), strict=True)
             states = np.concatenate([np.zeros(0), *(state for r, state in unknown if r.begins == "estimate")])
         problem: Problem | None = None
         for gamma in (*path, 0.0):
@@ -277,19 +279,19 @@ class Workbench:
             except (RuntimeError, FloatingPointError, np.linalg.LinAlgError):  # a quadratic program of huge numbers
                 continue
             if solution.status is Status.INTERRUPTED:
-                self.struck.append(solution.status)
+                self.interrupted_fits.append(solution.status)
             if np.all(np.isfinite(solution.theta)):
                 vector, states = problem.parameters(solution.theta), solution.theta[n_free:]
         if problem is None:
             return None
         theta = np.concatenate([vector[problem.free], states if states is not None else problem.start[n_free:]])
         cost = problem.cost(theta)
-        return (cost, theta, problem) if cost < ENDLESS else None
+        return (cost, theta, problem) if cost < DIVERGED else None
 
-    def begun(
+    def initial_states(
         self, simulator: Simulator, model: Model, vector: np.ndarray, states: Sequence[np.ndarray]
     ) -> list[np.ndarray]:
-        """Initial states (n_state,) whose first entries are given; laws begin at rest, where each recording begins."""
+        """Complete initial states (n_state,) from their first entries; laws begin at rest at the first inputs."""
         out, n = [], model.n_state
         for r, given in zip(self.recordings, states, strict=True):
             state = np.asarray(given, dtype=float)[:n]
@@ -300,11 +302,11 @@ class Workbench:
         return out
 
     def rerun(self, fitted: Fitted, simulator: Simulator | None = None) -> Fitted:
-        """The same values on this bench's steps, with a law's parameters as in `simulator` where that is given."""
+        """Run the same values on this bench's steps, with the laws' parameters of `simulator` if that is given."""
         simulator = simulator or fitted.simulator
         model = self.model(simulator)
         engine = make_engine(model, self.engine)
-        states = self.begun(simulator, model, model.parameters.pack(fitted.values), fitted.begin)
+        states = self.initial_states(simulator, model, model.parameters.pack(fitted.values), fitted.begin)
         return self.result(simulator, fitted.values, states, engine, model)
 
     def result(
@@ -315,9 +317,9 @@ class Workbench:
         engine: Engine,
         model: Model,
     ) -> Fitted:
-        """Residuals at given values and initial states."""
+        """Compute the residuals at given values and initial states."""
         vector = model.parameters.pack(values)
-        with np.errstate(over="ignore", invalid="ignore"):  # what diverges has an infinite cost
+        with np.errstate(over="ignore", invalid="ignore"):  # a diverging run has an infinite cost
             runs = zip(self.recordings, initial, strict=True)
             residual = [engine.simulate(model.drive(r), vector, state)[0] - r.y for r, state in runs]
             scored = [(e / self.scale)[r.skip :] for e, r in zip(residual, self.recordings, strict=True)]
@@ -325,7 +327,7 @@ class Workbench:
         return Fitted(simulator, model, engine, values, initial, residual, cost)
 
 
-def started(model: Model, start: Mapping[str, Any]) -> np.ndarray:
-    """Parameter vector at start values by name, inside the bounds; what the model does not know is left out."""
+def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
+    """Return the parameter vector at start values by name, clipped to the bounds; unknown names are ignored."""
     p = model.parameters
     return np.asarray(np.clip(p.pack({k: v for k, v in start.items() if k in p}), p.lower, p.upper))

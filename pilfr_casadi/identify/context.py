@@ -101,7 +101,7 @@ class FitContext:
     def iterate_noise(
         self, problem: Problem, solution: Solution, stage: str, **others: Any
     ) -> tuple[Problem, Solution]:
-        """Where there are priors, set the noise to the error reached and solve again, until the two agree."""
+        """Solve again with the noise set to the error reached, until the two agree; only if there are priors."""
         priors = any(p.prior is not None and not np.all(p.fixed) for p in problem.model.parameters.values())
         for _ in range(NOISE_ROUNDS if priors and self.options.noise is None else 0):
             error = rms_error(problem, solution)

@@ -83,7 +83,7 @@ def test_only_what_begins_somehow_begins_where_its_signal_stands():
     for initial, expected in (("estimate", 7.0), ("zero", 0.0)):
         bench = Workbench.of(simulator, [r.with_(initial=initial)], "zero")
         model = bench.model(simulator)
-        begun = bench.begun(simulator, model, model.parameters.start, [np.array([5.0, 5.0])])[0]
+        begun = bench.initial_states(simulator, model, model.parameters.start, [np.array([5.0, 5.0])])[0]
         assert begun[2] == expected
 
 

@@ -19,7 +19,7 @@ CUBIC, DRY = laws.CubicStiffness(values={"k_3": 4e5}), laws.CoulombFriction(valu
 @pytest.fixture
 def fits(monkeypatch):
     """How often each law was begun beside its parent's, and each hypothesis fitted thoroughly."""
-    begun, polished, found = Counter(), Counter(), {"begun": Trials._begun, "polished": Trials.polished}
+    begun, polished, found = Counter(), Counter(), {"begun": Trials._fit_briefly, "polished": Trials.polish}
 
     def begin(self, parent, entries, gain):
         begun[parent.key, (entries[0].port, type(entries[0].law))] += 1
@@ -29,8 +29,8 @@ def fits(monkeypatch):
         polished[trial.key] += 1
         return found["polished"](self, trial)
 
-    monkeypatch.setattr(Trials, "_begun", begin)
-    monkeypatch.setattr(Trials, "polished", polish)
+    monkeypatch.setattr(Trials, "_fit_briefly", begin)
+    monkeypatch.setattr(Trials, "polish", polish)
     return begun, polished
 
 
@@ -61,7 +61,7 @@ def test_what_two_effects_are_exchanged_for_is_not_fitted_twice(fits):
 
 
 def test_an_interrupt_of_a_fit_keeps_what_there_is(monkeypatch):
-    seen, whole = [], Trials.judged
+    seen, whole = [], Trials.make_trial
 
     def struck(self, found, count):
         seen.append(count)
@@ -69,7 +69,7 @@ def test_an_interrupt_of_a_fit_keeps_what_there_is(monkeypatch):
             raise KeyboardInterrupt
         return whole(self, found, count)
 
-    monkeypatch.setattr(Trials, "judged", struck)
+    monkeypatch.setattr(Trials, "make_trial", struck)
     found = searched(recordings(CUBIC, count=1), 2)
     assert found.interrupted and found.root.key in found.memo
     assert found.best is found.root

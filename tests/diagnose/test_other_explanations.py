@@ -11,7 +11,7 @@ from pilfr_casadi import Parameter, Recording, Simulator, laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.other_explanations import varying
+from pilfr_casadi.diagnose.other_explanations import find_varying_values
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.report.diagnosis_tables import headline
@@ -121,7 +121,7 @@ def told(*recordings):
     bench = Workbench.of(cart(), recordings, "zero")
     floor = Floor(np.full(1, 1e-3), "estimated")
     search = Search(bench, bench.fit(bench.simulator), floor, (), 1, Stages(lambda *_: None))
-    return varying(search.run(0))
+    return find_varying_values(search.run(0))
 
 
 def test_recordings_that_disagree_are_told_with_the_value_that_differs():

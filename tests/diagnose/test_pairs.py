@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.diagnose.pairs import together
+from pilfr_casadi.diagnose.pairs import pair_shares
 from pilfr_casadi.diagnose.remainder import orthonormal
 from problems.concealed import case
 from problems.concealed_score import score
@@ -16,7 +16,7 @@ from problems.concealed_score import score
 def test_the_share_of_a_pair_is_that_of_least_squares(seed, widths):
     rng = np.random.default_rng(seed)
     parts, left = [orthonormal(rng.standard_normal((60, w))) for w in widths], rng.standard_normal(60)
-    found = together(parts, left)
+    found = pair_shares(parts, left)
     for i in range(len(parts)):
         for j in range(len(parts)):
             if i != j:

@@ -42,7 +42,7 @@ def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monk
         def run(self, effects):
             return self
 
-        def room(self, trial):
+        def can_improve(self, trial):
             return True
 
     def prepare(*given, early, say):
@@ -52,7 +52,7 @@ def test_what_seems_early_beside_something_unexplained_is_searched_as_it_is(monk
 
     monkeypatch.setattr(pipeline, "prepare", prepare)
     monkeypatch.setattr(pipeline, "Search", Unsure)
-    ready, _ = pipeline._searched(a_request())
+    ready, _ = pipeline._search(a_request())
     assert early_or_not == ([True] if interrupted else [True, False])
     assert ready.gates == (() if nearer and not interrupted else gates)
 
@@ -62,13 +62,13 @@ class Searched:
 
     def __init__(self, whole, interrupted=False, fits=3):
         self.best, self.interrupted, self.out_of_time = SimpleNamespace(whole=whole), interrupted, False
-        self.bench = SimpleNamespace(otherwise_held=lambda: SimpleNamespace(hold="linear"))
+        self.bench = SimpleNamespace(with_other_hold=lambda: SimpleNamespace(hold="linear"))
         self.memo = dict.fromkeys(range(fits))
 
-    def misheld(self):
+    def other_hold_fits_better(self):
         return True
 
-    def settled(self, effects):
+    def resume(self, effects):
         return self
 
 
@@ -91,11 +91,11 @@ def test_the_search_with_the_other_hold_is_taken_where_it_comes_nearer(monkeypat
             raise again
         return SimpleNamespace(gates=()), again
 
-    monkeypatch.setattr(pipeline, "said_hold", lambda *given: given[2])
-    monkeypatch.setattr(pipeline, "_searched", searched)
+    monkeypatch.setattr(pipeline, "stated_hold", lambda *given: given[2])
+    monkeypatch.setattr(pipeline, "_search", searched)
     monkeypatch.setattr(pipeline, "hold_note", lambda *given: given[1])
     monkeypatch.setattr(pipeline, "replace", lambda of, **more: SimpleNamespace(**{**vars(of), **more}))
-    prepared, search = pipeline._searched_both_holds(a_request())
+    prepared, search = pipeline._search_both_holds(a_request())
     assert search is (again if taken else first)
     assert prepared.gates == (("linear",) if taken else ())
     assert search.interrupted is getattr(again, "interrupted", False)
@@ -111,14 +111,14 @@ def test_an_answer_that_is_there_outlives_an_interrupt_of_what_adds_to_it(monkey
     search = SimpleNamespace(interrupted=unfinished, out_of_time=False, bench=None, root=best)
     answer = SimpleNamespace(best=best, sure=0.0, effects=())
     monkeypatch.setattr(pipeline, "posterior", lambda search: answer)
-    monkeypatch.setattr(pipeline, "as_named", lambda *given: None)
+    monkeypatch.setattr(pipeline, "named_correction", lambda *given: None)
     monkeypatch.setattr(pipeline, "tones", lambda *given: ())
     monkeypatch.setattr(pipeline, "judge", lambda *given: Verdict("unexplained", "Something is missing."))
-    monkeypatch.setattr(pipeline, "held_value", lambda *given: None)
+    monkeypatch.setattr(pipeline, "find_pinned_parameter", lambda *given: None)
     monkeypatch.setattr(pipeline, "clipped_input", lambda *given: None)
     monkeypatch.setattr(pipeline, "mean_nrmse", lambda *given: 0.5)
-    monkeypatch.setattr(pipeline, "beyond_the_ports", interrupted)
-    monkeypatch.setattr(pipeline, "varying", lambda search: ())
+    monkeypatch.setattr(pipeline, "find_undeclared_port", interrupted)
+    monkeypatch.setattr(pipeline, "find_varying_values", lambda search: ())
     found = pipeline.conclude(search, ())
     assert search.interrupted and found.verdict.kind == "unexplained"
     assert ("interrupted before" in found.verdict.sentence) == unfinished

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pilfr_casadi.diagnose.gates import Offset
-from pilfr_casadi.diagnose.posterior import posterior, share_named, unfollowed
+from pilfr_casadi.diagnose.posterior import explainable_remainder, posterior, share_named
 from pilfr_casadi.diagnose.trials import Trial
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, DirectionalFriction, QuadraticDrag
 from pilfr_casadi.simulators import Placed
@@ -33,7 +33,7 @@ def searched(told, flexible=0.0, full=1.0):
         floor2=NOISE,
         bench=SimpleNamespace(simulator=SimpleNamespace(output_names=("x",))),
         evidence=lambda t: evidence[t.key],
-        promise=lambda t: full * evidence[t.key],
+        optimistic_evidence=lambda t: full * evidence[t.key],
         flexible=lambda t: {"a": flexible, "b": 0.0},
     )
 
@@ -119,11 +119,11 @@ def test_what_a_flexible_force_would_still_follow_speaks_against_the_name():
     hypothesis, named, share = trial(DRY, left=0.3), [], []
     for flexible in (0.0, 0.3, 0.9):
         search = searched([(trial(left=1.0), 0.0), (hypothesis, 60.0)], flexible)
-        share.append(unfollowed(search, hypothesis))
+        share.append(explainable_remainder(search, hypothesis))
         named.append(posterior(search).named)
     assert share == sorted(share) and share[-1] == pytest.approx(0.3 * (0.9 + 0.2 * 0.1))
     assert named == sorted(named, reverse=True) and named[-1] < 0.5
-    assert unfollowed(search, trial(DRY)) == 0.0
+    assert explainable_remainder(search, trial(DRY)) == 0.0
 
 
 def test_a_law_that_leaves_nothing_is_the_physics_and_one_that_leaves_all_is_none():

@@ -7,7 +7,7 @@ from test_slips import DT, recorded, tanks
 
 from pilfr_casadi import Recording
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.gates import Checked, as_it_came_out, find_offsets, offset_gates
+from pilfr_casadi.diagnose.gates import Checked, final_gates, find_offsets, offset_gates
 from pilfr_casadi.diagnose.preparation import prepare, refitted
 
 
@@ -54,6 +54,6 @@ def test_a_constant_of_a_sensor_is_found_and_kept():
     assert gate.value == pytest.approx(0.3, rel=0.02)
     (again,) = offset_gates(fitted.simulator.elements, fitted.values)
     assert again.value == gate.value and "parameter of the corrected simulator" in again.sentence
-    (told,) = as_it_came_out([gate], fitted, {gate.parameter: np.array(0.03)}, False, False)
+    (told,) = final_gates([gate], fitted, {gate.parameter: np.array(0.03)}, False, False)
     assert "may be a part of that" in told.sentence
-    assert not as_it_came_out([gate], fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none
+    assert not final_gates([gate], fitted, {gate.parameter: np.array(0.3)}, False, False)  # it may be none

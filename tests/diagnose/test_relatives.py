@@ -9,7 +9,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.relatives import _imitated, felt, relatives
+from pilfr_casadi.diagnose.relatives import _matching_forces, port_signals, relatives
 from pilfr_casadi.diagnose.screen import Scored
 from pilfr_casadi.diagnose.trials import Trials
 from pilfr_casadi.engine import make_engine
@@ -120,7 +120,7 @@ def bench(port, law):
 def flexible_fit(on, port, kind):
     """A flexible law at a port, fitted beside the cart."""
     without = on.fit(cart())
-    local = felt(on, without, port)
+    local = port_signals(on, without, port)
     shape = next(iter(kind().shapes(local)))
     weights = np.append(-0.3 * (port != "ground"), np.full(5, 0.05))
     law = kind().at({**shape, "w": weights}, kind().bounds(local))
@@ -140,7 +140,7 @@ def test_simple_laws_whose_force_is_alike_are_put_up(port, hidden, flexible, sim
     best, local = flexible_fit(on, port, flexible)
     kinds = dict.fromkeys((*simple, type(hidden)))
     entries = [Scored(port, kind(), 0.1, ({},), local) for kind in kinds][::-1]
-    found = {type(s.law): s.starts[0] for s in _imitated(on, [best], entries)}
+    found = {type(s.law): s.starts[0] for s in _matching_forces(on, [best], entries)}
     start = found[type(hidden)]
     for name, value in hidden.values.items():
         if name not in hidden.strength and name != "v_0":
@@ -150,9 +150,9 @@ def test_simple_laws_whose_force_is_alike_are_put_up(port, hidden, flexible, sim
 def test_a_simple_law_stands_for_itself():
     on = bench("actuator:force", Saturation().at({"L": 8.0}))
     best = Trials(on, 1).fitted(cart().with_element("actuator:force", Saturation().at({"L": 8.0})), [{}], 1)
-    local = felt(on, best.fitted, "actuator:force")
+    local = port_signals(on, best.fitted, "actuator:force")
     np.testing.assert_allclose(local.z, on.recordings[0].u[:, 0])
-    assert _imitated(on, [best], [Scored("actuator:force", DeadZone(), 0.1, ({},), local)]) == []
+    assert _matching_forces(on, [best], [Scored("actuator:force", DeadZone(), 0.1, ({},), local)]) == []
 
 
 def test_a_rate_that_is_no_number_is_compared_with_nothing(monkeypatch):
@@ -160,7 +160,7 @@ def test_a_rate_that_is_no_number_is_compared_with_nothing(monkeypatch):
     on = bench("actuator:force", DeadZone().at({"g": 3.0}))
     best, local = flexible_fit(on, "actuator:force", PlayHysteresis)
     entries = [Scored("actuator:force", DeadZone(), 0.1, ({},), local)]
-    assert _imitated(on, [best], entries)
+    assert _matching_forces(on, [best], entries)
     nowhere = replace(local, dz=np.where(np.arange(len(local.dz)) == 7, np.nan, local.dz))
-    monkeypatch.setitem(_imitated.__globals__, "felt", lambda *_: nowhere)
-    assert _imitated(on, [best], entries) == []
+    monkeypatch.setitem(_matching_forces.__globals__, "port_signals", lambda *_: nowhere)
+    assert _matching_forces(on, [best], entries) == []

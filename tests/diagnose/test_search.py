@@ -41,7 +41,7 @@ def test_an_interrupt_leaves_what_there_is(monkeypatch):
     def interrupted(self, trial):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Trials, "polished", interrupted)
+    monkeypatch.setattr(Trials, "polish", interrupted)
     found = searching(recordings(FRICTION, count=1)).run(2)
     assert found.interrupted and len(found.memo) > 1
 

@@ -8,7 +8,7 @@ from diagnosis_rig import DT
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.step_refinement import on_steps_as_fine
+from pilfr_casadi.diagnose.step_refinement import refine_steps
 from pilfr_casadi.diagnose.workbench import FINER, THOROUGH
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, Delay, Polynomial
@@ -87,11 +87,11 @@ def bent(r):
 def test_finer_steps_only_where_the_run_depends_on_them_whatever_else_is_missing():
     plain = Workbench.of(carriage(), [ran(0, 1e-4)], "zero")
     fitted = plain.fit(carriage())
-    assert on_steps_as_fine(plain, fitted) == (plain, fitted)  # far off, but not for its steps
+    assert refine_steps(plain, fitted) == (plain, fitted)  # far off, but not for its steps
     for records in (plain.recordings, [bent(r) for r in plain.recordings]):
         bench = Workbench.of(sharp(), records, "zero")
         coarse = bench.fit(sharp(), solver=THOROUGH)
-        finer, found = on_steps_as_fine(bench, coarse)
+        finer, found = refine_steps(bench, coarse)
         assert finer.substeps == found.model.substeps >= FINER * bench.substeps
         law = CoulombFriction(values={"F_c": F_C, "v_0": 1e-6})  # counted from the steps that were chosen first
         assert finer.model(sharp().with_element("guide", law)).substeps == finer.substeps

@@ -8,7 +8,7 @@ from diagnosis_rig import recordings, rig
 
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.gates import Offset, without_idle_offsets
-from pilfr_casadi.diagnose.verdict import _gone
+from pilfr_casadi.diagnose.verdict import _describe_vanished
 from pilfr_casadi.laws import CoulombFriction
 
 
@@ -20,7 +20,7 @@ def test_only_what_is_the_users_own_is_told_to_come_out_as_zero():
     before, after = (SimpleNamespace(fitted=SimpleNamespace(values=dict.fromkeys(own.parameters, v))) for v in (1, 0))
     search = SimpleNamespace(bench=SimpleNamespace(simulator=own), root=before)
     found = SimpleNamespace(effects=("a law",), best=after)
-    assert _gone(search, found) == " Beside it, d and guide.F_c come out as zero."
+    assert _describe_vanished(search, found) == " Beside it, d and guide.F_c come out as zero."
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
