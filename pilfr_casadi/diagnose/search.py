@@ -142,10 +142,15 @@ class Search:
 
     def evidence(self, trial: Trial) -> float:
         """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known."""
-        known, of_root = self.held_out.get(trial.key), self.held_out.get(self.root.key)
-        worse = of_root.mean_square / self.root.whole if of_root else 1.0
-        v = known.mean_square if known else trial.whole * (worse if np.isfinite(worse) else 1.0)
+        known = self.held_out.get(trial.key)
+        v = known.mean_square if known else trial.whole * self._held_out_ratio()
         return self._log_evidence(trial, v, self.samples)
+
+    def _held_out_ratio(self) -> float:
+        """Compute the usual ratio of held-out to fit error (mean squares), for hypotheses that were not predicted."""
+        known = ((h.mean_square, self.memo[key].whole) for key, h in self.held_out.items() if key in self.memo)
+        ratios = [held_out / fit for held_out, fit in known if np.isfinite(held_out) and fit > 0]
+        return float(np.median(ratios)) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
         told = trial.information if trial.information is not None else np.zeros(0)
