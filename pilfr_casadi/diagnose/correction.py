@@ -161,7 +161,8 @@ def _trial_competitor(search: Search, trial: Trial) -> Iterator[_Competitor]:
     """Generate the candidate of a trial, if it can be simulated."""
     with suppress(InputError):
         trial = search.thorough(trial)
-        yield trial.fitted, trial.fitted, partial(search.predicts, trial)
+        if np.isfinite(trial.whole):
+            yield trial.fitted, trial.fitted, partial(search.predicts, trial)
 
 
 def _may_recur(search: Search, trial: Trial) -> bool:

@@ -155,10 +155,10 @@ class Trials:
     def make_trial(self, found: Fitted, count: int) -> Trial:
         """Make a trial of a fit to a part of the recordings."""
         laws = found.simulator.elements[len(found.simulator.elements) - count :] if count else ()
-        whole = found.cost
+        whole = found
         if self.part is not self.bench:
-            whole = self.bench.result(found.simulator, found.values, found.initial, found.engine, found.model).cost
-        return Trial(laws, found, found.cost, whole if np.isfinite(whole) else np.inf)
+            whole = self.bench.result(found.simulator, found.values, found.initial, found.engine, found.model)
+        return Trial(laws, whole, found.cost, whole.cost if np.isfinite(whole.cost) else np.inf)
 
     def polish(self, trial: Trial) -> Trial:
         """Fit a trial to convergence and to all samples."""

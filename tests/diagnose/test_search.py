@@ -1,5 +1,7 @@
 """The search over hypotheses: when it stops, what it keeps, and what an interrupt and a time limit leave."""
 
+import sys
+
 import numpy as np
 import pytest
 from diagnosis_rig import OFF, recordings, rig
@@ -53,6 +55,16 @@ def test_at_the_time_limit_the_search_answers_from_what_it_has():
     assert "The time limit ended the search" in str(diagnosis)
     with pytest.raises(pilfr.InputError, match="time_limit=0 was given"):
         pilfr.diagnose(rig(OFF), recordings(FRICTION, count=1), time_limit=0)
+
+
+def test_a_hypothesis_fitted_to_a_part_is_judged_on_everything(monkeypatch):
+    monkeypatch.setitem(vars(sys.modules[Trials.__module__]), "LONG", 300)
+    search = searching(recordings(FRICTION, count=1))
+    placed = rig(OFF).with_element("ground-m1", FRICTION)
+    trial = search.fits.fitted(placed, [{}], 1)
+    (whole,) = search.bench.recordings
+    assert [len(e) for e in trial.fitted.residual] == [len(whole)]
+    assert trial.whole == trial.fitted.cost != trial.part
 
 
 def test_a_law_that_only_led_the_simulator_out_of_a_dead_end_is_no_physics():
