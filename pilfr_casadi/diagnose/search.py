@@ -148,7 +148,7 @@ class Search:
 
     def _held_out_ratio(self) -> float:
         """Compute the usual ratio of held-out to fit error (mean squares), for hypotheses that were not predicted."""
-        known = ((h.mean_square, self.memo[key].whole) for key, h in self.held_out.items() if key in self.memo)
+        known = ((h.error**2, self.memo[key].whole) for key, h in self.held_out.items() if key in self.memo)
         ratios = [held_out / fit for held_out, fit in known if np.isfinite(held_out) and fit > 0]
         return float(np.median(ratios)) if ratios else 1.0
 
