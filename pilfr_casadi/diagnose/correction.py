@@ -10,10 +10,9 @@ are never used.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
 from .cross_validation import HeldOut
-from .learned import Learned, LearnedForce, candidates, describe_learned
+from .learned import Learned, LearnedForce, describe_learned
 from .posterior import Posterior, explainable_remainder
 from .search import FORMULA, Search
 from .trials import Trial
@@ -30,10 +29,6 @@ from .verdict import SURE
 from .workbench import Fitted
 
 TRIED = 3  # hypotheses with laws that compete if no law is named
-PORTS = 3  # ports at which an element is learned: those where a flexible force explains most
-JUDGED = 2  # learned elements that are compared on held-out blocks: those with the smallest fit error
-# fitted, without its learned element, and a function that computes the held-out errors
-_Competitor = tuple[Fitted, Fitted, Callable[[], HeldOut]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +47,8 @@ class Correction:
     before, after : float
         Rms error on held-out blocks of the refit and of the corrected simulator, in units of the outputs' deviation;
         nan if nothing was compared.
+    closest : Trial, optional
+        The hypothesis with its named laws, if something was compared.
     """
 
     elements: tuple[tuple[str, str, str], ...]
@@ -59,14 +56,15 @@ class Correction:
     learned: tuple[Learned, ...] = ()
     before: float = np.nan
     after: float = np.nan
+    closest: Trial | None = None
 
     @property
     def words(self) -> str:
         """The elements in words, such as "Coulomb friction at seal and a learned force at seal"."""
         names = []
         for port, law, form in self.elements:
-            name = "a learned force" if law == LearnedForce.id else display_name(law)
-            names.append(f"{name}{f' ({display_name(form)})' if form else ''} at {port}")
+            learned = "a learned force" + (f" ({form})" if form else "")
+            names.append(f"{learned if law == LearnedForce.id else display_name(law, form)} at {port}")
         return " and ".join(names)
 
     @property
@@ -101,12 +99,20 @@ class Correction:
 
 
 @dataclass(frozen=True, eq=False)
-class _Hypothesis:
-    """A fitted simulator, the one without its learned element, and its errors on held-out blocks."""
+class _Candidate:
+    """A fitted simulator, the hypothesis whose named laws it has, and its spread for other inputs (mean square)."""
 
     fitted: Fitted
-    named: Fitted
-    held_out: HeldOut
+    base: Trial
+    spread: float
+
+    @property
+    def least(self) -> float:
+        """Lower bound of its expected mean square error: held-out error is never below the fit error."""
+        return self.fitted.cost + self.spread
+
+
+_Predicted = tuple[_Candidate, HeldOut]
 
 
 def find_correction(search: Search, answer: Posterior, named: bool = False) -> tuple[Correction, Fitted]:
@@ -118,38 +124,59 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     best_laws = answer.best
     if named and answer.sure > SURE and explainable_remainder(search, best_laws) < FORMULA:
         return named_correction(search, best_laws.fitted), best_laws.fitted
-    found: list[_Hypothesis] = []
-    for fitted, named_only, predict in _competitors(search, best_laws if named else None):
-        least = min((h.held_out.mean_square for h in found), default=np.inf)
-        if fitted.cost < least:  # held-out error is never below the fit error
-            found.append(_Hypothesis(fitted, named_only, predict()))
-        if time.perf_counter() > search.deadline:
+    refitted = _predict(search, [_of_trial(search, search.root)], [])
+    tried = [search.thorough(best_laws)] if named else _with_laws(search)
+    predicted = _predict(search, [_of_trial(search, t) for t in tried], refitted)
+    beside = best_laws if named else _choose(predicted)[0].base
+    taken = {e.port for e in best_laws.laws} if named else set[str]()
+    learned = _learned(search, search.memo[beside.key]) if beside.laws else []
+    learned += [c for c in _learned(search, search.root) if c.fitted.simulator.elements[-1].port not in taken]
+    candidate, held_out = _choose(_predict(search, learned, predicted))
+    fitted, base = candidate.fitted, candidate.base
+    shares = _shares(search, base.fitted, fitted)
+    elements: tuple[Learned, ...] = ()
+    if fitted is not base.fitted:
+        laws = dict.fromkeys((*CATALOGUE, *search.laws))
+        elements = (describe_learned(search.bench, fitted, shares["learned"], laws),)
+    errors = refitted[0][1].error, held_out.error
+    return Correction(_elements(search, fitted), shares, elements, *errors, base), fitted
+
+
+def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_Predicted]) -> list[_Predicted]:
+    """Predict held-out data with further candidates, the most promising first; leave out those that cannot be best."""
+    out = list(predicted)
+    for c in sorted(candidates, key=lambda c: c.least):
+        least = min((h.mean_square for _, h in out), default=np.inf)
+        if out and (c.least >= least or time.perf_counter() > search.deadline):
             break
-    if not found:
-        return named_correction(search, best_laws.fitted), best_laws.fitted
-    best = min(found, key=lambda h: h.held_out.expected)
-    shares = _shares(search, best.named, best.fitted)
-    learned: tuple[Learned, ...] = ()
-    if best.fitted is not best.named:
-        learned = (
-            describe_learned(search.bench, best.fitted, shares["learned"], dict.fromkeys((*CATALOGUE, *search.laws))),
-        )
-    refit = next((h.held_out.error for h in found if h.fitted is search.root.fitted), np.inf)
-    return Correction(_elements(search, best.fitted), shares, learned, refit, best.held_out.error), best.fitted
+        out.append((c, search.predicts(c.base) if c.fitted is c.base.fitted else search.predict(c.fitted, c.spread)))
+    return out
 
 
-def _competitors(search: Search, named: Trial | None) -> Iterator[_Competitor]:
-    """Generate the candidates: the refit, the named or likeliest laws, other laws, and learned elements."""
-    ranked = sorted(
-        (t for t in search.memo.values() if _may_recur(search, t)), key=search.optimistic_evidence, reverse=True
-    )
-    others = [t for i, t in enumerate(t for t in ranked if t.laws) if i < TRIED or t.key in search.held_out]
-    first = named or next(iter(others), search.root)
-    for trial in {t.key: t for t in (search.root, first, *others)}.values():
-        yield from _trial_competitor(search, trial)
-    if first.laws:
-        yield from _learned_competitors(search, search.memo[first.key])
-    yield from _learned_competitors(search, search.root, {e.port for e in named.laws} if named else set())
+def _choose(predicted: Sequence[_Predicted]) -> _Predicted:
+    """Choose the candidate with the smallest expected error on other recordings."""
+    return min(predicted, key=lambda p: p[1].mean_square)
+
+
+def _with_laws(search: Search) -> list[Trial]:
+    """List the hypotheses with laws that may correct: the likeliest, and of those not yet polished only a few."""
+    found = list[Trial]()
+    likely = sorted(search.likeliest(search.optimistic_evidence), key=search.evidence, reverse=True)
+    for i, trial in enumerate(t for t in likely if t.laws and _may_recur(search, t)):
+        if trial.thorough or i < TRIED:
+            with suppress(InputError):
+                found.append(search.thorough(trial))
+    return [t for t in found if np.isfinite(t.whole)]
+
+
+def _of_trial(search: Search, trial: Trial) -> _Candidate:
+    """Make the candidate of a trial."""
+    return _Candidate(trial.fitted, trial, search.spread(trial.fitted, trial.laws))
+
+
+def _learned(search: Search, base: Trial) -> list[_Candidate]:
+    """Make the candidates with a learned force beside a trial."""
+    return [_Candidate(f, base, search.spread(f, _own_elements(search, f))) for f in search.learned(base)]
 
 
 def named_correction(search: Search, fitted: Fitted) -> Correction:
@@ -157,27 +184,9 @@ def named_correction(search: Search, fitted: Fitted) -> Correction:
     return Correction(_elements(search, fitted), _shares(search, fitted, fitted))
 
 
-def _trial_competitor(search: Search, trial: Trial) -> Iterator[_Competitor]:
-    """Generate the candidate of a trial, if it can be simulated."""
-    with suppress(InputError):
-        trial = search.thorough(trial)
-        if np.isfinite(trial.whole):
-            yield trial.fitted, trial.fitted, partial(search.predicts, trial)
-
-
 def _may_recur(search: Search, trial: Trial) -> bool:
     """Tell whether a hypothesis may hold for another recording; a trend in time within one recording may not."""
     return len(search.bench.recordings) > 1 or not any("t" in e.law.reads() for e in trial.laws)
-
-
-def _learned_competitors(search: Search, base: Trial, taken: Collection[str] = ()) -> Iterator[_Competitor]:
-    """Generate learned elements beside a trial, at the free ports where a flexible force explains most."""
-    shares = search.flexible(base)
-    ports = [name for name in sorted(shares, key=lambda name: -shares[name]) if name not in taken][:PORTS]
-    with suppress(InputError, np.linalg.LinAlgError):
-        inputs, part = search.bench.simulator.inputs, search.fits.part
-        for fitted in candidates(search.bench, part, base.fitted, ports, inputs, search.workers)[:JUDGED]:
-            yield fitted, base.fitted, partial(search.predict, fitted, _own_elements(search, fitted))
 
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:

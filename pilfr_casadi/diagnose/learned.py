@@ -27,11 +27,12 @@ import numpy as np
 
 from .._base import InputError, side_by_side
 from ..engine import make_engine
-from ..laws import SCALABLE, Law, Local, display_name, scaled, unit_forces
+from ..laws import SCALABLE, Law, Local, display_name, scheduled, unit_forces
 from ..models import Parameter, play
 from .force_recovery import law_signals
 from .linearise import linearised
 from .remainder import Remainder, Task, lengths, usable
+from .screen import start_values
 from .workbench import QUICK, Fitted, Workbench, start_vector
 
 STOPS = 8  # number of stops
@@ -159,7 +160,7 @@ class Start:
     share: float
 
 
-def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str], inputs: Sequence[str]) -> list[Start]:
+def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str]) -> list[Start]:
     """Solve the linear problem at each port, without and with each input that may scale the force, best first."""
     probe, runs = linearised(bench, base)
     rest = Remainder.of(bench, probe, runs, (LearnedForce,))
@@ -170,7 +171,7 @@ def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str], inp
             continue
         shape = task.pairs[0][1][0]
         forces = unit_forces(LearnedForce(), task.part, [shape]).reshape(len(task.part.z), -1)
-        for factor in ("", *(name for name in inputs if _may_scale(task, name))):
+        for factor in ("", *(name for name in task.local.inputs if _may_scale(task, name))):
             out.append(_solve_weights(rest, task, forces, shape, factor, samples / len(rest.left)))
     return sorted(out, key=lambda s: -s.share)
 
@@ -224,7 +225,6 @@ def candidates(
     part: Workbench,
     base: Fitted,
     port_names: Sequence[str],
-    inputs: Sequence[str] = (),
     workers: int = 1,
 ) -> list[Fitted]:
     """Fit a learned element at each of some ports, on top of a fitted simulator, which may already have elements.
@@ -235,8 +235,6 @@ def candidates(
         The bench with as much of the recordings as is needed to choose; the chosen elements are fitted to all.
     port_names : sequence of str
         Ports to try.
-    inputs : sequence of str
-        Inputs that may scale the force; each is tried in addition to the force alone.
     workers : int
         Threads; the best few elements by the linear solution are fitted.
 
@@ -245,7 +243,7 @@ def candidates(
     list of Fitted
         Smallest error first; the learned element is the last of each. Fits that diverge are left out.
     """
-    starts = [s for s in linear_starts(bench, base, port_names, inputs) if s.share > 0]
+    starts = [s for s in linear_starts(bench, base, port_names) if s.share > 0]
     found = side_by_side(lambda start: _fit_element(bench, part, base, start), starts[:FITS], workers)
     return sorted((f for f in found if f is not None), key=lambda f: f.cost)
 
@@ -285,12 +283,34 @@ def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[n
 
 @dataclass(frozen=True, eq=False)
 class NearLaw:
-    """A named law close to the learned force: its rms error over the force's deviation, and its force (M,)."""
+    """A named law close to the learned force.
 
-    law: str
-    form: str
+    Attributes
+    ----------
+    kind : Law
+        The law.
+    start : dict
+        Its values nearest to the learned force.
+    error : float
+        Rms error of its force over the learned force's deviation.
+    force : array, shape (M,)
+        Its force; nan for samples that were not compared.
+    """
+
+    kind: Law
+    start: dict[str, Any]
     error: float
     force: np.ndarray
+
+    @property
+    def law(self) -> str:
+        """Id of the law."""
+        return self.kind.id
+
+    @property
+    def form(self) -> str:
+        """Form of the law."""
+        return self.kind.form
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for diagnosis.json."""
@@ -348,17 +368,26 @@ class Learned:
 def describe_learned(bench: Workbench, fitted: Fitted, share: float, laws: Collection[type[Law]]) -> Learned:
     """Describe the last element of a fitted simulator, a learned one, with the nearest laws."""
     element = fitted.simulator.elements[-1]
+    nearest = nearest_to_learned(bench, fitted, laws)
+    return Learned(element.port, element.law.factor, share, *signals_along(bench, fitted), nearest)
+
+
+def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[Law]]) -> tuple[NearLaw, ...]:
+    """Find the laws nearest to the last element of a fitted simulator, a learned one.
+
+    Their strengths may vary with the input that scales the learned force, or with the local coordinate.
+    """
+    element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)
     inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in bench.recordings]).T, strict=True))
-    lengths_ = tuple(map(len, bench.recordings))
-    local = Local(
-        z, dz, bench.dt, lengths_, inputs=inputs, from_zero=tuple(r.begins == "zero" for r in bench.recordings)
-    )
+    rest = tuple(r.begins == "zero" for r in bench.recordings)
+    local = Local(z, dz, bench.dt, tuple(map(len, bench.recordings)), inputs=inputs, from_zero=rest)
     kinds = bench.simulator.port(element.port).kinds
-    factor = element.law.factor
     tried = [law for law in laws if kinds & set(law.places)]
-    tried += [scaled(law, factor) for law in SCALABLE if factor and law in laws and "parallel" in kinds]
-    return Learned(element.port, factor, share, z, dz, force, nearest_laws(local, force, tried))
+    for law in SCALABLE if "parallel" in kinds else ():
+        signals = [element.law.factor] * bool(element.law.factor) + ["z"] * law.dissipative
+        tried += [scheduled(law, by) for by in signals if law in laws]
+    return nearest_laws(local, force, tried)
 
 
 def nearest_laws(local: Local, force: np.ndarray, laws: Sequence[type[Law]]) -> tuple[NearLaw, ...]:
@@ -383,10 +412,11 @@ def nearest_laws(local: Local, force: np.ndarray, laws: Sequence[type[Law]]) -> 
             a = columns[:, k, :] - columns[:, k, :].mean(axis=0)
             if not np.all(np.isfinite(a)):
                 continue
-            fit = a @ np.linalg.lstsq(a, centred, rcond=1e-9)[0]
+            strengths = np.linalg.lstsq(a, centred, rcond=1e-9)[0]
+            fit = a @ strengths
             error = float(np.sqrt(np.mean((centred - fit) ** 2))) / deviation
-            if error < best.get(law.id, NearLaw("", "", 1.0, fit)).error:
+            if error < (best[law.id].error if law.id in best else 1.0):
                 whole = np.full(len(force), np.nan)
                 whole[kept] = fit + np.mean(force[kept])
-                best[law.id] = NearLaw(law.id, law.form, error, whole)
+                best[law.id] = NearLaw(law, start_values(law, shapes[k], strengths), error, whole)
     return tuple(sorted(best.values(), key=lambda n: n.error)[:SHOWN])

@@ -224,6 +224,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
         verdict = Verdict(verdict.kind, sentence)
     elif verdict.kind == "unexplained" and not search.interrupted:
         correction, fitted = corrected or find_correction(search, answer)
+        verdict = judge(search, answer, gates, correction.closest)
         verdict = Verdict(verdict.kind, f"{verdict.sentence} {correction.sentence}")
         return Conclusion(verdict, gates, fitted, correction)
     return Conclusion(verdict, gates, refitted, named_correction(search, refitted))

@@ -8,8 +8,9 @@ a memo and count in the posterior.
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -24,6 +25,7 @@ from .cross_validation import HeldOut, held_out_errors
 from .evidence import EFFECT_PRIOR, EXACT, Sample, information, log_evidence, log_prior, spread
 from .floor import Floor, effective_size, white_part
 from .gates import Gate, Offset
+from .learned import candidates, nearest_to_learned
 from .linearise import linearised
 from .pairs import choose_pairs, fit_pair
 from .relatives import complements, relatives
@@ -39,8 +41,10 @@ ROUNDS = 3  # rounds of exchanges
 FORMULA = 1e-3  # share of a mismatch that the formula of the right law may leave: 3 % of its force
 FEWEST = 30.0  # least effective samples of the recordings
 WRONG = 0.2  # share of model error in the error above which models are judged on held-out blocks
-PREDICTED = 6  # hypotheses judged on held-out blocks at most
+PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
 LOUDEST = 0.05  # share of an output's deviation; larger slow errors are not sensor noise
+PORTS = 3  # ports at which a force is learned: those where a flexible force explains most
+LEARNED = 2  # learned forces that are kept: those with the smallest error
 HOLD_RATIO = 1.05  # least ratio of rms errors for which the other hold is better
 BETTER_MINIMUM = 0.8  # largest share of the mean square left by a refit in a better minimum
 
@@ -94,6 +98,7 @@ class Search:
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
     gates: tuple[Gate, ...] = ()
     open: dict[Key, dict[str, float]] = field(default_factory=dict)
+    learned_forces: dict[Key, list[Fitted]] = field(default_factory=dict)
     held_out: dict[Key, HeldOut] = field(default_factory=dict)
     screens: dict[Key, tuple[list[Scored], np.ndarray | None]] = field(default_factory=dict)
     times: dict[str, float] = field(default_factory=dict)
@@ -160,17 +165,17 @@ class Search:
     def predicts(self, trial: Trial) -> HeldOut:
         """Compute the held-out errors of a hypothesis, once."""
         if trial.key not in self.held_out:
-            self.held_out[trial.key] = self.predict(trial.fitted, trial.laws)
+            self.held_out[trial.key] = self.predict(trial.fitted, self.spread(trial.fitted, trial.laws))
         return self.held_out[trial.key]
 
-    def predict(self, fitted: Fitted, laws: Sequence[Placed]) -> HeldOut:
-        """Compute the held-out errors of a fitted simulator with some laws."""
-        found = held_out_errors(self.bench, fitted, self.workers)
-        if not np.isfinite(found.mean_square):
-            return found
+    def predict(self, fitted: Fitted, spread: float) -> HeldOut:
+        """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
+        return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
+
+    def spread(self, fitted: Fitted, laws: Sequence[Placed]) -> float:
+        """Compute the mean square uncertainty of a fitted simulator's predictions for other inputs."""
         own = Sample(self.floor2, _count_samples(fitted, self.bench))
-        v = fitted.cost + self.tolerance
-        return replace(found, spread=spread(self.bench, fitted, laws, v, own.effective(0.0)))
+        return spread(self.bench, fitted, laws, fitted.cost + self.tolerance, own.effective(0.0))
 
     def _predict(self) -> None:
         """Compute the held-out errors of the likeliest hypotheses.
@@ -179,22 +184,26 @@ class Search:
         that follow the recordings equally well, the right one predicts best.
         """
         wrong = self.samples < EXACT / WRONG
-        if not wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
+        if (
+            not wrong
+            and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self.likeliest(self.evidence)}) < 2
+        ):
             return
         began = self.begin("held-out blocks")
         if wrong:
             self.predicts(self.root)
-        for _ in range(PREDICTED):
-            left = [t for t in self._likeliest() if t.key not in self.held_out]
-            if not left or not self._in_time():
+        for done in itertools.count():
+            likely = sorted(self.likeliest(self.evidence), key=self.evidence, reverse=True)
+            left = [t for t in likely if t.key not in self.held_out]
+            if not left or (done >= PREDICTED and left[0] is not likely[0]) or not self._in_time():
                 break
-            self.predicts(max(left, key=self.evidence))
+            self.predicts(left[0])
         self.timed("held-out blocks", began)
 
-    def _likeliest(self) -> list[Trial]:
-        """List the hypotheses that may be the likeliest."""
-        least = max(map(self.evidence, self.memo.values())) - REACH
-        return [t for t in self.memo.values() if self.evidence(t) > least]
+    def likeliest(self, evidence: Callable[[Trial], float]) -> list[Trial]:
+        """List the hypotheses that may be the likeliest by an evidence."""
+        least = max(map(evidence, self.memo.values())) - REACH
+        return [t for t in self.memo.values() if evidence(t) > least]
 
     def flexible(self, trial: Trial) -> dict[str, float]:
         """Compute the share of a trial's residual that a flexible force explains, by port."""
@@ -231,7 +240,7 @@ class Search:
         self.keep(Trial((), self.without, self.without.cost, self.without.cost, True))
         try:
             self._estimate_noise()
-            if self._grow(effects):
+            if self._grow(effects) and self._name_rest(effects):
                 self._every_sensor()
                 self._predict()
         except KeyboardInterrupt:
@@ -263,6 +272,14 @@ class Search:
         if effects > 1 and _count(self.best) < 2 and self.can_improve(self.best) and self._in_time():
             self.add_two()
         return True
+
+    def _name_rest(self, effects: float) -> bool:
+        """Name the forces learned beside the simulator and the best hypothesis; go on if one of the laws leads."""
+        best = self.best
+        for base in {t.key: t for t in (self.root, best)}.values():
+            if _count(base) < effects and self.can_improve(best) and self._in_time():
+                self.name_learned(base)
+        return self.best is best or self._grow(effects)
 
     def _pays(self, trial: Trial) -> bool:
         """Tell whether the last of several laws was worth it; a wrong model can always use one more."""
@@ -301,6 +318,7 @@ class Search:
         if known is None or trial.supersedes(known):
             self.memo[trial.key] = trial
             self.open.pop(trial.key, None)
+            self.learned_forces.pop(trial.key, None)
             self.held_out.pop(trial.key, None)
             self.screens.pop(trial.key, None)
 
@@ -403,6 +421,37 @@ class Search:
                 self.keep(found)
                 self._polish([found])
 
+    def learned(self, base: Trial) -> list[Fitted]:
+        """Fit learned forces beside a hypothesis, at the ports where a flexible force explains most; best first."""
+        if base.key not in self.learned_forces:
+            began = self.begin("learned force")
+            shares = self.flexible(base)
+            ports = sorted(shares, key=lambda name: -shares[name])[:PORTS]
+            try:
+                found = candidates(self.bench, self.fits.part, base.fitted, ports, self.workers)
+            except (InputError, np.linalg.LinAlgError):
+                found = []
+            self.learned_forces[base.key] = found[:LEARNED]
+            self.timed("learned force", began)
+        return self.learned_forces[base.key]
+
+    def name_learned(self, base: Trial) -> None:
+        """Fit the laws whose forces are nearest to those learned beside a hypothesis."""
+        entries = list[Scored]()
+        for fitted in self.learned(base):
+            at = [s for s in self.screened(base)[0] if s.port == fitted.simulator.elements[-1].port]
+            for near in nearest_to_learned(self.bench, fitted, self.laws):
+                like = [s for s in at if s.law.dissipative == near.kind.dissipative]
+                entries += [replace(s, law=near.kind, starts=(near.start,)) for s in like[:1]]
+        if not entries:
+            return
+        enough = float(np.sqrt(self.floor2))
+        trials = self._fitted(base, entries, None, enough, True)
+        for trial in trials:
+            self.keep(trial)
+        self._polish(trials)
+        self.steps.append(Step(base, tuple(entries), tuple(trials)))
+
     def exchange(self) -> None:
         """Try all other laws in place of each of several laws, the rest fixed in place, until none changes."""
         for _ in range(ROUNDS):
@@ -472,6 +521,7 @@ class Search:
         if alone.cost > BETTER_MINIMUM * self.root.whole:
             return False
         self.without, self.memo, self.open, self.held_out, self.screens, self.steps = alone, {}, {}, {}, {}, []
+        self.learned_forces = {}
         self.keep(Trial((), alone, alone.cost, alone.cost, True))
         return True
 

@@ -14,6 +14,7 @@ from .posterior import Posterior
 from .proof import mean_nrmse
 from .recording_faults import ringing
 from .search import Search
+from .trials import Trial
 
 AT_FLOOR = 1.15  # ratio to the noise that counts as at the noise
 # largest ratio of noise to a measured floor; to an estimated floor; to that if no force explains the noise
@@ -35,8 +36,11 @@ class Verdict:
     sentence: str
 
 
-def judge(search: Search, found: Posterior, gates: Sequence[Gate]) -> Verdict:
-    """Choose the verdict: a fault if it was the mismatch, else the likeliest answer of the posterior."""
+def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Trial | None = None) -> Verdict:
+    """Choose the verdict: a fault if it was the mismatch, else the likeliest answer of the posterior.
+
+    `closest` is the hypothesis that an unexplained mismatch is compared with, by default the likeliest one.
+    """
     off = mean_nrmse(search.bench, search.root.fitted)
     if search.stand_in_error and off < AS_NEAR * search.stand_in_error:
         return Verdict(
@@ -64,7 +68,7 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate]) -> Verdict:
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
             "outputs' deviation, and no force at any port explains any of the rest.",
         )
-    return Verdict("unexplained", _describe_unexplained(search, found, opened, own))
+    return Verdict("unexplained", _describe_unexplained(search, closest or found.best, opened, own))
 
 
 def _is_noise(search: Search, hum: Sequence[Gate], still: float, own: float | None) -> bool:
@@ -111,10 +115,11 @@ def _describe_vanished(search: Search, found: Posterior) -> str:
     return f" Beside {beside}, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
 
 
-def _describe_unexplained(search: Search, found: Posterior, opened: dict[str, float], own: float | None) -> str:
+def _describe_unexplained(search: Search, closest: Trial, opened: dict[str, float], own: float | None) -> str:
     root, still = search.root, max(opened.values(), default=0.0)
     where = max(opened, key=lambda k: opened[k], default="")
-    if not found.effects:
+    laws = [e for e in closest.laws if e.law.id != "offset"]
+    if not laws:
         rings = (
             f" The rest swings at the simulator's own {own:.3g} Hz, as from a force that was not recorded or a value "
             "that varies in time."
@@ -128,12 +133,13 @@ def _describe_unexplained(search: Search, found: Posterior, opened: dict[str, fl
             f"{100 * mean_nrmse(search.bench, root.fitted):.3g} % of the outputs' deviation; the noise is about "
             f"{100 * noise:.3g} %.{at}{rings}"
         )
-    near = found.effects[0].element
-    port = where if opened.get(near.port, 0.0) < 0.5 * still else near.port
-    left = (found.best.whole - search.floor2) / max(root.whole - search.floor2, 1e-300)
-    rest = max(search.flexible(found.best).values(), default=0.0)
+    port = where if opened.get(laws[0].port, 0.0) < 0.5 * still else laws[0].port
+    left = (closest.whole - search.floor2) / max(root.whole - search.floor2, 1e-300)
+    rest = max(search.flexible(closest).values(), default=0.0)
+    words = " and ".join(f"{display_name(e.law.id, e.law.form)} at {e.port}" for e in laws)
+    named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
     return (
-        f"Physics is missing, most likely at {port}, and no law of the catalogue explains it. The closest law, "
-        f"{display_name(near.law.id)} at {near.port}, removes {1 - left:.0%} of the mismatch on the training "
-        f"recordings. The rest is not noise: a force at a port explains {rest:.0%} of it."
+        f"Physics is missing, most likely at {port}, and no law of the catalogue explains all of it. The closest "
+        f"{named} {1 - left:.0%} of the mismatch on the training recordings. The rest is not noise: a force at a port "
+        f"explains {rest:.0%} of it."
     )

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         SCALABLE as SCALABLE,
         behind_gap as behind_gap,
         scaled as scaled,
+        scheduled as scheduled,
     )
     from .curves import (
         AsymmetricDeadZone as AsymmetricDeadZone,

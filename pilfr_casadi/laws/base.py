@@ -34,6 +34,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -121,6 +122,13 @@ class Local:
         return max(self.lengths) * self.dt
 
 
+class Values(SimpleNamespace):
+    """Parameters by name, `p.k` or `p["k"]`."""
+
+    def __getitem__(self, name: str) -> Any:
+        return getattr(self, name)
+
+
 # an attribute of `Local` ("" for none) and its multiples, or the values as a function of it
 Tried = tuple[Any, ...] | Callable[[Local], Any]
 
@@ -164,8 +172,8 @@ class Law:
         Smallest number of integration steps per sample.
     knee : str
         Name of the speed within which the force changes its sign; integration steps have to be fine there.
-    scaled_by : str
-        Input that multiplies the force, if any; see `scaled`.
+    scaled_by, scheduled_by : str
+        Input that multiplies the force, or signal with which the strengths vary, if any; see `scaled`, `scheduled`.
 
     Parameters
     ----------
@@ -202,6 +210,7 @@ class Law:
     substeps: ClassVar[int] = 1
     knee: ClassVar[str] = ""
     scaled_by: ClassVar[str] = ""
+    scheduled_by: ClassVar[str] = ""
 
     values: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
@@ -281,6 +290,10 @@ class Law:
         out[: len(out) if self.shifts else self.follows] = z
         return out
 
+    def schedule(self, local: Local) -> np.ndarray:
+        """Signal (M,) with which the strengths vary."""
+        return local.z if self.scheduled_by == "z" else local.inputs[self.scheduled_by]
+
     def on_grid(self, h: float) -> Law:
         """Copy for steps of length h, s; only a delay depends on them."""
         return self
@@ -324,10 +337,11 @@ def _tried(entry: Tried, local: Local) -> Any:
     return [getattr(local, attribute) * multiple if attribute else multiple for multiple in multiples]
 
 
-def display_name(law: str) -> str:
-    """Write the id of a law or of its form as words: "coulomb_friction" -> "Coulomb friction"."""
+def display_name(law: str, form: str = "") -> str:
+    """Write the id of a law, and its form, as words: "coulomb_friction" -> "Coulomb friction"."""
     text = PROPER_NAMES.get(law, law.replace("_", " "))
-    return text.capitalize() if text.split(" ")[0] in PEOPLE else text
+    text = text.capitalize() if text.split(" ")[0] in PEOPLE else text
+    return f"{text} ({display_name(form)})" if form else text
 
 
 def readable_unit(unit: str, w: str, z: str) -> str:

@@ -14,8 +14,9 @@ from typing import Any
 import casadi as ca
 
 from .._base import InputError
+from ..models import Parameter
 from . import curves, dynamic, friction, hysteresis, stiffness
-from .base import Law, Local, contact_onset
+from .base import Law, Local, Values, contact_onset
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
 
@@ -36,6 +37,27 @@ def scaled(law: type[Law], by: str) -> type[Law]:
         If it is not a law, or acts in series with a signal.
     """
     return _scaled(_parallel(law), by)
+
+
+def scheduled(law: type[Law], by: str) -> type[Law]:
+    """Make a law whose strength varies linearly with a signal, such as friction that grows with a pressure.
+
+    Each strength, such as `F_c`, becomes two: `F_c` where the signal is lowest in the recordings (`low`), and
+    `F_c_high` where it is highest (`high`). A force that opposes motion does so in the whole range.
+
+    Parameters
+    ----------
+    law : class of Law
+        Any law that may act in parallel, as a force.
+    by : str
+        An input of the simulator, or "z", the local coordinate.
+
+    Raises
+    ------
+    InputError
+        If it is not a law, or acts in series with a signal.
+    """
+    return _scheduled(_parallel(law), by)
 
 
 def behind_gap(law: type[Law]) -> type[Law]:
@@ -84,6 +106,55 @@ def _scaled(base: Any, by: str) -> Any:
         scaled_by = by
 
     return _name(Scaled, f"{base.__name__}ScaledBy_{by}", f"{base.__doc__}\n\n    Its strength is scaled by {by}.")
+
+
+@functools.cache
+def _scheduled(base: Any, by: str) -> Any:
+    high = {name: f"{name}_high" for name in base.strength}
+    unit = "z" if by == "z" else f"[{by}]"
+    read = [*inspect.signature(base.step if base.memory else base.force).parameters]
+
+    def strengths(p: Any, u: Any, z: Any) -> dict[str, Any]:
+        """Parameters of the law at a value of the signal."""
+        signal = z if by == "z" else u[by]
+        share = (signal - p["low"]) / (p["high"] - p["low"])
+        own = {name: p[name] for name in base.units}
+        return own | {name: p[name] + share * (p[end] - p[name]) for name, end in high.items()}
+
+    class Scheduled(base):
+        form = f"{base.form}, scheduled by {by}".removeprefix(", ")
+        equation = f"{base.equation}  with {', '.join(base.strength)} linear in {by}"
+        sentence = f"{base.sentence}; its strength varies with {by}"
+        units = {**base.units, **{end: base.units[name] for name, end in high.items()}, "low": unit, "high": unit}
+        strength = (*base.strength, *high.values())
+        places = ("parallel",)
+        scheduled_by = by
+
+        def parameters(self) -> dict[str, Parameter]:
+            """Parameters, of which the ends of the signal's range are fixed."""
+            ends = {k: Parameter(float(self.values.get(k, k == "high")), unit, fixed=True) for k in ("low", "high")}
+            return {**super().parameters(), **ends}
+
+        def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+            """Shapes of the law, with the range of the signal."""
+            signal = self.schedule(local)
+            for own in super().shapes(local):
+                yield {**own, "low": float(signal.min()), "high": float(signal.max())}
+
+        if base.memory:
+
+            def step(self, z: Any, s: Any, p: Any, dz: Any = 0.0, u: Any = None) -> Any:
+                at = p if u is None and by != "z" else strengths(p, u, z)
+                have = {"z": z, "s": s, "p": at, "dz": dz}
+                return super().step(**{k: have[k] for k in read if k in have})
+
+        else:
+
+            def force(self, z: Any, dz: Any, u: Any, p: Any) -> Any:
+                have = {"z": z, "dz": dz, "p": Values(**strengths(p, u, z))}
+                return super().force(**{k: have[k] for k in read if k in have})
+
+    return _name(Scheduled, f"{base.__name__}ScheduledBy_{by}", f"{base.__doc__}\n\n    Its strength varies with {by}.")
 
 
 @functools.cache
@@ -149,7 +220,7 @@ CATALOGUE: tuple[type[Law], ...] = (
     behind_gap(friction.CoulombFriction),
 )
 
-# laws that may be scaled by an input which the simulator's equations do not read
+# laws whose strength may vary with a signal
 SCALABLE: tuple[type[Law], ...] = (
     stiffness.LinearStiffness,
     friction.ViscousDamping,

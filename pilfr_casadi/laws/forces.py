@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Sequence
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -13,14 +12,7 @@ import numpy as np
 
 from .._base import one_at_a_time
 from ..models import accumulate_steps, map_points
-from .base import Law, Local
-
-
-class _Values(SimpleNamespace):
-    """Parameters by name, `p.k` or `p["k"]`."""
-
-    def __getitem__(self, name: str) -> Any:
-        return getattr(self, name)
+from .base import Law, Local, Values
 
 
 def count_columns(law: Law) -> int:
@@ -37,9 +29,13 @@ def unit_forces(law: Law, local: Local, shapes: Sequence[dict[str, Any]]) -> np.
     if not shapes:
         return np.zeros((len(local.z), 0, count_columns(law)))
     kind: Any = type(law)
-    if law.scaled_by:
-        bare = unit_forces(kind.__base__(law.values, law.limits), local, shapes)
-        return np.asarray(bare * local.inputs[law.scaled_by][:, None, None])
+    if law.scaled_by or law.scheduled_by:
+        bare = unit_forces(kind.__base__(), local, [{k: s[k] for k in kind.__base__.units if k in s} for s in shapes])
+        if law.scaled_by:
+            return np.asarray(bare * local.inputs[law.scaled_by][:, None, None])
+        signal = law.schedule(local)
+        share = ((signal - np.min(signal)) / np.ptp(signal))[:, None, None]
+        return np.concatenate([bare * (1 - share), bare * share], axis=2)
     step = _all_lanes(kind, len(shapes), local.dt if law.shifts else 0.0)
     p = law.at(shapes[0]).parameters()
     names = [name for name in p if name not in law.strength]
@@ -92,7 +88,7 @@ def _lane(kind: Any, h: float) -> ca.Function:
     shape = {n: vector[int(a) : int(b)] for n, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
     forces = []
     for strength in _unit_strengths(law):
-        values = _Values(**shape, **strength)
+        values = Values(**shape, **strength)
         if n_s:
             rate = {"dz": dz} if "dz" in law.reads() else {}
             w, end = law.step(z, own, values, **rate)

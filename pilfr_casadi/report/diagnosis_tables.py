@@ -10,7 +10,7 @@ import numpy as np
 
 from .._base import to_json
 from ..diagnose import Diagnosis, learned_force
-from ..laws import display_name, scaled
+from ..laws import display_name, scaled, scheduled
 from ..models import Parameter, ParameterSet
 from .page import Block, Code, Table, Text, number_text, render, uncertain_text
 
@@ -286,9 +286,9 @@ def _parts(law: Any) -> tuple[tuple[Any, ...], str]:
     """List what has to be imported to make the class of a law, and write the expression that makes it."""
     if getattr(law, "factor", ""):
         return (learned_force,), f"learned_force({law.factor!r})"
-    if law.scaled_by:
-        base = law.__base__
-        return (scaled, base), f"scaled({base.__name__}, {law.scaled_by!r})"
+    if by := law.scaled_by or law.scheduled_by:
+        compose, base = (scaled if law.scaled_by else scheduled), law.__base__
+        return (compose, base), f"{compose.__name__}({base.__name__}, {by!r})"
     return (law,), law.__name__
 
 
