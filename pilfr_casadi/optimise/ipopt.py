@@ -22,7 +22,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
+from .._base import InputError, handled_interrupt
 from .gauss_newton import (
     ACCEPTED_RATIO,
     LEAST_DAMPING,
@@ -30,7 +30,6 @@ from .gauss_newton import (
     SMALLEST_DIVISOR,
     ZERO_COLUMN,
     Damping,
-    handled_interrupt,
 )
 from .problem import Problem
 from .solution import Iteration, Progress, Solution, Status, check_solver_options
