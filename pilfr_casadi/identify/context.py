@@ -104,7 +104,7 @@ class FitContext:
         """Solve again with the noise set to the error reached, until the two agree; only if there are priors."""
         priors = any(p.prior is not None and not np.all(p.fixed) for p in problem.model.parameters.values())
         for _ in range(NOISE_ROUNDS if priors and self.options.noise is None else 0):
-            error = rms_error(problem, solution)
+            error = rms_error(problem, solution.theta)
             if abs(error / problem.noise - 1) < NOISE_AGREES or error == 0 or solution.status is Status.INTERRUPTED:
                 break
             problem = self.problem(problem.model, error, **{**others, "engine": problem.engine})
@@ -286,10 +286,9 @@ def mark_interrupted(model: Model, problem: Problem, solution: Solution, note: s
     return model, problem, replace(solution, status=Status.INTERRUPTED), note
 
 
-def rms_error(problem: Problem, solution: Solution) -> float:
+def rms_error(problem: Problem, theta: Array) -> float:
     """Compute the root mean square of the normalised residuals."""
-    e = problem.residual(solution.theta)
-    return float(np.sqrt(np.mean(e**2)))
+    return float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
 
 
 def find_open_memory(problem: Problem, theta: Array, recording: Recording, state: Array) -> Array:

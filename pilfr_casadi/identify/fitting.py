@@ -370,7 +370,7 @@ def _fit_from_starts(
         structure,
         {k: p.value for k, p in linear.parameters.items()},
         start=str(starts.kind),
-        level=rms_error(problem, solution),
+        level=rms_error(problem, solution.theta),
         coordinates=not known_entries(structure),
     )
     candidates, best, stopped = search_starts(search, starts.count, starts.seed, starts.executor, report)

@@ -25,7 +25,7 @@ from ..engine import Engine, make_engine
 from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
 from ..optimise import GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
 from .context import FitContext, check_recordings, report_iterations
-from .multistart import EXPLORE, run_tasks
+from .multistart import EXPLORE, judge, run_tasks
 from .result import Candidate, Fit, with_solution
 
 OUTPUT_SHARES = (1.0, 0.3, 0.1, 0.0)  # shares of the measured output that a NOE reads in the stages of its training
@@ -143,7 +143,9 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
     engine = make_engine(model, search.context.engine)
     problem = Problem(model, search.context.recordings, engine=engine)
     theta = solution.theta
-    known = [r for k, r in zip(search.training, search.context.recordings, strict=False) if _begins_alike(k, r)]
+    pairs = zip(search.training, search.context.recordings, strict=False)
+    # the given recordings that begin with the data trained on
+    known = [r for k, r in pairs if k.begins == r.begins and np.array_equal(k.y, r.y[: len(k)])]
     known = known if len(known) == len(search.training) else []
     if problem.size > len(theta) or not known:  # add the initial states of recordings held back or cut
         fitted, n = with_solution(model, problem, solution), int(problem.free.sum())
@@ -153,17 +155,7 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
         bounds, rest = np.split(solution.multipliers, [len(solution.theta)])
         bounds = np.concatenate([bounds[: len(after)], np.zeros(len(theta) - len(after))])
         solution = replace(solution, multipliers=np.concatenate([bounds, rest]))
-    with np.errstate(over="ignore", invalid="ignore"):
-        e = problem.residual(theta)
-        error = float(np.sqrt(np.mean(e**2)))
-    error = error if np.isfinite(error) else np.inf
-    nrmse = float(np.mean(problem.nrmse(theta))) if np.isfinite(error) else np.inf
-    return Candidate(seed, model, theta, error, replace(solution, theta=theta), nrmse=nrmse)
-
-
-def _begins_alike(training: Recording, given: Recording) -> bool:
-    """Tell whether the data trained on are a given recording or its beginning."""
-    return training.begins == given.begins and np.array_equal(training.y, given.y[: len(training)])
+    return judge(seed, model, problem, replace(solution, theta=theta))
 
 
 def one_step(fit: Any, recording: Recording) -> np.ndarray:
