@@ -30,6 +30,7 @@ from .._base import (
 from ..data import Recording, as_recordings
 from ..models import PILFR, Lagged, Model, PrandtlIshlinskii, StaticNetwork
 from ..optimise import (
+    Candidate,
     Constraint,
     Problem,
     Solution,
@@ -45,7 +46,7 @@ from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_
 from .lagged import check_lagged_options, fit_lagged
 from .multistart import DEFAULT_SOLVER, KEEP, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
-from .result import Candidate, Fit, FitOptions, match_channels, with_solution
+from .result import Fit, FitOptions, match_channels, with_solution
 from .start import known_entries, linear_model, transform_to_known_basis
 
 DEAD_WORKER = (

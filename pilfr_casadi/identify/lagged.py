@@ -23,10 +23,10 @@ from .._base import InputError, one_blas_thread
 from ..data import Recording, as_recordings, group_by_input, mean_period, repeats_itself
 from ..engine import Engine, make_engine
 from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
-from ..optimise import GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
+from ..optimise import Candidate, GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
 from .context import FitContext, check_recordings, report_iterations
 from .multistart import EXPLORE, judge, run_tasks
-from .result import Candidate, Fit, with_solution
+from .result import Fit, with_solution
 
 OUTPUT_SHARES = (1.0, 0.3, 0.1, 0.0)  # shares of the measured output that a NOE reads in the stages of its training
 PATIENCE = 20  # consecutive points without improvement after which training stops

@@ -41,9 +41,9 @@ from ..models import (
     places,
     weight_density,
 )
-from ..optimise import GaussNewton, Problem, Solution, Status, at_active_radius, loosen_radii
+from ..optimise import Candidate, GaussNewton, Problem, Solution, Status, at_active_radius, loosen_radii
 from .context import FitContext, solve_within_bounds
-from .result import DENSITY_PRIOR, Candidate
+from .result import DENSITY_PRIOR
 from .start import Blocks, envelope_start, grid_start, has_networks, network_start, paper_start, unit_states
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)

@@ -23,11 +23,11 @@ import numpy as np
 from .._base import InputError, Progress, is_number
 from ..data import Recording, as_recordings, fingerprint
 from ..models import LAYER, PILFR, PrandtlIshlinskii
-from ..optimise import Status
+from ..optimise import Candidate, Status
 from .context import context_of_fit, rms_error
 from .fitting import fit as identify
 from .multistart import DEFAULT_SOLVER, StartSearch, hold_near_density, polish, regrid
-from .result import DENSITY_PRIOR, Candidate, Fit
+from .result import DENSITY_PRIOR, Fit
 
 FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # on the strength of priors
 STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of the L1 penalty, in units of the objective without it
