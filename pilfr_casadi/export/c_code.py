@@ -62,9 +62,10 @@ def write_c(
 
 def _header(names: Mapping[str, Any], interpolated: bool) -> str:
     name, big = names["name"], names["name"].upper()
+    rounded = f"min and max rounded, eps = {names['smooth']:g}" if names["smooth"] else "min and max exact"
     sizes = {"NX": len(names["states"]), "NU": len(names["inputs"]), "NY": len(names["outputs"])}
     lines = [
-        f"/* {name}: one step of an identified model, every {names['dt']:.10g} s; {_accuracy(names['smooth'])}.",
+        f"/* {name}: one step of an identified model, every {names['dt']:.10g} s; {rounded}.",
         " *",
         f" *   double x[{big}_NX], u[{big}_NU], y[{big}_NY];",
         f" *   {name}_x0(x);                 once, at the start",
@@ -153,10 +154,6 @@ def _use_all_parameters(code: str) -> str:
         return "\n  ".join([match[0], " ".join(f"(void){name};" for name in names)])
 
     return re.sub(r"^[^\n]*\(([^()\n]*\bint mem)\) \{$", mark_used, code, flags=re.MULTILINE)
-
-
-def _accuracy(smooth: float) -> str:
-    return f"min and max rounded, eps = {smooth:g}" if smooth else "min and max exact"
 
 
 def _describe_entry(names: Mapping[str, Any], name: str) -> str:
