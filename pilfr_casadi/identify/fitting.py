@@ -17,16 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import (
-    InputError,
-    Progress,
-    check_executor,
-    filled,
-    one_blas_thread,
-    progress_bar,
-    whole,
-    worker_pool,
-)
+from .._base import InputError, Progress, check_executor, filled, one_blas_thread, progress_bar, whole, worker_pool
 from ..data import Recording, as_recordings
 from ..models import PILFR, Lagged, Model, PrandtlIshlinskii, StaticNetwork
 from ..optimise import (
