@@ -251,19 +251,11 @@ def report_iterations(progress: Progress | None, stage: str, most: int) -> Calla
 
 
 def context_of_fit(
-    fit: Fit,
-    train: Recording | Sequence[Recording],
-    *,
-    solver: Any,
-    stable: bool | float | None = None,
-    constraints: Any = None,
-    noise: float | str | None = None,
-    weights: Any = None,
-    engine: str = "auto",
+    fit: Fit, train: Recording | Sequence[Recording], *, solver: Any, engine: str = "auto", **others: Any
 ) -> FitContext:
-    """Make the context of a fit that continues an earlier one, with its options unless others are given."""
+    """Make the context of a fit that continues an earlier one; `others` replace its options, see `FitOptions`."""
     recordings = as_recordings(train)
-    options = fit.options.updated(stable, constraints, noise, weights, recordings)
+    options = fit.options.updated(**others, train=recordings)
     return FitContext(recordings, solver, options.all_constraints(fit.structure), engine=engine, options=options)
 
 
