@@ -230,7 +230,7 @@ def solve_within_bounds(
 ) -> Solution:
     """Solve a problem inside exact bounds on spectral radii with any solver (`solve_within_radii`).
 
-    Solvers of the package report their steps under the name `stage`; `last` gets their limit on time.
+    Solvers of the package report their steps under the name `stage`; `bound_solver` gets their limit on time.
     """
     start = problem.start if start is None else start
     if not isinstance(solver, GaussNewton | Ipopt):

@@ -207,9 +207,8 @@ def _cut_in_time(r: Recording, share: float) -> tuple[Recording, Recording]:
         mean = mean_period(r.slice(r.skip, r.skip + whole))
         cut = min(max(round((1 - share) * len(mean)), 2), len(mean) - 1)
         twice = mean.with_(u=np.tile(mean.u, (2, 1)), y=np.tile(mean.y, (2, 1)), initial="zero")
-        return mean.slice(0, cut), _score_from(
-            twice, len(mean) + cut
-        )  # a period from rest before the part that is scored
+        # a period from rest before the part that is scored
+        return mean.slice(0, cut), _score_from(twice, len(mean) + cut)
     cut = min(max(r.skip + round((1 - share) * (len(r) - r.skip)), r.skip + 2), len(r) - 1)
     return r.slice(0, cut), _score_from(r, cut)
 

@@ -17,9 +17,8 @@ import numpy as np
 from .._base import InputError, filled, listed
 
 Array = np.ndarray
-LARGEST_MODEL = (
-    20_000  # parameters: the Gauss-Newton Hessian then takes 3.2 GB, and its factorisation a minute per step
-)
+# parameters: the Gauss-Newton Hessian then takes 3.2 GB, and its factorisation a minute per step
+LARGEST_MODEL = 20_000
 
 
 def check_size(owner: str, count: int) -> None:
