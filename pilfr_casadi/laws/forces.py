@@ -5,22 +5,14 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Sequence
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
-from ..models import accumulate_steps, map_points
+from ..models import Named, accumulate_steps, map_points
 from .base import Law, Local
-
-
-class _Values(SimpleNamespace):
-    """Parameters by name, `p.k` or `p["k"]`."""
-
-    def __getitem__(self, name: str) -> Any:
-        return getattr(self, name)
 
 
 def count_columns(law: Law) -> int:
@@ -92,7 +84,7 @@ def _lane(kind: Any, h: float) -> ca.Function:
     shape = {n: vector[int(a) : int(b)] for n, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
     forces = []
     for strength in _unit_strengths(law):
-        values = _Values(**shape, **strength)
+        values = Named("parameter", {**shape, **strength})
         if n_s:
             rate = {"dz": dz} if "dz" in law.reads() else {}
             w, end = law.step(z, own, values, **rate)

@@ -258,6 +258,30 @@ class ParameterSet(Mapping[str, Parameter]):
         return ParameterSet({n: replace(p, **changes[n]) if n in changes else p for n, p in self.items()})
 
 
+class Named:
+    """Symbols by name: `x.pos`, `p.k` or `p["k"]`."""
+
+    def __init__(self, kind: str, values: Mapping[str, Any]) -> None:
+        self.__dict__.update(_kind=kind, _values=dict(values))
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self._values[name]
+        except KeyError:
+            if name.startswith("__"):
+                raise AttributeError(name) from None
+            known = ", ".join(self._values) or "none"
+            raise InputError(f"There is no {self._kind} {name!r}; there are {known}.") from None
+
+    __getitem__ = __getattr__
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise InputError(f"The {self._kind} {name!r} cannot be assigned; return the equations in a dict instead.")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+
 class Neighbours:
     """Judge the size of an entry by the other entries of its row, its column and its matrix.
 
