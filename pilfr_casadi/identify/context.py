@@ -124,10 +124,10 @@ class FitContext:
         A linearised step in the initial states alone predicts the largest decrease of the cost. `correlated` residuals
         count as one, because a model's errors change slowly. True also if θ has initial states already.
         """
-        if problem.size > int(problem.free.sum()) or not any(r.begins == "estimate" for r in self.recordings):
+        if problem.size > problem.n_free or not any(r.begins == "estimate" for r in self.recordings):
             return True
         freed = self.problem(problem.model, engine=problem.engine, constraints=())
-        n_free = int(freed.free.sum())
+        n_free = freed.n_free
         _, gradient, hessian = freed.normal(np.concatenate([theta, freed.start[n_free:]]))
         cost = 0.5 * float(np.mean(problem.residual(theta) ** 2))
         if not np.isfinite(cost) or cost == 0:

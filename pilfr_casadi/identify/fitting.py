@@ -311,7 +311,7 @@ def fit_from_values(model: Model, structure: PILFR | None, context: FitContext, 
     start = problem.start
     if earlier is not None:
         estimated = [r for r in context.recordings if r.begins == "estimate"]
-        begin = np.concatenate([start[: int(problem.free.sum())], *(earlier.initial_state(r) for r in estimated)])
+        begin = np.concatenate([start[: problem.n_free], *(earlier.initial_state(r) for r in estimated)])
         start = begin if problem.cost(begin) < problem.cost(start) else start
     latest = model, problem, context.solve(problem, "solve", start), ""
     try:

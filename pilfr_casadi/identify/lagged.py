@@ -148,7 +148,7 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
     known = [r for k, r in pairs if k.begins == r.begins and np.array_equal(k.y, r.y[: len(k)])]
     known = known if len(known) == len(search.training) else []
     if problem.size > len(theta) or not known:  # add the initial states of recordings held back or cut
-        fitted, n = with_solution(model, problem, solution), int(problem.free.sum())
+        fitted, n = with_solution(model, problem, solution), problem.n_free
         others = [r for r in search.context.recordings[len(known) :] if r.begins == "estimate"]
         after = theta if known else theta[:n]
         theta = np.concatenate([after, *(first_state(fitted, engine, r) for r in others)])

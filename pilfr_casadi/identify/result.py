@@ -229,7 +229,7 @@ class Fit:
         """Find the first sample that is scored: after `skip`, and after those that an initial state is fitted to."""
         recording = self._matched(recording)
         estimated = recording.begins == "estimate"
-        if not estimated or fingerprint(recording) in self.initial or not self.model.n_x + self.model.n_s:
+        if not estimated or fingerprint(recording) in self.initial or not self.model.n_state:
             return recording.skip
         first = max(recording.skip, samples_for_state(self.model))
         if first >= len(recording):

@@ -142,7 +142,7 @@ def polish_fit(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any 
     search = StartSearch(context, structure, {}, level=float(np.mean(fit.train_nrmse)))
     problem = search.problem(fit.model)
     states = [fit.initial_state(r) for r in context.recordings if r.begins == "estimate"]
-    theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
+    theta = np.concatenate([problem.start[: problem.n_free], *states])
     error = rms_error(problem, theta)
     best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))
     if best.model is fit.model and best.error >= error:
@@ -312,7 +312,7 @@ def thin_operators(
         model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
         model = hold_near_density(model, values, SPREAD)
         problem = context.problem(model, float(np.mean(fit.train_nrmse)))
-        begin = np.concatenate([problem.start[: int(problem.free.sum())], *states])
+        begin = np.concatenate([problem.start[: problem.n_free], *states])
         if not np.isfinite(problem.cost(begin)):
             continue
         fitted = context.result(model, smaller, problem, context.solve(problem, "solve", begin), note=DENSITY_PRIOR)
