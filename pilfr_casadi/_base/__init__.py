@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .interrupts import (
         Clock as Clock,
         deferred_interrupt as deferred_interrupt,
+        handled_interrupt as handled_interrupt,
         terminable as terminable,
         time_limit as time_limit,
         unwrapped_interrupt as unwrapped_interrupt,

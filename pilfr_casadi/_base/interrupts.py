@@ -45,6 +45,17 @@ def unwrapped_interrupt() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def handled_interrupt(handle: Callable[[], None]) -> Iterator[None]:
+    """Call `handle` on Ctrl-C in place of raising KeyboardInterrupt, which CasADi may swallow.
+
+    Has no effect outside the main thread, or where other code handles Ctrl-C.
+    """
+    own = _in_main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with _handler(signal.SIGINT, lambda *_: handle()) if own else contextlib.nullcontext():
+        yield
+
+
+@contextlib.contextmanager
 def repeated_interrupt() -> Iterator[Callable[[], None]]:
     """Yield a function that raises the KeyboardInterrupt of Ctrl-C again, once, if one was raised since its last call.
 
@@ -52,7 +63,7 @@ def repeated_interrupt() -> Iterator[Callable[[], None]]:
     """
     pressed: list[bool] = []
 
-    def note(*_: object) -> None:
+    def note() -> None:
         pressed.append(True)
         raise KeyboardInterrupt
 
@@ -61,8 +72,7 @@ def repeated_interrupt() -> Iterator[Callable[[], None]]:
             pressed.clear()
             raise KeyboardInterrupt
 
-    own = _in_main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    with _handler(signal.SIGINT, note) if own else contextlib.nullcontext(), unwrapped_interrupt():
+    with handled_interrupt(note), unwrapped_interrupt():
         yield repeat
 
 

@@ -49,32 +49,29 @@ def takes_options(function: Callable[[Any], int]) -> Callable[..., int]:
 
 def whole(text: str, least: int, most: int, default: int | None = None, metavar: str = "N") -> Any:
     """Make an option that takes a whole number."""
-
-    def parse(given: str) -> int:
-        try:
-            value = int(given)
-        except ValueError:
-            value = least - 1
-        if not least <= value <= most:
-            raise typer.BadParameter(f"{given} was given; give a whole number from {least} to {most}.")
-        return value
-
-    return typer.Option(default, parser=parse, metavar=metavar, help=text, show_default=False)
+    wanted = f"a whole number from {least} to {most}"
+    return _numeric(int, lambda value: least <= value <= most, wanted, default, metavar, text)
 
 
 def seconds(text: str) -> Any:
     """Make an option that takes a time above zero."""
+    wanted = "a number of seconds above zero"
+    return _numeric(float, lambda value: 0 < value < math.inf, wanted, None, "SECONDS", text)
 
-    def parse(given: str) -> float:
+
+def _numeric(kind: Any, accepts: Callable[[Any], bool], wanted: str, default: Any, metavar: str, text: str) -> Any:
+    """Make an option that takes a number of a kind, if it `accepts` it."""
+
+    def parse(given: str) -> Any:
         try:
-            value = float(given)
+            value = kind(given)
         except ValueError:
             value = math.nan
-        if not 0 < value < math.inf:
-            raise typer.BadParameter(f"{given} was given; give a number of seconds above zero.")
+        if not accepts(value):
+            raise typer.BadParameter(f"{given} was given; give {wanted}.")
         return value
 
-    return typer.Option(None, parser=parse, metavar="SECONDS", help=text, show_default=False)
+    return typer.Option(default, parser=parse, metavar=metavar, help=text, show_default=False)
 
 
 def option(text: str, metavar: str | None = None, default: Any = None, name: str | None = None) -> Any:

@@ -21,7 +21,7 @@ from ._common import BAD_INPUT, DONE, INTERRUPTED, NO_RESULT, UsageError, say
 
 COMMANDS = {  # name: (file, help)
     "fit": ("models", "Identify a PI-LFR model from recordings."),
-    "check": ("check", "Find what recordings can reveal about a simulator, before a diagnosis."),
+    "check": ("diagnose", "Find what recordings can reveal about a simulator, before a diagnosis."),
     "diagnose": ("diagnose", "Find the physics that a simulator leaves out."),
     "simulate": ("models", "Simulate a saved model on a recording's inputs."),
     "export": ("models", "Write a model's step as a serialized CasADi function or as C."),

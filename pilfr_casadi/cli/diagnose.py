@@ -1,7 +1,12 @@
-"""`pilfr diagnose`: read and check the files, find the missing physics, write and print the diagnosis."""
+"""`pilfr diagnose` and `pilfr check`: read and check the files, and compare the simulator with the recordings.
+
+The first finds the missing physics, and writes and prints the diagnosis. The second prints what the recordings can
+reveal, and writes check.json where a folder is given.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._base import InputError, deferred_interrupt, listed, progress_bar
+from .._base import InputError, deferred_interrupt, listed, progress_bar, write_atomically
 from ..data import SAME_STEP, TIME_NAMES, Recording, column_names
 from ..simulators import Simulator, as_simulator
 from ..studies import LARGEST_SIZE
@@ -31,6 +36,7 @@ from ._common import (
     takes_options,
     whole,
 )
+from .app import name_options
 
 if TYPE_CHECKING:
     from ..diagnose import Diagnosis
@@ -250,3 +256,35 @@ def _same_samples(options: DiagnoseOptions, name: str) -> bool:
     """Tell whether the simulation has the same samples of a column as one of the recordings."""
     first, *others = (options.read(f, (name,), (), only_these=True).u for f in options.recordings)
     return any(len(o) == len(first) and bool(np.allclose(o, first, rtol=1e-6, atol=0.0)) for o in others)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckOptions(SimulatorOptions):
+    """The options of `pilfr check`."""
+
+    out: str | None = option("Folder for check.json (default: nothing is written).", "DIR")
+    overwrite: bool = flag("Replace an existing check.json in that folder.", "--overwrite")
+
+
+@takes_options
+def check_command(options: CheckOptions) -> int:
+    """Refits only the simulator itself; with --out, the answer is in DIR/check.json."""
+    options.check_files()
+    if options.out is not None:
+        new_file(options.out, "check.json", options.overwrite)
+    given = load_simulator(options.files[0])
+    simulator = as_simulator(given)
+    recordings = [options.read(path, simulator.inputs, simulator.output_names) for path in options.train]
+    folder = make_folder(options.out) if options.out is not None else None
+    for path, recording in zip(options.train, recordings, strict=True):
+        print(describe("training", path, recording), flush=True)
+    with deferred_interrupt():
+        from ..diagnose import check
+    found = check(as_simulator(given, recordings), recordings, hold=options.hold)
+    print(name_options(str(found)))
+    if folder is not None:
+        target = folder / "check.json"
+        content = json.dumps(found.to_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+        write_atomically(target, content)
+        print(f"check: {target}")
+    return DONE

@@ -190,11 +190,6 @@ def _table(name: str, kind: str, starts: str, rows: list[list[str]]) -> tuple[st
     return f"static const {kind} {name}[] = {{{flat}}};", f"static const int {starts}[] = {{{begins}}};"
 
 
-def loops_code() -> str:
-    """Return the C source of the time loops."""
-    return "\n".join((_text("_kernel.h"), _text("_kernel.c")))
-
-
 # without fused multiply-adds the generated step gives the bits of the virtual machine, so the same operators slip
 COMMON = ("-fPIC", "-shared", "-std=gnu11", "-fno-math-errno", "-ffp-contract=off")
 FLAGS = (("-march=native", *COMMON), COMMON)  # the second if the compiler refuses the first
@@ -329,7 +324,7 @@ def _load(library: Path) -> ctypes.CDLL:
 @functools.cache
 def _loops(_cache: Path) -> ctypes.CDLL:
     """Load the time loops, once per cache directory."""
-    return _load(build(loops_code(), LOOPS))
+    return _load(build("\n".join((_text("_kernel.h"), _text("_kernel.c"))), LOOPS))
 
 
 class Compiled:

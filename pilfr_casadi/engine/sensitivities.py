@@ -35,9 +35,8 @@ TARGETS = {
     "x": ("x", "w", "c", "p"),
     "y": ("x", "w", "p"),
 }
-MOST_STAGED = (
-    64  # states with memory up to which slopes by way of intermediate values fit the processor's fastest cache
-)
+# states with memory up to which slopes by way of intermediate values fit the processor's fastest cache
+MOST_STAGED = 64
 BLOCKS = tuple((target, source) for target, sources in TARGETS.items() for source in sources)
 
 

@@ -7,7 +7,6 @@ from .._base.lazy import lazy_face
 if TYPE_CHECKING:
     from .model_file import (
         FitContent as FitContent,
-        SavedStart as SavedStart,
         model_text as model_text,
         read_model_file as read_model_file,
         write_model_file as write_model_file,

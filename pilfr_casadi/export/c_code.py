@@ -35,7 +35,6 @@ C_HEADERS = frozenset(  # of C's library, which a file `<name>.h` would hide
         "stdarg stdbool stddef stdint stdio stdlib string strings tgmath threads time uchar unistd wchar wctype"
     ).split()
 )
-WORK = {"arg": "const casadi_real *arg", "res": "casadi_real *res", "iw": "casadi_int iw", "w": "casadi_real w"}
 
 
 def check_name(name: Any) -> None:
@@ -54,95 +53,40 @@ def check_name(name: Any) -> None:
 def write_c(
     folder: str | os.PathLike[str], step: ca.Function, names: Mapping[str, Any], interpolated: bool
 ) -> tuple[Path, Path]:
-    """Write source and header of a step `(x, u) -> (x_next, y)` with `Exported.names()`; see `Exported.to_c`."""
-    target, name = make_folder(folder), names["name"]
-    header = write_atomically(target / f"{name}.h", _header(names, interpolated))
-    return write_atomically(target / f"{name}.c", _source(step, names)), header
+    """Write source and header of a step `(x, u) -> (x_next, y)` with `Exported.names()`; see `Exported.to_c`.
 
-
-def _header(names: Mapping[str, Any], interpolated: bool) -> str:
-    name, big = names["name"], names["name"].upper()
-    sizes = {"NX": len(names["states"]), "NU": len(names["inputs"]), "NY": len(names["outputs"])}
-    lines = [
-        f"/* {name}: one step of an identified model, every {names['dt']:.10g} s; {_accuracy(names['smooth'])}.",
-        " *",
-        f" *   double x[{big}_NX], u[{big}_NU], y[{big}_NY];",
-        f" *   {name}_x0(x);                 once, at the start",
-        f" *   {name}_step(x, u, x, y);      every sample: y now, and x for the next one",
-        " *",
-        *(
-            [" * Inputs are interpolated: u holds the inputs of this sample, then those of the next one.", " *"]
-            * interpolated
-        ),
-        " * Nothing is allocated and nothing is kept between calls; several threads may call it at once.",
-        " */",
-        f"#ifndef {big}_H",
-        f"#define {big}_H",
-        "",
-        *(f"#define {big}_{key} {size}" for key, size in sizes.items()),
-        f"#define {big}_DT {names['dt']!r} /* s */",
-    ]
-    for letter, role in (("X", "states"), ("U", "inputs"), ("Y", "outputs")):
-        entries = list(names[role])
-        title = f"entries of {letter.lower()}"
-        constants = _constant_names(f"{big}_{letter}_", entries)
-        rows = [
-            f"#define {constant} {i} /* {_clean_comment(_describe_entry(names, entry))} */"
-            for i, (constant, entry) in enumerate(zip(constants, entries, strict=True))
-        ]
-        lines += ["", f"/* {title} */", *rows]
-    lines += [
-        "",
-        "#ifdef __cplusplus",
-        'extern "C" {',
-        "#endif",
-        "",
-        "/* Start state. */",
-        f"void {name}_x0(double *x);",
-        "",
-        "/* Output at this sample and state at the next one; x_next may be x. */",
-        f"void {name}_step(const double *x, const double *u, double *x_next, double *y);",
-        "",
-        "#ifdef __cplusplus",
-        "}",
-        "#endif",
-        "",
-        "#endif",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _source(step: ca.Function, names: Mapping[str, Any]) -> str:
-    name, big = names["name"], names["name"].upper()
+    Both are templates in this folder, `_step.c` and `_step.h`.
+    """
+    target, name, big = make_folder(folder), names["name"], names["name"].upper()
     inner = f"{name.rstrip('_')}_casadi"
     x, u = (ca.MX.sym(key, step.size1_in(key)) for key in ("x", "u"))
     # long ones hold a loop and stay as they are, called from a function of the right name
-    renamed = step.expand(inner) if step.is_a("SXFunction") else ca.Function(inner, [x, u], step.call([x, u]))
+    function = step.expand(inner) if step.is_a("SXFunction") else ca.Function(inner, [x, u], step.call([x, u]))
     generator = ca.CodeGenerator(inner)
-    generator.add(renamed)
-    sizes = {"arg": renamed.sz_arg(), "res": renamed.sz_res(), "iw": renamed.sz_iw(), "w": renamed.sz_w()}
-    start = [f"  x[{i}] = {float(v)!r};" for i, v in enumerate(names["x0"])] or ["  (void)x;"]
-    lines = [
-        f'#include "{name}.h"',
-        "",
-        _use_all_parameters(generator.dump()),
-        f"void {name}_x0(double *x) {{",
-        *start,
-        "}",
-        "",
-        f"void {name}_step(const double *x, const double *u, double *x_next, double *y) {{",
-        *(f"  {kind}[{max(1, sizes[key])}];" for key, kind in WORK.items()),
-        f"  double now[{max(1, len(names['states']))}]; /* x_next may be x */",
-        "  int i;",
-        f"  for (i = 0; i < {big}_NX; i++) now[i] = x[i];" if names["states"] else "  (void)x; i = 0; now[i] = 0;",
-        "  arg[0] = now;",
-        "  arg[1] = u;",
-        "  res[0] = x_next;",
-        "  res[1] = y;",
-        f"  {inner}(arg, res, iw, w, 0);",
-        "}",
-    ]
-    return "\n".join(lines) + "\n"
+    generator.add(function)
+    entries = {}
+    for letter, role in (("X", "states"), ("U", "inputs"), ("Y", "outputs")):
+        constants = _constant_names(f"{big}_{letter}_", list(names[role]))
+        comments = [_clean_comment(_describe_entry(names, entry)) for entry in names[role]]
+        entries[letter] = list(zip(constants, comments, strict=True))
+    values = {**names, "big": big, "entries": entries, "interpolated": interpolated, "function": function}
+    header = write_atomically(target / f"{name}.h", _fill("_step.h", values))
+    values["code"] = _use_all_parameters(generator.dump())
+    return write_atomically(target / f"{name}.c", _fill("_step.c", values)), header
+
+
+def _fill(template: str, values: Mapping[str, Any]) -> str:
+    """Fill a template of this folder."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader(__package__, ""),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template(template).render(values)
 
 
 def _use_all_parameters(code: str) -> str:
@@ -153,10 +97,6 @@ def _use_all_parameters(code: str) -> str:
         return "\n  ".join([match[0], " ".join(f"(void){name};" for name in names)])
 
     return re.sub(r"^[^\n]*\(([^()\n]*\bint mem)\) \{$", mark_used, code, flags=re.MULTILINE)
-
-
-def _accuracy(smooth: float) -> str:
-    return f"min and max rounded, eps = {smooth:g}" if smooth else "min and max exact"
 
 
 def _describe_entry(names: Mapping[str, Any], name: str) -> str:

@@ -37,6 +37,7 @@ from .._base import (
     write_atomically,
 )
 from ..models import (
+    OPERATORS,
     PILFR,
     Combined,
     Element,
@@ -44,14 +45,12 @@ from ..models import (
     GeneralizedPlay,
     Model,
     Part,
-    Play,
     PrandtlIshlinskii,
     Products,
     StaticNetwork,
-    Stop,
     block_shapes,
 )
-from ..optimise import Iteration, Limit, Solution, Status
+from ..optimise import Candidate, Iteration, Limit, Solution, Status
 
 if TYPE_CHECKING:
     from . import model_schema as schema
@@ -62,21 +61,9 @@ VERSION_WITHOUT_DIGEST = 1  # still read, with a warning
 LARGEST_FILE = 200_000_000  # bytes; a model with 500 states takes 20 million
 MOST_PARTS = 100  # combined elements and degrees of products; more would only exhaust the memory
 HISTORY = ("number", "cost", "seconds", "step", "damping")  # columns of a solver's history
-OPERATORS: dict[str, Any] = {"play": Play, "stop": Stop, "generalized_play": GeneralizedPlay}
 WRITTEN = {Envelope: ("channels",), Products: ("channels", "degrees"), StaticNetwork: ("hidden", "channels")}
 LIMIT_NUMBERS = ("value", "lower", "upper", "multiplier")
 DEEPEST = 3  # nested lists of an array: no parameter has more dimensions than two
-
-
-@dataclass(frozen=True, eq=False)
-class SavedStart:
-    """A start of a multistart search: its seed, the error it reached, how its solve ended, and whether it was drawn."""
-
-    seed: int
-    error: float
-    solution: Solution
-    note: str = ""
-    drawn: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +91,7 @@ class FitContent:
     limits: tuple[Limit, ...] | None = ()
     noise: float | None = None
     weights: Mapping[str, float] | None = None
-    starts: tuple[SavedStart, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
 
 
 class _Unusable(Exception):
@@ -170,7 +157,7 @@ def _tables_of_fit(fit: FitContent) -> dict[str, Any]:
                     "drawn": c.drawn,
                     **_solve_table(c.solution),
                 }
-                for c in fit.starts
+                for c in fit.candidates
             ],
         },
     }
@@ -235,7 +222,7 @@ def _layout(value: Any, depth: int = 0) -> str:
 def read_model_file(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> FitContent:
     """Read a file that `write_model_file` wrote, as `identify.load` describes.
 
-    Solutions of the starts have an empty `theta`: a file keeps only their results.
+    Candidates and their solutions have an empty `theta`: a file keeps only their results.
     """
     from .model_schema import read_tables
 
@@ -356,7 +343,10 @@ def _fit_content(tables: schema.ModelTables, given: Model | PILFR | None) -> Fit
         limits=limits,
         noise=training.noise,
         weights=training.weights,
-        starts=tuple(SavedStart(s.seed, s.error, _solution(s, s.status), s.note, s.drawn) for s in training.starts),
+        candidates=tuple(
+            Candidate(s.seed, model, np.zeros(0), s.error, _solution(s, s.status), s.note, s.drawn)
+            for s in training.starts
+        ),
     )
 
 

@@ -371,7 +371,7 @@ def exported(
         dt = _check_dt(dt)
         closed = _discretise_over_sample(model, dt, hold, substeps)
         step = _build_step(closed, dt, model)
-        rhs = _right_hand_side(model, f"{name}_rhs")
+        rhs = _right_hand_side(model, f"{name.rstrip('_')}_rhs")
     else:
         if hold is not None or substeps is not None:
             raise InputError("The model has its own steps; `hold` and `substeps` are for simulators, leave them out.")

@@ -104,7 +104,7 @@ class FitContext:
         """Solve again with the noise set to the error reached, until the two agree; only if there are priors."""
         priors = any(p.prior is not None and not np.all(p.fixed) for p in problem.model.parameters.values())
         for _ in range(NOISE_ROUNDS if priors and self.options.noise is None else 0):
-            error = rms_error(problem, solution)
+            error = rms_error(problem, solution.theta)
             if abs(error / problem.noise - 1) < NOISE_AGREES or error == 0 or solution.status is Status.INTERRUPTED:
                 break
             problem = self.problem(problem.model, error, **{**others, "engine": problem.engine})
@@ -124,10 +124,10 @@ class FitContext:
         A linearised step in the initial states alone predicts the largest decrease of the cost. `correlated` residuals
         count as one, because a model's errors change slowly. True also if θ has initial states already.
         """
-        if problem.size > int(problem.free.sum()) or not any(r.begins == "estimate" for r in self.recordings):
+        if problem.size > problem.n_free or not any(r.begins == "estimate" for r in self.recordings):
             return True
         freed = self.problem(problem.model, engine=problem.engine, constraints=())
-        n_free = int(freed.free.sum())
+        n_free = freed.n_free
         _, gradient, hessian = freed.normal(np.concatenate([theta, freed.start[n_free:]]))
         cost = 0.5 * float(np.mean(problem.residual(theta) ** 2))
         if not np.isfinite(cost) or cost == 0:
@@ -230,7 +230,7 @@ def solve_within_bounds(
 ) -> Solution:
     """Solve a problem inside exact bounds on spectral radii with any solver (`solve_within_radii`).
 
-    Solvers of the package report their steps under the name `stage`; `last` gets their limit on time.
+    Solvers of the package report their steps under the name `stage`; `bound_solver` gets their limit on time.
     """
     start = problem.start if start is None else start
     if not isinstance(solver, GaussNewton | Ipopt):
@@ -251,19 +251,11 @@ def report_iterations(progress: Progress | None, stage: str, most: int) -> Calla
 
 
 def context_of_fit(
-    fit: Fit,
-    train: Recording | Sequence[Recording],
-    *,
-    solver: Any,
-    stable: bool | float | None = None,
-    constraints: Any = None,
-    noise: float | str | None = None,
-    weights: Any = None,
-    engine: str = "auto",
+    fit: Fit, train: Recording | Sequence[Recording], *, solver: Any, engine: str = "auto", **others: Any
 ) -> FitContext:
-    """Make the context of a fit that continues an earlier one, with its options unless others are given."""
+    """Make the context of a fit that continues an earlier one; `others` replace its options, see `FitOptions`."""
     recordings = as_recordings(train)
-    options = fit.options.updated(stable, constraints, noise, weights, recordings)
+    options = fit.options.updated(**others, train=recordings)
     return FitContext(recordings, solver, options.all_constraints(fit.structure), engine=engine, options=options)
 
 
@@ -286,10 +278,9 @@ def mark_interrupted(model: Model, problem: Problem, solution: Solution, note: s
     return model, problem, replace(solution, status=Status.INTERRUPTED), note
 
 
-def rms_error(problem: Problem, solution: Solution) -> float:
+def rms_error(problem: Problem, theta: Array) -> float:
     """Compute the root mean square of the normalised residuals."""
-    e = problem.residual(solution.theta)
-    return float(np.sqrt(np.mean(e**2)))
+    return float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
 
 
 def find_open_memory(problem: Problem, theta: Array, recording: Recording, state: Array) -> Array:

@@ -17,19 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from .._base import (
-    InputError,
-    Progress,
-    check_executor,
-    filled,
-    one_blas_thread,
-    progress_bar,
-    whole,
-    worker_pool,
-)
+from .._base import InputError, Progress, check_executor, filled, one_blas_thread, progress_bar, whole, worker_pool
 from ..data import Recording, as_recordings
 from ..models import PILFR, Lagged, Model, PrandtlIshlinskii, StaticNetwork
 from ..optimise import (
+    Candidate,
     Constraint,
     Problem,
     Solution,
@@ -45,7 +37,7 @@ from .context import FitContext, Stage, check_recordings, mark_interrupted, rms_
 from .lagged import check_lagged_options, fit_lagged
 from .multistart import DEFAULT_SOLVER, KEEP, START_KINDS, StartSearch, search_starts
 from .penalty import check_penalty, solve_with_penalty
-from .result import Candidate, Fit, FitOptions, match_channels, with_solution
+from .result import Fit, FitOptions, match_channels, with_solution
 from .start import known_entries, linear_model, transform_to_known_basis
 
 DEAD_WORKER = (
@@ -319,7 +311,7 @@ def fit_from_values(model: Model, structure: PILFR | None, context: FitContext, 
     start = problem.start
     if earlier is not None:
         estimated = [r for r in context.recordings if r.begins == "estimate"]
-        begin = np.concatenate([start[: int(problem.free.sum())], *(earlier.initial_state(r) for r in estimated)])
+        begin = np.concatenate([start[: problem.n_free], *(earlier.initial_state(r) for r in estimated)])
         start = begin if problem.cost(begin) < problem.cost(start) else start
     latest = model, problem, context.solve(problem, "solve", start), ""
     try:
@@ -370,7 +362,7 @@ def _fit_from_starts(
         structure,
         {k: p.value for k, p in linear.parameters.items()},
         start=str(starts.kind),
-        level=rms_error(problem, solution),
+        level=rms_error(problem, solution.theta),
         coordinates=not known_entries(structure),
     )
     candidates, best, stopped = search_starts(search, starts.count, starts.seed, starts.executor, report)

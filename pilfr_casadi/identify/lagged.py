@@ -23,10 +23,10 @@ from .._base import InputError, one_blas_thread
 from ..data import Recording, as_recordings, group_by_input, mean_period, repeats_itself
 from ..engine import Engine, make_engine
 from ..models import NARX, PILFR, Lagged, Model, lagged_start, reading_output
-from ..optimise import GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
+from ..optimise import Candidate, GaussNewton, Ipopt, Problem, Progress, Solution, Status, first_state
 from .context import FitContext, check_recordings, report_iterations
-from .multistart import EXPLORE, run_tasks
-from .result import Candidate, Fit, with_solution
+from .multistart import EXPLORE, judge, run_tasks
+from .result import Fit, with_solution
 
 OUTPUT_SHARES = (1.0, 0.3, 0.1, 0.0)  # shares of the measured output that a NOE reads in the stages of its training
 PATIENCE = 20  # consecutive points without improvement after which training stops
@@ -143,27 +143,19 @@ def _candidate(search: LaggedSearch, seed: int, model: Model, solution: Solution
     engine = make_engine(model, search.context.engine)
     problem = Problem(model, search.context.recordings, engine=engine)
     theta = solution.theta
-    known = [r for k, r in zip(search.training, search.context.recordings, strict=False) if _begins_alike(k, r)]
+    pairs = zip(search.training, search.context.recordings, strict=False)
+    # the given recordings that begin with the data trained on
+    known = [r for k, r in pairs if k.begins == r.begins and np.array_equal(k.y, r.y[: len(k)])]
     known = known if len(known) == len(search.training) else []
     if problem.size > len(theta) or not known:  # add the initial states of recordings held back or cut
-        fitted, n = with_solution(model, problem, solution), int(problem.free.sum())
+        fitted, n = with_solution(model, problem, solution), problem.n_free
         others = [r for r in search.context.recordings[len(known) :] if r.begins == "estimate"]
         after = theta if known else theta[:n]
         theta = np.concatenate([after, *(first_state(fitted, engine, r) for r in others)])
         bounds, rest = np.split(solution.multipliers, [len(solution.theta)])
         bounds = np.concatenate([bounds[: len(after)], np.zeros(len(theta) - len(after))])
         solution = replace(solution, multipliers=np.concatenate([bounds, rest]))
-    with np.errstate(over="ignore", invalid="ignore"):
-        e = problem.residual(theta)
-        error = float(np.sqrt(np.mean(e**2)))
-    error = error if np.isfinite(error) else np.inf
-    nrmse = float(np.mean(problem.nrmse(theta))) if np.isfinite(error) else np.inf
-    return Candidate(seed, model, theta, error, replace(solution, theta=theta), nrmse=nrmse)
-
-
-def _begins_alike(training: Recording, given: Recording) -> bool:
-    """Tell whether the data trained on are a given recording or its beginning."""
-    return training.begins == given.begins and np.array_equal(training.y, given.y[: len(training)])
+    return judge(seed, model, problem, replace(solution, theta=theta))
 
 
 def one_step(fit: Any, recording: Recording) -> np.ndarray:
@@ -215,9 +207,8 @@ def _cut_in_time(r: Recording, share: float) -> tuple[Recording, Recording]:
         mean = mean_period(r.slice(r.skip, r.skip + whole))
         cut = min(max(round((1 - share) * len(mean)), 2), len(mean) - 1)
         twice = mean.with_(u=np.tile(mean.u, (2, 1)), y=np.tile(mean.y, (2, 1)), initial="zero")
-        return mean.slice(0, cut), _score_from(
-            twice, len(mean) + cut
-        )  # a period from rest before the part that is scored
+        # a period from rest before the part that is scored
+        return mean.slice(0, cut), _score_from(twice, len(mean) + cut)
     cut = min(max(r.skip + round((1 - share) * (len(r) - r.skip)), r.skip + 2), len(r) - 1)
     return r.slice(0, cut), _score_from(r, cut)
 

@@ -41,9 +41,9 @@ from ..models import (
     places,
     weight_density,
 )
-from ..optimise import GaussNewton, Problem, Solution, Status, at_active_radius, loosen_radii
+from ..optimise import Candidate, GaussNewton, Problem, Solution, Status, at_active_radius, loosen_radii
 from .context import FitContext, solve_within_bounds
-from .result import DENSITY_PRIOR, Candidate
+from .result import DENSITY_PRIOR
 from .start import Blocks, envelope_start, grid_start, has_networks, network_start, paper_start, unit_states
 
 EXPLORE = GaussNewton(max_iterations=60, tolerance=1e-3)
@@ -93,9 +93,7 @@ def explore(search: StartSearch, seed: int, sequence: np.random.SeedSequence) ->
     model, solver = search.model(start_values(search, seed, sequence)), search.context.solver
     problem = search.problem(model)
     solution = search.solve(problem, None, EXPLORE if search.start == "grid" else solver)
-    candidate = replace(
-        _candidate(seed, model, problem, solution), drawn=is_drawn(search.structure, search.start, seed)
-    )
+    candidate = replace(judge(seed, model, problem, solution), drawn=is_drawn(search.structure, search.start, seed))
     if search.start != "paper" or solution.status is Status.INTERRUPTED or not np.isfinite(candidate.error):
         return candidate
     polished = polish(search, candidate)
@@ -104,7 +102,7 @@ def explore(search: StartSearch, seed: int, sequence: np.random.SeedSequence) ->
     # the last solve is the user's solver's
     problem = search.problem(polished.model, problem.engine, noise=polished.error)
     solution = search.solve(problem, polished.theta, solver)
-    return _candidate(seed, polished.model, problem, solution, polished.note)
+    return judge(seed, polished.model, problem, solution, polished.note)
 
 
 def start_values(search: StartSearch, seed: int, sequence: np.random.SeedSequence) -> Blocks:
@@ -130,7 +128,8 @@ def is_drawn(structure: Any, start: str, seed: int) -> bool:
     return seed >= len(places(structure)) and (several or not direction_fixed(structure))
 
 
-def _candidate(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:
+def judge(seed: int, model: Model, problem: Problem, solution: Solution, note: str = "") -> Candidate:
+    """Make the candidate of a solution, with its error over the problem's recordings; infinite if it diverges."""
     e = problem.residual(solution.theta)
     with np.errstate(over="ignore", invalid="ignore"):
         error = float(np.sqrt(e @ e / e.size))
@@ -152,7 +151,7 @@ def polish(search: StartSearch, candidate: Candidate) -> Candidate:
         return candidate
     engine = make_engine(candidate.model, search.context.engine)
     n_free = int(parameters.free.sum())
-    at_bound = _at_active_radius(search, candidate)
+    at_bound = at_active_radius(search.problem(candidate.model), candidate.theta, candidate.solution)
     candidates = [candidate]
     for extent, spread in ((1.0, 0.0), (1.3, 0.02)):
         best = min(candidates, key=_merit)
@@ -167,23 +166,18 @@ def polish(search: StartSearch, candidate: Candidate) -> Candidate:
         problem = search.problem(model, engine, noise=best.error)
         begin = np.concatenate([problem.start[:n_free], best.theta[n_free:]])
         solution = search.solve(problem, begin, DEFAULT_SOLVER, at_bound)
-        candidates.append(_candidate(candidate.seed, model, problem, solution, DENSITY_PRIOR if spread else ""))
+        candidates.append(judge(candidate.seed, model, problem, solution, DENSITY_PRIOR if spread else ""))
         if solution.status is Status.INTERRUPTED:
             return _best_so_far(candidates)
     smooth = candidates[-1]
     problem = search.problem(candidate.model, engine, noise=smooth.error)
     solution = search.solve(problem, smooth.theta, DEFAULT_SOLVER, at_bound)
-    candidates.append(_candidate(candidate.seed, candidate.model, problem, solution))
+    candidates.append(judge(candidate.seed, candidate.model, problem, solution))
     if solution.status is Status.INTERRUPTED:
         return _best_so_far(candidates)
     best = min(candidates, key=_merit)
     usable = _merit(smooth)[0] == _merit(best)[0]
     return smooth if usable and smooth.error <= MARGIN * best.error else best
-
-
-def _at_active_radius(search: StartSearch, candidate: Candidate) -> bool:
-    """Tell whether an exact bound on a spectral radius is active at a candidate."""
-    return at_active_radius(search.problem(candidate.model), candidate.theta, candidate.solution)
 
 
 def _best_so_far(candidates: list[Candidate]) -> Candidate:
@@ -230,7 +224,7 @@ def regrid(
         Fitted thresholds and weights; returned as they are if no weight or range is above zero.
     reach : float
         Largest |z| visited.
-    beyond : float
+    extent : float
         Largest threshold, in units of `reach`; the tail is extrapolated log-linearly and never rises.
     smooth : float
         Kernel width in units of `reach`.
@@ -239,6 +233,8 @@ def regrid(
     spacing : float
         Power of the density by which thresholds are spaced; 0 gives an even grid.
     """
+    from scipy.integrate import cumulative_trapezoid
+
     if not (np.sum(w) > 0 and reach > 0):
         return r[:count], w[:count]
     grid = np.linspace(0.0, extent * reach, 600)
@@ -250,15 +246,11 @@ def regrid(
     slope = min(float(np.polyfit(grid[tail], log_d[tail], 1)[0]), 0.0)
     outside = grid > 0.85 * reach
     d[outside] = np.exp(np.mean(log_d[tail]) + slope * (grid[outside] - np.mean(grid[tail])))
-    cumulative = _integral(d**spacing, grid)
+    cumulative = cumulative_trapezoid(d**spacing, grid, initial=0)
     edges = np.interp(np.linspace(0, 1, (count or len(r)) + 1), cumulative / cumulative[-1], grid)
-    mass = np.diff(np.interp(edges, grid, _integral(d, grid)))
-    moment = np.diff(np.interp(edges, grid, _integral(d * grid, grid)))
+    mass = np.diff(np.interp(edges, grid, cumulative_trapezoid(d, grid, initial=0)))
+    moment = np.diff(np.interp(edges, grid, cumulative_trapezoid(d * grid, grid, initial=0)))
     return moment / np.maximum(mass, 1e-300), mass
-
-
-def _integral(f: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return np.concatenate([[0.0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(x))])
 
 
 def regrid_channels(
@@ -312,7 +304,7 @@ def search_starts(
     if search.start != "grid" or stopped:
         return found, usable[0], stopped
     chosen = usable[:keep]
-    if any(_at_active_radius(search, c) for c in usable):
+    if any(at_active_radius(search.problem(c.model), c.theta, c.solution) for c in usable):
         # At a bound the errors after exploration rank candidates poorly. Polish every candidate that was among the best
         # so far when it was explored, so that more starts are never worse than fewer.
         chosen = [c for i, c in enumerate(found) if c in sorted(found[: i + 1], key=_merit)[:keep] and c in usable]

@@ -95,8 +95,8 @@ def merge_operators(fixed_problem: Problem, theta: np.ndarray) -> np.ndarray:
     place = np.where(fixed_problem.free, np.cumsum(fixed_problem.free) - 1, -1)
     shape = (element.channels, element.n)
     w_at, r_at = (place[parameters.position(name)].reshape(shape, order="F") for name in LAYER)
-    size, n_x = fixed_problem.model.n_x + fixed_problem.model.n_s, fixed_problem.model.n_x
-    state_starts = range(int(fixed_problem.free.sum()), fixed_problem.size, size)
+    size, n_x = fixed_problem.model.n_state, fixed_problem.model.n_x
+    state_starts = range(fixed_problem.n_free, fixed_problem.size, size)
     limit = (1 + SLACK) * fixed_problem.cost(theta)
 
     def trial(i: int, a: int, b: int) -> np.ndarray:
@@ -131,7 +131,7 @@ def merge_operators(fixed_problem: Problem, theta: np.ndarray) -> np.ndarray:
 
 def restore_variables(solution: Solution, fixed_problem: Problem, problem: Problem) -> Solution:
     """Express the solution of a problem with fixed parameters in the variables of the full problem."""
-    n_fixed, n = int(fixed_problem.free.sum()), int(problem.free.sum())
+    n_fixed, n = fixed_problem.n_free, problem.n_free
     theta = np.concatenate([fixed_problem.parameters(solution.theta)[problem.free], solution.theta[n_fixed:]])
     multipliers = np.zeros(problem.size + len(problem.g_lower))
     if len(solution.multipliers) == fixed_problem.size + len(fixed_problem.g_lower):
@@ -151,20 +151,18 @@ def solve_with_penalty(model: Model, problem: Problem, solution: Solution, conte
     if solution.status is Status.INTERRUPTED:
         return model, problem, solution, "interrupted before the L1 penalty was applied"
     found = normalise_weights(with_solution(model, problem, solution))
-    states = solution.theta[int(problem.free.sum()) :]
+    states = solution.theta[problem.n_free :]
     options: dict[str, Any] = {"engine": problem.engine, "l1": context.l1}
     whole, fixed_problem = (
         context.problem(m, problem.noise, **options) for m in (found, hold_all_but_element(found, context.l1))
     )
-    begin = merge_operators(
-        fixed_problem, np.concatenate([fixed_problem.start[: int(fixed_problem.free.sum())], states])
-    )
-    states = begin[int(fixed_problem.free.sum()) :]
+    begin = merge_operators(fixed_problem, np.concatenate([fixed_problem.start[: fixed_problem.n_free], states]))
+    states = begin[fixed_problem.n_free :]
     last = fix_idle_operators(
         fixed_problem.model.with_parameters(fixed_problem.model.parameters.at(fixed_problem.parameters(begin)))
     )
     if np.any(last.parameters.free):
         fixed_problem = context.problem(last, problem.noise, **options)
-    begin = np.concatenate([fixed_problem.start[: int(fixed_problem.free.sum())], states])
+    begin = np.concatenate([fixed_problem.start[: fixed_problem.n_free], states])
     result = restore_variables(context.solve(fixed_problem, "L1 penalty", begin), fixed_problem, whole)
     return found, whole, result, penalty_sentence(with_solution(found, whole, result), context.l1)

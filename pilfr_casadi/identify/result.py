@@ -21,9 +21,10 @@ import numpy as np
 from .._base import InputError, is_number, listed
 from ..data import NOTHING_SENTENCE, Recording, as_recordings, explains_nothing, fingerprint, nrmse, rmse_per_output
 from ..engine import Engine, make_engine
-from ..export import FitContent, SavedStart, exported, read_model_file, write_model_file
+from ..export import FitContent, exported, read_model_file, write_model_file
 from ..models import PILFR, Model
 from ..optimise import (
+    Candidate,
     Constraint,
     Limit,
     Problem,
@@ -120,20 +121,6 @@ def _constraint_list(given: Constraint | Sequence[Constraint]) -> tuple[Constrai
     if not isinstance(given, Sequence) or not all(isinstance(c, Constraint) for c in given):
         raise InputError(f"constraints = {given!r} was given; give a Constraint, or a list of them.")
     return tuple(given)
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """The result of one start; `drawn` tells whether the start depends on the seed, `nrmse` averages the recordings."""
-
-    seed: int
-    model: Model
-    theta: np.ndarray
-    error: float
-    solution: Solution
-    note: str = ""
-    drawn: bool = True
-    nrmse: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +229,7 @@ class Fit:
         """Find the first sample that is scored: after `skip`, and after those that an initial state is fitted to."""
         recording = self._matched(recording)
         estimated = recording.begins == "estimate"
-        if not estimated or fingerprint(recording) in self.initial or not self.model.n_x + self.model.n_s:
+        if not estimated or fingerprint(recording) in self.initial or not self.model.n_state:
             return recording.skip
         first = max(recording.skip, samples_for_state(self.model))
         if first >= len(recording):
@@ -339,8 +326,7 @@ class Fit:
     def content(self) -> FitContent:
         """Collect what a model file stores of this fit."""
         shared = {f.name: getattr(self, f.name) for f in fields(FitContent) if hasattr(self, f.name)}
-        starts = tuple(SavedStart(c.seed, c.error, c.solution, c.note, c.drawn) for c in self.candidates)
-        return FitContent(**shared, noise=self.options.noise, weights=self.options.weights, starts=starts)
+        return FitContent(**shared, noise=self.options.noise, weights=self.options.weights)
 
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
         """`casadi.Function (x, u) -> (x_next, y)`, operator memory inside x; see `export.to_casadi`."""
@@ -435,14 +421,10 @@ def load(path: str | os.PathLike[str], model: Model | PILFR | None = None) -> Fi
     """
     content = read_model_file(path, model)
     shared = {f.name: getattr(content, f.name) for f in fields(content) if f.name in Fit.__dataclass_fields__}
-    candidates = tuple(
-        Candidate(c.seed, content.model, np.zeros(0), c.error, c.solution, note=c.note, drawn=c.drawn)
-        for c in content.starts
-    )
     options = FitOptions()  # files of the first versions have none
     if content.limits is not None:
         options = options_from_limits(content.limits, content.structure, noise=content.noise, weights=content.weights)
-    return Fit(**{**shared, "limits": content.limits or ()}, candidates=candidates, options=options)
+    return Fit(**{**shared, "limits": content.limits or ()}, options=options)
 
 
 def _shown(error: float) -> str:

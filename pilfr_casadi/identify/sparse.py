@@ -23,15 +23,15 @@ import numpy as np
 from .._base import InputError, Progress, is_number
 from ..data import Recording, as_recordings, fingerprint
 from ..models import LAYER, PILFR, PrandtlIshlinskii
-from ..optimise import Status
-from .context import context_of_fit
+from ..optimise import Candidate, Status
+from .context import context_of_fit, rms_error
 from .fitting import fit as identify
 from .multistart import DEFAULT_SOLVER, StartSearch, hold_near_density, polish, regrid
-from .result import DENSITY_PRIOR, Candidate, Fit
+from .result import DENSITY_PRIOR, Fit
 
 FACTORS = (0.01, 0.1, 1.0, 10.0, 100.0)  # on the strength of priors
 STRENGTHS = (1.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # of the L1 penalty, in units of the objective without it
-# (beyond, spacing) of `regrid`, for each way of spreading operators
+# (extent, spacing) of `regrid`, for each way of spreading operators
 SPREADINGS = tuple((extent, spacing) for extent in (1.0, 1.15, 1.3) for spacing in (0.25, 0.4))
 SPREAD = 0.02  # relative deviation of the prior on weights that are spread over a density
 
@@ -135,11 +135,6 @@ def prune(fit: Fit, train: Recording | Sequence[Recording], **options: Any) -> F
     return fitted if fitted.status is Status.INTERRUPTED else polish_fit(fitted, train, **options)
 
 
-def _error(fit: Fit, recordings: Sequence[Recording]) -> float:
-    error = fit.nrmse(recordings)
-    return error if np.isfinite(error) else np.inf
-
-
 def polish_fit(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any = None, **options: Any) -> Fit:
     """Polish a fit as the search does with its best starts (`polish`); return the fit itself if that is worse."""
     structure, context = fit.structure, context_of_fit(fit, train, solver=solver or DEFAULT_SOLVER, **options)
@@ -147,8 +142,8 @@ def polish_fit(fit: Fit, train: Recording | Sequence[Recording], *, solver: Any 
     search = StartSearch(context, structure, {}, level=float(np.mean(fit.train_nrmse)))
     problem = search.problem(fit.model)
     states = [fit.initial_state(r) for r in context.recordings if r.begins == "estimate"]
-    theta = np.concatenate([problem.start[: int(problem.free.sum())], *states])
-    error = float(np.sqrt(np.mean(problem.residual(theta) ** 2)))
+    theta = np.concatenate([problem.start[: problem.n_free], *states])
+    error = rms_error(problem, theta)
     best = polish(search, Candidate(0, fit.model, theta, error, fit.solution, fit.note))
     if best.model is fit.model and best.error >= error:
         return fit
@@ -277,7 +272,7 @@ def _fit_sparser(
     n = max(1, pruned.structure.element.n)  # type: ignore[union-attr]
     if n not in thin:
         thin[n] = tuple(_raise_if_interrupted(f) for f in thin_operators(fit, training, n, **options))
-    return min((pruned, *thin[n]), key=lambda f: _error(f, unseen))
+    return min((pruned, *thin[n]), key=lambda f: np.nan_to_num(f.nrmse(unseen), nan=np.inf))
 
 
 def _raise_if_interrupted(fit: Fit) -> Fit:
@@ -317,7 +312,7 @@ def thin_operators(
         model = smaller.model(old.n_u, old.n_y, values, inputs=old.inputs, outputs=old.outputs)
         model = hold_near_density(model, values, SPREAD)
         problem = context.problem(model, float(np.mean(fit.train_nrmse)))
-        begin = np.concatenate([problem.start[: int(problem.free.sum())], *states])
+        begin = np.concatenate([problem.start[: problem.n_free], *states])
         if not np.isfinite(problem.cost(begin)):
             continue
         fitted = context.result(model, smaller, problem, context.solve(problem, "solve", begin), note=DENSITY_PRIOR)

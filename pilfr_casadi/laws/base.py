@@ -34,7 +34,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -120,13 +119,6 @@ class Local:
     def duration(self) -> float:
         """Length of the longest recording, s."""
         return max(self.lengths) * self.dt
-
-
-class Values(SimpleNamespace):
-    """Parameters by name, `p.k` or `p["k"]`."""
-
-    def __getitem__(self, name: str) -> Any:
-        return getattr(self, name)
 
 
 # an attribute of `Local` ("" for none) and its multiples, or the values as a function of it

@@ -14,9 +14,9 @@ from typing import Any
 import casadi as ca
 
 from .._base import InputError
-from ..models import Parameter
+from ..models import Named, Parameter
 from . import curves, dynamic, friction, hysteresis, stiffness
-from .base import Law, Local, Values, contact_onset
+from .base import Law, Local, contact_onset
 
 GAPS = (0.1, 0.3, 0.6)  # tried gaps over the largest |z|
 
@@ -151,7 +151,7 @@ def _scheduled(base: Any, by: str) -> Any:
         else:
 
             def force(self, z: Any, dz: Any, u: Any, p: Any) -> Any:
-                have = {"z": z, "dz": dz, "p": Values(**strengths(p, u, z))}
+                have = {"z": z, "dz": dz, "p": Named("parameter", strengths(p, u, z))}
                 return super().force(**{k: have[k] for k in read if k in have})
 
     return _name(Scheduled, f"{base.__name__}ScheduledBy_{by}", f"{base.__doc__}\n\n    Its strength varies with {by}.")

@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 
 from .._base import one_at_a_time
-from ..models import accumulate_steps, map_points
-from .base import Law, Local, Values
+from ..models import Named, accumulate_steps, map_points
+from .base import Law, Local
 
 
 def count_columns(law: Law) -> int:
@@ -88,7 +88,7 @@ def _lane(kind: Any, h: float) -> ca.Function:
     shape = {n: vector[int(a) : int(b)] for n, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
     forces = []
     for strength in _unit_strengths(law):
-        values = Values(**shape, **strength)
+        values = Named("parameter", {**shape, **strength})
         if n_s:
             rate = {"dz": dz} if "dz" in law.reads() else {}
             w, end = law.step(z, own, values, **rate)

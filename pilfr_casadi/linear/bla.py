@@ -362,8 +362,7 @@ def _find_lines(U: Array) -> Array:
     limit = EXCITED**2 * power[1:].max(axis=0, initial=0.0) * np.ones_like(power)
     if n_periods > 1:
         noise = np.mean(np.var(U, axis=2, ddof=1), axis=(0, 1)) / n_periods
-        smooth = np.stack([moving_mean(x, 10) for x in noise.T], axis=1)
-        limit = np.maximum(limit, EXCITED_OVER_NOISE * smooth)
+        limit = np.maximum(limit, EXCITED_OVER_NOISE * moving_mean(noise, 10))
     excited = np.all(power > limit, axis=1)
     excited[0] = False
     return np.flatnonzero(excited)

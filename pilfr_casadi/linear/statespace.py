@@ -38,15 +38,14 @@ import numpy as np
 
 from .._base import InputError, whole
 from ..data import Recording
-from ..models import Model, Parameter
+from ..models import Model, Parameter, or_one
 
 Array = np.ndarray
 DEFECTIVE = 1e10  # condition number of the eigenvectors above which A counts as defective to rounding
 REAL = 1e-12  # imaginary part, next to the largest eigenvalue, below which an eigenvalue is real
 INJECTION = "observer"  # name of the parameter γ
-FADING = (
-    1 - 1e-4
-)  # factor on A that makes an integrator no output sees detectable; 1e-4 per sample is far below any fit
+# factor on A that makes an integrator no output sees detectable; 1e-4 per sample is far below any fit
+FADING = 1 - 1e-4
 
 
 def resolvent(A: Array, C: Array, z: Array) -> Array:
@@ -159,8 +158,7 @@ def in_modal_coordinates(blocks: Mapping[str, Array], recordings: tuple[Recordin
     a, b = back @ blocks["A"] @ t, back @ blocks["B_u"]
     a = np.where(np.isnan(modal(len(a))), a, 0.0)
     states = [propagate(a.T, (r.u @ b.T)[None], np.zeros((1, len(a))))[0][0] for r in recordings]
-    spread = np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0))
-    spread = np.where(spread > 0, spread, 1.0)
+    spread = or_one(np.sqrt(np.mean(np.concatenate(states) ** 2, axis=0)))
     return {**blocks, "A": a * spread / spread[:, None], "B_u": b / spread[:, None], "C_y": blocks["C_y"] @ t * spread}
 
 

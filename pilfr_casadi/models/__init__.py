@@ -45,6 +45,7 @@ if TYPE_CHECKING:
         stop as stop,
     )
     from .parameters import (
+        Named as Named,
         Neighbours as Neighbours,
         Parameter as Parameter,
         ParameterSet as ParameterSet,

@@ -70,15 +70,10 @@ def to_plays(structure: PILFR, values: Mapping[str, Any]) -> tuple[PILFR, dict[s
     return _convert(structure, values, Play())
 
 
-def _layer(structure: PILFR) -> PrandtlIshlinskii:
+def _convert(structure: PILFR, values: Mapping[str, Any], operator: Play | Stop) -> tuple[PILFR, dict[str, Array]]:
     element = structure.element
     if not isinstance(element, PrandtlIshlinskii) or not isinstance(element.operator, Play | Stop):
         raise InputError("Only a Prandtl-Ishlinskii element of plays or stops has a complement; convert one of those.")
-    return element
-
-
-def _convert(structure: PILFR, values: Mapping[str, Any], operator: Play | Stop) -> tuple[PILFR, dict[str, Array]]:
-    element = _layer(structure)
     if type(element.operator) is type(operator):
         return structure, {name: np.array(value, dtype=float) for name, value in values.items()}
     touched = {block for block, factors in SLOPES.items() if not any(is_zero(structure, f) for f in factors)}

@@ -17,9 +17,8 @@ import numpy as np
 from .._base import InputError, filled, listed
 
 Array = np.ndarray
-LARGEST_MODEL = (
-    20_000  # parameters: the Gauss-Newton Hessian then takes 3.2 GB, and its factorisation a minute per step
-)
+# parameters: the Gauss-Newton Hessian then takes 3.2 GB, and its factorisation a minute per step
+LARGEST_MODEL = 20_000
 
 
 def check_size(owner: str, count: int) -> None:
@@ -257,6 +256,30 @@ class ParameterSet(Mapping[str, Parameter]):
         """Copy with fields of some parameters replaced: `change(A={"fixed": True}, w={"bounds": (0, 1)})`."""
         self._require(changes)
         return ParameterSet({n: replace(p, **changes[n]) if n in changes else p for n, p in self.items()})
+
+
+class Named:
+    """Symbols by name: `x.pos`, `p.k` or `p["k"]`."""
+
+    def __init__(self, kind: str, values: Mapping[str, Any]) -> None:
+        self.__dict__.update(_kind=kind, _values=dict(values))
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self._values[name]
+        except KeyError:
+            if name.startswith("__"):
+                raise AttributeError(name) from None
+            known = ", ".join(self._values) or "none"
+            raise InputError(f"There is no {self._kind} {name!r}; there are {known}.") from None
+
+    __getitem__ = __getattr__
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise InputError(f"The {self._kind} {name!r} cannot be assigned; return the equations in a dict instead.")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
 
 
 class Neighbours:

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from .ipopt import Ipopt as Ipopt
     from .problem import Problem as Problem, check_weights as check_weights
     from .solution import (
+        Candidate as Candidate,
         Iteration as Iteration,
         Limit as Limit,
         Progress as Progress,

@@ -26,16 +26,7 @@ import casadi as ca
 import numpy as np
 
 from .._base import InputError, filled, numbers
-from ..models import (
-    PILFR,
-    GeneralizedPlay,
-    ParameterSet,
-    Play,
-    PrandtlIshlinskii,
-    Stop,
-    element_slopes,
-    unknown_slope,
-)
+from ..models import PILFR, GeneralizedPlay, ParameterSet, Play, PrandtlIshlinskii, Stop, element_slopes, unknown_slope
 
 TOLERATED = 1e-6  # violation, in units of a constraint, up to which it counts as met
 LARGEST_UNIT, SMALLEST_UNIT = 100.0, 1e-6  # a unit is at most 100 limits, at least this share of the change

@@ -218,7 +218,7 @@ class SchurProblem:
     def constraint_jacobian(self, x: Array) -> Array:
         """Return the Jacobian of `constraint`."""
         problem, theta = self.problem, self.theta(x)
-        n_free, p = int(problem.free.sum()), problem.parameters(theta)
+        n_free, p = problem.n_free, problem.parameters(theta)
         out = np.zeros((len(self.g_lower), self.size))
         out[: len(self.kept), : problem.size] = problem.constraint_jacobian(theta)[self.kept]
         row = len(self.kept)
@@ -362,7 +362,7 @@ def _scale_inside(problem: Problem, theta: Array) -> Array:
         return theta
     share = 0.999 * float(np.exp(room))
     scaled = {**values, **{k: share * values[k] for k in names}}
-    start = np.concatenate([parameters.pack(scaled)[problem.free], theta[int(problem.free.sum()) :]])
+    start = np.concatenate([parameters.pack(scaled)[problem.free], theta[problem.n_free :]])
     return np.asarray(np.clip(start, problem.lower, problem.upper))
 
 

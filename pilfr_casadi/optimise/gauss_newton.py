@@ -19,11 +19,8 @@ that point, with more damping and a larger penalty.
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -31,7 +28,7 @@ from typing import Protocol
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, unwrapped_interrupt
+from .._base import InputError, handled_interrupt, unwrapped_interrupt
 from ..data import Recording
 from ..engine import Engine
 from ..models import Model, Neighbours
@@ -288,23 +285,6 @@ class BestFeasible:
     def beats(self, cost: float, violation: float) -> bool:
         """Tell whether the best feasible point beats one of this cost and violation."""
         return bool(np.isfinite(self.cost)) and (violation > TOLERATED or cost > self.cost * (1.0 + self.tolerance))
-
-
-@contextlib.contextmanager
-def handled_interrupt(handle: Callable[[], None]) -> Iterator[None]:
-    """Call `handle` on Ctrl-C in place of raising KeyboardInterrupt, which CasADi may swallow.
-
-    Has no effect outside the main thread, or where other code handles Ctrl-C.
-    """
-    ours = threading.current_thread() is threading.main_thread()
-    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if ours:
-        signal.signal(signal.SIGINT, lambda *_: handle())
-    try:
-        yield
-    finally:
-        if ours:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @dataclass(frozen=True)

@@ -22,16 +22,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError
-from .gauss_newton import (
-    ACCEPTED_RATIO,
-    LEAST_DAMPING,
-    MOST_DAMPING,
-    SMALLEST_DIVISOR,
-    ZERO_COLUMN,
-    Damping,
-    handled_interrupt,
-)
+from .._base import InputError, handled_interrupt
+from .gauss_newton import ACCEPTED_RATIO, LEAST_DAMPING, MOST_DAMPING, SMALLEST_DIVISOR, ZERO_COLUMN, Damping
 from .problem import Problem
 from .solution import Iteration, Progress, Solution, Status, check_solver_options
 

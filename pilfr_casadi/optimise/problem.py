@@ -112,11 +112,6 @@ def check_weights(given: Sequence[float] | Array | None, count: int) -> Array:
     return weights
 
 
-def output_scale(recordings: Sequence[Recording]) -> Array:
-    """Return the standard deviation of each output over all recordings, (n_y,)."""
-    return np.std(np.concatenate([r.y[r.skip :] for r in recordings]), axis=0)
-
-
 class Penalties:
     """Quadratic and L1 terms that are added to the simulation error.
 
@@ -308,7 +303,8 @@ class Problem:
                     f"The recording has {r.n_u} inputs and {r.n_y} outputs, "
                     f"the model {len(model.inputs)} and {model.n_y}; they must match."
                 )
-        self.scale = output_scale(self.recordings) if scale is None else np.asarray(scale, dtype=float)
+        own = np.std(np.concatenate([r.y[r.skip :] for r in self.recordings]), axis=0)
+        self.scale = own if scale is None else np.asarray(scale, dtype=float)
         self.weights = check_weights(weights, len(self.recordings))
         scales = [self.scale / weight for weight in self.weights]
         self._placed = list(place_recordings(model, self.recordings, self.n_free, scales))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._base import InputError, is_number, positive, whole
+from ..models import Model
 from .constraints import TOLERATED, BeyondRadius
 from .problem import Problem
 
@@ -84,6 +85,20 @@ class Solution:
     multipliers: np.ndarray = field(default_factory=lambda: np.zeros(0))
     history: tuple[Iteration, ...] = ()
     message: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """The result of one start; `drawn` tells whether the start depends on the seed, `nrmse` averages the recordings."""
+
+    seed: int
+    model: Model
+    theta: np.ndarray
+    error: float
+    solution: Solution
+    note: str = ""
+    drawn: bool = True
+    nrmse: float = np.nan
 
 
 Progress = Callable[[Iteration], None]

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from .canvas import (
     BLUE,
@@ -40,7 +42,7 @@ def mismatch_map(found: Mapping[str, Any], unit: str = "") -> Axes:
     """Draw the residual over frequency and amplitude (`diagnose.mismatch`), in % of the outputs' deviation."""
     ax = axes_or_new(None)
     data, (size, label) = found["map"], _size(found, unit)
-    edges, rms = np.asarray(data["edges"]) * size, 100 * _with_gaps(data["rms"])
+    edges, rms = np.asarray(data["edges"]) * size, 100 * np.array(data["rms"], dtype=float)
     top = max(float(np.nanmax(rms, initial=0.0)), 1e-12)
     rows = _rows(data, np.nanmax(np.nan_to_num(rms), axis=1) > 1e-3 * top)
     y = np.append(np.asarray(data["low"])[rows], data["high"][rows.stop - 1])
@@ -71,11 +73,6 @@ def _size(found: Mapping[str, Any], unit: str, kind: str = "amplitude") -> tuple
     return scale / factor, with_unit(f"{kind} of {name}", label)
 
 
-def _with_gaps(values: Any) -> np.ndarray:
-    """Convert nested lists to an array, None to nan."""
-    return np.array(values, dtype=float)
-
-
 def mismatch_bands(found: Mapping[str, Any]) -> Axes:
     """Draw the residual in each frequency band beside the noise floor; bands with a tenth or more of it are filled."""
     ax = axes_or_new(None)
@@ -104,7 +101,7 @@ def mismatch_growth(found: Mapping[str, Any], unit: str = "", kind: str = "ampli
     data, (size, label) = found[kind], _size(found, unit, kind)
     edges = np.asarray(data["edges"])
     middle = (edges[1:] + edges[:-1]) / 2
-    rms = 100 * _with_gaps(data["rms"])
+    rms = 100 * np.array(data["rms"], dtype=float)
     ax.plot(middle * size, rms, "o-", color=VERMILLION, linewidth=1.8, label="residual")
     known = np.isfinite(rms) & (rms > 0)
     if np.any(known):
@@ -123,7 +120,7 @@ def mismatch_level(found: Mapping[str, Any], unit: str = "") -> Axes:
     data = found["level"]
     edges = found["scale"][data["output"]] * np.asarray(data["edges"])
     size, across = scale_axis(data["output"], edges, unit)
-    rms = 100 * _with_gaps(data["rms"])
+    rms = 100 * np.array(data["rms"], dtype=float)
     ax.stairs(rms, edges / size, color=VERMILLION, linewidth=1.8, label="residual", baseline=None)
     noise_line(ax, 100 * found["floor"])
     return finish(ax, across, "residual [% of deviation]", "over level")
@@ -196,7 +193,8 @@ def port_law_map(
         ax.text(j + 0.5, i + 0.5, text, ha="center", va="center", fontsize=FONT - 1,
                 color="white" if dark else INK, fontweight="bold" if framed else "normal")  # fmt: skip
         if framed:
-            ax.add_patch(_frame(j, i))
+            ax.add_patch(Rectangle((j + 0.03, i + 0.05), 0.94, 0.9, fill=False, edgecolor=VERMILLION, linewidth=2.2,
+                                   zorder=5))  # fmt: skip
     ax.set_xticks(np.arange(len(ports)) + 0.5, [_wrap(p) for p in ports], fontsize=FONT - 1)
     ax.set_yticks(np.arange(len(laws)) + 0.5, [plain(law) for law in laws], fontsize=FONT - 1)
     ax.invert_yaxis()
@@ -230,18 +228,10 @@ def _colour_bar(ax: Axes, mesh: Any, label: str, **style: Any) -> None:
 
 def _readable_log(axis: Any, low: float, high: float) -> None:
     """Write the ticks of a logarithmic axis as a few plain numbers."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     subs = (1.0,) if high > 300 * low else (1.0, 2.0, 5.0) if high > 3 * low else tuple(np.arange(1.0, 10.0))
     axis.set_major_locator(LogLocator(10, subs))
     axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}" if 1e-4 < v < 1e5 else f"{v:.0e}"))
     axis.set_minor_formatter(NullFormatter())
-
-
-def _frame(j: int, i: int) -> Any:
-    from matplotlib.patches import Rectangle
-
-    return Rectangle((j + 0.03, i + 0.05), 0.94, 0.9, fill=False, edgecolor=VERMILLION, linewidth=2.2, zorder=5)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..data import Recording, nrmse
 from ..export import FittedModel
 from ..linear import output_spectra
 from ..models import Model
-from ..optimise import Solution
+from ..optimise import Candidate, Solution
 from .canvas import (
     BLUE,
     GREEN,
@@ -39,14 +39,6 @@ from .canvas import (
     scale_axis,
     with_unit,
 )
-
-
-class Start(Protocol):
-    """A start of a multistart search."""
-
-    @property
-    def solution(self) -> Solution:
-        """Result of its solve."""
 
 
 class PlottedFit(FittedModel, Protocol):
@@ -73,7 +65,7 @@ class PlottedFit(FittedModel, Protocol):
         """The winning solve."""
 
     @property
-    def candidates(self) -> Sequence[Start]:
+    def candidates(self) -> Sequence[Candidate]:
         """Every start that was tried."""
 
     def simulate(self, recording: Recording) -> np.ndarray:

@@ -266,18 +266,19 @@ def usage(diagnosis: Diagnosis) -> str:
     simulator = diagnosis.corrected
     fitted = {k: to_json(np.asarray(p.value)) for k, p in simulator.parameter_set.items()}
     modules: dict[str, set[str]] = {}
+    elements = []
     for e in simulator.elements:
-        for part in _parts(type(e.law))[0]:
+        imported, expression = _parts(type(e.law))
+        for part in imported:
             modules.setdefault(_home(part), set()).add(part.__name__)
+        limits = {k: tuple(np.asarray(end, dtype=float).tolist() for end in ends) for k, ends in e.law.limits.items()}
+        elements.append((e, expression, e.own(fitted), limits))
     return render(
         "use_diagnosis.txt",
         diagnosis=diagnosis,
         simulator=simulator,
         modules=modules,
-        elements=[
-            (e, _parts(type(e.law))[1], e.own(fitted), {k: tuple(map(_literal, v)) for k, v in e.law.limits.items()})
-            for e in simulator.elements
-        ],
+        elements=elements,
         values={k: v for k, v in fitted.items() if k in diagnosis.refitted.parameters},
     )
 
@@ -296,8 +297,3 @@ def _home(law: Any) -> str:
     from .. import laws
 
     return laws.__name__ if getattr(laws, law.__name__, None) is law else law.__module__
-
-
-def _literal(value: Any) -> Any:
-    found = np.asarray(value, dtype=float)
-    return found.tolist()

@@ -18,26 +18,14 @@ from ..data import Recording, as_recordings, rmse_per_output
 from ..identify import Fit
 from ..models import StaticNetwork
 from ..optimise import Status
-from .fit_sections import (
-    curve,
-    hysteresis,
-    limit_blocks,
-    linear_part,
-    output_pictures,
-    parameter_blocks,
-)
+from .fit_sections import curve, hysteresis, limit_blocks, linear_part, output_pictures, parameter_blocks
 from .page import Block, Code, Page, Picture, Section, Table, Text, numbered, render
 
 Records = Recording | Sequence[Recording]
 RUNAWAY = 1e3  # NRMSE above which the page reports that the simulation diverges
 
 
-def fit_report(
-    fit: Fit,
-    train: Records,
-    tests: Records,
-    folder: str | os.PathLike[str],
-) -> Path:
+def fit_report(fit: Fit, train: Records, tests: Records, folder: str | os.PathLike[str]) -> Path:
     """Write `report.html` and `model.json` of a fit into a folder; return the page's path.
 
     `train` are the recordings of the fit, `tests` the recordings to judge it on, possibly none. An `InputError` is
@@ -49,13 +37,7 @@ def fit_report(
     return write_atomically(target / "report.html", page.html())
 
 
-def fit_page(
-    fit: Fit,
-    train: Records,
-    tests: Records,
-    *,
-    model_file: str = "model.json",
-) -> Page:
+def fit_page(fit: Fit, train: Records, tests: Records, *, model_file: str = "model.json") -> Page:
     """Fill the page of a fit; see `fit_report`."""
     used, judged = as_recordings(train), as_recordings(tests) if isinstance(tests, Recording) or len(tests) else ()
     named = [(r.with_(name=r.name or numbered("training", i, len(used))), "training") for i, r in enumerate(used)]

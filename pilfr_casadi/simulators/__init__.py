@@ -1,8 +1,8 @@
 """The user's equations with ports for missing physics.
 
 `equations` evaluates them with their laws, `integration` makes them a discrete-time `Model`, `simulator` holds the
-class `Simulator`, `equilibrium_state` computes the state in which its laws begin at rest, and `adapters` accept a
-Python file, a state space or a fitted model in its place.
+class `Simulator` and the state in which its laws begin at rest, and `adapters` accept a Python file, a state space or a
+fitted model in its place.
 """
 
 from typing import TYPE_CHECKING
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
         user_variable as user_variable,
     )
     from .equations import Named as Named, Placed as Placed, Port as Port, in_series as in_series
-    from .equilibrium_state import compute_equilibrium as compute_equilibrium, resting_elements as resting_elements
     from .integration import (
         LARGEST_STEP as LARGEST_STEP,
         MOST_SUBSTEPS as MOST_SUBSTEPS,
@@ -33,6 +32,10 @@ if TYPE_CHECKING:
         signals as signals,
         states_along as states_along,
     )
-    from .simulator import Simulator as Simulator
+    from .simulator import (
+        Simulator as Simulator,
+        compute_equilibrium as compute_equilibrium,
+        resting_elements as resting_elements,
+    )
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

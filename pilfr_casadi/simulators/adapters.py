@@ -89,7 +89,7 @@ def _from_model(
         parameters[f"gain_{name}"] = Parameter(1.0, bounds=GAIN)
         parameters[f"offset_{name}"] = Parameter(0.0, bounds=(-reach, reach))
     states = tuple(model.states)
-    states += tuple(f"memory{i + 1}" for i in range(model.n_x + model.n_s - len(states)))
+    states += tuple(f"memory{i + 1}" for i in range(model.n_state - len(states)))
 
     def step(x: Named, u: Named, p: Named) -> Any:
         state = ca.vertcat(ca.SX(0, 1), *(x[n] for n in states))

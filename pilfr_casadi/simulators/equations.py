@@ -10,7 +10,7 @@ actuator or a sensor a law acts in series: it adds `w = law(u) - u` to the signa
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self, cast
@@ -18,34 +18,10 @@ from typing import Any, Self, cast
 import casadi as ca
 
 from .._base import InputError, listed
-from ..models import Parameter, ParameterSet
+from ..models import Named, Parameter, ParameterSet
 
 Expression = Callable[..., Any]
 BUILT_IN = ("actuator:", "sensor:", "equation:")  # prefixes of the ports that need no declaration
-
-
-class Named:
-    """Symbols by name: `x.pos`, `p.k` or `p["k"]`."""
-
-    def __init__(self, kind: str, values: Mapping[str, Any]) -> None:
-        self.__dict__.update(_kind=kind, _values=dict(values))
-
-    def __getattr__(self, name: str) -> Any:
-        try:
-            return self._values[name]
-        except KeyError:
-            if name.startswith("__"):
-                raise AttributeError(name) from None
-            known = ", ".join(self._values) or "none"
-            raise InputError(f"There is no {self._kind} {name!r}; there are {known}.") from None
-
-    __getitem__ = __getattr__
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        raise InputError(f"The {self._kind} {name!r} cannot be assigned; return the equations in a dict instead.")
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
 
 
 def call(function: Expression, name: str, **available: Any) -> Any:

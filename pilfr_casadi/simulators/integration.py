@@ -35,11 +35,8 @@ VERY_FAST = 8 * LARGEST_STEP  # |λ| times the sampling interval above which a r
 INFINITE = 1e12  # rate that stands for an infinite one, rad/s
 ENDLESS = 1e100  # size of a state above which it has diverged
 FINE = 20  # sub-steps per sample of the run that looks for the rates
-BEGINNING, SETTLING, EVERY = (
-    400,
-    40,
-    20,
-)  # its samples at most, those left out first, and the spacing of those looked at
+# its samples at most, those left out first, and the spacing of those looked at
+BEGINNING, SETTLING, EVERY = 400, 40, 20
 HIGH, FEWEST = 0.9, 5  # quantile of the rates along it that counts, and the rates that are too few to tell
 SHOWN = 8  # values named in a message
 

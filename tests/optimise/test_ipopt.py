@@ -7,11 +7,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pilfr_casadi._base import InputError
+from pilfr_casadi._base import InputError, handled_interrupt
 from pilfr_casadi.data import Recording
 from pilfr_casadi.models import PILFR, Play, PrandtlIshlinskii
 from pilfr_casadi.optimise import Constraint, GaussNewton, Ipopt, Problem, Status
-from pilfr_casadi.optimise.gauss_newton import handled_interrupt
 from pilfr_casadi.optimise.ipopt import DampedHessian, Point, Scaled, _Callback
 from problems.zoo import CASES
 
