@@ -4,18 +4,17 @@ A hypothesis is the simulator with laws in its ports. All hypotheses are fitted 
 one log evidence; verdict, effects and confidence are sums over their posterior. `pipeline` shows how an answer comes
 about. The files by stage:
 
-- The whole: `pipeline` (the steps in their order), `arguments` (their checks), `workbench` (what all steps share).
-- Preparation: `preparation` calls the checks of recordings, each an edit that puts a fault right: `gates` (the edit
-- Preparation: `preparation` calls the checks of recordings. Each check makes an edit that corrects a fault: `gates`
-  (the edit and its acceptance; sign, unit, exchange, offset), `recording_faults` (glitches, stale and clipped samples,
-  unsettled periods, tones) and `timing` (shift, clock, gap). `step_refinement` chooses the integration steps, `floor`
-  estimates the noise.
-- Search: `search` moves from hypothesis to hypothesis. `linearise`, `remainder`, `screen`, `pairs` and `relatives`
-  select the hypotheses that are worth a fit, `trials` fits them.
-- Evidence: `evidence` (log evidence), `cross_validation` (held-out blocks), `posterior`, `verdict`.
-- Correction: `correction` chooses the corrected simulator, with a `learned` element where named laws do not suffice.
+- The whole: `pipeline` (the steps in their order), `workbench` (what all steps share).
+- Preparation: `preparation` checks the arguments, then the recordings. Each check of recordings makes an edit that
+  corrects a fault: `gates` (the edit and its acceptance; sign, unit or gain, exchange, offset), `recording_faults`
+  (glitches, stale and clipped samples, unsettled periods, tones) and `timing` (shift, clock, gap). `floor` estimates
+  the noise.
+- Search: `search` moves from hypothesis to hypothesis. `linearise`, `remainder`, `screen` and `relatives` select the
+  hypotheses that are worth a fit, `trials` fits them. `learned` fits forces that have no name yet.
+- Evidence: `evidence` (log evidence, prior of laws, errors on held-out data), `posterior`, `verdict`.
+- Correction: `correction` chooses the corrected simulator, with a learned force where named laws do not suffice.
 - Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
-- Proof: `proof`, `experiment` (placebo, next experiment), `force_recovery`, `mismatch_map`.
+- Proof: `proof` (errors before and after, placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
 - Before a diagnosis: `checkup` (what the recordings can reveal), based on `identifiability` (of parameters) and
   `detectability` (of laws).

@@ -17,19 +17,17 @@ import numpy as np
 
 from .._base import in_words, one_blas_thread, to_json
 from ..data import Recording
-from ..laws import Law, display_name
+from ..laws import LINEAR, Law, display_name
 from ..simulators import in_series
-from .arguments import check_laws, match_recordings
 from .detectability import Excitation, LawRow, assess_laws, excitations, group_alike
 from .floor import ABOVE_NOISE, noise_floor
 from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters, helpful_sensors
 from .linearise import linearised
-from .preparation import stated_hold
+from .preparation import check_laws, match_recordings, stated_hold
 from .workbench import Fitted, Workbench
 
 FINEST = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
 HALF = 0.5  # mean square error over the outputs' power above which the linearisation may be far from the machine
-LINEAR = ("linear_stiffness", "viscous_damping")  # laws that the simulator's own parameters usually cover
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
     "identifiable": ("yes", ""),

@@ -1,7 +1,7 @@
 """The corrected simulator: the candidate that best predicts data it was not fitted to, with or without a named law.
 
 If the named answer is not sure, or leaves error above the noise, several candidates compete on held-out parts of the
-training recordings (`cross_validation`): the refitted simulator, the laws that the search has fitted, and a learned
+training recordings (`evidence`): the refitted simulator, the laws that the search has fitted, and a learned
 force alone or beside them. The score is the held-out error plus the spread of predictions for other inputs
 (`evidence.spread`), which is large if many parameters are hardly determined. The smallest score wins. Test recordings
 are never used.
@@ -20,7 +20,7 @@ import numpy as np
 from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
-from .cross_validation import HeldOut
+from .evidence import HeldOut
 from .learned import Learned, LearnedForce, describe_learned
 from .posterior import Posterior, explainable_remainder
 from .search import FORMULA, Search

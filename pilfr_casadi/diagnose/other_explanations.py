@@ -17,7 +17,7 @@ import numpy as np
 
 from .._base import InputError
 from ..data import Recording
-from ..laws import display_name
+from ..laws import LINEAR, display_name
 from ..simulators import states_along
 from .gates import CERTAIN, EXPLAINED, LEAST_GAIN, SAME, USELESS_FIT, Gate, describe_fall, gain, open_start, refit
 from .posterior import Posterior, posterior
@@ -29,7 +29,6 @@ from .workbench import THOROUGH, Fitted, Workbench
 WELL_ABOVE = 3.0  # error over the noise above which something else is missing
 # factors on a parameter's start value that are tried if the refit says nothing
 FAR = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)
-LINEAR = ("linear_stiffness", "viscous_damping")  # laws that are equivalent to other parameter values
 NAMED = 3  # values reported at most
 
 

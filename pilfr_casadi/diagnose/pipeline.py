@@ -14,17 +14,26 @@ from .._base import InputError, Progress, Stages, one_blas_thread, processors, w
 from ..data import Recording
 from ..laws import Law, readable_unit
 from ..simulators import Simulator
-from .arguments import add_scaled_laws, check_laws, check_limits, match_recordings, match_tests
 from .checkup import BlindSpot, assess
 from .correction import Correction, find_correction, named_correction
 from .detectability import port_units
-from .experiment import next_experiment, placebo
 from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
 from .posterior import Named, Posterior, names, posterior
-from .preparation import CHECKS, Prepared, hold_note, prepare, stated_hold
-from .proof import deviations, mean_nrmse, parameter_table, test_errors
+from .preparation import (
+    CHECKS,
+    Prepared,
+    add_scaled_laws,
+    check_laws,
+    check_limits,
+    hold_note,
+    match_recordings,
+    match_tests,
+    prepare,
+    stated_hold,
+)
+from .proof import deviations, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
 from .recording_faults import clipped_input, tones
 from .result import Diagnosis, Effect
 from .search import Search
@@ -33,7 +42,7 @@ from .trials import Trial
 from .verdict import SURE, Verdict, judge
 from .workbench import Fitted
 
-AS_GIVEN = 0.5  # ratio of mean squares below which a search without shifted early channels replaces the first search
+AS_GIVEN = 0.5  # ratio of mean squares below which a second search, with channels as they were given, counts
 SEARCHING = 0.7  # share of the remaining time for the search; the rest is for the correction
 
 
@@ -70,7 +79,7 @@ class Conclusion:
         The elements that `fitted` has beside the refitted simulator.
     effects : tuple of Named
         The named effects.
-    let_go : str
+    freed : str
         The pinned parameter whose other value explains as much as the named law.
     """
 
@@ -79,7 +88,7 @@ class Conclusion:
     fitted: Fitted
     correction: Correction
     effects: tuple[Named, ...] = ()
-    let_go: str = ""
+    freed: str = ""
 
 
 @one_blas_thread
@@ -104,7 +113,8 @@ def diagnose_in_steps(
     2. Check the recordings for faults, refit the simulator, and measure the noise (`preparation`).
     3. Fit hypotheses, which are sets of laws in ports, and keep all of them (`search`).
     4. Weigh all hypotheses; choose verdict, effects and corrected simulator (`conclude`).
-    5. Compute the proof (`proof`): errors on test recordings, placebos, standard errors. It changes nothing above.
+    5. Compute the proof (`proof`): errors on test recordings, placebos, standard errors. It changes no verdict; offsets
+       that gain nothing beside the effects are set to zero.
     """
     began = time.perf_counter()
     workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
@@ -308,7 +318,7 @@ def _build_diagnosis(
         out_of_time=search.out_of_time,
         evidence={"search": search, "without": without, "after": after},
         substeps=after.model.substeps,
-        let_go=found.let_go,
+        freed=found.freed,
         correction=found.correction,
         blind_spots=_blind_spots(request, search),
     )

@@ -1,19 +1,23 @@
-"""Errors on training and test recordings, and parameters, before and after the correction."""
+"""Errors and parameters before and after the correction, the placebo test of a law, and the next experiment."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..data import Recording, nrmse
 from ..engine import Engine, make_engine
+from ..laws import Law
 from ..models import Model
 from ..optimise import first_state, samples_for_state
 from ..simulators import Simulator
 from .floor import effective_size
 from .gates import Gate
+from .linearise import linearised
+from .remainder import Remainder, held_out
 from .workbench import Fitted, Workbench
 
 
@@ -140,3 +144,95 @@ def parameter_table(
             "unit": p.unit,
         }
     return out
+
+
+SHARES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
+SINES = 12  # frequencies of sines that are tried
+MOST_SAMPLES = 3000  # longest simulated experiment, in samples
+
+
+def next_experiment(
+    bench: Workbench, one: Fitted, other: Fitted, noise: np.ndarray, limits: Mapping[str, float] | None = None
+) -> dict[str, Any] | None:
+    """Find the input that separates two fitted explanations best.
+
+    Parameters
+    ----------
+    noise : array, shape (n_y,)
+        Deviation of the outputs' noise.
+    limits : mapping, optional
+        Largest amplitude of each input; by default what was recorded.
+
+    Returns
+    -------
+    dict or None
+        `input`, `waveform`, `amplitude`, `frequency` (Hz), `separation` (rms difference over the noise), `recorded`
+        (the separation in the recordings) and `sentence`; None if nothing within the limits separates them.
+    """
+    u = np.concatenate([r.u for r in bench.recordings])
+    m, dt = min(max(map(len, bench.recordings)), MOST_SAMPLES), bench.dt
+    t, rest = np.arange(m) * dt, np.median(u, axis=0)
+    best: dict[str, Any] | None = None
+
+    def separation(drive: np.ndarray) -> float:
+        recording = bench.recordings[0].with_(
+            u=drive, y=np.zeros((len(drive), len(noise))), initial="zero", period=None, skip=0
+        )
+        with np.errstate(all="ignore"):
+            y = [
+                f.engine.simulate(f.model.drive(recording), f.vector, np.zeros(f.model.n_state))[0]
+                for f in (one, other)
+            ]
+            value = float(np.sqrt(np.mean(((y[0] - y[1]) / np.maximum(noise, 1e-300)) ** 2)))
+        return value if np.isfinite(value) else 0.0
+
+    recorded = max(separation(r.u[:m]) for r in bench.recordings)
+    for i, name in enumerate(bench.simulator.inputs):
+        most = (limits or {}).get(name, float(np.max(np.abs(u[:, i] - rest[i]))))
+        trials = [("sine", f) for f in np.geomspace(4 / (m * dt), 0.2 / dt, SINES)]
+        trials += [("triangle", f) for f in np.geomspace(2 / (m * dt), 0.02 / dt, 5)]
+        for waveform, f in trials:
+            wave = np.sin(2 * np.pi * f * t)
+            if waveform == "triangle":
+                wave = 2 / np.pi * np.arcsin(wave)
+            for share in SHARES:
+                drive = np.tile(rest, (m, 1))
+                drive[:, i] += share * most * wave
+                value = separation(drive)
+                if best is None or value > 1.05 * best["separation"]:
+                    best = {
+                        "input": name,
+                        "waveform": waveform,
+                        "amplitude": share * most,
+                        "frequency": float(f),
+                        "separation": value,
+                    }
+    if best is None or best["separation"] < 1.0:
+        return None
+    unit = bench.recordings[0].units.get(best["input"], "")
+    best["recorded"] = recorded
+    best["sentence"] = (
+        f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {best['amplitude']:.3g}"
+        f"{' ' + unit if unit else ''} at {best['input']} separates them best: their outputs then differ by "
+        f"{best['separation']:.3g} times the noise ({recorded:.3g} times in the recordings)."
+    )
+    return best
+
+
+def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[float, float]:
+    """Compute the held-out share of the residual that a law explains with its own signal, and with an unrelated one.
+
+    The unrelated signal is the port's own, shifted by half a recording: it has the same statistics but no relation to
+    the residual.
+    """
+    probe, runs = linearised(bench, fitted)
+    shares = []
+    for moved in (False, True):
+        shifted = [
+            replace(r, z=np.roll(r.z, len(r.z) // 2, axis=0), dz=np.roll(r.dz, len(r.dz) // 2, axis=0)) if moved else r
+            for r in runs
+        ]
+        rest = Remainder.of(bench, probe, shifted, [type(law)], at=port)
+        found = [held_out(rest.columns(task)[0], rest.left, rest.odd, (1e-6, 1e-3)) for task in rest.tasks]
+        shares.append(found[0] if found else 0.0)
+    return shares[0], shares[1]

@@ -1,6 +1,6 @@
-"""Further hypotheses that are related to the best ones, and that the screen did not select.
+"""Further hypotheses that the screen did not select: relatives of the best ones, and pairs of laws at once.
 
-Each is a pair of port and law with its own start values:
+A relative is a pair of port and law with its own start values:
 
 - a special case of the best law, and a law that the best one refines;
 - another form of a law that came near;
@@ -8,12 +8,20 @@ Each is a pair of port and law with its own start values:
 - a resonance of known frequency: as a mass attached at another port, or in place of a delay or a lag;
 - a law of a signal with its own time scale, at the other end of a nearly linear simulator;
 - a simple law whose force is most like that of a flexible law along its port's own signal.
+
+Two effects may hide each other, so that neither law explains enough alone. Then every pair of laws at two ports is
+scored along the refitted simulation. Let Q_a and Q_b be orthonormal columns of the output changes by small doses of the
+two (`remainder`), and e' the remaining error. The pair explains the share
+
+    |Q_aᵀ e'|² + rᵀ (I - W Wᵀ)⁻¹ r,    r = Q_bᵀ e' - W Q_aᵀ e',    W = Q_bᵀ Q_a
+
+of it. The best pairs are fitted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +29,9 @@ import numpy as np
 from ..laws import Attached, Delay, Lag, Law, Local, Resonance, unit_forces
 from ..models import map_points
 from ..simulators import in_series, signals, states_along
-from .evidence import FLEXIBLE
+from .remainder import Dose, Remainder, held_out, orthonormal
 from .screen import Scored, start_values
-from .trials import Trial
+from .trials import BRIEF, Trial, Trials, place_law
 from .workbench import Fitted, Workbench
 
 NEAR = 1.5  # ratio to the best error beyond which a related law gets another start
@@ -32,15 +40,6 @@ DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in place of a del
 MATCHES = 3  # simple laws, with a force like that of a flexible law, that are tried
 SEEN = 4000  # approximate number of samples on which forces are compared
 HUGE = 1e60  # bound on signals, above which a simulation diverges
-# by law: the laws that are special cases of it
-CONTAINS = {
-    "hysteresis": ("backlash", "coulomb_friction", "linear_stiffness"),
-    "stribeck_friction": ("coulomb_friction",),
-    "clearance": ("piecewise_stiffness", "linear_stiffness"),
-    "piecewise_stiffness": ("linear_stiffness",),
-    "creep": ("linear_stiffness", "viscous_damping"),
-    "extra_mode": ("linear_stiffness", "viscous_damping"),
-}
 
 
 def complements(one: Law, other: Law) -> bool:
@@ -83,7 +82,7 @@ def _near(trials: Sequence[Trial]) -> set[tuple[str, type[Law]]]:
 def _special_cases(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     """Select special cases of the best law at its port that did not come near, as from a wrong minimum."""
     best, near = trials[0], _near(trials)
-    cases = CONTAINS.get(best.law.id, ())
+    cases = best.law.contains
     return [s for s in scored if s.port == best.port and s.law.id in cases and (s.port, type(s.law)) not in near]
 
 
@@ -177,11 +176,11 @@ def _simpler_laws(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Sco
 def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     """Select simple laws at the best law's port with the most similar force; none if the best law is simple."""
     best, near = trials[0], _near(trials)
-    if best.law.id not in FLEXIBLE:
+    if not best.law.flexible:
         return []
     entries: dict[type[Law], Scored] = {}
     for s in scored:
-        if s.port == best.port and s.law.id not in FLEXIBLE and (s.port, type(s.law)) not in near:
+        if s.port == best.port and not s.law.flexible and (s.port, type(s.law)) not in near:
             entries.setdefault(type(s.law), s)
     local = port_signals(bench, best.fitted, best.port)
     # also excludes nan, for example from the root of a negative number
@@ -235,3 +234,100 @@ def _match_force(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict
         if left < best:
             best, start = left, start_values(law, shape, found)
     return best, start
+
+
+SHAPES = 5  # shapes of each law at each port: the best alone
+PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each pair of ports
+LOOKED_AT = 60  # pairs of laws whose share is cross-validated
+RIDGE = 1e-4  # on the gram matrix of orthonormal columns, against nearly parallel laws
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """A law of one shape at a port, and its dose."""
+
+    scored: Scored
+    dose: Dose
+
+
+def _blocks(rest: Remainder) -> Iterator[_Block]:
+    for task in rest.tasks:
+        for law, doses in rest.doses(task):
+            felt, sense = [d for d in doses if np.any(d.phi)], rest.runs[0].sense(law, task.index)
+            shares = [float(np.sum((orthonormal(d.phi).T @ rest.left) ** 2)) for d in felt]
+            for k in np.argsort(shares)[::-1][:SHAPES]:
+                scored = Scored(task.port.name, law, shares[k], (), task.local, sense)
+                yield _Block(scored, replace(felt[k], phi=felt[k].phi.copy()))
+
+
+def pair_shares(parts: Sequence[np.ndarray], left: np.ndarray) -> np.ndarray:
+    """Compute the share of `left` that each two parts explain together, shape (n, n); parts are orthonormal columns."""
+    q, width = np.hstack(parts), [p.shape[1] for p in parts]
+    begin = np.cumsum([0, *width])
+    gram, right = q.T @ q, q.T @ left
+    out = np.zeros((len(parts), len(parts)))
+    of_width = {w: np.flatnonzero(np.equal(width, w)) for w in set(width)}
+    for i in range(len(parts)):
+        own = slice(begin[i], begin[i + 1])
+        rest = right - gram[:, own] @ right[own]
+        for w, which in of_width.items():
+            at = begin[which][:, None] + np.arange(w)
+            r, across = rest[at], gram[:, own][at]
+            inner = (1 + RIDGE) * np.eye(w) - across @ np.swapaxes(across, 1, 2)
+            gained = np.einsum("jk,jk->j", r, np.linalg.solve(inner, r[:, :, None])[:, :, 0])
+            out[i, which] = right[own] @ right[own] + gained
+    return np.asarray(out / max(float(left @ left), 1e-300))
+
+
+def choose_pairs(rest: Remainder) -> list[tuple[_Block, _Block]]:
+    """Choose the pairs worth a fit, best first: a few of each of the best pairs of ports."""
+    blocks = list(_blocks(rest))
+    if len(blocks) < 2:
+        return []
+    left = 1 - pair_shares([orthonormal(b.dose.phi) for b in blocks], rest.left)
+    ports = np.array([b.scored.port for b in blocks])
+    worth = np.maximum(left, 0.0)
+    worth[ports[:, None] == ports] = np.inf
+    seen: dict[tuple[Any, ...], tuple[float, tuple[_Block, _Block]]] = {}
+    for flat in np.argsort(worth, axis=None):
+        i, j = np.unravel_index(flat, worth.shape)
+        if len(seen) >= LOOKED_AT or not np.isfinite(worth[i, j]):
+            break
+        pair = blocks[min(i, j)], blocks[max(i, j)]
+        key = tuple((b.scored.port, type(b.scored.law)) for b in pair)
+        if key not in seen and _opposes(pair, rest.left):
+            kept = 1 - held_out(np.hstack([b.dose.phi for b in pair]), rest.left, rest.odd)
+            seen[key] = (kept, pair)
+    chosen: dict[tuple[str, str], list[tuple[_Block, _Block]]] = {}
+    for _, pair in sorted(seen.values(), key=lambda s: s[0]):
+        place = pair[0].scored.port, pair[1].scored.port
+        if (place in chosen or len(chosen) < PLACES) and len(chosen.setdefault(place, [])) < LAWS:
+            chosen[place].append(pair)
+    return [pair for pairs in chosen.values() for pair in pairs]
+
+
+def _strengths(pair: tuple[_Block, _Block], left: np.ndarray) -> list[np.ndarray]:
+    """Compute the strengths of both laws that explain most together."""
+    phi = np.hstack([b.dose.phi for b in pair])
+    found = -np.linalg.lstsq(phi, left, rcond=1e-8)[0] / np.concatenate([b.dose.size for b in pair])
+    return np.split(found, [len(pair[0].dose.size)])
+
+
+def _opposes(pair: tuple[_Block, _Block], left: np.ndarray) -> bool:
+    """Tell whether each law that must oppose motion, or push back, has the right sign."""
+    for block, found in zip(pair, _strengths(pair, left), strict=True):
+        if len(found) == 1 and block.scored.sense * found[0] < 0:
+            return False
+    return True
+
+
+def fit_pair(trials: Trials, root: Fitted, rest: Remainder, pair: tuple[_Block, _Block]) -> Trial | None:
+    """Fit a pair from its screened start values, with the simulator's parameters as refitted and as given."""
+    simulator, named = root.simulator, dict[str, Any]()
+    for block, strength in zip(pair, _strengths(pair, rest.left), strict=True):
+        start = start_values(block.scored.law, block.dose.shape, strength)
+        simulator, own = place_law(simulator, block.scored, start)
+        named |= own
+    nominal = {k: p.value for k, p in root.simulator.parameters.items()}
+    starts = [{**root.values, **named}, {**nominal, **named}]
+    return trials.fitted(simulator, starts, 2, states=root.begin, solver=BRIEF)

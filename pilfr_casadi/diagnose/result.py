@@ -106,7 +106,7 @@ class Diagnosis:
         Whether the time limit ended the search.
     substeps : int
         Integration steps per sample with which the corrected simulator was fitted.
-    let_go : str
+    freed : str
         Parameter that was fixed or at a bound and is free in the corrected simulator; see `other_explanations`.
     correction : Correction or None
         The elements of `corrected` beside the refit: laws, a learned element, and their shares. Elements that are not
@@ -136,7 +136,7 @@ class Diagnosis:
     out_of_time: bool = False
     evidence: Mapping[str, Any] = field(default_factory=dict)
     substeps: int = 1
-    let_go: str = ""
+    freed: str = ""
     correction: Correction | None = None
     blind_spots: tuple[BlindSpot, ...] = ()
 
@@ -259,7 +259,7 @@ class Diagnosis:
     @property
     def _changed(self) -> bool:
         """Whether the corrected simulator differs from the refitted one."""
-        return bool(self.effects or self.nameless or self.let_go)
+        return bool(self.effects or self.nameless or self.freed)
 
     @property
     def shares(self) -> dict[str, float]:

@@ -21,14 +21,22 @@ from ..data import Recording
 from ..engine import make_engine
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
-from .cross_validation import HeldOut, held_out_errors
-from .evidence import EFFECT_PRIOR, EXACT, Sample, information, log_evidence, log_prior, spread
+from .evidence import (
+    EFFECT_PRIOR,
+    EXACT,
+    HeldOut,
+    Sample,
+    held_out_errors,
+    information,
+    log_evidence,
+    log_prior,
+    spread,
+)
 from .floor import Floor, effective_size, white_part
 from .gates import Gate, Offset
 from .learned import candidates, nearest_to_learned
 from .linearise import linearised
-from .pairs import choose_pairs, fit_pair
-from .relatives import complements, relatives
+from .relatives import choose_pairs, complements, fit_pair, relatives
 from .remainder import Remainder
 from .screen import Scored, flexible_shares, screen
 from .trials import Key, Trial, Trials
@@ -64,11 +72,21 @@ class Search:
 
     Attributes
     ----------
+    bench : Workbench
+        Recordings, and the settings for runs and fits.
+    without : Fitted
         The refitted simulator, with no law.
+    floor : Floor
+        The noise; if it is only estimated, the search improves the estimate.
+    laws : sequence of type of Law
+        The laws that are tried.
     memo : dict
         The best trial of every fitted hypothesis, by key.
     steps : list of Step
         The moves, in their order.
+    screens, open, learned_forces, held_out : dict
+        By hypothesis: scores of all further laws, share of the rest that a force at each port explains, learned forces,
+        and errors on held-out data.
     hold_said : bool
         Whether somebody stated the hold of the inputs between samples.
     stand_in_error : float

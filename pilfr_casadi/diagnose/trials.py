@@ -25,8 +25,7 @@ from ..optimise import GaussNewton
 from ..simulators import Placed, Simulator
 from .gates import open_start
 from .screen import Scored
-from .step_refinement import knee_starts, refit_on_finer_steps
-from .workbench import QUICK, THOROUGH, Fitted, Workbench, start_vector
+from .workbench import QUICK, THOROUGH, Fitted, Workbench, knee_starts, refit_on_finer_steps, start_vector
 
 LONG = 8000  # samples used by brief fits
 BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)  # first fit of each pair, to rank the pairs

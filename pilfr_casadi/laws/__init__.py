@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .catalogue import (
         CATALOGUE as CATALOGUE,
         FINER as FINER,
+        LINEAR as LINEAR,
         SCALABLE as SCALABLE,
         behind_gap as behind_gap,
         scaled as scaled,

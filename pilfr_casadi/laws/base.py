@@ -150,6 +150,10 @@ class Law:
     dissipative, restoring : bool
         The force always opposes the motion, or always pushes back towards z = 0. This fixes the sign of all strengths
         except those in `signed`.
+    flexible : bool
+        The law can imitate many others, and is less likely before the data are seen.
+    contains : tuple of str
+        Ids of laws that are special cases of it.
     signed : tuple of str
         Strengths of a dissipative or restoring law that may have either sign.
     two_sided : bool
@@ -194,6 +198,8 @@ class Law:
     dissipative: ClassVar[bool] = False
     restoring: ClassVar[bool] = False
     two_sided: ClassVar[bool] = False
+    flexible: ClassVar[bool] = False
+    contains: ClassVar[tuple[str, ...]] = ()
     signed: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[int] = 0
     follows: ClassVar[int] = 0

@@ -220,6 +220,9 @@ CATALOGUE: tuple[type[Law], ...] = (
     behind_gap(friction.CoulombFriction),
 )
 
+# ids of laws that are equivalent to other values of the simulator's own parameters, if it has a spring or damper there
+LINEAR = (stiffness.LinearStiffness.id, friction.ViscousDamping.id)
+
 # laws whose strength may vary with a signal
 SCALABLE: tuple[type[Law], ...] = (
     stiffness.LinearStiffness,

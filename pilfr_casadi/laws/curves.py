@@ -18,6 +18,7 @@ class Polynomial(Law):
     """A memoryless curve: quadratic and cubic terms."""
 
     id = "static_curve"
+    flexible = True
     form = "polynomial"
     equation = "w = a_2 z^2 + a_3 z^3"
     source = "Billings & Fakhouri (1982), Automatica 18(1)"

@@ -74,6 +74,7 @@ class Relaxation(Law):
     """Creep of a support or material: a spring and a damper in series, in parallel to the rest (Maxwell 1867)."""
 
     id = "creep"
+    contains = ("linear_stiffness", "viscous_damping")
     equation = "w = k_v (z - q),  dq/dt = (z - q) / T"
     source = "Findley, Lai & Onaran (1976), Creep and Relaxation, ch. 5"
     sentence = "creep: under a constant load the deflection goes on slowly"
@@ -159,6 +160,8 @@ class Lag(Law):
     """An actuator or a sensor that follows with a lag."""
 
     id = "extra_mode"
+    flexible = True
+    contains = ("linear_stiffness", "viscous_damping")
     form = "lag"
     equation = "w = q - u,  dq/dt = (u - q) / T"
     source = "Franklin, Powell & Emami-Naeini (2015), sec. 3.3"
@@ -181,6 +184,8 @@ class Resonance(Law):
     """An actuator or a sensor with dynamics of second order."""
 
     id = "extra_mode"
+    flexible = True
+    contains = ("linear_stiffness", "viscous_damping")
     form = "resonance"
     equation = "w = q_1 - u,  d2q_1/dt2 = W^2 (u - q_1) - 2 D W dq_1/dt"
     source = "Franklin, Powell & Emami-Naeini (2015), sec. 3.3"
@@ -245,6 +250,7 @@ class Drift(Law):
     """A slow trend in time."""
 
     id = "drift"
+    flexible = True
     equation = "w = a t + b t^2"
     source = "Ljung (1999), System Identification, sec. 14.1"
     sentence = "a slow trend in time that no input explains"

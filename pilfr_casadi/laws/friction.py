@@ -100,6 +100,8 @@ class StribeckFriction(CoulombFriction):
     """Dry friction that falls as motion sets in (Stribeck 1902; Armstrong-Hélouvry et al. 1994)."""
 
     id = "stribeck_friction"
+    flexible = True
+    contains = ("coulomb_friction",)
     form = ""
     equation = "w = (F_c + F_e exp(-(dz/dt / v_s)^2)) tanh(dz/dt / v_0)"
     sentence = "dry friction that is larger at rest than in motion"
@@ -128,6 +130,8 @@ class PreslidingStribeckFriction(PreslidingFriction):
     """Falling dry friction whose contact springs back first: an elasto-plastic element of falling strength."""
 
     id = "stribeck_friction"
+    flexible = True
+    contains = ("coulomb_friction",)
     equation = "w = (k_t + k_e exp(-(dz/dt / v_s)^2)) stop_r[z],  F_c = k_t r"
     source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7); Jenkins (1962)"
     sentence = "dry friction that is larger at rest than in motion, and whose contact springs back before it slides"

@@ -37,6 +37,8 @@ class StopHysteresis(Law):
     """Rate-independent hysteresis: a Prandtl-Ishlinskii layer of stops (Krikelis et al. 2024, Eq. 16)."""
 
     id = "hysteresis"
+    flexible = True
+    contains = ("backlash", "coulomb_friction", "linear_stiffness")
     form = "prandtl_ishlinskii"
     equation = "w = sum_i w_i stop_{r_i}[z]"
     source = "Krikelis et al. (2024), Eq. 2 and 16"
@@ -154,6 +156,8 @@ class SmoothHysteresis(Law):
     """Rate-independent hysteresis with rounded loops (Masing 1926; Iwan 1966; Segalman 2005)."""
 
     id = "hysteresis"
+    flexible = True
+    contains = ("backlash", "coulomb_friction", "linear_stiffness")
     form = "prandtl_ishlinskii"
     equation = "w = k_h sum_i g_i stop_{R q_i}[z],  g_i ~ q_i^(a - 1) exp(-a q_i)"
     source = "Segalman (2005), J. Appl. Mech. 72(5); Krikelis et al. (2024), Eq. 26"
@@ -182,6 +186,8 @@ class BoucWen(Law):
     """Hysteresis by the Bouc-Wen equation (Bouc 1967; Wen 1976)."""
 
     id = "hysteresis"
+    flexible = True
+    contains = ("backlash", "coulomb_friction", "linear_stiffness")
     form = "bouc_wen"
     equation = "w = k_h q,  dq/dt = dz/dt (1 - (1 - s + s sign(q dz/dt)) |q/q_0|^n)"
     source = "Wen (1976), J. Eng. Mech. 102(2); Ismail, Ikhouane & Rodellar (2009)"

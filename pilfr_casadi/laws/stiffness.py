@@ -117,6 +117,7 @@ class PiecewiseStiffness(Law):
     """A contact: another spring acts beyond a point (Shaw & Holmes 1983)."""
 
     id = "piecewise_stiffness"
+    contains = ("linear_stiffness",)
     form = "above"
     equation = "w = k_c max(z - g, 0)"
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
@@ -160,6 +161,7 @@ class Clearance(Law):
     """A gap spring: force only beyond the clearance on either side (Shaw & Holmes 1983)."""
 
     id = "clearance"
+    contains = ("piecewise_stiffness", "linear_stiffness")
     form = "symmetric"
     equation = "w = k_g (z - clip(z, -g, g))"
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
@@ -234,6 +236,7 @@ class PeriodicForce(Law):
     """A force that repeats with position: cogging, ripple of a screw or gear (Hanselman 2006)."""
 
     id = "periodic_force"
+    flexible = True
     equation = "w = a sin(2 pi z / L) + b cos(2 pi z / L)"
     source = "Hanselman (2006), Brushless Permanent Magnet Motor Design, sec. 8.3"
     sentence = "a force that repeats with position, as from cogging or the pitch of a screw or gear"

@@ -130,7 +130,7 @@ def _result(d: Diagnosis) -> list[Block]:
     out: list[Block] = []
     for k in range(len(d.effects)):
         out += tables.effect_blocks(d, k)
-    if d.verdict == "complete" and not d.let_go:
+    if d.verdict == "complete" and not d.freed:
         out.append(Text("Refitted within its bounds, the simulator follows the recordings down to the noise."))
     elif d.verdict == "unexplained":
         out.append(

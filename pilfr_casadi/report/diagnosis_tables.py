@@ -40,7 +40,7 @@ def correction_words(diagnosis: Diagnosis) -> str:
         return f"with {' and '.join(names)} {'put back' if stated else 'added'}"
     if diagnosis.nameless:
         return "corrected"
-    return f"with {diagnosis.let_go} let go" if diagnosis.let_go else ""
+    return f"with {diagnosis.freed} let go" if diagnosis.freed else ""
 
 
 def tone(diagnosis: Diagnosis) -> str:

@@ -321,7 +321,7 @@ def test_a_saved_model_is_diagnosed_to_the_end(capsys, files, truth, monkeypatch
         force, position = truth[name]
         write_csv(files / f"{name}.csv", force[:300], position[:300])
     monkeypatch.setattr(
-        importlib.import_module("pilfr_casadi.diagnose.arguments"), "CATALOGUE", (CubicStiffness, Saturation)
+        importlib.import_module("pilfr_casadi.diagnose.preparation"), "CATALOGUE", (CubicStiffness, Saturation)
     )
     given = arguments(files, "--hold", "zero", "--initial", "zero", simulator="fit/model.json")
     status, out, _ = run(capsys, *given)

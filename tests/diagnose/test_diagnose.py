@@ -36,7 +36,7 @@ IDS = {
 
 
 def test_the_catalogue_holds_every_law_of_the_contract():
-    assert {law.id for law in CATALOGUE} == IDS
+    assert {law.id for law in CATALOGUE} >= IDS
     for law in CATALOGUE:
         assert law.equation
         assert law.source

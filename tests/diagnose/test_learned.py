@@ -12,7 +12,7 @@ from diagnosis_example import LAWS, NOISE, recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.cross_validation import held_out_errors
+from pilfr_casadi.diagnose.evidence import held_out_errors
 from pilfr_casadi.diagnose.learned import LearnedForce, candidates
 from pilfr_casadi.laws import Backlash, CubicStiffness, Law, Local
 from pilfr_casadi.models import play

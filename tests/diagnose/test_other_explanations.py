@@ -31,7 +31,7 @@ def test_a_value_that_cannot_go_where_it_should_is_told(known):
     p = simulator.parameters
     held = simulator.with_parameters({**p, "k1": replace(p["k1"], **known)})
     found = pilfr.diagnose(held, short(), laws=(laws.LinearStiffness,), effects=1, workers=1)
-    assert (found.verdict, found.effects, found.let_go) == ("complete", (), "k1"), str(found)
+    assert (found.verdict, found.effects, found.freed) == ("complete", (), "k1"), str(found)
     assert found.parameters["k1"]["refit_with"] == pytest.approx(1100, rel=0.03)
 
 
@@ -58,7 +58,7 @@ def test_a_value_that_is_held_is_told_in_place_of_a_spring(held, words):
     found = pilfr.diagnose(simulator.with_parameters({**p, "k1": replace(p["k1"], **held)}), recordings())
     assert (found.verdict, found.effects) == ("complete", ())
     assert "with k1 = 1" in found.sentence and words in found.sentence
-    assert found.let_go == "k1" and "% with k1 let go" in headline(found).replace("\u00a0", " ")
+    assert found.freed == "k1" and "% with k1 let go" in headline(found).replace("\u00a0", " ")
     assert found.parameters["k1"]["refit_with"] == pytest.approx(1100, rel=0.02)
     assert found.errors["train"]["after"] < 0.01 < found.errors["train"]["before"]
 
@@ -70,7 +70,7 @@ def test_a_value_whose_bounds_are_powers_of_ten_away_is_told_and_no_law_is_named
     p = simulator.parameters
     far = replace(p["k1"], value=1.0, bounds=(0.3, 5.0))
     found = pilfr.diagnose(simulator.with_parameters({**p, "k1": far}), recordings())
-    assert (found.verdict, found.effects, found.let_go) == ("complete", (), "k1"), str(found)
+    assert (found.verdict, found.effects, found.freed) == ("complete", (), "k1"), str(found)
     assert "by its bounds at 5" in found.sentence
     assert found.parameters["k1"]["refit_with"] == pytest.approx(1100, rel=0.02)
 

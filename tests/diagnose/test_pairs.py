@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.diagnose.pairs import pair_shares
+from pilfr_casadi.diagnose.relatives import pair_shares
 from pilfr_casadi.diagnose.remainder import orthonormal
 from problems.concealed import case
 from problems.concealed_score import score

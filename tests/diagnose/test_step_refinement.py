@@ -8,8 +8,7 @@ from diagnosis_rig import DT
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
-from pilfr_casadi.diagnose.step_refinement import refine_steps
-from pilfr_casadi.diagnose.workbench import FINER, THOROUGH
+from pilfr_casadi.diagnose.workbench import FINER, THOROUGH, refine_steps
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.laws import CoulombFriction, Delay, Polynomial
 from pilfr_casadi.simulators import Simulator, discretise
