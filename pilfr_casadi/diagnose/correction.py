@@ -23,7 +23,7 @@ from ..simulators import Placed
 from .evidence import HeldOut
 from .learned import Learned, LearnedForce, describe_learned
 from .posterior import Posterior, explainable_remainder
-from .search import FORMULA, Search
+from .search import FORMULA, Search, likeliest
 from .trials import Trial
 from .verdict import SURE
 from .workbench import Fitted
@@ -160,9 +160,9 @@ def _choose(predicted: Sequence[_Predicted]) -> _Predicted:
 
 def _with_laws(search: Search) -> list[Trial]:
     """List the hypotheses with laws that may correct: the likeliest, and of those not yet polished only a few."""
-    found = list[Trial]()
-    likely = sorted(search.likeliest(search.optimistic_evidence), key=search.evidence, reverse=True)
-    for i, trial in enumerate(t for t in likely if t.laws and _may_recur(search, t)):
+    found, recurring = list[Trial](), [t for t in search.memo.values() if _may_recur(search, t)]
+    likely = sorted(likeliest(recurring, search.optimistic_evidence), key=search.evidence, reverse=True)
+    for i, trial in enumerate(t for t in likely if t.laws):
         if trial.thorough or i < TRIED:
             with suppress(InputError):
                 found.append(search.thorough(trial))

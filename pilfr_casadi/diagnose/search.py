@@ -202,26 +202,22 @@ class Search:
         that follow the recordings equally well, the right one predicts best.
         """
         wrong = self.samples < EXACT / WRONG
-        if (
-            not wrong
-            and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self.likeliest(self.evidence)}) < 2
-        ):
+        if not wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
             return
         began = self.begin("held-out blocks")
         if wrong:
             self.predicts(self.root)
         for done in itertools.count():
-            likely = sorted(self.likeliest(self.evidence), key=self.evidence, reverse=True)
+            likely = sorted(self._likeliest(), key=self.evidence, reverse=True)
             left = [t for t in likely if t.key not in self.held_out]
             if not left or (done >= PREDICTED and left[0] is not likely[0]) or not self._in_time():
                 break
             self.predicts(left[0])
         self.timed("held-out blocks", began)
 
-    def likeliest(self, evidence: Callable[[Trial], float]) -> list[Trial]:
-        """List the hypotheses that may be the likeliest by an evidence."""
-        least = max(map(evidence, self.memo.values())) - REACH
-        return [t for t in self.memo.values() if evidence(t) > least]
+    def _likeliest(self) -> list[Trial]:
+        """List the hypotheses that may be the likeliest."""
+        return likeliest(list(self.memo.values()), self.evidence)
 
     def flexible(self, trial: Trial) -> dict[str, float]:
         """Compute the share of a trial's residual that a flexible force explains, by port."""
@@ -558,6 +554,12 @@ class Search:
         return Trial(
             simulator.elements[len(simulator.elements) - len(laws) :] if laws else (), fitted, fitted.cost, fitted.cost
         )
+
+
+def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
+    """List the hypotheses that may be the likeliest by an evidence, the likeliest first."""
+    ranked = sorted(trials, key=evidence, reverse=True)
+    return [t for t in ranked if evidence(t) > evidence(ranked[0]) - REACH]
 
 
 def _count_samples(fitted: Fitted, bench: Workbench) -> float:

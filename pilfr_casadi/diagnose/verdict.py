@@ -68,7 +68,9 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
             "outputs' deviation, and no force at any port explains any of the rest.",
         )
-    return Verdict("unexplained", _describe_unexplained(search, closest or found.best, opened, own))
+    return Verdict(
+        "unexplained", _describe_unexplained(search, closest if closest and closest.laws else found.best, opened, own)
+    )
 
 
 def _is_noise(search: Search, hum: Sequence[Gate], still: float, own: float | None) -> bool:
