@@ -11,22 +11,28 @@ from pilfr_casadi.laws import (
     CoulombFriction,
     CubicStiffness,
     Drift,
+    Local,
     PreslidingFriction,
     Relaxation,
     Saturation,
     SoftClearance,
     behind_gap,
     scaled,
+    scheduled,
+    unit_forces,
 )
 from pilfr_casadi.simulators import discretise
 
 DT, SAMPLES = 2e-3, 3000
 
 
-def rig(k=900.0, d=6.0):
-    """A mass on a spring; the coil's voltage is recorded, and nobody knows what it does."""
+def rig(k=900.0, d=6.0, push=0.0):
+    """A mass on a spring; the coil's voltage is recorded, and nobody knows what it does unless it pushes."""
     return pilfr.Simulator(
-        lambda x, u, p: {"pos": x.vel, "vel": (u.force - p.k * x.pos - p.d * x.vel) / 2.0},
+        lambda x, u, p: {
+            "pos": x.vel,
+            "vel": (u.force + (push * u.voltage if push else 0) - p.k * x.pos - p.d * x.vel) / 2.0,
+        },
         lambda x: {"position": x.pos},
         states=("pos", "vel"),
         inputs=("force", "voltage"),
@@ -76,6 +82,56 @@ def test_a_composed_law_is_found(law, values, form):
         assert found.effects[0].parameters[name]["value"] == pytest.approx(values[name], rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("law", "values"),
+    [
+        (
+            scheduled(PreslidingFriction, "voltage"),
+            {"k_t": 600.0, "k_t_high": 3000.0, "r": 0.002, "low": 0.5, "high": 4},
+        ),
+        pytest.param(
+            scheduled(CoulombFriction, "z"),
+            {"F_c": 0.5, "F_c_high": 5.0, "v_0": 5e-3, "low": -0.15, "high": 0.15},
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=("with an input", "with the coordinate"),
+)
+def test_friction_that_varies_with_a_signal_is_found(law, values):
+    """The equations read the voltage already, so that only a part of the friction follows it."""
+    true = rig(push=4.0).with_element("damper", law().at(values))
+    found = pilfr.diagnose(rig(1000.0, 7.5, push=4.0), recorded(true, 0), test=recorded(true, 1))
+    assert [(e.port, e.law) for e in found.effects] == [("damper", "coulomb_friction")], str(found)
+    assert law.scheduled_by in found.effects[0].form.partition("scheduled by ")[2]
+    assert found.errors["test"]["after"] < 0.05 * found.errors["test"]["before"]
+
+
+def test_a_scheduled_law_is_the_law_where_the_signal_stands_still():
+    values = {"k_t": 400.0, "k_t_high": 800.0, "r": 0.004, "low": 0.0, "high": 4.0}
+    law, plain = (
+        scheduled(PreslidingFriction, "voltage")().at(values),
+        PreslidingFriction().at({"k_t": 500.0, "r": 0.004}),
+    )
+    r = recorded(rig(), 3)
+    still = r.with_(u=np.column_stack([r.u[:, 0], np.ones(len(r))]))
+    y = simulated(rig().with_element("damper", law), still)
+    np.testing.assert_allclose(y, simulated(rig().with_element("damper", plain), still), atol=1e-12)
+    assert law.parameters()["low"].fixed and law.parameters()["k_t_high"].unit == "w/z"
+
+
+def test_forces_of_a_scheduled_law_at_unit_strength_add_up():
+    rng = np.random.default_rng(0)
+    z, u = np.cumsum(rng.standard_normal(200)) / 10, rng.uniform(1, 3, 200)
+    local = Local(z, np.gradient(z, 0.1), 0.1, (200,), inputs={"p": u})
+    for by, signal in (("p", u), ("z", z)):
+        law = scheduled(CoulombFriction, by)()
+        shape = next(iter(law.shapes(local)))
+        columns = unit_forces(law, local, [shape])[:, 0]
+        bare = unit_forces(CoulombFriction(), local, [{"v_0": shape["v_0"]}])[:, 0, 0]
+        share = (signal - signal.min()) / np.ptp(signal)
+        np.testing.assert_allclose(columns, bare[:, None] * np.column_stack([1 - share, share]), atol=1e-12)
+
+
 def test_a_scaled_law_is_the_law_times_the_signal():
     """Half the strength at twice the voltage is the same; and it is not nothing."""
     law, half = (scaled(PreslidingFriction, "voltage")().at({"k_t": k, "r": 0.004}) for k in (400.0, 200.0))
@@ -123,6 +179,7 @@ def test_only_inputs_that_no_equation_reads_are_tried_as_scales():
     [
         (lambda: scaled("coulomb_friction", "voltage"), "made of a class of laws"),
         (lambda: scaled(Saturation, "voltage"), "stands in series"),
+        (lambda: scheduled(Saturation, "voltage"), "stands in series"),
         (lambda: behind_gap(Relaxation), "states of its own"),
         (lambda: behind_gap(SoftClearance), "a gap of its own"),
         (lambda: behind_gap(Drift), "reads more than z and dz"),
