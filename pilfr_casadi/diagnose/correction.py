@@ -21,7 +21,7 @@ from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
 from .evidence import HeldOut
-from .learned import Learned, LearnedForce, describe_learned
+from .learned import Learned, LearnedForce, describe_learned, refit_learned
 from .posterior import Posterior, explainable_remainder
 from .search import FORMULA, Search, likeliest
 from .trials import Trial
@@ -176,7 +176,12 @@ def _of_trial(search: Search, trial: Trial) -> _Candidate:
 
 def _learned(search: Search, base: Trial) -> list[_Candidate]:
     """Make the candidates with a learned force beside a trial."""
-    return [_Candidate(f, base, search.spread(f, _own_elements(search, f))) for f in search.learned(base)]
+    out = []
+    for found in search.learned(base):
+        with suppress(InputError):
+            fitted = refit_learned(search.bench, found)
+            out.append(_Candidate(fitted, base, search.spread(fitted, _own_elements(search, fitted))))
+    return out
 
 
 def named_correction(search: Search, fitted: Fitted) -> Correction:

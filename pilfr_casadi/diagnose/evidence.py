@@ -75,7 +75,11 @@ def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.
     rest = np.setdiff1d(np.arange(len(hessian)), laws_at)
     width = _widths(fitted, laws, problem.free, np.diag(hessian)[: len(own)])[laws_at]
     with np.errstate(all="ignore"):
-        block = _without(hessian, laws_at, rest) * np.outer(width, width)
+        block = hessian[np.ix_(laws_at, laws_at)] * np.outer(width, width)
+        size = np.sqrt(np.maximum(np.diag(hessian)[rest], 1e-300))
+        across = hessian[np.ix_(rest, laws_at)] * width / size[:, None]
+        inner = hessian[np.ix_(rest, rest)] / np.outer(size, size)
+        block = block - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
     if not np.all(np.isfinite(block)):
         return np.full(int(own.sum()), np.inf)
     return np.maximum(np.linalg.eigvalsh(block), 0.0)
@@ -86,10 +90,9 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
 
     The other inputs are the recorded ones times INPUT_FACTOR. The parameters have the covariance (n H / v + P)^-1 of
     Laplace's approximation, with H the Fisher information of a sample and P the precision of the prior. With H' the
-    information of a sample for the other inputs, beside unknown initial states, the spread is tr(H' (n H / v + P)^-1).
-    It reveals parameters that the
-    recordings hardly determine, such as a curve of a pressure that had two levels; a cross-validation on the same
-    recordings cannot.
+    information of a sample for the other inputs, the spread is tr(H' (n H / v + P)^-1). Initial states are among the
+    parameters, because the two may make up for each other. The spread reveals parameters that the recordings hardly
+    determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings cannot.
     """
     problem, told = _hessian(bench, fitted)
     _, asked = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
@@ -101,20 +104,14 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     own = _widths(fitted, laws, problem.free, np.diag(told)[:free])
     width = np.concatenate([own, 1 / np.sqrt(np.maximum(np.diag(told)[free:], 1e-300))])
     prior = np.concatenate([np.ones(free), np.full(len(width) - free, STATE_PRIOR)])
+    # an initial state that the recordings do not reveal is a matter of the next recording
+    felt = (np.diag(told) > STATE_PRIOR * np.diag(asked)) | (np.arange(len(told)) < free)
+    told, asked = told[np.ix_(felt, felt)], asked[np.ix_(felt, felt)]
+    width, prior = width[felt], prior[felt]
     precision = n / v * told * np.outer(width, width) + np.diag(prior)
-    covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)[:free, :free]
-    states, parameters = np.arange(free, len(asked)), np.arange(free)  # another recording has its own initial states
-    found = float(np.sum(covariance * _without(asked, parameters, states) * np.outer(own, own)))
+    covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)
+    found = float(np.sum(covariance * asked * np.outer(width, width)))
     return found if np.isfinite(found) else np.inf
-
-
-def _without(hessian: np.ndarray, kept: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Compute the information on some parameters if the others are unknown: the Schur complement."""
-    size = np.sqrt(np.maximum(np.diag(hessian)[others], 1e-300))
-    across = hessian[np.ix_(others, kept)] / size[:, None]
-    inner = hessian[np.ix_(others, others)] / np.outer(size, size)
-    found = hessian[np.ix_(kept, kept)] - across.T @ np.linalg.pinv(inner, rcond=1e-10, hermitian=True) @ across
-    return np.asarray(found)
 
 
 def _of_laws(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:

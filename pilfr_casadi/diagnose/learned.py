@@ -33,7 +33,7 @@ from .force_recovery import law_signals
 from .linearise import linearised
 from .remainder import Remainder, Task, lengths, usable
 from .screen import start_values
-from .workbench import QUICK, Fitted, Workbench, start_vector
+from .workbench import Fitted, Workbench, start_vector
 
 STOPS = 8  # number of stops
 # thresholds over half the range of z: from presliding to a stop that slips in every large motion and so forgets its
@@ -220,19 +220,13 @@ def _held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge:
     return sum(float(np.sum((left[b] - phi[b] @ _ridge(phi[a], left[a], ridge)) ** 2)) for a, b in parts)
 
 
-def candidates(
-    bench: Workbench,
-    part: Workbench,
-    base: Fitted,
-    port_names: Sequence[str],
-    workers: int = 1,
-) -> list[Fitted]:
+def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], workers: int = 1) -> list[Fitted]:
     """Fit a learned element at each of some ports, on top of a fitted simulator, which may already have elements.
 
     Parameters
     ----------
-    part : Workbench
-        The bench with as much of the recordings as is needed to choose; the chosen elements are fitted to all.
+    bench : Workbench
+        The bench with as much of the recordings as is needed to choose; see `refit_learned`.
     port_names : sequence of str
         Ports to try.
     workers : int
@@ -244,11 +238,11 @@ def candidates(
         Smallest error first; the learned element is the last of each. Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names) if s.share > 0]
-    found = side_by_side(lambda start: _fit_element(bench, part, base, start), starts[:FITS], workers)
+    found = side_by_side(lambda start: _fit_element(bench, base, start), starts[:FITS], workers)
     return sorted((f for f in found if f is not None), key=lambda f: f.cost)
 
 
-def _fit_element(bench: Workbench, part: Workbench, base: Fitted, start: Start) -> Fitted | None:
+def _fit_element(bench: Workbench, base: Fitted, start: Start) -> Fitted | None:
     """Fit a learned element together with the simulator's own parameters; None if every start diverges."""
     placed = base.simulator.with_element(start.port, start.law)
     model = bench.model(placed)
@@ -262,12 +256,21 @@ def _fit_element(bench: Workbench, part: Workbench, base: Fitted, start: Start) 
         return found if np.isfinite(found) else np.inf
 
     try:
-        best, states = min(starts, key=cost), base.initial
-        for some in {id(b): b for b in (part, bench)}.values():
-            fitted = some.fit(placed, [best], states=states, solver=QUICK, model=model, engine=engine)
-            best, states = fitted.values, fitted.initial
+        return bench.fit(placed, [min(starts, key=cost)], states=base.initial, model=model, engine=engine)
     except InputError:
         return None
+
+
+def refit_learned(bench: Workbench, found: Fitted) -> Fitted:
+    """Fit a learned element to all samples, and set the ranges outside of which its signals are saturated.
+
+    Raises
+    ------
+    InputError
+        If the simulation diverges.
+    """
+    placed, model, engine = found.simulator, found.model, found.engine
+    fitted = bench.fit(placed, [found.values], states=found.initial, model=model, engine=engine)
     z, dz, _ = signals_along(bench, fitted)
     seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _ranges(EXTENSION, z=z, v=dz).items()}
     return bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)

@@ -34,7 +34,7 @@ from .evidence import (
 )
 from .floor import Floor, effective_size, white_part
 from .gates import Gate, Offset
-from .learned import candidates, nearest_to_learned
+from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
 from .remainder import Remainder
@@ -436,13 +436,13 @@ class Search:
                 self._polish([found])
 
     def learned(self, base: Trial) -> list[Fitted]:
-        """Fit learned forces beside a hypothesis, at the ports where a flexible force explains most; best first."""
+        """Fit learned forces beside a hypothesis to a part of the recordings, at the most promising ports; best first."""
         if base.key not in self.learned_forces:
             began = self.begin("learned force")
             shares = self.flexible(base)
             ports = sorted(shares, key=lambda name: -shares[name])[:PORTS]
             try:
-                found = candidates(self.bench, self.fits.part, base.fitted, ports, self.workers)
+                found = learn_forces(self.fits.part, base.fitted, ports, self.workers)
             except (InputError, np.linalg.LinAlgError):
                 found = []
             self.learned_forces[base.key] = found[:LEARNED]
@@ -454,7 +454,7 @@ class Search:
         entries = list[Scored]()
         for fitted in self.learned(base):
             at = [s for s in self.screened(base)[0] if s.port == fitted.simulator.elements[-1].port]
-            for near in nearest_to_learned(self.bench, fitted, self.laws):
+            for near in nearest_to_learned(self.fits.part, fitted, self.laws):
                 like = [s for s in at if s.law.dissipative == near.kind.dissipative]
                 entries += [replace(s, law=near.kind, starts=(near.start,)) for s in like[:1]]
         if not entries:

@@ -13,7 +13,7 @@ from diagnosis_example import LAWS, NOISE, recorded, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.evidence import held_out_errors
-from pilfr_casadi.diagnose.learned import LearnedForce, candidates
+from pilfr_casadi.diagnose.learned import LearnedForce, learn_forces
 from pilfr_casadi.laws import Backlash, CubicStiffness, Law, Local
 from pilfr_casadi.models import play
 from pilfr_casadi.report import diagnosis_report, usage
@@ -114,7 +114,7 @@ def test_held_out_blocks_tell_a_better_simulator():
     true = rig().with_element("ground", Nameless())
     bench = Workbench.of(rig(430.0, 5.0), [recorded(true, 0)], "zero")
     refit = bench.fit(bench.simulator)
-    (learned, *_) = candidates(bench, bench, refit, ["ground"], ["force"])
+    (learned, *_) = learn_forces(bench, refit, ["ground"])
     before, after = held_out_errors(bench, refit), held_out_errors(bench, learned)
     assert after.blocks < 0.3 * before.blocks and after.ahead < 0.3 * before.ahead
     assert after.error == pytest.approx(max(after.blocks, after.ahead) ** 0.5)
