@@ -9,8 +9,9 @@ are never used.
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -128,9 +129,8 @@ def find_correction(search: Search, answer: Posterior, named: bool = False) -> t
     tried = [search.thorough(best_laws)] if named else _with_laws(search)
     predicted = _predict(search, [_of_trial(search, t) for t in tried], refitted)
     beside = best_laws if named else _choose(predicted)[0].base
-    taken = {e.port for e in best_laws.laws} if named else set[str]()
     learned = _learned(search, search.memo[beside.key]) if beside.laws else []
-    learned += [c for c in _learned(search, search.root) if c.fitted.simulator.elements[-1].port not in taken]
+    learned += _learned(search, search.root, {e.port for e in best_laws.laws} if named else ())
     candidate, held_out = _choose(_predict(search, learned, predicted))
     fitted, base = candidate.fitted, candidate.base
     shares = _shares(search, base.fitted, fitted)
@@ -174,14 +174,13 @@ def _of_trial(search: Search, trial: Trial) -> _Candidate:
     return _Candidate(trial.fitted, trial, search.spread(trial.fitted, trial.laws))
 
 
-def _learned(search: Search, base: Trial) -> list[_Candidate]:
-    """Make the candidates with a learned force beside a trial."""
-    out = []
-    for found in search.learned(base):
-        with suppress(InputError):
-            fitted = refit_learned(search.bench, found)
-            out.append(_Candidate(fitted, base, search.spread(fitted, _own_elements(search, fitted))))
-    return out
+def _learned(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:
+    """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one."""
+    free = (f for f in search.learned(base) if f.simulator.elements[-1].port not in taken)
+    with suppress(InputError):
+        for fitted in (refit_learned(search.bench, f) for f in itertools.islice(free, 1)):
+            return [_Candidate(fitted, base, search.spread(fitted, _own_elements(search, fitted)))]
+    return []
 
 
 def named_correction(search: Search, fitted: Fitted) -> Correction:

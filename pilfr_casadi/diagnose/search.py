@@ -436,7 +436,7 @@ class Search:
                 self._polish([found])
 
     def learned(self, base: Trial) -> list[Fitted]:
-        """Fit learned forces beside a hypothesis to a part of the recordings, at the most promising ports; best first."""
+        """Fit learned forces beside a hypothesis, at the most promising ports, to a part of the recordings."""
         if base.key not in self.learned_forces:
             began = self.begin("learned force")
             shares = self.flexible(base)
