@@ -340,7 +340,7 @@ class Search:
         """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
         scored, gain = self.screened(parent)
         beside = parent.laws
-        scored = [s for s in scored if all(e.port != s.port or complements(e.law, s.law) for e in beside)]
+        scored = [s for s in scored if _may_stand_beside(beside, s.port, s.law)]
         enough = float(np.sqrt(self.floor2 + NEARLY * max(parent.whole - self.floor2, 0.0)))
         trials = self._fitted(parent, scored, gain, enough, again)
         more = relatives(self.bench, trials, scored) if self._in_time() else []
@@ -455,7 +455,8 @@ class Search:
         for fitted in self.learned(base):
             at = [s for s in self.screened(base)[0] if s.port == fitted.simulator.elements[-1].port]
             for near in nearest_to_learned(self.fits.part, fitted, self.laws):
-                like = [s for s in at if s.law.dissipative == near.kind.dissipative]
+                fits = at and _may_stand_beside(base.laws, at[0].port, near.kind)
+                like = [s for s in at if fits and s.law.dissipative == near.kind.dissipative]
                 entries += [replace(s, law=near.kind, starts=(near.start,)) for s in like[:1]]
         if not entries:
             return
@@ -560,6 +561,11 @@ def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> li
     """List the hypotheses that may be the likeliest by an evidence, the likeliest first."""
     ranked = sorted(trials, key=evidence, reverse=True)
     return [t for t in ranked if evidence(t) > evidence(ranked[0]) - REACH]
+
+
+def _may_stand_beside(laws: Sequence[Placed], port: str, law: Law) -> bool:
+    """Tell whether a law at a port may be a further effect beside some laws."""
+    return all(e.port != port or complements(e.law, law) for e in laws)
 
 
 def _count_samples(fitted: Fitted, bench: Workbench) -> float:
