@@ -164,9 +164,13 @@ class Search:
         return self._log_evidence(trial, trial.whole, self.sample.effective(0.0))
 
     def evidence(self, trial: Trial) -> float:
-        """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known."""
+        """Compute the log evidence of a hypothesis, from its error on held-out blocks if that is known.
+
+        Where all models are wrong, the spread of predictions for other inputs counts as an error.
+        """
         known = self.held_out.get(trial.key)
-        v = known.mean_square if known else trial.whole * self._held_out_ratio()
+        v = known.error**2 if known else trial.whole * self._held_out_ratio()
+        v += known.spread if known and self._all_wrong else 0.0
         return self._log_evidence(trial, v, self.samples)
 
     def _held_out_ratio(self) -> float:
@@ -195,17 +199,21 @@ class Search:
         own = Sample(self.floor2, _count_samples(fitted, self.bench))
         return spread(self.bench, fitted, laws, fitted.cost + self.tolerance, own.effective(0.0))
 
+    @property
+    def _all_wrong(self) -> bool:
+        """Whether even the best model's error is mostly model error."""
+        return self.samples < EXACT / WRONG
+
     def _predict(self) -> None:
         """Compute the held-out errors of the likeliest hypotheses.
 
         If only one is likely and its error is noise, the fit error is enough. A wrong model may overfit; and of several
         that follow the recordings equally well, the right one predicts best.
         """
-        wrong = self.samples < EXACT / WRONG
-        if not wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
+        if not self._all_wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
             return
         began = self.begin("held-out blocks")
-        if wrong:
+        if self._all_wrong:
             self.predicts(self.root)
         for done in itertools.count():
             likely = sorted(self._likeliest(), key=self.evidence, reverse=True)
