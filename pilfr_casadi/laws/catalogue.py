@@ -129,7 +129,6 @@ def _scheduled(base: Any, by: str) -> Any:
         strength = (*base.strength, *high.values())
         places = ("parallel",)
         scheduled_by = by
-        flexible = True
 
         def parameters(self) -> dict[str, Parameter]:
             """Parameters, of which the ends of the signal's range are fixed."""
