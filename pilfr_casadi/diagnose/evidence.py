@@ -108,7 +108,10 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     felt = (np.diag(told) > STATE_PRIOR * np.diag(asked)) | (np.arange(len(told)) < free)
     told, asked = told[np.ix_(felt, felt)], asked[np.ix_(felt, felt)]
     width, prior = width[felt], prior[felt]
-    precision = n / v * told * np.outer(width, width) + np.diag(prior)
+    with np.errstate(all="ignore"):
+        precision = n / v * told * np.outer(width, width) + np.diag(prior)
+    if not np.all(np.isfinite(precision)):  # a parameter that the recordings hardly feel
+        return np.inf
     covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)
     found = float(np.sum(covariance * asked * np.outer(width, width)))
     return found if np.isfinite(found) else np.inf

@@ -72,7 +72,7 @@ def test_the_file_and_the_page_show_what_is_learned(nameless, tmp_path):
     low, high = content["learned"][0]["range"]["z"]
     assert low < 0 < high and content["description"]["elements"][-1]["law"] == "learned"
     page = path.read_text()
-    assert "The learned force at ground over its local coordinate" in page and "has a learned force" in page
+    assert "The learned force at ground over its local coordinate" in page and "a learned force" in page
 
 
 def test_the_code_on_the_page_builds_the_same_simulator(nameless, monkeypatch):

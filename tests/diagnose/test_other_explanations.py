@@ -42,7 +42,7 @@ def test_friction_where_no_port_is_declared_is_told_where_it_acts():
     found = pilfr.diagnose(
         replace(full, ports=full.ports[1:]), hidden, laws=(laws.CoulombFriction,), effects=1, workers=1
     )
-    assert found.verdict == "unexplained" and "no law of the catalogue explains it" in found.sentence
+    assert found.verdict == "unexplained" and "no law of the catalogue explains" in found.sentence
     (note,) = [g for g in found.gates if g.finding == "undeclared"]
     assert (note.channel, note.value, note.corrected) == ("v1", "coulomb friction", False)
 
