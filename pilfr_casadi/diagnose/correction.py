@@ -1,15 +1,15 @@
 """The corrected simulator: the candidate that best predicts data it was not fitted to, with or without a named law.
 
 If the named answer is not sure, or leaves error above the noise, several candidates compete on held-out parts of the
-training recordings (`evidence`): the refitted simulator, the laws that the search has fitted, and a learned
+training recordings (`evidence`): the refitted simulator, the named laws or else all likely hypotheses, and a learned
 force alone or beside them. The score is the held-out error plus the spread of predictions for other inputs
-(`evidence.spread`), which is large if many parameters are hardly determined. The smallest score wins. Test recordings
-are never used.
+(`evidence.spread`), which is large if many parameters are hardly determined. The smallest score wins. Candidates are
+predicted in the order of their fit error plus spread, until that exceeds the smallest score. Test recordings are never
+used.
 """
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
@@ -29,7 +29,7 @@ from .trials import Trial
 from .verdict import SURE
 from .workbench import Fitted
 
-TRIED = 3  # hypotheses with laws that compete if no law is named
+TRIED = 3  # of the likeliest hypotheses, those that compete even if they were not fitted to convergence before
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class _Candidate:
 
     @property
     def least(self) -> float:
-        """Lower bound of its expected mean square error: held-out error is never below the fit error."""
+        """Least expected mean square error: held-out error is hardly ever below the fit error."""
         return self.fitted.cost + self.spread
 
 
@@ -177,10 +177,14 @@ def _of_trial(search: Search, trial: Trial) -> _Candidate:
 def _learned(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:
     """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one."""
     free = (f for f in search.learned(base) if f.simulator.elements[-1].port not in taken)
-    with suppress(InputError):
-        for fitted in (refit_learned(search.bench, f) for f in itertools.islice(free, 1)):
-            return [_Candidate(fitted, base, search.spread(fitted, _own_elements(search, fitted)))]
-    return []
+    found = next(free, None)
+    if found is None:
+        return []
+    try:
+        fitted = refit_learned(search.bench, found)
+    except InputError:  # it diverges
+        return []
+    return [_Candidate(fitted, base, search.spread(fitted, _own_elements(search, fitted)))]
 
 
 def named_correction(search: Search, fitted: Fitted) -> Correction:

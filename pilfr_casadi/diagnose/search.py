@@ -1,9 +1,10 @@
 """The search over hypotheses: sets of laws in ports, each fitted once and kept, all compared by one log evidence.
 
 Moves lead from one hypothesis to others: *add* a law to the present ones; *exchange* one of several laws for another,
-the others fixed in place; *add two* at once, if neither helps alone. A move starts from the most promising hypothesis.
-The search ends if a move brings no better one, if the error is at the noise, or at the time limit. All fits are kept in
-a memo and count in the posterior.
+the others fixed in place; *add two* at once, if neither helps alone; *name a learned force*: fit the laws nearest to a
+force that was learned beside a hypothesis. A move starts from the most promising hypothesis. The search ends if a move
+brings no better one, if the error is at the noise, or at the time limit. All fits are kept in a memo and count in the
+posterior.
 """
 
 from __future__ import annotations
@@ -461,11 +462,12 @@ class Search:
         """Fit the laws whose forces are nearest to those learned beside a hypothesis."""
         entries = list[Scored]()
         for fitted in self.learned(base):
-            at = [s for s in self.screened(base)[0] if s.port == fitted.simulator.elements[-1].port]
+            port = fitted.simulator.elements[-1].port
+            screened = [s for s in self.screened(base)[0] if s.port == port]
             for near in nearest_to_learned(self.fits.part, fitted, self.laws):
-                fits = at and _may_stand_beside(base.laws, at[0].port, near.kind)
-                like = [s for s in at if fits and s.law.dissipative == near.kind.dissipative]
-                entries += [replace(s, law=near.kind, starts=(near.start,)) for s in like[:1]]
+                alike = [s for s in screened if s.law.dissipative == near.kind.dissipative]
+                if alike and _may_stand_beside(base.laws, port, near.kind):
+                    entries.append(replace(alike[0], law=near.kind, starts=(near.start,)))
         if not entries:
             return
         enough = float(np.sqrt(self.floor2))
