@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -58,6 +58,9 @@ class DiagnoseOptions(SimulatorOptions):
         "Number of parallel fits (default: one per processor, at most four).", 1, LARGEST_SIZE["workers"]
     )
     time_limit: float | None = seconds("Answer after about this time from what was found (default: no limit).")
+    focus: Literal["simulation", "prediction"] | None = option(
+        "Errors of a free run, or of predictions one sample ahead (default: a free run, where the simulator can)."
+    )
     out: str = option("Folder for diagnosis.json and report.html (default: diagnosis).", "DIR", "diagnosis")
     overwrite: bool = flag("Replace an existing diagnosis in that folder.", "--overwrite")
 
@@ -125,6 +128,7 @@ def diagnose_command(options: DiagnoseOptions) -> int:
                 workers=options.workers,
                 stand_in_error=error,
                 time_limit=options.time_limit,
+                focus=options.focus,
                 progress=progress,
             )
     except KeyboardInterrupt:

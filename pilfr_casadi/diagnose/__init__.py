@@ -5,7 +5,8 @@ one log evidence; verdict, effects and confidence are sums over their posterior.
 about. The files by stage:
 
 - The whole: `pipeline` (the steps in their order), `workbench` (what all steps share).
-- Preparation: `preparation` checks the arguments, then the recordings. Each check of recordings makes an edit that
+- Preparation: `prediction` lets the recordings lead an unstable simulator. `preparation` checks the arguments, then the
+  recordings. Each check of recordings makes an edit that
   corrects a fault: `gates` (the edit and its acceptance; sign, unit or gain, exchange, offset), `recording_faults`
   (glitches, stale and clipped samples, unsettled periods, tones) and `timing` (shift, clock, gap). `floor` estimates
   the noise.
@@ -58,6 +59,7 @@ def diagnose(
     engine: str = "auto",
     stand_in_error: float = 0.0,
     time_limit: float | None = None,
+    focus: str | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Find what a simulator leaves out, from recordings of the machine.
@@ -87,6 +89,9 @@ def diagnose(
         NRMSE between a surrogate and the simulation that it stands for; it counts as noise.
     time_limit : float, optional
         Seconds after which the search ends; the answer then rests on what was fitted until then.
+    focus : {"simulation", "prediction"}, optional
+        Errors to minimise: of a free run, or of predictions one sample ahead by an observer, as for an unstable machine
+        in closed loop. By default a free run, and predictions if the simulator is unstable and runs away.
     progress : callable
         Called with (stage, done, total, smallest error so far).
 
@@ -113,5 +118,6 @@ def diagnose(
         engine=engine,
         stand_in_error=stand_in_error,
         time_limit=time_limit,
+        focus=focus,
         progress=progress,
     )

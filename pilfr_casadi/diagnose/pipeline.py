@@ -21,6 +21,7 @@ from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
 from .posterior import Named, Posterior, names, posterior
+from .prediction import FOCUS, prediction_note, predictor
 from .preparation import (
     CHECKS,
     Prepared,
@@ -40,7 +41,7 @@ from .search import Search
 from .surrogates import surrogate_gates
 from .trials import Trial
 from .verdict import SURE, Verdict, judge
-from .workbench import Fitted
+from .workbench import Fitted, RunsAway
 
 AS_GIVEN = 0.5  # ratio of mean squares below which a second search, with channels as they were given, counts
 SEARCHING = 0.7  # share of the remaining time for the search; the rest is for the correction
@@ -60,6 +61,8 @@ class Request:
     stand_in_error: float
     deadline: float
     say: Stages
+    focus: str | None = None
+    notes: tuple[Gate, ...] = ()
 
     @property
     def hold_said(self) -> bool:
@@ -105,6 +108,7 @@ def diagnose_in_steps(
     engine: str,
     stand_in_error: float,
     time_limit: float | None,
+    focus: str | None,
     progress: Progress | None,
 ) -> Diagnosis:
     """Carry out `diagnose`, whose parameters these are.
@@ -121,18 +125,36 @@ def diagnose_in_steps(
     most_effects = np.inf if effects is None else whole(effects, "effects", 0)
     if time_limit is not None and not time_limit > 0:
         raise InputError(f"time_limit={time_limit!r} was given; give seconds, a positive number.")
+    if focus not in (None, *FOCUS):
+        raise InputError(f"focus={focus!r} was given; use 'simulation', 'prediction' or None.")
     say = Stages(progress or (lambda stage, done, total, best: None))
     simulator, recordings = match_recordings(simulator, train, hold)
     tests = match_tests(simulator, test, recordings)
     check_limits(simulator, limits)
     tried = add_scaled_laws(check_laws(laws), simulator)
     deadline = np.inf if time_limit is None else began + float(time_limit)
-    request = Request(simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say)
-    ready, search = _search_both_holds(request)
+    request = Request(
+        simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say, focus
+    )
+    request, ready, search = _search_with_focus(request)
     concluding = search.begin("conclusion")
-    found = conclude(search, (*ready.gates, *search.gates))
+    found = conclude(search, (*request.notes, *ready.gates, *search.gates))
     search.timed("conclusion", concluding)
     return _build_diagnosis(request, ready, search, found, tests, limits, began)
+
+
+def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
+    """Search; if nobody stated the focus and the simulator runs away, let the recordings lead it."""
+    if request.focus != "prediction":
+        try:
+            return request, *_search_both_holds(request)
+        except RunsAway:
+            if request.focus:
+                raise
+    hold = stated_hold(request.simulator, request.recordings, request.hold) or "zero"
+    led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
+    request = replace(request, simulator=led, notes=(prediction_note(request.simulator, memory),))
+    return request, *_search_both_holds(request)
 
 
 def _search_both_holds(request: Request) -> tuple[Prepared, Search]:
@@ -365,6 +387,8 @@ def _effect(search: Search, named: Named, fitted: Fitted, std: dict[str, np.ndar
 
 def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] | None) -> dict[str, Any] | None:
     """Design the experiment that would separate the first tie, if there is one."""
+    if search.bench.simulator.observer is not None:  # a proposed input has no outputs to be led by
+        return None
     for effect in effects:
         if effect.alike:
             name, other = next(iter(effect.alike.items()))

@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -294,11 +294,14 @@ class Diagnosis:
     def export(self, **options: Any) -> Any:
         """Export the corrected simulator as a step over one sample, with the hold and sub-steps of the fit.
 
+        An observer (`focus="prediction"`) is left out.
+
         `options` are those of `pilfr.exported`; the result has `step`, `c_code` and the other exports.
         """
         from ..export import exported
 
-        return exported(self.corrected, dt=self.train[0].dt, hold=self.hold, substeps=self.substeps, **options)
+        free = replace(self.corrected, observer=None)
+        return exported(free, dt=self.train[0].dt, hold=self.hold, substeps=self.substeps, **options)
 
     def to_casadi(self, name: str = "model", smooth: float = 0.0) -> Any:
         """Export the corrected simulator as a `casadi.Function (x, u) -> (x_next, y)`; see `pilfr.to_casadi`."""

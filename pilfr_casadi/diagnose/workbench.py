@@ -46,6 +46,10 @@ FINER = 4  # largest factor on the sub-steps for a law
 THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)  # solver of the fits that results are based on
 
 
+class RunsAway(InputError):
+    """The simulator is unstable, and no values within its bounds keep it near the recordings."""
+
+
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """A simulator fitted to recordings.
@@ -203,9 +207,10 @@ class Workbench:
             if found is not None and (best is None or found[0] < best[0]):
                 best = found
         if best is None:
-            raise InputError(
+            unstable = self._describe_instability(simulator)
+            raise (RunsAway if unstable else InputError)(
                 f"The simulation diverges at the start values{self._describe_divergence(model, engine, starts[0])}; "
-                + (self._describe_instability(simulator) or "check the parameters' values and units, and the hold.")
+                + (unstable or "check the parameters' values and units, and the hold.")
             )
         _, theta, problem = best
         values = model.parameters.unpack(problem.parameters(theta))
@@ -229,16 +234,17 @@ class Workbench:
         """Refuse a fit that is far beyond what was recorded because the simulator is unstable."""
         if fitted.cost > RUNAWAY**2 and (why := self._describe_instability(self.simulator)):
             off = f"{fitted.cost**0.5:.3g} times the outputs' deviation"
-            raise InputError(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
+            raise RunsAway(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
 
     def _describe_instability(self, simulator: Simulator) -> str:
         """Say what to do about a simulator too unstable to follow a controlled machine; empty if it is not."""
-        rate = growth_rate(simulator, self.recordings[0])
+        rate = growth_rate(simulator, self.recordings[0]) if simulator.observer is None else 0.0
         if rate * max(len(r) for r in self.recordings) * self.dt < MOST_GROWTH:
             return ""
         return (
             f"it is unstable (it grows e-fold in {1 / rate:.2g} s) and cannot be run by its own inputs alone: put the "
-            "controller into the simulator, with its reference as the input."
+            "controller into the simulator, with its reference as the input; or let the recordings lead it, by the "
+            "focus 'prediction'."
         )
 
     def _run_fixed(self, simulator: Simulator, model: Model, engine: Engine) -> Fitted:

@@ -52,7 +52,7 @@ class Model:
         `(z, s, p) -> (w, s_next)`, the element; without one it has no memory and `w = 0`.
     parameters : ParameterSet
         All parameters, the element's included.
-    reads : tuple of {"u", "next", "t", "y"}
+    reads : tuple of {"u", "next", "t", "y", "sampled"}
         Signals in the columns of the step's u; see `drive`.
     substeps : int
         Steps within a sample; outputs are taken at the first of them.
@@ -77,7 +77,8 @@ class Model:
         """Make the signals that the step reads along a recording, shape (M * substeps, n_u), in the order of `reads`.
 
         `u` is the input at the start of a sub-step and `next` at its end (both interpolated between samples; `u` alone
-        is held over the sample), `t` the time in s since the recording's first sample, `y` the measured output.
+        is held over the sample), `t` the time in s since the recording's first sample, `y` the measured output, and
+        `sampled` one where a sample is taken and zero in the sub-steps after it.
         """
         n, m = self.substeps, len(recording)
         share = np.tile(np.arange(n) / n, m)
@@ -85,6 +86,8 @@ class Model:
         for signal in self.reads:
             if signal == "t":
                 columns.append((np.repeat(np.arange(m), n) + share)[:, None] * recording.dt)
+            elif signal == "sampled":
+                columns.append((share == 0)[:, None].astype(float))
             elif signal == "u" and "next" not in self.reads:
                 columns.append(np.repeat(recording.u, n, axis=0))
             else:

@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Any, Self, cast
 
 import casadi as ca
+import numpy as np
 
 from .._base import InputError, listed
 from ..models import Named, Parameter, ParameterSet
@@ -149,6 +150,7 @@ class Equations:
     discrete: bool = False
     elements: tuple[Placed, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    observer: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for kind in ("dynamics", "outputs"):
@@ -173,6 +175,21 @@ class Equations:
         for port in self.ports:
             self.into(port, x, u, p, t)
             self.across(port, x, u, p, t)
+        if self.observer is not None:
+            object.__setattr__(self, "observer", self._checked_gain(self.observer))
+
+    def _checked_gain(self, given: Any) -> np.ndarray:
+        wanted = len(self.states), len(self.output_names)
+        try:
+            gain = np.asarray(given, dtype=float)
+        except (TypeError, ValueError):
+            gain = np.zeros(0)
+        if gain.shape != wanted or not np.all(np.isfinite(gain)):
+            raise InputError(
+                f"The simulator's observer is {given!r}; give finite numbers, a row for each of {wanted[0]} states and "
+                f"a column for each of {wanted[1]} outputs."
+            )
+        return gain
 
     def _with(self, **changes: Any) -> Self:
         """Copy with other elements or values of parameters, which leave the equations as they were checked."""

@@ -165,6 +165,13 @@ def discretise(simulator: Equations, dt: float, hold: str = "zero", substeps: in
         reads, columns = [*reads, "next"], [*columns, u1]
     if ca.depends_on(ca.vertcat(x_next, y, begun), t):
         reads, columns = [*reads, "t"], [*columns, t]
+    if simulator.observer is not None:
+        measured, sampled = ca.SX.sym("measured", y.numel()), ca.SX.sym("sampled")
+        gain = np.zeros((x_next.numel(), y.numel()))
+        gain[: len(simulator.states)] = simulator.observer
+        pushed = sampled * (ca.DM(gain) @ (measured - y))
+        x_next, stages = x_next + pushed, stages and (*stages[:3], stages[3] + pushed)
+        reads, columns = [*reads, "y", "sampled"], [*columns, measured, sampled]
     x_next, y = ca.cse([x_next, y])
     port = None
     if s.numel() and not step.shifts.any() and not ca.depends_on(z, s):

@@ -51,6 +51,9 @@ class Simulator(Equations):
         Laws in the ports; see `close_loop`.
     units : mapping
         Units of inputs and outputs by name.
+    observer : array, shape (n_x, n_y), optional
+        Gain of a one-step predictor (Ljung 1999, System Identification, sec. 4.3): after each sample, it times the
+        measured minus the simulated output is added to the states. Outputs are then predictions one sample ahead.
 
     Raises
     ------
@@ -94,6 +97,8 @@ class Simulator(Equations):
         own = recording.with_(
             u=recording.u[:, [recording.inputs.index(name) for name in self.inputs]], inputs=self.inputs
         )
+        if self.observer is not None:
+            own = own.with_(y=self._measured(own), outputs=self.output_names)
         asked = max((int(getattr(e.law, "substeps", 1)) for e in self.elements), default=1)
         substeps = 1 if self.discrete else max(asked, choose_substeps(self, [own]))
         model = discretise(self, own.dt, own.hold or self.hold or "zero", substeps)

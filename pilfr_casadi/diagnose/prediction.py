@@ -1,0 +1,97 @@
+"""Prediction focus: the recordings lead the simulator, and its errors are those of one-step predictions.
+
+An unstable simulator cannot be run by its inputs alone, and one with a drift or an unrecorded disturbance leaves its
+recordings however good it is. An observer leads it (Ljung 1999, System Identification, sec. 4.3),
+
+    x̂ₖ₊₁ = f(x̂ₖ, uₖ) + L (yₖ - ŷₖ),
+
+so that it forgets its past within a memory τ. The gain L is that of a predictor without process noise for e^(dt/τ) A
+in place of A: every eigenvalue of A - L C is then within e^(-dt/τ) (prescribed degree of stability: Anderson & Moore
+1971, Linear Optimal Control, sec. 3.5), and eigenvalues that are there already stay.
+
+A long memory shows missing physics best: its effect adds up over τ. So the longest memory is used with which the
+refitted simulator follows the recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from .._base import InputError
+from ..data import Recording
+from ..linear import steady_state_gain
+from ..simulators import Simulator, discretise, growth_rate
+from .gates import Gate
+from .workbench import MOST_GROWTH, Workbench
+
+FOCUS = "simulation", "prediction"
+# memories that are tried, in turn: times the time of e-fold growth, or the longest recording's duration
+OF_GROWTH, OF_DURATION = (3.0, 1.0, 0.3, 0.1), (0.1, 0.03, 0.01, 0.003)
+FOLLOWED = 0.25  # share of the outputs' variance that a simulator which follows the recordings leaves at most
+
+
+def runs_away(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
+    """Tell whether a simulator is so unstable that no initial state keeps it near the recordings."""
+    if simulator.observer is not None:
+        return False
+    return growth_rate(simulator, recordings[0]) * max(len(r) * r.dt for r in recordings) > MOST_GROWTH
+
+
+def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Simulator, float]:
+    """Give a simulator the observer with the longest memory that follows the recordings; return it and its memory, s.
+
+    Raises
+    ------
+    InputError
+        If it follows the recordings with no observer.
+    """
+    rate, duration = growth_rate(simulator, recordings[0]), max(len(r) * r.dt for r in recordings)
+    unstable = rate * duration > MOST_GROWTH
+    memories = [times / rate for times in OF_GROWTH] if unstable else [times * duration for times in OF_DURATION]
+    best: tuple[float, Simulator, float] | None = None
+    for memory in memories:
+        led = replace(simulator, observer=observer(simulator, recordings, hold, memory))
+        bench = Workbench.of(led, recordings, hold, engine)
+        try:
+            cost = bench.fit(led).cost
+        except InputError:
+            continue
+        if cost < FOLLOWED:
+            return led, memory
+        if best is None or cost < best[0]:
+            best = cost, led, memory
+    if best is None or best[0] >= 1:
+        raise InputError(
+            "Led by the recordings, the simulator still cannot follow them; check the signs and units of its equations "
+            "and of the recordings."
+        )
+    return best[1:]
+
+
+def prediction_note(simulator: Simulator, memory: float) -> Gate:
+    """Note that the errors are those of predictions."""
+    sentence = (
+        f"The recordings lead the simulator: an observer lets it forget its past within {memory:.3g} s, and all errors "
+        "are those of predictions one sample ahead, not of a free run."
+    )
+    return Gate(", ".join(simulator.output_names), "prediction", memory, sentence)
+
+
+def observer(simulator: Simulator, recordings: Sequence[Recording], hold: str, memory: float) -> np.ndarray:
+    """Compute the gain (n_x, n_y) of an observer that forgets within `memory` seconds, where a recording begins."""
+    bench = Workbench.of(simulator, recordings, hold)
+    model = discretise(simulator, bench.dt, hold, bench.substeps)
+    x, u, p = ca.SX.sym("x", model.n_state), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.parameters.size)
+    following, y = model.closed(x, u, p)
+    slopes = ca.Function("slopes", [x, u, p], [ca.jacobian(following, x), ca.jacobian(y, x)])
+    r, begun = bench.recordings[0], np.zeros(model.n_state)
+    if not isinstance(r.initial, str):
+        begun[: len(r.initial)] = r.initial
+    a, c = (np.asarray(v) for v in slopes(begun, model.drive(r)[0], model.parameters.start))
+    a, faster = np.linalg.matrix_power(a, model.substeps), np.exp(bench.dt / memory)
+    gain = steady_state_gain(faster * a, c, np.zeros_like(a), np.diag(bench.scale**2)) / faster
+    return np.asarray(gain[: len(simulator.states)])
