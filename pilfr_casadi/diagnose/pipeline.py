@@ -21,7 +21,7 @@ from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
 from .posterior import Named, Posterior, names, posterior
-from .prediction import FOCUS, prediction_note, predictor
+from .prediction import FOCUS, can_be_led, prediction_note, predictor
 from .preparation import (
     CHECKS,
     Prepared,
@@ -34,7 +34,7 @@ from .preparation import (
     prepare,
     stated_hold,
 )
-from .proof import deviations, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
+from .proof import deviations, free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
 from .recording_faults import clipped_input, tones
 from .result import Diagnosis, Effect
 from .search import Search
@@ -149,11 +149,11 @@ def _search_with_focus(request: Request) -> tuple[Request, Prepared, Search]:
         try:
             return request, *_search_both_holds(request)
         except RunsAway:
-            if request.focus:
+            if request.focus or not can_be_led(request.simulator, request.recordings):
                 raise
     hold = stated_hold(request.simulator, request.recordings, request.hold) or "zero"
     led, memory = predictor(request.simulator, request.recordings, hold, request.engine)
-    request = replace(request, simulator=led, notes=(prediction_note(request.simulator, memory),))
+    request = replace(request, simulator=led, notes=(prediction_note(request.simulator, request.recordings, memory),))
     return request, *_search_both_holds(request)
 
 
@@ -296,10 +296,12 @@ def _build_diagnosis(
     if found.effects and not np.isfinite(found.correction.after):  # what was compared is handed back as it is
         after = without_idle_offsets(bench, after)
     std = deviations(bench, after)
-    errors = {
+    errors: dict[str, dict[str, float] | None] = {
         "train": {"nominal": ready.nominal, "before": mean_nrmse(bench, without), "after": mean_nrmse(bench, after)},
         "test": test_errors(bench, tests, found.gates, request.simulator, without, after) if tests else None,
     }
+    if bench.simulator.observer is not None:
+        errors["free_run"] = free_run_errors(bench, tests or bench.recordings, request.simulator, without, after)
     effects = tuple(_effect(search, e, after, std) for e in found.effects)
     settled = found.verdict.kind in ("complete", "recording-fault") or (
         min((e.confidence for e in effects), default=0) > SURE

@@ -34,11 +34,9 @@ OF_GROWTH, OF_DURATION = (3.0, 1.0, 0.3, 0.1), (0.1, 0.03, 0.01, 0.003)
 FOLLOWED = 0.25  # share of the outputs' variance that a simulator which follows the recordings leaves at most
 
 
-def runs_away(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
-    """Tell whether a simulator is so unstable that no initial state keeps it near the recordings."""
-    if simulator.observer is not None:
-        return False
-    return growth_rate(simulator, recordings[0]) * max(len(r) * r.dt for r in recordings) > MOST_GROWTH
+def can_be_led(simulator: Simulator, recordings: Sequence[Recording]) -> bool:
+    """Tell whether the error of an unstable simulator grows by less than a factor e within a sample."""
+    return growth_rate(simulator, recordings[0]) * recordings[0].dt < 1
 
 
 def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, engine: str) -> tuple[Simulator, float]:
@@ -52,6 +50,7 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
     rate, duration = growth_rate(simulator, recordings[0]), max(len(r) * r.dt for r in recordings)
     unstable = rate * duration > MOST_GROWTH
     memories = [times / rate for times in OF_GROWTH] if unstable else [times * duration for times in OF_DURATION]
+    memories = [memory for memory in memories if memory >= recordings[0].dt]
     best: tuple[float, Simulator, float] | None = None
     for memory in memories:
         led = replace(simulator, observer=observer(simulator, recordings, hold, memory))
@@ -64,7 +63,7 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
             return led, memory
         if best is None or cost < best[0]:
             best = cost, led, memory
-    if best is None or best[0] >= 1:
+    if best is None:
         raise InputError(
             "Led by the recordings, the simulator still cannot follow them; check the signs and units of its equations "
             "and of the recordings."
@@ -72,11 +71,14 @@ def predictor(simulator: Simulator, recordings: Sequence[Recording], hold: str, 
     return best[1:]
 
 
-def prediction_note(simulator: Simulator, memory: float) -> Gate:
-    """Note that the errors are those of predictions."""
+def prediction_note(simulator: Simulator, recordings: Sequence[Recording], memory: float) -> Gate:
+    """Note that the errors are those of predictions, and that the simulator is unstable if it is."""
+    rate = growth_rate(simulator, recordings[0])
+    unstable = rate * memory > OF_GROWTH[-1]
+    why = f"The simulator is unstable by itself (it grows e-fold in {1 / rate:.2g} s). " if unstable else ""
     sentence = (
-        f"The recordings lead the simulator: an observer lets it forget its past within {memory:.3g} s, and all errors "
-        "are those of predictions one sample ahead, not of a free run."
+        f"{why}The recordings lead the simulator: an observer lets it forget its past within {memory:.3g} s, and the "
+        "errors are those of predictions one sample ahead, not of a free run."
     )
     return Gate(", ".join(simulator.output_names), "prediction", memory, sentence)
 

@@ -13,7 +13,7 @@ from ..engine import Engine, make_engine
 from ..laws import Law
 from ..models import Model
 from ..optimise import first_state, samples_for_state
-from ..simulators import Simulator
+from ..simulators import Simulator, discretise
 from .floor import effective_size
 from .gates import Gate
 from .linearise import linearised
@@ -93,6 +93,19 @@ def test_errors(
         out[name] = errors_of(
             bench.on(tests), one.model.with_parameters(one.model.parameters.at(one.vector)), starts_of(one)
         )
+    return out
+
+
+def free_run_errors(
+    bench: Workbench, recordings: Sequence[Recording], simulator: Simulator, without: Fitted, after: Fitted
+) -> dict[str, float]:
+    """Compute the NRMSE without an observer, on recordings as they are."""
+    bench, out = bench.on(recordings), dict[str, float]()
+    steps = {"nominal": without, "before": without, "after": after}
+    for name, fitted in steps.items():
+        led = simulator if name == "nominal" else fitted.corrected()
+        free = discretise(replace(led, observer=None), bench.dt, bench.hold, fitted.model.substeps)
+        out[name] = errors_of(bench, free, starts_of(fitted))
     return out
 
 

@@ -32,6 +32,7 @@ STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # t
 MOST = 8  # parameters and blind spots that are printed at most
 WORSE = 1.05  # ratio of the test errors after and before above which a correction makes the test recordings worse
 SURE = 0.5  # confidence above which an effect is stated as found; below it is a guess
+RUN_AWAY = 1e4  # error from which its size says nothing
 CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
 FAR = 3.0  # ratio of the test error to the training error above which the result warns
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
@@ -99,7 +100,9 @@ class Diagnosis:
     corrected : Simulator
         The simulator with the effects added, at the fitted values (without effects: refitted).
     errors : dict
-        `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs.
+        `train`, `test` -> `nominal`, `before`, `after`: NRMSE averaged over outputs. With an observer these are errors
+        of predictions, and `free_run` has those of the same simulators without it, on the test recordings if there
+        are any.
     floor : dict
         `nrmse` and `source`.
     out_of_time : bool
@@ -382,11 +385,11 @@ class Diagnosis:
     def _error_lines(self) -> list[str]:
         """Format the errors as a table, with the noise floor below it."""
         lines = [f"{'NRMSE':<12}" + "".join(f"{name:>11}" for name in STEPS.values())]
-        for kind in ("train", "test"):
-            errors = self.errors[kind]
+        for kind in ("train", "test", "free_run"):
+            errors = self.errors.get(kind)
             if errors:
-                shown = (f"{errors[k]:.4f}" if np.isfinite(errors[k]) else "diverges" for k in STEPS)
-                lines.append(f"  {kind:<10}" + "".join(f"{text:>11}" for text in shown))
+                shown = (f"{errors[k]:.4f}" if errors[k] < RUN_AWAY else "runs away" for k in STEPS)
+                lines.append(f"  {kind.replace('_', ' '):<10}" + "".join(f"{text:>11}" for text in shown))
         return [*lines, f"  noise floor {self.floor['nrmse']:.4f} ({self.floor['source']})"]
 
     def _blind_lines(self) -> list[str]:

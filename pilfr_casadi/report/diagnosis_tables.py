@@ -20,9 +20,12 @@ RANKED = 12  # rows of the ranked table above the fold
 STEPS = {"nominal": "as given", "before": "refitted"}
 
 
+LARGEST = 1e4  # relative error from which its size says nothing
+
+
 def percent(value: float | None) -> str:
     """Write a relative error as a percentage."""
-    if value is None or not np.isfinite(value):
+    if value is None or not value < LARGEST:
         return "diverges"
     return f"{number_text(100 * value, 3)}\u00a0%"
 
@@ -92,17 +95,18 @@ def error_table(diagnosis: Diagnosis) -> Table:
     """Tabulate the errors before and after, on training and test recordings."""
     steps = _steps(diagnosis)
     rows: list[list[Any]] = []
-    for kind, name in (("train", "training"), ("test", "test (held out)")):
+    led = "free_run" in diagnosis.errors
+    for kind, name in (("train", "training"), ("test", "test (held out)"), ("free_run", "the same, free run")):
         errors = diagnosis.errors.get(kind)
         if errors:
             rows.append([name, *(percent(errors.get(k)) for k in steps), percent(diagnosis.floor["nrmse"])])
     note = (
-        "Rms error of the free-run simulation divided by the standard deviation of the measured output, averaged over "
-        "outputs."
+        f"Rms error of {'the predictions one sample ahead' if led else 'the free-run simulation'} divided by the "
+        "standard deviation of the measured output, averaged over outputs."
     )
     if diagnosis.floor["source"] == "estimated":
         note += " The noise floor is estimated from the residual; coloured noise would make it larger."
-    return Table(["recordings", *steps.values(), "noise floor"], rows, note=note, emphasis=[len(rows) - 1])
+    return Table(["recordings", *steps.values(), "noise floor"], rows, note=note, emphasis=[len(rows) - 1 - led])
 
 
 def effect_blocks(diagnosis: Diagnosis, number: int) -> list[Block]:

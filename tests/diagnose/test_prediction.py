@@ -1,0 +1,116 @@
+"""Prediction focus: an observer leads an unstable simulator along recordings of its closed loop."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pilfr_casadi as pilfr
+from pilfr_casadi import Parameter, Port, Recording, Simulator
+from pilfr_casadi._base import InputError
+from pilfr_casadi.diagnose.prediction import can_be_led, observer
+from pilfr_casadi.engine import make_engine
+from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Saturation
+from pilfr_casadi.simulators import discretise
+
+DT, SAMPLES = 0.01, 1500
+GAINS = 60.0, 8.0  # of the controller, which the simulator does not know
+
+
+def levitation(a=25.0, d=0.5):
+    """A body on a spring of negative stiffness, as in a magnetic bearing."""
+    return Simulator(
+        lambda x, u, p: {"q": x.v, "v": p.a * x.q - p.d * x.v + u.f},
+        lambda x: {"gap": x.q},
+        states=("q", "v"),
+        inputs=("f",),
+        parameters={"a": Parameter(a, bounds=(5, 1e5)), "d": Parameter(d, bounds=(0, 10))},
+        ports=Port("guide", into={"v": -1.0}, across=lambda x: x.q, rate=lambda x: x.v, unit="N"),
+        hold="zero",
+    )
+
+
+def controlled(seed, friction=1.5):
+    """Record the body under its controller, with Coulomb friction in its guide."""
+    rng = np.random.default_rng(seed)
+    plant = levitation()
+    if friction:
+        plant = pilfr.close_loop(plant, CoulombFriction(), "guide")
+        known = {"guide.F_c": friction, "guide.v_0": 0.01}
+        own = {k: replace(p, value=known.get(k, p.value), bounds=(0, np.inf)) for k, p in plant.parameters.items()}
+        plant = plant.with_parameters(own)
+    model = discretise(plant, DT, "zero", 10)
+    p = model.parameters.start
+    reference = 4 * np.cumsum(rng.standard_normal(SAMPLES)) * DT
+    x, y, u = np.zeros(2), np.zeros((SAMPLES, 1)), np.zeros((SAMPLES, 1))
+    for k in range(SAMPLES):
+        y[k] = x[0] + 1e-3 * rng.standard_normal()
+        u[k] = -GAINS[0] * (y[k, 0] - reference[k]) - GAINS[1] * x[1] + rng.normal(0, 3)
+        for _ in range(model.substeps):
+            x = np.asarray(model.closed(x, u[k], p)[0]).ravel()
+    return Recording(u, y, DT, ("f",), ("gap",), hold="zero")
+
+
+@pytest.fixture(scope="module")
+def machine():
+    return controlled(0), controlled(1)
+
+
+@pytest.mark.parametrize("memory", [0.6, 0.1])
+def test_every_eigenvalue_of_the_observer_forgets_within_its_memory(machine, memory):
+    gain = observer(levitation(), machine[:1], "zero", memory)
+    model = discretise(replace(levitation(), observer=gain), DT, "zero", 1)
+    read = [0.0, 0.0, 1.0]  # input, measured output, and that a sample is taken
+    moved = [model.closed(unit, read, model.parameters.start)[0] for unit in np.eye(2)]
+    step = np.column_stack([np.asarray(x).ravel() for x in moved])
+    assert np.max(np.abs(np.linalg.eigvals(step))) <= np.exp(-DT / memory) + 1e-6
+
+
+def test_predictions_read_each_measured_sample_once_and_later(machine):
+    led = replace(levitation(), observer=np.array([[0.3], [2.0]]))
+    r = machine[0]
+    other = r.with_(y=r.y + 0.1 * (np.arange(SAMPLES) == 700)[:, None])
+    before, after = led.simulate(r), led.simulate(other)
+    changed = np.flatnonzero(np.abs(after - before)[:, 0] > 0)
+    assert changed[0] == 701
+    assert after[701] - before[701] == pytest.approx(0.3 * 0.1, rel=1e-6)
+
+
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_the_engines_agree_on_predictions_and_their_slopes(machine, substeps):
+    led = replace(levitation(), observer=np.array([[0.3], [2.0]]))
+    model = discretise(pilfr.close_loop(led, CoulombFriction(), "guide"), DT, "zero", substeps)
+    p, x = model.parameters.start, np.zeros(model.n_state)
+    runs = [make_engine(model, engine).simulate(model.drive(machine[0]), p, x)[0] for engine in ("c", "vm")]
+    assert np.allclose(*runs, rtol=0, atol=1e-10)
+
+
+def test_friction_in_an_unstable_machine_is_named_and_a_complete_simulator_is_too(machine):
+    laws = (CoulombFriction, CubicStiffness, Saturation)
+    found = pilfr.diagnose(levitation(30.0, 1.0), machine[0], test=machine[1], laws=laws, workers=1)
+    assert [(e.port, e.law) for e in found.effects] == [("guide", "coulomb_friction")]
+    assert found.effects[0].parameters["F_c"]["value"] == pytest.approx(1.5, rel=0.05)
+    assert found.errors["test"]["after"] < 0.3 * found.errors["test"]["before"]
+    assert found.errors["free_run"]["after"] > 100 * found.errors["test"]["after"]
+    assert "free run" in str(found) and "unstable by itself" in str(found)
+    assert found.nrmse(machine[1]) == pytest.approx(found.errors["test"]["after"], rel=1e-6)
+    assert found.to_casadi().size1_in(1) == 1  # the exported step reads no measured output
+    complete = pilfr.diagnose(levitation(30.0, 1.0), controlled(2, 0.0), laws=laws, workers=1)
+    assert complete.verdict == "complete"
+
+
+def test_the_focus_can_be_stated(machine):
+    with pytest.raises(InputError, match="let the recordings lead it, by the focus 'prediction'"):
+        pilfr.diagnose(levitation(), machine[0], focus="simulation")
+    with pytest.raises(InputError, match="focus='errors' was given; use 'simulation', 'prediction' or None"):
+        pilfr.diagnose(levitation(), machine[0], focus="errors")
+
+
+def test_a_wrong_gain_is_refused():
+    with pytest.raises(InputError, match="a row for each of 2 states and a column for each of 1 outputs"):
+        replace(levitation(), observer=np.ones((1, 2)))
+
+
+def test_what_grows_within_a_sample_cannot_be_led(machine):
+    assert can_be_led(levitation(), machine)
+    assert not can_be_led(levitation(2e4), machine)
