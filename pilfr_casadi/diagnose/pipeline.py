@@ -21,7 +21,7 @@ from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
 from .posterior import Named, Posterior, names, posterior
-from .prediction import FOCUS, can_be_led, prediction_note, predictor
+from .prediction import FOCUS, FOLLOWED, can_be_led, prediction_note, predictor
 from .preparation import (
     CHECKS,
     Prepared,
@@ -200,6 +200,8 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         early=shift_early,
         say=request.say,
     )
+    if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
+        ready.bench.check_followed(ready.without, FOLLOWED)
     floor = ready.floor
     search = Search(
         ready.bench,

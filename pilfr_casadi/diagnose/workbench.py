@@ -230,9 +230,9 @@ class Workbench:
                 return f" ({name} is out of all bounds {k * r.dt:.3g} s into {r.label})"
         return ""
 
-    def check_followed(self, fitted: Fitted) -> None:
-        """Refuse a fit that is far beyond what was recorded because the simulator is unstable."""
-        if fitted.cost > RUNAWAY**2 and (why := self._describe_instability(self.simulator)):
+    def check_followed(self, fitted: Fitted, most: float = RUNAWAY**2) -> None:
+        """Refuse a fit of an unstable simulator that leaves more than `most` of the mean square."""
+        if fitted.cost > most and (why := self._describe_instability(self.simulator)):
             off = f"{fitted.cost**0.5:.3g} times the outputs' deviation"
             raise RunsAway(f"Refitted, the simulation runs away from the recordings, by {off}; {why}")
 
