@@ -33,7 +33,8 @@ from ..identify import regrid
 from ..laws import OPERATORS, Law, Local, display_name, hysteresis_layer, unit_forces
 from ..models import check_size, play
 from ..simulators import Placed, Simulator, discretise, in_series, on_grid
-from .evidence import HeldOut
+from .evidence import HeldOut, Sample, held_out_errors, spread
+from .floor import effective_size
 from .learned import signals_along
 from .result import Diagnosis
 from .search import Search
@@ -42,6 +43,7 @@ from .workbench import THOROUGH, Fitted, Workbench
 FINE = 40  # thresholds of each of the two fine grids from which the density of weights is estimated
 BENDS = (-0.2, 0.0, 0.2)  # tried bends of generalized plays, a_2 times the largest |z|, as in the catalogue
 FLOOR = 0.01  # least weight of an operator at a start, over the mean weight
+IDLE = 1e-9  # deviation of an operator's output, over that of the strongest, below which it is idle
 EXTENT = 1.2  # range in which thresholds are spread, over the threshold below which 99 % of the weight lies
 ROUNDS, GAIN = 3, 0.99  # rounds of spreading thresholds anew; ratio of costs above which there is no further round
 GRID = 201  # points of a loading curve
@@ -101,12 +103,12 @@ class Refinement:
     @property
     def sentence(self) -> str:
         """Say whether the layer replaces the diagnosed law, and why."""
-        what = f"a layer of {len(self.weights)} {self.kind.replace('_', ' ')}s at {self.port}"
+        what = f"A layer of {len(self.weights)} {self.kind.replace('_', ' ')}s at {self.port}"
         before, after = (f"{100 * self.held_out[k].expected:.3g} %" for k in (DIAGNOSED, self.kind))
-        errors = f"the expected error is {after} of the outputs' deviation with it and {before} with {self._law}"
+        errors = f"the expected error is {after} of the outputs' deviation with the layer and {before} with the law"
         if self.improves:
-            return f"{what.capitalize()} takes the place of {self._law}: on held-out training data {errors}."
-        return f"{what.capitalize()} does not predict held-out training data better: {errors}. The diagnosed law stays."
+            return f"{what} takes the place of {self._law}: by held-out training data {errors}."
+        return f"{what} does not predict better than {self._law}, which stays: by held-out training data {errors}."
 
     def simulate(self, recording: Recording) -> np.ndarray:
         """Simulate the chosen simulator along the inputs of a recording, shape (M, n_y); see `Diagnosis.simulate`."""
@@ -182,16 +184,13 @@ def refine(diagnosis: Diagnosis, operators: int, kind: str | None, port: str | N
     kinds: tuple[str, ...] = ("play", "stop", "generalized_play") if series else ("stop", "play")
     if kind is not None:
         kinds = (kind,)
-    own = after.simulator.elements[len(search.bench.simulator.elements) :]
     laws = {name: hysteresis_layer(name, n, series) for name in kinds}  # refuses what cannot stand there
-    held_out = {DIAGNOSED: search.predict(after, search.spread(after, own))}
+    held_out = {DIAGNOSED: _predict(search, after)}
     layers: dict[str, Fitted] = {}
     for name, law in laws.items():
         fitted = _fit_layer(search.bench, after, number, law)
         if fitted is not None:
-            added = fitted.simulator.elements[len(search.bench.simulator.elements) :]
-            layers[name] = fitted
-            held_out[name] = search.predict(fitted, search.spread(fitted, added))
+            layers[name], held_out[name] = fitted, _predict(search, fitted)
     if not layers:
         raise InputError(
             f"With a layer of {n} operators at {element.port} the simulation diverges; give fewer operators, or keep "
@@ -199,6 +198,21 @@ def refine(diagnosis: Diagnosis, operators: int, kind: str | None, port: str | N
         )
     best = min(layers, key=lambda name: held_out[name].mean_square)
     return _build(diagnosis, search.bench, best, layers[best], number, held_out)
+
+
+def _predict(search: Search, fitted: Fitted) -> HeldOut:
+    """Compute the errors of a fitted simulator on held-out data, and its spread for other inputs.
+
+    The spread takes the held-out error for the mean square error. A search adds what a formula may leave and still be
+    the right name; a layer has no name to defend.
+    """
+    bench = search.bench
+    found = held_out_errors(bench, fitted, search.workers)
+    v = max(found.blocks, found.ahead)
+    residual = [e[r.skip :] for e, r in zip(fitted.residual, bench.recordings, strict=True)]
+    n = Sample(search.floor2, effective_size(residual)).effective(v)
+    own = fitted.simulator.elements[len(bench.simulator.elements) :]
+    return replace(found, spread=spread(bench, fitted, own, v, n) if np.isfinite(v) else np.inf)
 
 
 def _found_hysteresis(diagnosis: Diagnosis, after: Fitted, given: int, port: str | None) -> int:
@@ -262,7 +276,7 @@ def _start_values(law: Any, local: Local, force: np.ndarray, found: Mapping[str,
     bends: list[dict[str, Any]] = [{}]
     if "a_2" in law.units:
         bends = [{"a_2": bend / local.reach, "a_3": 0.0} for bend in BENDS]
-        bends += [{name: found[name] for name in ("a_2", "a_3")}] * ("a_2" in found)
+        bends += [{name: found[name] for name in ("a_2", "a_3")}] if "a_2" in found else []
     solved = [_fit_weights(law, local, force, {"r": fine, **bend}) for bend in bends]
     (_, dense), bend = min(zip(solved, bends, strict=True), key=lambda pair: pair[0][0])
     even = local.half * (np.arange(n) + 0.5) / n
@@ -290,7 +304,8 @@ def _fit_weights(law: Any, local: Local, force: np.ndarray, shape: dict[str, Any
     linear = {name: z**power for name, power in (("k_0", 1), ("b_2", 2)) if name in law.units}
     a = np.column_stack([columns, *linear.values()])
     a = a - a.mean(axis=0)
-    size = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
+    size = np.linalg.norm(a, axis=0)
+    size = np.where(size > IDLE * np.max(size), size, np.inf)  # an idle operator gets no weight
     low = np.append(np.zeros(len(r)), np.full(len(linear), -np.inf))
     found = lsq_linear(a / size, force - force.mean(), (low, np.inf))
     w = found.x[: len(r)] / size[: len(r)]
