@@ -36,6 +36,7 @@ from ..simulators import Placed, Simulator, discretise, in_series, on_grid
 from .evidence import HeldOut, Sample, held_out_errors, spread
 from .floor import effective_size
 from .learned import signals_along
+from .proof import mean_nrmse
 from .result import Diagnosis
 from .search import Search
 from .workbench import THOROUGH, Fitted, Workbench
@@ -46,6 +47,7 @@ FLOOR = 0.01  # least weight of an operator at a start, over the mean weight
 IDLE = 1e-9  # deviation of an operator's output, over that of the strongest, below which it is idle
 EXTENT = 1.2  # range in which thresholds are spread, over the threshold below which 99 % of the weight lies
 ROUNDS, GAIN = 3, 0.99  # rounds of spreading thresholds anew; ratio of costs above which there is no further round
+USED = 1e-3  # weight of an operator, over the largest, below which it is not printed
 GRID = 201  # points of a loading curve
 PER_OPERATOR = 10  # least samples for each operator: its weight, its threshold and their standard errors
 DIAGNOSED = "diagnosed"  # key of the law that the diagnosis has found
@@ -69,8 +71,8 @@ class Refinement:
     linear : float
         Coefficient k_0 of the linear term beside the operators; 0 if there is none.
     loading_curve : tuple of array, shape (G,)
-        z from 0 to the largest |z| in the training recordings, and w there from empty memory; at an actuator or a
-        sensor the whole signal z + w.
+        z from 0 to half its range in the training recordings, and w there from empty memory; at an actuator or a sensor
+        the whole signal z + w.
     held_out : mapping
         Rms errors on held-out training data with the spread for other inputs, in units of the outputs' deviation, of
         the "diagnosed" law and of each kind of layer that was tried.
@@ -151,14 +153,14 @@ class Refinement:
         for kind, errors in self.errors.items():
             if errors is not None:
                 lines.append(f"  {kind:<10}" + "".join(f"{errors[k]:>11.4g}" for k in (DIAGNOSED, "refined")))
-        lines.append(f"expected error on held-out training data{'':<3}(its part on blocks and second halves)")
+        lines.append(f"{'held-out training data':<24}{'error':>9}{'expected':>11}  (with the spread for other inputs)")
         for name, found in self.held_out.items():
-            lines.append(f"  {name.replace('_', ' '):<20}{found.expected:>9.4g}{found.error:>11.4g}")
+            lines.append(f"  {name.replace('_', ' '):<22}{found.error:>9.4g}{found.expected:>11.4g}")
         port = self.layer.port(self.port)
         unit = f" [{port.across_unit}]" if port.across_unit else ""
-        used = int(np.sum(self.weights > 0))
-        lines.append(f"{used} of {len(self.weights)} operators have weight; threshold{unit} and weight:")
-        lines += [f"  {r:11.5g}{w:13.5g}" for r, w in zip(self.thresholds, self.weights, strict=True) if w > 0]
+        used = self.weights > USED * np.max(self.weights)
+        lines.append(f"{np.sum(used)} of {len(used)} operators are in use; threshold{unit} and weight:")
+        lines += [f"  {r:11.5g}{w:13.5g}" for r, w in zip(self.thresholds[used], self.weights[used], strict=True)]
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -361,13 +363,15 @@ def _build(
         evidence={**diagnosis.evidence, "after": fitted},
         substeps=fitted.model.substeps,
     )
-    errors: dict[str, dict[str, float] | None] = {"train": None, "test": None}
-    for name, recordings in (("train", diagnosis.train), ("test", diagnosis.test)):
-        if recordings:
-            errors[name] = {DIAGNOSED: diagnosis.nrmse(recordings), "refined": refined.nrmse(recordings)}
+    errors: dict[str, dict[str, float] | None] = {
+        "train": {DIAGNOSED: mean_nrmse(bench, after), "refined": mean_nrmse(bench, fitted)},
+        "test": None,
+    }
+    if diagnosis.test:
+        errors["test"] = {DIAGNOSED: diagnosis.nrmse(diagnosis.test), "refined": refined.nrmse(diagnosis.test)}
     loops = [signals_along(bench, one, number) for one in (fitted, after)]
     signal = in_series(port)
-    z = np.linspace(0.0, float(np.max(np.abs(loops[0][0]))), GRID)
+    z = np.linspace(0.0, float(np.ptp(loops[0][0])) / 2, GRID)
     order = np.argsort(values["r"])
     improves = held_out[kind].mean_square < held_out[DIAGNOSED].mean_square
     old = after.simulator.elements[number].law

@@ -323,10 +323,10 @@ def refined_hysteresis(
     loading.plot(curve[0] / sx, curve[1] / sy, color=BLUE, linewidth=1.8)
     loading.margins(x=0)
     finish(loading, across, up, "initial loading curve")
-    r, used = layer[0] / sx, layer[1] > 0
-    limit, label, right = 1.05 * max(float(curve[0][-1]) / sx, float(np.max(r))), "weights w (left)", None
+    r, used = layer[0] / sx, layer[1] > 1e-3 * np.max(layer[1])
+    limit, right = 1.3 * float(np.max(r[used], initial=0.0)) or 1.0, None
     weights.vlines(r[used], 0, layer[1][used], color=SKY, linewidth=1.5)
-    weights.plot(r, layer[1], "o", color=BLUE, markersize=4, label=label)
+    weights.plot(r, layer[1], "o", color=BLUE, markersize=4, label="weights w (left)")
     if np.count_nonzero(used) >= FEWEST_FOR_DENSITY:
         right, grid = weights.twinx(), np.linspace(0.0, limit, 300)
         density = weight_density(r, layer[1], grid, limit / 12)
@@ -337,6 +337,8 @@ def refined_hysteresis(
     finish(weights, across.replace(z.name, "threshold r", 1), "weight w", "weights over thresholds", 1, beside=right)
     weights.set_ylim(bottom=0)
     weights.set_xlim(-0.02 * limit, limit)
+    for ax in (loops, loading, weights):
+        ax.locator_params(axis="x", nbins=6)
     return figure
 
 
