@@ -3,7 +3,8 @@
     y = g u + y_0            (what an engineer writes first)
 
 Recordings as in `piezo_stack`: trained on the 1 Hz sine, judged on the varying amplitude (rms error in % of its range).
-Beside it stands what twelve plays leave, identified from the same sine with no simulator.
+Beside it stands what a layer of twelve operators in place of the hysteresis that was found leaves (`Diagnosis.refine`),
+and what twelve plays leave, identified from the same sine with no simulator.
 """
 
 from __future__ import annotations
@@ -46,10 +47,14 @@ def simulator() -> Simulator:
 
 def judge(folder: Path, diagnosis: Diagnosis) -> dict[str, float]:
     """Rms errors on the varying amplitude in % of its range, `before` and `after`."""
-    r = recordings(folder)["varying"]
-    full = np.ptp(r.y[r.skip :])
     pairs = (("before", diagnosis.refitted), ("after", diagnosis.corrected))
-    return {name: 100 * rmse(free_run(one, r, diagnosis.hold, FIRST)[r.skip :]) / full for name, one in pairs}
+    return {name: error(folder, one, diagnosis.hold) for name, one in pairs}
+
+
+def error(folder: Path, one: Simulator, hold: str) -> float:
+    """Compute the rms error of a simulator on the varying amplitude in % of its range."""
+    r = recordings(folder)["varying"]
+    return 100 * rmse(free_run(one, r, hold, FIRST)[r.skip :]) / float(np.ptp(r.y[r.skip :]))
 
 
 def run(folder: Path, **options: Any) -> tuple[Diagnosis, dict[str, float]]:
@@ -72,11 +77,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(diagnosis)
     for port, law, form, sure in answer(diagnosis):
         print(f"found: {law} ({form}) at {port}, confidence {sure:.2f}")
+    refined = diagnosis.refine()
+    print(refined)
     data = recordings(folder)
     plays = share_of_range(identify(data["sine"], 0, 12), data["varying"], data["varying"])
     rows: list[tuple[str, Sequence[float | None]]] = [
         ("a gain, refitted", [errors["before"]]),
         ("with what was found", [errors["after"]]),
+        ("its hysteresis refined", [error(folder, refined.simulator, diagnosis.hold)]),
         ("twelve plays identified", [plays]),
     ]
     print(table("rms error [% of range], sine -> varying", rows, ["test"]))

@@ -16,7 +16,7 @@ about. The files by stage:
 - Correction: `correction` chooses the corrected simulator, with a learned force where named laws do not suffice.
 - Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
 - Proof: `proof` (errors before and after, placebo, next experiment), `force_recovery`, `mismatch_map`.
-- Result: `result`.
+- Result: `result`, and `refinement`: a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
 - Before a diagnosis: `checkup` (what the recordings can reveal), based on `identifiability` (of parameters) and
   `detectability` (of laws).
 - Without a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
+    from .refinement import Refinement as Refinement
     from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect
     from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate
     from .workbench import Fitted as Fitted, Workbench as Workbench

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from .floor import ABOVE_NOISE
 from .gates import Gate
 from .learned import Learned
 from .proof import run_free, starts_of
+
+if TYPE_CHECKING:
+    from .refinement import Refinement
 
 VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
@@ -325,6 +328,37 @@ class Diagnosis:
         from ..report import diagnosis_report
 
         return diagnosis_report(self, folder)
+
+    def refine(self, operators: int = 12, kind: str | None = None, *, port: str | None = None) -> Refinement:
+        """Identify a Prandtl-Ishlinskii layer in the port where hysteresis was found; see `refinement`.
+
+        It takes the place of the found law (hysteresis, backlash, or friction with presliding) and is fitted together
+        with the simulator's parameters to the training recordings. If it does not predict held-out parts of these
+        better than the found law, the result says so and keeps that law.
+
+        Parameters
+        ----------
+        operators : int
+            Operators of the layer.
+        kind : {"stop", "play", "generalized_play"}, optional
+            The operators; by default all that may stand at the port are tried, and the smallest held-out error decides.
+            Generalized plays are for actuators and sensors.
+        port : str, optional
+            The port; by default that of the surest effect with hysteresis.
+
+        Returns
+        -------
+        Refinement
+            With `simulator`, `loading_curve`, `weights` over `thresholds`, `nrmse`, `plot` and `export`.
+
+        Raises
+        ------
+        InputError
+            If the diagnosis has found no hysteresis (at the port), or an argument is wrong.
+        """
+        from .refinement import refine
+
+        return refine(self, operators, kind, port)
 
     def warnings(self) -> list[str]:
         """List the reasons for doubt: an interrupt, parameters at their bounds, errors that stay large."""

@@ -68,6 +68,7 @@ if TYPE_CHECKING:
         ViscousDamping as ViscousDamping,
     )
     from .hysteresis import (
+        OPERATORS as OPERATORS,
         Backlash as Backlash,
         BoucWen as BoucWen,
         BoucWenActuator as BoucWenActuator,
@@ -77,6 +78,7 @@ if TYPE_CHECKING:
         PlayHysteresis as PlayHysteresis,
         SmoothHysteresis as SmoothHysteresis,
         StopHysteresis as StopHysteresis,
+        hysteresis_layer as hysteresis_layer,
     )
     from .stiffness import (
         Clearance as Clearance,

@@ -10,6 +10,7 @@ comes near to a single Jenkins element. The density follows Iwan (1966) and Sega
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from .._base import InputError
 from ..models import Parameter, play
 from .base import Law, Local
 
@@ -242,3 +244,82 @@ class Backlash(Law):
     def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
         following = play(z, s, p["r"])
         return following - z, following
+
+
+OPERATORS = ("stop", "play", "generalized_play")  # kinds of layers
+
+
+def hysteresis_layer(kind: str, n: int, series: bool) -> type[StopHysteresis]:
+    """Make the law of a Prandtl-Ishlinskii layer of n operators (Krikelis et al. 2024, Eq. 16).
+
+    All weights and thresholds are at least zero. Beside the operators there may be a linear term:
+
+    | kind               | a force that opposes motion    | a signal that lags                                      |
+    | ------------------ | ------------------------------ | ------------------------------------------------------- |
+    | "stop"             | sum_i w_i stop_i[z]            | k_0 z - sum_i w_i stop_i[z]                             |
+    | "play"             | k_0 z - sum_i w_i play_i[z]    | k_0 z + sum_i w_i play_i[z]                             |
+    | "generalized_play" |                                | k_0 z + b_2 z^2 + sum_i w_i play_i[z + a_2 z^2 + a_3 z^3] |
+
+    Because play + stop = z (Eq. 8), the first two rows differ only in the linear term.
+
+    Parameters
+    ----------
+    kind : {"stop", "play", "generalized_play"}
+        The operator.
+    n : int
+        Operators, one or more.
+    series : bool
+        Whether it acts at an actuator or a sensor, on a signal, and not as a force inside the dynamics.
+
+    Raises
+    ------
+    InputError
+        If the kind is unknown, or generalized plays are asked for as a force.
+    """
+    if kind not in OPERATORS:
+        raise InputError(f"The kind of operators is {kind!r}; give {', '.join(map(repr, OPERATORS))}.")
+    if kind == "generalized_play" and not series:
+        raise InputError("Generalized plays act at an actuator or a sensor, not as a force; give 'stop' or 'play'.")
+    return _layer(kind, n, series)
+
+
+@functools.cache  # the same class for the same arguments
+def _layer(kind: str, operators: int, in_signal: bool) -> Any:
+    bent, minus = kind == "generalized_play", kind == ("stop" if in_signal else "play")
+    shown = f"{'stop' if kind == 'stop' else 'play'}_{{r_i}}[{'z + a_2 z^2 + a_3 z^3' if bent else 'z'}]"
+    gain = {"k_0": "w/z"} if in_signal or kind == "play" else {}
+    linear = ["k_0 z"] * bool(gain) + ["b_2 z^2"] * bent
+
+    class Layer(StopHysteresis):
+        form = "generalized_play" if bent else "prandtl_ishlinskii"
+        equation = f"w = {' + '.join(linear)}{' - ' if minus else ' + ' if linear else ''}sum_i w_i {shown}"
+        units = {
+            "w": "w/z",
+            **gain,
+            **({"b_2": "w/z^2"} if bent else {}),
+            "r": "z",
+            **({"a_2": "1/z", "a_3": "1/z^2"} if bent else {}),
+        }
+        defaults = {"a_2": 0.0, "a_3": 0.0} if bent else {}
+        signed = ("k_0", "b_2") if in_signal else ()
+        places = ("series",) if in_signal else ("parallel",)
+        dissipative = not in_signal
+        n = memory = operators
+        operator, sign = kind, -1 if minus else 1
+
+        def step(self, z: Any, s: Any, p: Any) -> tuple[Any, Any]:
+            at = z + p["a_2"] * z**2 + p["a_3"] * z**3 if bent else z
+            following = [play(at, s[i], p["r"][i]) for i in range(self.n)]
+            total = sum(p["w"][i] * (at - q if kind == "stop" else q) for i, q in enumerate(following))
+            w = (p["k_0"] * z if gain else 0) + (p["b_2"] * z**2 if bent else 0) + self.sign * total
+            return w, ca.vertcat(*following)
+
+        def bounds(self, local: Local) -> dict[str, tuple[Any, Any]]:
+            limits: dict[str, tuple[Any, Any]] = {"w": (0.0, np.inf), "r": (0.0, 0.97 * local.half)}
+            if gain:
+                limits["k_0"] = (-1.0 if in_signal else 0.0, np.inf)
+            return {**GeneralizedHysteresis().bounds(local), **limits} if bent else limits
+
+    Layer.__name__ = Layer.__qualname__ = f"Layer_{kind}_{operators}{'_series' if in_signal else ''}"
+    Layer.__doc__ = f"A Prandtl-Ishlinskii layer of {operators} operators: {Layer.equation}."
+    return Layer

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         mismatch_map as mismatch_map,
         mismatch_time as mismatch_time,
         port_law_map as port_law_map,
+        refined_hysteresis as refined_hysteresis,
     )
     from .fits import (
         convergence as convergence,

@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from ..models import weight_density
 from .canvas import (
     BLUE,
     FONT,
@@ -21,6 +23,7 @@ from .canvas import (
     INK,
     PALE_GREY,
     SHADES,
+    SKY,
     VERMILLION,
     axes_or_new,
     choose_scale,
@@ -35,6 +38,7 @@ from .canvas import (
 )
 
 CLOUD_POINTS = 2500  # more cannot be told apart in a figure
+FEWEST_FOR_DENSITY = 4  # operators in use; fewer weights do not sample a density
 LINE_POINTS = 400  # samples along which laws are drawn over a learned force: a few swings
 
 
@@ -283,6 +287,59 @@ def learned_force(x: Signal, force: Signal, laws: Sequence[tuple[str, np.ndarray
             ax.plot(x.values[part] / sx, values[part] / sy, style, color=colour, linewidth=1.2, label=plain(name))
     ax.set_ylim(*_robust_limits(force.values / sy, np.concatenate([f[known] for _, f in laws]) / sy if laws else None))
     return finish(ax, across, up, title)
+
+
+def refined_hysteresis(
+    z: Signal,
+    w: Signal,
+    before: tuple[np.ndarray, np.ndarray],
+    curve: tuple[np.ndarray, np.ndarray],
+    layer: tuple[np.ndarray, np.ndarray],
+    *,
+    names: tuple[str, str] = ("layer", "diagnosed law"),
+) -> Figure:
+    """Draw a Prandtl-Ishlinskii layer: its loops beside those of a law, its loading curve, its weights over thresholds.
+
+    Parameters
+    ----------
+    z, w : Signal
+        Signals of the layer along recordings, (M,).
+    before : (z, w)
+        Signals of the law that it replaces, (M,) each.
+    curve : (z, w)
+        Initial loading curve, (G,) each.
+    layer : (thresholds, weights)
+        Thresholds in the unit of z, and weights, (n,) each.
+    names : (str, str)
+        Names of the layer and of the law.
+    """
+    figure = new_figure(12.5, 3.9)
+    loops, loading, weights = (figure.add_subplot(1, 3, k) for k in (1, 2, 3))
+    (sx, across), (sy, up) = (scale_axis(v.name, v.values, v.unit) for v in (z, w))
+    style: dict[str, Any] = {"linewidth": 0.8, "rasterized": True}
+    loops.plot(before[0] / sx, before[1] / sy, color=VERMILLION, alpha=0.55, label=plain(names[1]), **style)
+    loops.plot(z.values / sx, w.values / sy, color=BLUE, label=plain(names[0]), **style)
+    finish(loops, across, up, "loops in the training recordings", 1)
+    loading.plot(curve[0] / sx, curve[1] / sy, color=BLUE, linewidth=1.8)
+    loading.margins(x=0)
+    finish(loading, across, up, "initial loading curve")
+    r, used = layer[0] / sx, layer[1] > 1e-3 * np.max(layer[1])
+    limit, right = 1.3 * float(np.max(r[used], initial=0.0)) or 1.0, None
+    weights.vlines(r[used], 0, layer[1][used], color=SKY, linewidth=1.5)
+    weights.plot(r, layer[1], "o", color=BLUE, markersize=4, label="weights w (left)")
+    if np.count_nonzero(used) >= FEWEST_FOR_DENSITY:
+        right, grid = weights.twinx(), np.linspace(0.0, limit, 300)
+        density = weight_density(r, layer[1], grid, limit / 12)
+        right.plot(grid, density, color=VERMILLION, linewidth=1.8, label="smoothed density (right)")
+        finish(right, "", "density dw/dr", legend=False).grid(False)
+        right.spines["right"].set_visible(True)
+        right.set_ylim(bottom=0)
+    finish(weights, across.replace(z.name, "threshold r", 1), "weight w", "weights over thresholds", 1, beside=right)
+    weights.set_ylim(bottom=0)
+    weights.set_xlim(-0.02 * limit, limit)
+    for ax in (loops, loading, weights):
+        ax.locator_params(axis="x", nbins=6)
+    return figure
 
 
 def force_time(t: np.ndarray, recovered: Signal, std: np.ndarray, law: np.ndarray, name: str = "law") -> Axes:
