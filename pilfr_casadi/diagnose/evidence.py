@@ -37,6 +37,7 @@ from ..identify import solve_within_bounds
 from ..laws import Law
 from ..optimise import GaussNewton, Problem
 from ..simulators import Placed
+from .floor import effective_size
 from .workbench import DIVERGED, Fitted, Workbench
 
 EXACT = 8.0  # effective samples of a model whose whole error is model error (n_0)
@@ -65,7 +66,7 @@ class Sample:
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
     """Compute the eigenvalues λ of a sample's information on the laws' parameters, in units of their prior widths."""
     own = _of_laws(fitted, laws)
-    problem, hessian = _hessian(bench, fitted)
+    problem, _, hessian = _hessian(bench, fitted)
     own = own[problem.free]
     if not own.any():
         return np.zeros(0)
@@ -94,8 +95,8 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     parameters, because the two may make up for each other. The spread reveals parameters that the recordings hardly
     determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings cannot.
     """
-    problem, told = _hessian(bench, fitted)
-    _, asked = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
+    problem, _, told = _hessian(bench, fitted)
+    *_, asked = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
     free = int(problem.free.sum())
     if not free:
         return 0.0
@@ -127,18 +128,34 @@ def _of_laws(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
     return own
 
 
-def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray]:
-    """Compute the Fisher information of one sample on free parameters and initial states; it may be infinite."""
-    model = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
-    problem = bench.problem(model, fitted.engine)
-    theta, n_free = problem.start.copy(), problem.n_free
-    states = [s for r, s in zip(bench.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
-    theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
+def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray, np.ndarray]:
+    """Compute the Fisher information of one sample on free parameters and initial states; it may be infinite.
+
+    Also returns the simulation-error problem and its variables at the fitted values.
+    """
+    problem, theta = bench.problem_at(fitted)
     try:
         with np.errstate(all="ignore"):
-            return problem, np.nan_to_num(problem.normal(theta)[2], nan=np.inf)
+            return problem, theta, np.nan_to_num(problem.normal(theta)[2], nan=np.inf)
     except (InputError, RuntimeError):  # the run diverges
-        return problem, np.full((len(theta), len(theta)), np.inf)
+        return problem, theta, np.full((len(theta), len(theta)), np.inf)
+
+
+def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
+    """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds.
+
+    Initial states are estimated together with the parameters.
+    """
+    problem, theta, hessian = _hessian(bench, fitted)
+    inside, diagonal = (theta > problem.lower) & (theta < problem.upper), np.diag(hessian)
+    kept = np.flatnonzero(inside & np.isfinite(diagonal) & (diagonal > 0))
+    size = np.sqrt(np.maximum(diagonal[kept], 1e-300))
+    scaled = hessian[np.ix_(kept, kept)] / np.outer(size, size)
+    matrix = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size, size)
+    own, n = kept < problem.n_free, max(effective_size(fitted.residual), 10.0)
+    full = np.full(fitted.model.parameters.size, np.nan)
+    full[np.flatnonzero(problem.free)[kept[own]]] = np.sqrt(np.maximum(np.diag(matrix)[own] * fitted.cost / n, 0))
+    return fitted.model.parameters.unpack(full)
 
 
 def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np.ndarray) -> np.ndarray:
@@ -228,11 +245,6 @@ class HeldOut:
         return max(self.blocks, self.ahead) + self.spread
 
     @property
-    def expected(self) -> float:
-        """Root of the mean square."""
-        return float(np.sqrt(self.mean_square))
-
-    @property
     def error(self) -> float:
         """Root of the larger of the two errors."""
         return float(np.sqrt(max(self.blocks, self.ahead)))
@@ -270,12 +282,9 @@ def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]
 
 def _errors_without(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Compute the scaled errors (M, n_y) of each recording from a fit that does not score the samples in `left`."""
-    model = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
-    states = [s for s, r in zip(fitted.initial, bench.recordings, strict=True) if r.begins == "estimate"]
-    if not np.any(model.parameters.free) and not states:
+    if not np.any(fitted.model.parameters.free) and all(r.begins != "estimate" for r in bench.recordings):
         return [e / bench.scale for e in fitted.residual]
-    problem = Problem(model, bench.recordings, engine=fitted.engine, scale=bench.scale, scored=[~mask for mask in left])
-    theta = np.concatenate([problem.start[: problem.n_free], *states])
+    problem, theta = bench.problem_at(fitted, [~mask for mask in left])
     try:
         with np.errstate(all="ignore"):
             found = solve_within_bounds(problem, theta, AGAIN).theta

@@ -19,9 +19,9 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import LINEAR, display_name
 from ..simulators import states_along
+from .evidence import deviations
 from .gates import CERTAIN, EXPLAINED, LEAST_GAIN, SAME, USELESS_FIT, Gate, describe_fall, gain, open_start, refit
 from .posterior import Posterior, posterior
-from .proof import deviations
 from .search import Search
 from .verdict import AT_FLOOR, SURE
 from .workbench import THOROUGH, Fitted, Workbench

@@ -17,6 +17,7 @@ from ..simulators import Simulator
 from .checkup import BlindSpot, assess
 from .correction import Correction, find_correction, named_correction
 from .detectability import port_units
+from .evidence import deviations
 from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
@@ -33,7 +34,7 @@ from .preparation import (
     prepare,
     stated_hold,
 )
-from .proof import deviations, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
+from .proof import mean_nrmse, next_experiment, parameter_table, placebo, test_errors
 from .recording_faults import clipped_input, tones
 from .result import Diagnosis, Effect
 from .search import Search

@@ -14,7 +14,6 @@ from ..laws import Law
 from ..models import Model
 from ..optimise import first_state, samples_for_state
 from ..simulators import Simulator
-from .floor import effective_size
 from .gates import Gate
 from .linearise import linearised
 from .remainder import Remainder, held_out
@@ -94,39 +93,6 @@ def test_errors(
             bench.on(tests), one.model.with_parameters(one.model.parameters.at(one.vector)), starts_of(one)
         )
     return out
-
-
-def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
-    """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds."""
-    return _by_name(fitted, *covariance(bench, fitted))
-
-
-def _by_name(fitted: Fitted, where: np.ndarray, matrix: np.ndarray) -> dict[str, np.ndarray]:
-    full = np.full(fitted.model.parameters.size, np.nan)
-    full[where] = np.sqrt(np.maximum(np.diag(matrix), 0))
-    return fitted.model.parameters.unpack(full)
-
-
-def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places (k,) of free parameters inside their bounds, and the covariance (k, k) of their estimates.
-
-    Initial states are estimated together with them.
-    """
-    free = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
-    problem = bench.problem(free, fitted.engine)
-    n_free = int(problem.free.sum())
-    theta = problem.start.copy()
-    states = [s for p, s in zip(problem._placed, fitted.initial, strict=True) if p.first is not None]
-    theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
-    _, _, hessian = problem.normal(theta)
-    inside = (theta > problem.lower) & (theta < problem.upper)
-    keep = np.flatnonzero(inside & (np.diag(hessian) > 0))
-    size = np.sqrt(np.maximum(np.diag(hessian)[keep], 1e-300))
-    scaled = hessian[np.ix_(keep, keep)] / np.outer(size, size)
-    matrix = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size, size)
-    n = max(effective_size(fitted.residual), 10.0)
-    own = keep < n_free
-    return np.flatnonzero(problem.free)[keep[own]], matrix[np.ix_(own, own)] * fitted.cost / n
 
 
 def parameter_table(

@@ -18,7 +18,7 @@ import numpy as np
 from .._base import InputError, one_at_a_time
 from ..data import Recording
 from ..engine import Engine, make_engine
-from ..identify import FitContext, match_channels, solve_within_bounds
+from ..identify import match_channels, solve_within_bounds
 from ..linear import INJECTION, with_output_injection
 from ..models import Model
 from ..optimise import GaussNewton, Problem, Status
@@ -163,14 +163,16 @@ class Workbench:
             least = min(least, FINER * self.chosen)
         return int(np.clip(wanted, least, max(FINER * self.chosen, least)))
 
-    def too_coarse(self, fitted: Fitted) -> bool:
-        """Tell whether a law became faster than the sub-steps allow, which were chosen at its start values."""
-        return self._substeps(fitted.corrected()) > fitted.model.substeps
+    def problem(self, model: Model, engine: Engine, scored: Sequence[np.ndarray] | None = None) -> Problem:
+        """Make the simulation-error problem of a model; `scored` marks the samples that count, all by default."""
+        return Problem(model, self.recordings, engine=engine, scale=self.scale, scored=scored)
 
-    def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:
-        """Make the simulation-error problem of a model."""
-        context = FitContext(tuple(recordings or self.recordings), QUICK)
-        return context.problem(model, engine=engine or self.engine, scale=self.scale)
+    def problem_at(self, fitted: Fitted, scored: Sequence[np.ndarray] | None = None) -> tuple[Problem, np.ndarray]:
+        """Make the simulation-error problem of a fitted simulator; return it and its variables at the fitted values."""
+        model = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
+        problem = self.problem(model, fitted.engine, scored)
+        states = [s for r, s in zip(self.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
+        return problem, np.concatenate([problem.start[: problem.n_free], *states])
 
     def fit(
         self,
