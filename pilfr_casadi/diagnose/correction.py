@@ -10,7 +10,6 @@ used.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -147,7 +146,7 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
     out = list(predicted)
     for c in sorted(candidates, key=lambda c: c.least):
         least = min((h.mean_square for _, h in out), default=np.inf)
-        if out and (c.least >= least or time.perf_counter() > search.deadline):
+        if out and (c.least >= least or search.past_deadline):
             break
         out.append((c, search.predicts(c.base) if c.fitted is c.base.fitted else search.predict(c.fitted, c.spread)))
     return out
@@ -175,7 +174,12 @@ def _of_trial(search: Search, trial: Trial) -> _Candidate:
 
 
 def _learned(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:
-    """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one."""
+    """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one.
+
+    After the deadline no further force is fitted.
+    """
+    if search.past_deadline:
+        return []
     free = (f for f in search.learned(base) if f.simulator.elements[-1].port not in taken)
     found = next(free, None)
     if found is None:

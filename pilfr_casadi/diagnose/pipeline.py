@@ -130,9 +130,8 @@ def diagnose_in_steps(
     deadline = np.inf if time_limit is None else began + float(time_limit)
     request = Request(simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say)
     ready, search = _search_both_holds(request)
-    concluding = search.begin("conclusion")
-    found = conclude(search, (*ready.gates, *search.gates))
-    search.timed("conclusion", concluding)
+    with search.stage("conclusion"):
+        found = conclude(search, ready.gates)
     return _build_diagnosis(request, ready, search, found, tests, limits, began)
 
 
@@ -381,7 +380,7 @@ def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] 
 
 def _row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
     """Return a candidate's row for diagnosis.json."""
-    held_out = search.held_out.get(t.key)
+    held_out = search.findings[t.key].held_out
     gain = search.evidence(t) - search.evidence(parent)
     return {
         "port": t.port,
