@@ -20,15 +20,12 @@ import numpy as np
 from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
-from .evidence import HeldOut
+from .evidence import FORMULA, SURE, HeldOut
 from .learned import Learned, LearnedForce, describe_learned, refit_learned
-from .posterior import Posterior, explainable_remainder
-from .search import FORMULA, Search, likeliest
+from .search import Search, likeliest
 from .trials import Trial
-from .verdict import SURE
-from .workbench import Fitted
-
-TRIED = 3  # of the likeliest hypotheses, those that compete even if they were not fitted to convergence before
+from .verdict import Posterior, explainable_remainder, share_left
+from .workbench import FEW, Fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +159,7 @@ def _with_laws(search: Search) -> list[Trial]:
     found, recurring = list[Trial](), [t for t in search.memo.values() if _may_recur(search, t)]
     likely = sorted(likeliest(recurring, search.optimistic_evidence), key=search.evidence, reverse=True)
     for i, trial in enumerate(t for t in likely if t.laws):
-        if trial.thorough or i < TRIED:
+        if trial.thorough or i < FEW:
             with suppress(InputError):
                 found.append(search.thorough(trial))
     return [t for t in found if np.isfinite(t.whole)]
@@ -203,12 +200,11 @@ def _may_recur(search: Search, trial: Trial) -> bool:
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
     """Compute the shares of the refit's mean square error above the noise; all are zero if there is none."""
-    excess = search.root.whole - search.floor2
-    if not excess > 0:
+    if not search.root.whole > search.floor2:
         return {"named": 0.0, "learned": 0.0, "left": 0.0}
-    after = [float(np.clip((f.cost - search.floor2) / excess, 0.0, 1.0)) for f in (named, whole)]
-    left = min(after)
-    return {"named": 1 - after[0], "learned": after[0] - left, "left": left}
+    beside_names, left = (share_left(search, f.cost) for f in (named, whole))
+    left = min(beside_names, left)
+    return {"named": 1 - beside_names, "learned": beside_names - left, "left": left}
 
 
 def _elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:

@@ -40,14 +40,46 @@ from ..simulators import Placed
 from .floor import effective_size
 from .workbench import DIVERGED, Fitted, Workbench
 
+# The priors and thresholds on which every answer of a search rests. The other numbers of these files limit the effort
+# or keep numbers finite: without them an answer would take longer, and rest on more fits.
+
+# Prior probabilities
+EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
+FLEXIBLE_PRIOR = np.log(0.2)  # the same of a law that can imitate others, relative to a law that cannot
+DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law degenerates into another
+OUTSIDE = 0.1  # probability that missing physics is in no law of the catalogue
+STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
+
+# Model error: no machine follows a formula exactly
+FORMULA = 1e-3  # share of a mismatch that the right explanation may leave: 3 % of its force
 EXACT = 8.0  # effective samples of a model whose whole error is model error (n_0)
 LEAST_WRONG = 0.05  # least share of the error that counts as model error
-EFFECT_PRIOR = np.log(0.5)  # log prior probability of each further effect
-# log prior probability of a flexible law, which can imitate others, relative to other laws
-FLEXIBLE_PRIOR = np.log(0.2)
+FEWEST = 30.0  # least effective samples of the recordings
+WRONG = 0.2  # share of model error in the error above which models are judged on held-out blocks
+DISTURBED = 0.2  # weight of a law's remainder that no force at a port explains: a disturbance may act beside the law
 INPUT_FACTOR = 0.7  # factor on the inputs for which the spread is computed: well inside the recorded range
-STATE_PRIOR = 1e-9  # precision of the prior of initial states, relative to the information of a sample
-DOUBTFUL_PRIOR = np.log(0.01)  # log prior probability of parameter values at which a law degenerates
+
+# Comparison of hypotheses
+SURE = 0.5  # probability above which an answer is stated: it is more likely than not
+ALIKE = 3.0  # nats within which two hypotheses are indistinguishable: odds of 20 (Kass & Raftery 1995)
+REACH = 8.0  # nats below the best within which a hypothesis may still win after more fits
+BETTER = 1.05  # ratio of rms errors from which one is better than another
+NEAR = 1.5  # ratio of rms errors within which one comes near another: more fits may reverse their order
+FAR = 3.0  # ratio of rms errors from which one is far behind another: more fits cannot reverse their order
+AS_GIVEN = 0.5  # largest ratio of mean squares of a search with channels as given to one with shifted channels
+
+# Noise, by rms ratios to the noise and by shares of an output's deviation
+AT_FLOOR = 1.15  # ratio to the noise that counts as at the noise
+SOMEWHAT, COLOURED = 4.0, 9.0  # largest ratio to the estimated (white) noise; the same if no force explains the error
+LOUDEST, QUIET = 0.05, 0.01  # shares of the deviation: above, an error is not sensor noise; below, it does not matter
+SILENT, CHANCE = 0.01, 0.05  # largest share of noise that a force may explain; the same of noise that does not matter
+HINT = 0.1  # least share of a residual that a flexible force has to explain to count
+
+# Held-out data
+FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
+LEAD = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
+# The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
+REFIT = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
 
 
 @dataclass(frozen=True)
@@ -216,13 +248,6 @@ def log_evidence(v: float, information: np.ndarray, prior: float, n: float) -> f
     return float(-0.5 * n * np.log(v) - 0.5 * np.sum(np.log1p(n * information / v)) + prior)
 
 
-FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
-# share of a block at the start of a recording that is never held out: it determines the unknown initial state
-LEAD = 0.5
-# The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
-AGAIN = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
-
-
 @dataclass(frozen=True)
 class HeldOut:
     """Mean square errors of a simulator on data that it was not fitted to, outputs in units of their deviation.
@@ -287,7 +312,7 @@ def _errors_without(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]
     problem, theta = bench.problem_at(fitted, [~mask for mask in left])
     try:
         with np.errstate(all="ignore"):
-            found = solve_within_bounds(problem, theta, AGAIN).theta
+            found = solve_within_bounds(problem, theta, REFIT).theta
             simulated = problem.simulate(found)
     except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
         return [np.full(r.y.shape, np.inf) for r in bench.recordings]

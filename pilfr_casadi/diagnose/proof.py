@@ -16,8 +16,12 @@ from ..optimise import first_state, samples_for_state
 from ..simulators import Simulator
 from .gates import Gate
 from .linearise import linearised
-from .remainder import Remainder, held_out
+from .screen import RIDGES, Remainder, held_out
 from .workbench import Fitted, Workbench
+
+AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
+SINES = 12  # frequencies of sines that are tried
+MOST_SAMPLES = 3000  # longest simulated experiment, in samples
 
 
 def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
@@ -89,9 +93,7 @@ def test_errors(
         if g.change is not None:
             tests = [g.change(r) for r in tests]
     for name, one in (("before", without), ("after", after)):
-        out[name] = errors_of(
-            bench.on(tests), one.model.with_parameters(one.model.parameters.at(one.vector)), starts_of(one)
-        )
+        out[name] = errors_of(bench.on(tests), one.fitted_model, starts_of(one))
     return out
 
 
@@ -110,11 +112,6 @@ def parameter_table(
             "unit": p.unit,
         }
     return out
-
-
-SHARES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
-SINES = 12  # frequencies of sines that are tried
-MOST_SAMPLES = 3000  # longest simulated experiment, in samples
 
 
 def next_experiment(
@@ -161,7 +158,7 @@ def next_experiment(
             wave = np.sin(2 * np.pi * f * t)
             if waveform == "triangle":
                 wave = 2 / np.pi * np.arcsin(wave)
-            for share in SHARES:
+            for share in AMPLITUDES:
                 drive = np.tile(rest, (m, 1))
                 drive[:, i] += share * most * wave
                 value = separation(drive)
@@ -199,6 +196,6 @@ def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[floa
             for r in runs
         ]
         rest = Remainder.of(bench, probe, shifted, [type(law)], at=port)
-        found = [held_out(rest.columns(task)[0], rest.left, rest.odd, (1e-6, 1e-3)) for task in rest.tasks]
+        found = [held_out(rest.columns(task)[0], rest.left, rest.odd, RIDGES) for task in rest.tasks]
         shares.append(found[0] if found else 0.0)
     return shares[0], shares[1]

@@ -23,8 +23,15 @@ from ..engine import make_engine
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
 from .evidence import (
+    BETTER,
     EFFECT_PRIOR,
     EXACT,
+    FEWEST,
+    FORMULA,
+    LOUDEST,
+    NEAR,
+    REACH,
+    WRONG,
     HeldOut,
     Sample,
     held_out_errors,
@@ -34,28 +41,19 @@ from .evidence import (
     spread,
 )
 from .floor import Floor, effective_size, white_part
-from .gates import Offset
+from .gates import CLEARLY, Offset
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
-from .remainder import Remainder
-from .screen import Scored, flexible_shares, screen
+from .screen import Remainder, Scored, flexible_shares, screen
 from .trials import Key, Trial, Trials
-from .workbench import THOROUGH, Fitted, Workbench, start_vector
+from .workbench import FEW, THOROUGH, Fitted, Workbench, start_vector
 
-POLISHED, BEHIND = 5, 1.5  # trials of a step fitted to convergence at most, and their largest ratio to the best error
-REACH = 8.0  # nats of log evidence below the best within which a hypothesis may still win
+# Effort
+POLISHED = 5  # trials of a step that are fitted to convergence at most
 NEARLY = 0.05  # share of the excess left by one law below which far worse laws are not refined
-ROUNDS = 3  # rounds of exchanges
-FORMULA = 1e-3  # share of a mismatch that the formula of the right law may leave: 3 % of its force
-FEWEST = 30.0  # least effective samples of the recordings
-WRONG = 0.2  # share of model error in the error above which models are judged on held-out blocks
 PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
-LOUDEST = 0.05  # share of an output's deviation; larger slow errors are not sensor noise
-PORTS = 3  # ports at which a force is learned: those where a flexible force explains most
 LEARNED = 2  # learned forces that are kept: those with the smallest error
-HOLD_RATIO = 1.05  # least ratio of rms errors for which the other hold is better
-BETTER_MINIMUM = 0.8  # largest share of the mean square left by a refit in a better minimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +330,7 @@ class Search:
             )
         except InputError:
             return False
-        return other.cost * HOLD_RATIO**2 < best.cost
+        return other.cost * BETTER**2 < best.cost
 
     def can_improve(self, trial: Trial) -> bool:
         """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""
@@ -412,7 +410,7 @@ class Search:
             self.keep(trial)
         kept = {t.key: self.memo[t.key] for t in trials}.values()
         ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
-        near = [t for t in ranked[:POLISHED] if not t.thorough and t.error < BEHIND * ranked[0].error]
+        near = [t for t in ranked[:POLISHED] if not t.thorough and t.error < NEAR * ranked[0].error]
         for trial in side_by_side(self.fits.polish, near, self.workers):
             self.keep(trial)
 
@@ -463,7 +461,7 @@ class Search:
         if known.learned is None:
             with self.stage("learned force"):
                 shares = self.flexible(base)
-                ports = sorted(shares, key=lambda name: -shares[name])[:PORTS]
+                ports = sorted(shares, key=lambda name: -shares[name])[:FEW]
                 try:
                     known.learned = learn_forces(self.fits.part, base.fitted, ports, self.workers)[:LEARNED]
                 except (InputError, np.linalg.LinAlgError):
@@ -486,7 +484,7 @@ class Search:
 
     def exchange(self) -> None:
         """Try all other laws in place of each of several laws, the rest fixed in place, until none changes."""
-        for _ in range(ROUNDS):
+        for _ in range(FEW):
             best = self.best
             for element in (e for e in best.laws if not isinstance(e.law, Offset)):
                 if not self._in_time():
@@ -542,7 +540,7 @@ class Search:
                 alone = bench.fit(bench.simulator, [best.values], states=best.begin, solver=THOROUGH)
             except InputError:
                 return False
-        if alone.cost > BETTER_MINIMUM * self.root.whole:
+        if alone.cost > CLEARLY * self.root.whole:
             return False
         self.without, self.memo, self.steps = alone, {}, []
         self.findings.clear()
@@ -561,9 +559,7 @@ class Search:
         vector = start_vector(model, named)
         initial = self.bench.initial_states(simulator, model, vector, joint.fitted.begin)
         fitted = self.bench.result(simulator, model.parameters.unpack(vector), initial, engine, model)
-        return Trial(
-            simulator.elements[len(simulator.elements) - len(laws) :] if laws else (), fitted, fitted.cost, fitted.cost
-        )
+        return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
 
 
 def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:

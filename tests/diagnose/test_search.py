@@ -12,9 +12,9 @@ from pilfr_casadi import laws
 from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench, correction, preparation
 from pilfr_casadi.diagnose.floor import Floor
-from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.trials import Trials
+from pilfr_casadi.diagnose.verdict import posterior
 from pilfr_casadi.optimise import GaussNewton, Status
 
 FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
