@@ -63,8 +63,13 @@ def test_after_the_deadline_the_correction_fits_nothing_more(monkeypatch):
     found = searching(recordings(FRICTION, count=1)).run(1)
     found.memo = {key: replace(t, thorough=False) for key, t in found.memo.items()}
     fitted, polish = [], Trials.polish
+
+    def refit(bench, found):
+        fitted.append(found)
+        raise pilfr.InputError("It diverges.")
+
     monkeypatch.setattr(Trials, "polish", lambda self, trial: fitted.append(trial) or polish(self, trial))
-    monkeypatch.setattr(correction, "refit_learned", lambda *_: fitted.append("a learned force"))
+    monkeypatch.setattr(correction, "refit_learned", refit)
     found.deadline = 0.0
     correction.find_correction(found, posterior(found))
     assert not fitted
