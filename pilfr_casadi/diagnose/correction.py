@@ -145,7 +145,8 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
         least = min((h.mean_square for _, h in out), default=np.inf)
         if out and (c.least >= least or search.past_deadline):
             break
-        out.append((c, search.predicts(c.base) if c.fitted is c.base.fitted else search.predict(c.fitted, c.spread)))
+        bare = c.fitted is c.base.fitted
+        out.append((c, search.held_out(c.base) if bare else search.held_out_errors(c.fitted, c.spread)))
     return out
 
 

@@ -40,8 +40,9 @@ from ..simulators import Placed
 from .floor import effective_size
 from .workbench import DIVERGED, Fitted, Workbench
 
-# The priors and thresholds on which every answer of a search rests. The other numbers of these files limit the effort
-# or keep numbers finite: without them an answer would take longer, and rest on more fits.
+# The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`), of
+# faults (`gates`), the bases of flexible forces (`screen`, `learned`) and the accuracy of integration (`workbench`).
+# All other numbers limit the effort or keep numbers finite.
 
 # Prior probabilities
 EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
@@ -127,26 +128,26 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     parameters, because the two may make up for each other. The spread reveals parameters that the recordings hardly
     determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings cannot.
     """
-    problem, _, told = _hessian(bench, fitted)
-    *_, asked = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
+    problem, _, recorded = _hessian(bench, fitted)
+    *_, other = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
     free = int(problem.free.sum())
     if not free:
         return 0.0
-    if not (np.all(np.isfinite(told)) and np.all(np.isfinite(asked))):
+    if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
         return np.inf
-    own = _widths(fitted, laws, problem.free, np.diag(told)[:free])
-    width = np.concatenate([own, 1 / np.sqrt(np.maximum(np.diag(told)[free:], 1e-300))])
+    own = _widths(fitted, laws, problem.free, np.diag(recorded)[:free])
+    width = np.concatenate([own, 1 / np.sqrt(np.maximum(np.diag(recorded)[free:], 1e-300))])
     prior = np.concatenate([np.ones(free), np.full(len(width) - free, STATE_PRIOR)])
     # an initial state that the recordings do not reveal is a matter of the next recording
-    felt = (np.diag(told) > STATE_PRIOR * np.diag(asked)) | (np.arange(len(told)) < free)
-    told, asked = told[np.ix_(felt, felt)], asked[np.ix_(felt, felt)]
+    felt = (np.diag(recorded) > STATE_PRIOR * np.diag(other)) | (np.arange(len(recorded)) < free)
+    recorded, other = recorded[np.ix_(felt, felt)], other[np.ix_(felt, felt)]
     width, prior = width[felt], prior[felt]
     with np.errstate(all="ignore"):
-        precision = n / v * told * np.outer(width, width) + np.diag(prior)
+        precision = n / v * recorded * np.outer(width, width) + np.diag(prior)
     if not np.all(np.isfinite(precision)):  # a parameter that the recordings hardly feel
         return np.inf
     covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)
-    found = float(np.sum(covariance * asked * np.outer(width, width)))
+    found = float(np.sum(covariance * other * np.outer(width, width)))
     return found if np.isfinite(found) else np.inf
 
 
@@ -298,23 +299,16 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
 
 
 def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> float:
-    """Compute the sum of squares over the omitted samples; infinite if the simulation diverges."""
+    """Refit without scoring the samples in `left`; return the sum of squares there, infinite if that diverges."""
+    residual: Sequence[np.ndarray] = fitted.residual
+    if np.any(fitted.model.parameters.free) or any(r.begins == "estimate" for r in bench.recordings):
+        problem, theta = bench.problem_at(fitted, [~mask for mask in left])
+        try:
+            with np.errstate(all="ignore"):
+                simulated = problem.simulate(solve_within_bounds(problem, theta, REFIT).theta)
+        except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
+            return np.inf
+        residual = [y - r.y for y, r in zip(simulated, bench.recordings, strict=True)]
     with np.errstate(over="ignore", invalid="ignore"):
-        pairs = zip(_errors_without(bench, fitted, left), left, strict=True)
-        value = float(sum(np.sum(e[here] ** 2) for e, here in pairs))
+        value = float(sum(np.sum((e / bench.scale)[here] ** 2) for e, here in zip(residual, left, strict=True)))
     return value if value < DIVERGED else np.inf
-
-
-def _errors_without(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Compute the scaled errors (M, n_y) of each recording from a fit that does not score the samples in `left`."""
-    if not np.any(fitted.model.parameters.free) and all(r.begins != "estimate" for r in bench.recordings):
-        return [e / bench.scale for e in fitted.residual]
-    problem, theta = bench.problem_at(fitted, [~mask for mask in left])
-    try:
-        with np.errstate(all="ignore"):
-            found = solve_within_bounds(problem, theta, REFIT).theta
-            simulated = problem.simulate(found)
-    except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
-        return [np.full(r.y.shape, np.inf) for r in bench.recordings]
-    with np.errstate(over="ignore", invalid="ignore"):
-        return [(y - r.y) / bench.scale for y, r in zip(simulated, bench.recordings, strict=True)]

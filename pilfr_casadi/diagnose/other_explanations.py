@@ -99,7 +99,7 @@ def find_undeclared_port(search: Search) -> Sequence[Gate]:
     bench = replace(search.bench, simulator=open_)
     try:
         without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
-        other = Search(bench, without, search.floor, search.laws, search.workers, search.say).run(1)
+        other = Search(bench, without, search.floor, search.laws, search.workers, search.say, until=search.until).run(1)
     except InputError:
         return ()
     except KeyboardInterrupt:

@@ -303,13 +303,13 @@ def screen(
     """
     probe, runs = linearised(bench, fitted)
     gain = observer_gain(probe, runs, noise)
-    led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
-    if not all(_stays_bounded(r, bench.scale) for r in led):
-        led = []
-    ways = [("simulation", Remainder.of(bench, probe, runs, laws))]
-    if led:
-        ways.append(("observer", Remainder.of(bench, probe, led, laws)))
-    tasks = [(rest, task, source) for source, rest in ways for task in rest.tasks]
+    observed = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
+    if not all(_stays_bounded(r, bench.scale) for r in observed):
+        observed = []
+    remainders = [("simulation", Remainder.of(bench, probe, runs, laws))]
+    if observed:
+        remainders.append(("observer", Remainder.of(bench, probe, observed, laws)))
+    tasks = [(rest, task, source) for source, rest in remainders for task in rest.tasks]
     found = [scored for one in side_by_side(lambda task: _score(*task), tasks, workers) for scored in one]
     seen = any(s.source == "observer" for s in found)
     return sorted(found, key=lambda s: -s.share), gain if seen else None

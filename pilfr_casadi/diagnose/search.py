@@ -15,6 +15,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -41,7 +42,7 @@ from .evidence import (
     spread,
 )
 from .floor import Floor, effective_size, white_part
-from .gates import CLEARLY, Offset
+from .gates import CLEARLY
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
@@ -196,18 +197,17 @@ class Search:
         return float(np.median(ratios)) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
-        told = trial.information if trial.information is not None else np.zeros(0)
-        v += self.tolerance
-        return log_evidence(v, told, log_prior(trial.laws, self.alternatives, trial.doubtful), n)
+        known = trial.information if trial.information is not None else np.zeros(0)
+        return log_evidence(v + self.tolerance, known, log_prior(trial.laws, self.alternatives, trial.doubtful), n)
 
-    def predicts(self, trial: Trial) -> HeldOut:
+    def held_out(self, trial: Trial) -> HeldOut:
         """Compute the held-out errors of a hypothesis, once."""
         known = self.findings[trial.key]
         if known.held_out is None:
-            known.held_out = self.predict(trial.fitted, self.spread(trial.fitted, trial.laws))
+            known.held_out = self.held_out_errors(trial.fitted, self.spread(trial.fitted, trial.laws))
         return known.held_out
 
-    def predict(self, fitted: Fitted, spread: float) -> HeldOut:
+    def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
         """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
         return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
 
@@ -221,7 +221,7 @@ class Search:
         """Whether even the best model's error is mostly model error."""
         return self.samples < EXACT / WRONG
 
-    def _predict(self) -> None:
+    def _judge_on_held_out_data(self) -> None:
         """Compute the held-out errors of the likeliest hypotheses.
 
         If only one is likely and its error is noise, the fit error is enough. A wrong model may overfit; and of several
@@ -231,13 +231,13 @@ class Search:
             return
         with self.stage("held-out blocks"):
             if self._all_wrong:
-                self.predicts(self.root)
+                self.held_out(self.root)
             for done in itertools.count():
                 likely = self._likeliest()
                 left = [t for t in likely if self.findings[t.key].held_out is None]
                 if not left or (done >= PREDICTED and left[0] is not likely[0]) or not self._in_time():
                     break
-                self.predicts(left[0])
+                self.held_out(left[0])
 
     def _likeliest(self) -> list[Trial]:
         """List the hypotheses that may be the likeliest."""
@@ -275,7 +275,7 @@ class Search:
             self._estimate_noise()
             if self._grow(effects) and self._name_rest(effects):
                 self._every_sensor()
-                self._predict()
+                self._judge_on_held_out_data()
         except KeyboardInterrupt:
             self.interrupted = True
         return self
@@ -289,7 +289,7 @@ class Search:
         """Add effects while that pays; return False as soon as the other hold proves better."""
         while (
             self.can_improve(parent := self.best)
-            and _count(parent) < effects
+            and len(parent.effects) < effects
             and self._pays(parent)
             and self._in_time()
         ):
@@ -298,11 +298,11 @@ class Search:
                 self.add(self.root)
             if self.other_hold_fits_better():
                 return False
-            if _count(self.best) > _count(parent) >= 1:
+            if len(self.best.effects) > len(parent.effects) >= 1:
                 self.exchange()
             if len(self.best.laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        if effects > 1 and _count(self.best) < 2 and self.can_improve(self.best) and self._in_time():
+        if effects > 1 and len(self.best.effects) < 2 and self.can_improve(self.best) and self._in_time():
             self.add_two()
         return True
 
@@ -310,14 +310,14 @@ class Search:
         """Name the forces learned beside the simulator and the best hypothesis; go on if one of the laws leads."""
         best = self.best
         for base in {t.key: t for t in (self.root, best)}.values():
-            if _count(base) < effects and self.can_improve(best) and self._in_time():
+            if len(base.effects) < effects and self.can_improve(best) and self._in_time():
                 self.name_learned(base)
         return self.best is best or self._grow(effects)
 
     def _pays(self, trial: Trial) -> bool:
         """Tell whether the last of several laws was worth it; a wrong model can always use one more."""
-        fewer = [t for t in self.memo.values() if t.laws and _count(t) < _count(trial)]
-        return _count(trial) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
+        fewer = [t for t in self.memo.values() if t.laws and len(t.effects) < len(trial.effects)]
+        return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
     def other_hold_fits_better(self) -> bool:
         """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
@@ -396,9 +396,7 @@ class Search:
     ) -> list[Trial]:
         began = time.perf_counter()
         stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
-        trials = self.fits.beside(
-            parent, scored, gain, enough, lambda done, total, error: self.say(stage, done, total, error), again
-        )
+        trials = self.fits.beside(parent, scored, gain, enough, partial(self.say, stage), again)
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
         if self.bench.interrupted_fits:
             raise KeyboardInterrupt
@@ -486,7 +484,7 @@ class Search:
         """Try all other laws in place of each of several laws, the rest fixed in place, until none changes."""
         for _ in range(FEW):
             best = self.best
-            for element in (e for e in best.laws if not isinstance(e.law, Offset)):
+            for element in best.effects:
                 if not self._in_time():
                     return
                 rest = self._beside([e for e in best.laws if e is not element], best)
@@ -577,8 +575,3 @@ def _count_samples(fitted: Fitted, bench: Workbench) -> float:
     """Compute the number of samples over the correlation time of a fit's residual."""
     residual = [e[r.skip :] for e, r in zip(fitted.residual, bench.recordings, strict=True)]
     return max(effective_size(residual), FEWEST)
-
-
-def _count(trial: Trial) -> int:
-    """Count the effects of a hypothesis; offsets are not effects."""
-    return sum(not isinstance(e.law, Offset) for e in trial.laws)

@@ -18,12 +18,11 @@ import numpy as np
 
 from .._base import InputError
 from ..data import Recording
-from ..engine import Engine, make_engine
+from ..engine import make_engine
 from ..laws import Law
-from ..models import Model
 from ..simulators import Placed, Simulator
 from .evidence import FAR, FORMULA
-from .gates import open_start
+from .gates import Offset, open_start
 from .screen import Pair, Scored
 from .workbench import (
     BRIEF,
@@ -74,6 +73,11 @@ class Trial:
     def key(self) -> Key:
         """Ports and classes of the laws; equal keys mean the same hypothesis."""
         return frozenset((e.port, type(e.law)) for e in self.laws)
+
+    @property
+    def effects(self) -> tuple[Placed, ...]:
+        """The laws that are effects; an offset is a finding about the recording."""
+        return tuple(e for e in self.laws if not isinstance(e.law, Offset))
 
     def supersedes(self, other: Trial) -> bool:
         """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
@@ -242,32 +246,32 @@ class Trials:
         nominal = {k: p.value for k, p in base.simulator.parameters.items()}
         starts: list[Mapping[str, Any]] = []
         # values from the observer's run, which may be near the truth if the simulation is not
-        led: list[Mapping[str, Any]] = []
+        observed: list[Mapping[str, Any]] = []
         for entry in entries:
             for i, own in enumerate(entry.starts):
                 _, named = place_law(base.simulator, entry, own)
                 starts.append({**base.values, **named})
                 if i == 0:
-                    led += [starts[-1]] if entry.source == "observer" else []
+                    observed += [starts[-1]] if entry.source == "observer" else []
                     starts.append({**nominal, **named})
         if set(first.law.parameters()) == set(first.law.strength):  # at zero strength the simulator is unchanged
             _, named = place_law(base.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
             starts.append({**base.values, **named})
         best, *rest = self.part.by_cost(placed, model, engine, starts, base.begin)
-        ranked = [best, *(s for s in led if s is not best), *(s for s in rest if not any(s is o for o in led))]
+        others = (s for s in rest if not any(s is o for o in observed))
+        ranked = [best, *(s for s in observed if s is not best), *others]
         count = len(parent.laws) + 1
         options = {"states": base.begin, "model": model, "engine": engine}
         brief = self.fitted(placed, ranked[:1], count, solver=BRIEF, **options)
-        return _BriefFit(placed, model, engine, ranked, base.begin, count, brief)
+        return _BriefFit(placed, options, ranked, count, brief)
 
-    def _refine(self, pairs: Sequence[_BriefFit], led: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
-        """Fit pairs from several starts, and if `led` by the observer as well; three that agree are enough."""
+    def _refine(self, pairs: Sequence[_BriefFit], observer: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
+        """Fit pairs from several starts, and if asked with the observer as well; three that agree are enough."""
 
         def submit(pair: _BriefFit, some: slice) -> list[Future[Trial | None]]:
-            options = {"states": pair.states, "model": pair.model, "engine": pair.engine}
             return [
-                pool.submit(self.fitted, pair.placed, [start], pair.count, anneal=anneal, **options)
-                for start, anneal in pair.starts_again(led)[some]
+                pool.submit(self.fitted, pair.placed, [start], pair.count, anneal=anneal, **pair.options)
+                for start, anneal in pair.starts_again(observer)[some]
             ]
 
         first = [submit(pair, slice(0, 3)) for pair in pairs]
@@ -282,22 +286,20 @@ class Trials:
 
 @dataclass(frozen=True, eq=False)
 class _BriefFit:
-    """A pair with its compiled model, its starts, best first, and its brief fit."""
+    """A pair with its compiled model among the options of its fits, its starts, best first, and its brief fit."""
 
     placed: Simulator
-    model: Model
-    engine: Engine
+    options: dict[str, Any]
     starts: list[Mapping[str, Any]]
-    states: list[np.ndarray]
     count: int
     trial: Trial | None
 
-    def starts_again(self, led: bool) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
+    def starts_again(self, observer: bool) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
         """Return the starts for further fits, each with the observer's gains; those with the observer come first."""
         starts = self.starts[:FEW]
         if self.trial is not None:
             starts = [self.trial.fitted.values, *starts[1:]]
-        return [(start, (1.0, 0.1)) for start in self.starts[: int(led)]] + [(start, ()) for start in starts]
+        return [(start, (1.0, 0.1)) for start in self.starts[: int(observer)]] + [(start, ()) for start in starts]
 
 
 def _agree(found: Sequence[Trial | None]) -> bool:

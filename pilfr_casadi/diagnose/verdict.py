@@ -114,8 +114,8 @@ class Posterior:
 
 
 def names(trial: Trial) -> frozenset[Name]:
-    """Return ports and law ids of a hypothesis; an offset is a finding about the recording, not an effect."""
-    return frozenset((e.port, e.law.id) for e in trial.laws if e.law.id != "offset")
+    """Return ports and law ids of the effects of a hypothesis."""
+    return frozenset((e.port, e.law.id) for e in trial.effects)
 
 
 def explainable_remainder(search: Search, trial: Trial) -> float:
@@ -152,7 +152,7 @@ def posterior(search: Search) -> Posterior:
         best = max((t for t in trials if names(t) == said), key=search.evidence)
         if not said:
             return Posterior(best, 0.0, (), by_names[said])
-        found = [_make_effect(search, best, e, by_names) for e in best.laws if e.law.id != "offset"]
+        found = [_make_effect(search, best, e, by_names) for e in best.effects]
         least = min(found, key=lambda e: e.confidence)
         fewer = said - {least.name}
         if least.confidence > SURE or fewer not in by_names or not fewer:
@@ -245,39 +245,39 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
         return Verdict("recording-fault", faults[0].sentence)
     if found.effects and found.named > SURE:
         return Verdict("missing-physics", _describe_effects(search, found))
-    opened = search.flexible(search.root)
-    still = max(opened.values(), default=0.0)
-    hum = [g for g in gates if g.finding == "tone" and not found.effects]
-    own = ringing(search.bench, search.root.fitted)
-    noise = not found.effects and _is_noise(search, hum, still, own)
-    if faults and (noise or cured or (still < HINT and not found.effects)):
+    shares = search.flexible(search.root)
+    share = max(shares.values(), default=0.0)
+    steady = [g for g in gates if g.finding == "tone" and not found.effects]
+    mode = ringing(search.bench, search.root.fitted)
+    noise = not found.effects and _is_noise(search, steady, share, mode)
+    if faults and (noise or cured or (share < HINT and not found.effects)):
         return Verdict("recording-fault", faults[0].sentence)
-    if noise and still < HINT:
-        beside = f" but a steady tone in {' and '.join(g.channel for g in hum)}" if hum else ""
+    if noise and share < HINT:
+        beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
         return Verdict(
             "complete",
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
             "outputs' deviation, and no force at any port explains any of the rest.",
         )
     return Verdict(
-        "unexplained", _describe_unexplained(search, closest if closest and closest.laws else found.best, opened, own)
+        "unexplained", _describe_unexplained(search, closest if closest and closest.laws else found.best, shares, mode)
     )
 
 
-def _is_noise(search: Search, hum: Sequence[Gate], still: float, own: float | None) -> bool:
+def _is_noise(search: Search, steady: Sequence[Gate], share: float, mode: float | None) -> bool:
     """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady."""
     root = search.root
-    quiet = root.error * max(1 - sum(1 - g.left for g in hum), 0.0) ** 0.5
+    quiet = root.error * max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5
     white = white_part(root.fitted.residual) if search.floor.source == "estimated" else search.floor.deviation
     times = quiet / float(np.sqrt(np.mean((white / search.bench.scale) ** 2)))
     if times < AT_FLOOR:
         return True
-    unexplained = still < (CHANCE if root.whole < QUIET**2 else SILENT)
+    unexplained = share < (CHANCE if root.whole < QUIET**2 else SILENT)
     if search.floor.source != "estimated":
         like = times < ABOVE_NOISE and unexplained
     else:
         like = times < SOMEWHAT or (times < COLOURED and unexplained and root.whole < LOUDEST**2)
-    return like and own is None and not _swells(search)
+    return like and mode is None and not _swells(search)
 
 
 def _swells(search: Search) -> bool:
@@ -308,25 +308,25 @@ def _describe_vanished(search: Search, found: Posterior) -> str:
     return f" Beside {beside}, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
 
 
-def _describe_unexplained(search: Search, closest: Trial, opened: dict[str, float], own: float | None) -> str:
-    root, still = search.root, max(opened.values(), default=0.0)
-    where = max(opened, key=lambda k: opened[k], default="")
-    laws = [e for e in closest.laws if e.law.id != "offset"]
+def _describe_unexplained(search: Search, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
+    root, share = search.root, max(shares.values(), default=0.0)
+    where = max(shares, key=lambda k: shares[k], default="")
+    laws = closest.effects
     if not laws:
         rings = (
-            f" The rest swings at the simulator's own {own:.3g} Hz, as from a force that was not recorded or a value "
+            f" The rest swings at the simulator's own {mode:.3g} Hz, as from a force that was not recorded or a value "
             "that varies in time."
-            if own
+            if mode
             else ""
         )
-        at = f" A force at {where} could explain {still:.0%} of the rest." if still > HINT else ""
+        at = f" A force at {where} could explain {share:.0%} of the rest." if share > HINT else ""
         noise = search.floor.nrmse(search.bench.scale)
         return (
             "Physics is missing, and no law of the catalogue explains it. The refitted simulator is off by "
             f"{100 * mean_nrmse(search.bench, root.fitted):.3g} % of the outputs' deviation; the noise is about "
             f"{100 * noise:.3g} %.{at}{rings}"
         )
-    port = where if opened.get(laws[0].port, 0.0) < 0.5 * still else laws[0].port
+    port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port
     left = share_left(search, closest.whole)
     rest = max(search.flexible(closest).values(), default=0.0)
     words = " and ".join(f"{display_name(e.law.id, e.law.form)} at {e.port}" for e in laws)
