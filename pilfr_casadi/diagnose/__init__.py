@@ -10,9 +10,10 @@ about. The files by stage:
   corrects a fault: `gates` (the edit and its acceptance; sign, unit or gain, exchange, offset), `recording_faults`
   (glitches, stale and clipped samples, unsettled periods, tones) and `timing` (shift, clock, gap). `floor` estimates
   the noise.
-- Search: `search` moves from hypothesis to hypothesis. `linearise`, `remainder`, `screen` and `relatives` select the
-  hypotheses that are worth a fit, `trials` fits them. `learned` fits forces that have no name yet.
-- Evidence: `evidence` (log evidence, prior of laws, errors on held-out data), `posterior`, `verdict`.
+- Search: `search` moves from hypothesis to hypothesis. `linearise`, `screen` and `relatives` select the hypotheses that
+  are worth a fit, `trials` fits them. `learned` fits forces that have no name yet.
+- Evidence: `evidence` is the one scale: log evidence, prior of laws, errors on held-out data, and a table of the
+  numbers on which answers rest. `verdict` turns the evidences into a posterior and a verdict.
 - Correction: `correction` chooses the corrected simulator, with a learned force where named laws do not suffice.
 - Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
 - Proof: `proof` (errors before and after, placebo, next experiment), `force_recovery`, `mismatch_map`.

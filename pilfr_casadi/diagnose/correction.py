@@ -10,7 +10,6 @@ used.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,15 +20,12 @@ import numpy as np
 from .._base import InputError
 from ..laws import CATALOGUE, display_name
 from ..simulators import Placed
-from .evidence import HeldOut
+from .evidence import FORMULA, SURE, HeldOut
 from .learned import Learned, LearnedForce, describe_learned, refit_learned
-from .posterior import Posterior, explainable_remainder
-from .search import FORMULA, Search, likeliest
+from .search import Search, likeliest
 from .trials import Trial
-from .verdict import SURE
-from .workbench import Fitted
-
-TRIED = 3  # of the likeliest hypotheses, those that compete even if they were not fitted to convergence before
+from .verdict import Posterior, explainable_remainder, share_left
+from .workbench import FEW, Fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,9 +143,10 @@ def _predict(search: Search, candidates: Sequence[_Candidate], predicted: list[_
     out = list(predicted)
     for c in sorted(candidates, key=lambda c: c.least):
         least = min((h.mean_square for _, h in out), default=np.inf)
-        if out and (c.least >= least or time.perf_counter() > search.deadline):
+        if out and (c.least >= least or search.past_deadline):
             break
-        out.append((c, search.predicts(c.base) if c.fitted is c.base.fitted else search.predict(c.fitted, c.spread)))
+        bare = c.fitted is c.base.fitted
+        out.append((c, search.held_out(c.base) if bare else search.held_out_errors(c.fitted, c.spread)))
     return out
 
 
@@ -163,7 +160,7 @@ def _with_laws(search: Search) -> list[Trial]:
     found, recurring = list[Trial](), [t for t in search.memo.values() if _may_recur(search, t)]
     likely = sorted(likeliest(recurring, search.optimistic_evidence), key=search.evidence, reverse=True)
     for i, trial in enumerate(t for t in likely if t.laws):
-        if trial.thorough or i < TRIED:
+        if trial.thorough or i < FEW:
             with suppress(InputError):
                 found.append(search.thorough(trial))
     return [t for t in found if np.isfinite(t.whole)]
@@ -175,7 +172,12 @@ def _of_trial(search: Search, trial: Trial) -> _Candidate:
 
 
 def _learned(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:
-    """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one."""
+    """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one.
+
+    After the deadline no further force is fitted.
+    """
+    if search.past_deadline:
+        return []
     free = (f for f in search.learned(base) if f.simulator.elements[-1].port not in taken)
     found = next(free, None)
     if found is None:
@@ -199,12 +201,11 @@ def _may_recur(search: Search, trial: Trial) -> bool:
 
 def _shares(search: Search, named: Fitted, whole: Fitted) -> dict[str, float]:
     """Compute the shares of the refit's mean square error above the noise; all are zero if there is none."""
-    excess = search.root.whole - search.floor2
-    if not excess > 0:
+    if not search.root.whole > search.floor2:
         return {"named": 0.0, "learned": 0.0, "left": 0.0}
-    after = [float(np.clip((f.cost - search.floor2) / excess, 0.0, 1.0)) for f in (named, whole)]
-    left = min(after)
-    return {"named": 1 - after[0], "learned": after[0] - left, "left": left}
+    beside_names, left = (share_left(search, f.cost) for f in (named, whole))
+    left = min(beside_names, left)
+    return {"named": 1 - beside_names, "learned": beside_names - left, "left": left}
 
 
 def _elements(search: Search, fitted: Fitted) -> tuple[tuple[str, str, str], ...]:

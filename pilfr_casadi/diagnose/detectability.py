@@ -1,7 +1,7 @@
 """Detectability of laws at ports: excitation, the smallest force that recordings reveal, and laws that look the same.
 
 Let φ be the change of the outputs by a law's force of unit size, and φ' its part that own parameters and unknown
-initial states cannot imitate, both in units of the noise (`remainder`). A force of size 3.29 / |φ'| is detected with 5
+initial states cannot imitate, both in units of the noise (`screen`). A force of size 3.29 / |φ'| is detected with 5
 % false alarms and 5 % misses (Currie 1968, Anal. Chem. 40(3)). Laws whose φ' are parallel look the same.
 """
 
@@ -21,7 +21,7 @@ from ..models import map_points
 from ..simulators import Port, Simulator
 from .identifiability import stacked
 from .linearise import Probe, Run, along
-from .remainder import Remainder, Task, lengths, orthonormal, own_changes, project_off
+from .screen import Remainder, Task, lengths, orthonormal, own_changes, project_off
 from .workbench import Fitted, Workbench
 
 DETECTED = 3.29  # standard errors: 5 % false alarms and 5 % misses (Currie 1968)

@@ -37,16 +37,50 @@ from ..identify import solve_within_bounds
 from ..laws import Law
 from ..optimise import GaussNewton, Problem
 from ..simulators import Placed
+from .floor import effective_size
 from .workbench import DIVERGED, Fitted, Workbench
 
+# The priors and thresholds on which every answer of a search rests. Elsewhere are those of the noise (`floor`), of
+# faults (`gates`), the bases of flexible forces (`screen`, `learned`) and the accuracy of integration (`workbench`).
+# All other numbers limit the effort or keep numbers finite.
+
+# Prior probabilities
+EFFECT_PRIOR = np.log(0.5)  # log probability of each further effect: one more effect is as likely as not
+FLEXIBLE_PRIOR = np.log(0.2)  # the same of a law that can imitate others, relative to a law that cannot
+DOUBTFUL_PRIOR = np.log(0.01)  # the same of parameter values at which a law degenerates into another
+OUTSIDE = 0.1  # probability that missing physics is in no law of the catalogue
+STATE_PRIOR = 1e-9  # precision of initial states relative to the information of a sample: hardly any prior
+
+# Model error: no machine follows a formula exactly
+FORMULA = 1e-3  # share of a mismatch that the right explanation may leave: 3 % of its force
 EXACT = 8.0  # effective samples of a model whose whole error is model error (n_0)
 LEAST_WRONG = 0.05  # least share of the error that counts as model error
-EFFECT_PRIOR = np.log(0.5)  # log prior probability of each further effect
-# log prior probability of a flexible law, which can imitate others, relative to other laws
-FLEXIBLE_PRIOR = np.log(0.2)
+FEWEST = 30.0  # least effective samples of the recordings
+WRONG = 0.2  # share of model error in the error above which models are judged on held-out blocks
+DISTURBED = 0.2  # weight of a law's remainder that no force at a port explains: a disturbance may act beside the law
 INPUT_FACTOR = 0.7  # factor on the inputs for which the spread is computed: well inside the recorded range
-STATE_PRIOR = 1e-9  # precision of the prior of initial states, relative to the information of a sample
-DOUBTFUL_PRIOR = np.log(0.01)  # log prior probability of parameter values at which a law degenerates
+
+# Comparison of hypotheses
+SURE = 0.5  # probability above which an answer is stated: it is more likely than not
+ALIKE = 3.0  # nats within which two hypotheses are indistinguishable: odds of 20 (Kass & Raftery 1995)
+REACH = 8.0  # nats below the best within which a hypothesis may still win after more fits
+BETTER = 1.05  # ratio of rms errors from which one is better than another
+NEAR = 1.5  # ratio of rms errors within which one comes near another: more fits may reverse their order
+FAR = 3.0  # ratio of rms errors from which one is far behind another: more fits cannot reverse their order
+AS_GIVEN = 0.5  # largest ratio of mean squares of a search with channels as given to one with shifted channels
+
+# Noise, by rms ratios to the noise and by shares of an output's deviation
+AT_FLOOR = 1.15  # ratio to the noise that counts as at the noise
+SOMEWHAT, COLOURED = 4.0, 9.0  # largest ratio to the estimated (white) noise; the same if no force explains the error
+LOUDEST, QUIET = 0.05, 0.01  # shares of the deviation: above, an error is not sensor noise; below, it does not matter
+SILENT, CHANCE = 0.01, 0.05  # largest share of noise that a force may explain; the same of noise that does not matter
+HINT = 0.1  # least share of a residual that a flexible force has to explain to count
+
+# Held-out data
+FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
+LEAD = 0.5  # share of a block that is never held out at the start of a recording: it determines the initial state
+# The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
+REFIT = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
 
 
 @dataclass(frozen=True)
@@ -65,7 +99,7 @@ class Sample:
 def information(bench: Workbench, fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
     """Compute the eigenvalues λ of a sample's information on the laws' parameters, in units of their prior widths."""
     own = _of_laws(fitted, laws)
-    problem, hessian = _hessian(bench, fitted)
+    problem, _, hessian = _hessian(bench, fitted)
     own = own[problem.free]
     if not own.any():
         return np.zeros(0)
@@ -94,26 +128,26 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     parameters, because the two may make up for each other. The spread reveals parameters that the recordings hardly
     determine, such as a curve of a pressure that had two levels; a cross-validation on the same recordings cannot.
     """
-    problem, told = _hessian(bench, fitted)
-    _, asked = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
+    problem, _, recorded = _hessian(bench, fitted)
+    *_, other = _hessian(bench.on([r.with_(u=INPUT_FACTOR * r.u) for r in bench.recordings]), fitted)
     free = int(problem.free.sum())
     if not free:
         return 0.0
-    if not (np.all(np.isfinite(told)) and np.all(np.isfinite(asked))):
+    if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
         return np.inf
-    own = _widths(fitted, laws, problem.free, np.diag(told)[:free])
-    width = np.concatenate([own, 1 / np.sqrt(np.maximum(np.diag(told)[free:], 1e-300))])
+    own = _widths(fitted, laws, problem.free, np.diag(recorded)[:free])
+    width = np.concatenate([own, 1 / np.sqrt(np.maximum(np.diag(recorded)[free:], 1e-300))])
     prior = np.concatenate([np.ones(free), np.full(len(width) - free, STATE_PRIOR)])
     # an initial state that the recordings do not reveal is a matter of the next recording
-    felt = (np.diag(told) > STATE_PRIOR * np.diag(asked)) | (np.arange(len(told)) < free)
-    told, asked = told[np.ix_(felt, felt)], asked[np.ix_(felt, felt)]
+    felt = (np.diag(recorded) > STATE_PRIOR * np.diag(other)) | (np.arange(len(recorded)) < free)
+    recorded, other = recorded[np.ix_(felt, felt)], other[np.ix_(felt, felt)]
     width, prior = width[felt], prior[felt]
     with np.errstate(all="ignore"):
-        precision = n / v * told * np.outer(width, width) + np.diag(prior)
+        precision = n / v * recorded * np.outer(width, width) + np.diag(prior)
     if not np.all(np.isfinite(precision)):  # a parameter that the recordings hardly feel
         return np.inf
     covariance = np.linalg.pinv(precision, rcond=1e-14, hermitian=True)
-    found = float(np.sum(covariance * asked * np.outer(width, width)))
+    found = float(np.sum(covariance * other * np.outer(width, width)))
     return found if np.isfinite(found) else np.inf
 
 
@@ -127,18 +161,34 @@ def _of_laws(fitted: Fitted, laws: Sequence[Placed]) -> np.ndarray:
     return own
 
 
-def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray]:
-    """Compute the Fisher information of one sample on free parameters and initial states; it may be infinite."""
-    model = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
-    problem = bench.problem(model, fitted.engine)
-    theta, n_free = problem.start.copy(), problem.n_free
-    states = [s for r, s in zip(bench.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
-    theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
+def _hessian(bench: Workbench, fitted: Fitted) -> tuple[Problem, np.ndarray, np.ndarray]:
+    """Compute the Fisher information of one sample on free parameters and initial states; it may be infinite.
+
+    Also returns the simulation-error problem and its variables at the fitted values.
+    """
+    problem, theta = bench.problem_at(fitted)
     try:
         with np.errstate(all="ignore"):
-            return problem, np.nan_to_num(problem.normal(theta)[2], nan=np.inf)
+            return problem, theta, np.nan_to_num(problem.normal(theta)[2], nan=np.inf)
     except (InputError, RuntimeError):  # the run diverges
-        return problem, np.full((len(theta), len(theta)), np.inf)
+        return problem, theta, np.full((len(theta), len(theta)), np.inf)
+
+
+def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
+    """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds.
+
+    Initial states are estimated together with the parameters.
+    """
+    problem, theta, hessian = _hessian(bench, fitted)
+    inside, diagonal = (theta > problem.lower) & (theta < problem.upper), np.diag(hessian)
+    kept = np.flatnonzero(inside & np.isfinite(diagonal) & (diagonal > 0))
+    size = np.sqrt(np.maximum(diagonal[kept], 1e-300))
+    scaled = hessian[np.ix_(kept, kept)] / np.outer(size, size)
+    matrix = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size, size)
+    own, n = kept < problem.n_free, max(effective_size(fitted.residual), 10.0)
+    full = np.full(fitted.model.parameters.size, np.nan)
+    full[np.flatnonzero(problem.free)[kept[own]]] = np.sqrt(np.maximum(np.diag(matrix)[own] * fitted.cost / n, 0))
+    return fitted.model.parameters.unpack(full)
 
 
 def _widths(fitted: Fitted, laws: Sequence[Placed], free: np.ndarray, square: np.ndarray) -> np.ndarray:
@@ -199,13 +249,6 @@ def log_evidence(v: float, information: np.ndarray, prior: float, n: float) -> f
     return float(-0.5 * n * np.log(v) - 0.5 * np.sum(np.log1p(n * information / v)) + prior)
 
 
-FOLDS, ROUNDS = 4, 2  # folds, and blocks of a recording in each fold: eight blocks, spread over the recording
-# share of a block at the start of a recording that is never held out: it determines the unknown initial state
-LEAD = 0.5
-# The fit to all blocks is near each of these fits; a fit that has not converged after so many steps is used as it is.
-AGAIN = GaussNewton(max_iterations=8, tolerance=1e-2, patience=2)
-
-
 @dataclass(frozen=True)
 class HeldOut:
     """Mean square errors of a simulator on data that it was not fitted to, outputs in units of their deviation.
@@ -226,11 +269,6 @@ class HeldOut:
     def mean_square(self) -> float:
         """The larger of the two errors plus the spread for other inputs."""
         return max(self.blocks, self.ahead) + self.spread
-
-    @property
-    def expected(self) -> float:
-        """Root of the mean square."""
-        return float(np.sqrt(self.mean_square))
 
     @property
     def error(self) -> float:
@@ -261,26 +299,16 @@ def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldO
 
 
 def _sum_of_squares(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> float:
-    """Compute the sum of squares over the omitted samples; infinite if the simulation diverges."""
+    """Refit without scoring the samples in `left`; return the sum of squares there, infinite if that diverges."""
+    residual: Sequence[np.ndarray] = fitted.residual
+    if np.any(fitted.model.parameters.free) or any(r.begins == "estimate" for r in bench.recordings):
+        problem, theta = bench.problem_at(fitted, [~mask for mask in left])
+        try:
+            with np.errstate(all="ignore"):
+                simulated = problem.simulate(solve_within_bounds(problem, theta, REFIT).theta)
+        except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
+            return np.inf
+        residual = [y - r.y for y, r in zip(simulated, bench.recordings, strict=True)]
     with np.errstate(over="ignore", invalid="ignore"):
-        pairs = zip(_errors_without(bench, fitted, left), left, strict=True)
-        value = float(sum(np.sum(e[here] ** 2) for e, here in pairs))
+        value = float(sum(np.sum((e / bench.scale)[here] ** 2) for e, here in zip(residual, left, strict=True)))
     return value if value < DIVERGED else np.inf
-
-
-def _errors_without(bench: Workbench, fitted: Fitted, left: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Compute the scaled errors (M, n_y) of each recording from a fit that does not score the samples in `left`."""
-    model = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
-    states = [s for s, r in zip(fitted.initial, bench.recordings, strict=True) if r.begins == "estimate"]
-    if not np.any(model.parameters.free) and not states:
-        return [e / bench.scale for e in fitted.residual]
-    problem = Problem(model, bench.recordings, engine=fitted.engine, scale=bench.scale, scored=[~mask for mask in left])
-    theta = np.concatenate([problem.start[: problem.n_free], *states])
-    try:
-        with np.errstate(all="ignore"):
-            found = solve_within_bounds(problem, theta, AGAIN).theta
-            simulated = problem.simulate(found)
-    except (InputError, RuntimeError, FloatingPointError, np.linalg.LinAlgError):
-        return [np.full(r.y.shape, np.inf) for r in bench.recordings]
-    with np.errstate(over="ignore", invalid="ignore"):
-        return [(y - r.y) / bench.scale for y, r in zip(simulated, bench.recordings, strict=True)]

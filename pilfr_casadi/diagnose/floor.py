@@ -14,7 +14,7 @@ import numpy as np
 
 from ..data import Recording
 
-ALIKE, CHANCE = 0.5, 1e-4  # rank correlation, and its p-value, from which a residual's power depends on a signal
+CORRELATED, P_VALUE = 0.5, 1e-4  # rank correlation, and its p-value, from which a residual's power depends on a signal
 ABOVE_NOISE = 2.0  # ratio of the error to the noise from which results say that more is missing
 LONGEST = 400  # longest correlation of a residual, in samples
 
@@ -112,6 +112,6 @@ def swells_with(residuals: Sequence[np.ndarray], signals: Sequence[np.ndarray]) 
             if len(loud) < 8 or not np.ptp(other) > 0:
                 continue
             rank, chance = spearmanr(loud, other)
-            if rank > ALIKE and chance < CHANCE:
+            if rank > CORRELATED and chance < P_VALUE:
                 return True
     return False

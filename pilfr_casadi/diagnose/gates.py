@@ -26,7 +26,7 @@ from ..optimise import GaussNewton
 from ..simulators import Simulator
 from .floor import Floor, effective_size, noise_floor
 from .linearise import Probe, Run, linearised
-from .remainder import followed, lengths, moved, project_off
+from .screen import followed, lengths, moved, project_off
 from .workbench import QUICK, THOROUGH, Fitted, Workbench
 
 Change = Callable[[Recording], Recording]

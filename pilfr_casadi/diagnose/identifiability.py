@@ -20,7 +20,7 @@ from .._base import in_words
 from ..simulators import Named, Simulator
 from .evidence import prior_width
 from .linearise import Probe, Run, along
-from .remainder import lengths, orthonormal, own_changes, project_off
+from .screen import lengths, orthonormal, own_changes, project_off
 from .workbench import Fitted, Workbench
 
 LARGEST_EXPONENT = 3  # in numerators and denominators; physical laws have small exponents

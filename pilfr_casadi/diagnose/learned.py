@@ -5,7 +5,7 @@
 The features phi_j are stops of z with fixed thresholds and their powers (loops), low powers of z and |z| (curves), and
 curves of dz/dt (friction), some of them times z. u~ is an input of the simulator, standardised, where one scales the
 force. The force is linear in its weights c and d, which are fitted together with the simulator's own parameters in
-simulation error. They start from the linear solution of the projected sensitivities (`remainder`), with a ridge prior
+simulation error. They start from the linear solution of the projected sensitivities (`screen`), with a ridge prior
 on the size of the force, whose strength is chosen on held-out blocks. This is the discrepancy of Kennedy & O'Hagan
 (2001, J. R. Statist. Soc. B 63), placed inside the loop.
 
@@ -31,9 +31,8 @@ from ..laws import SCALABLE, Law, Local, display_name, scheduled, unit_forces
 from ..models import Parameter, play
 from .force_recovery import law_signals
 from .linearise import linearised
-from .remainder import Remainder, Task, lengths, usable
-from .screen import start_values
-from .workbench import Fitted, Workbench, start_vector
+from .screen import Remainder, Task, fit_shapes, held_out_squares, lengths, ridge_solution, start_values, usable
+from .workbench import FEW, LONG, Fitted, Workbench
 
 STOPS = 8  # number of stops
 # thresholds over half the range of z: from presliding to a stop that slips in every large motion and so forgets its
@@ -45,12 +44,9 @@ FEATURES = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)  # number of features in `Lea
 EXTENSION = 0.5  # largest extension of a signal beyond its range, over half the range
 FIT_EXTENSION = 5.0  # the same during the fit, because the refit's run may be a poor guess of the range
 # ridge strengths tried, relative to the mean square response to a force of unit size
-RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
-SHARES = (1.0, 0.3, 0.0)  # fractions of the linear solution from which a fit may start
-FITS = 3  # elements that are fitted at most: the best by the linear solution
+WEIGHT_RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+START_SHARES = (1.0, 0.3, 0.0)  # fractions of the linear solution from which a fit may start
 SAME_SIGNAL = 0.99  # correlation with z or dz/dt above which an input counts as that signal and scales nothing
-SHOWN = 3  # nearest laws that are reported
-LONGEST = 8000  # samples on which laws are compared with the learned force
 
 
 class LearnedForce(Law):
@@ -202,22 +198,11 @@ def _solve_weights(
     if not np.any(felt):
         return Start(task.port.name, learned_force(factor)({**scales, "std": 0.0}), 0.0)
     phi, unit = phi[:, felt], float(np.mean(lengths(phi[:, felt]) ** 2))
-    wrong, ridge = min((_held_out_squares(phi, rest.left, rest.odd, unit * ridge), ridge) for ridge in RIDGES)
-    weights[felt] = -_ridge(phi, rest.left, unit * ridge) / size[felt]
+    wrong, ridge = min((held_out_squares(phi, rest.left, rest.odd, unit * ridge), ridge) for ridge in WEIGHT_RIDGES)
+    weights[felt] = -ridge_solution(phi, rest.left, unit * ridge) / size[felt]
     std[felt] = 1 / (size[felt] * np.sqrt(unit * ridge * repeated))
     law = learned_force(factor)({**scales, "c": weights, "std": std})
     return Start(task.port.name, law, 1 - wrong / max(float(rest.left @ rest.left), 1e-300))
-
-
-def _ridge(a: np.ndarray, b: np.ndarray, ridge: float) -> np.ndarray:
-    """Solve a x = b in the least squares sense, with the penalty ridge |x|²."""
-    return np.asarray(np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ b))
-
-
-def _held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> float:
-    """Compute the sum of squares on every second block by weights fitted to the others, and vice versa."""
-    parts = ((fold, ~fold) for fold in (odd, ~odd))
-    return sum(float(np.sum((left[b] - phi[b] @ _ridge(phi[a], left[a], ridge)) ** 2)) for a, b in parts)
 
 
 def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], workers: int = 1) -> list[Fitted]:
@@ -238,7 +223,7 @@ def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], work
         Smallest error first; the learned element is the last of each. Fits that diverge are left out.
     """
     starts = [s for s in linear_starts(bench, base, port_names) if s.share > 0]
-    found = side_by_side(lambda start: _fit_element(bench, base, start), starts[:FITS], workers)
+    found = side_by_side(lambda start: _fit_element(bench, base, start), starts[:FEW], workers)
     return sorted((f for f in found if f is not None), key=lambda f: f.cost)
 
 
@@ -248,15 +233,10 @@ def _fit_element(bench: Workbench, base: Fitted, start: Start) -> Fitted | None:
     model = bench.model(placed)
     engine = make_engine(model, bench.engine)
     name = f"{placed.elements[-1].prefix}c"
-    starts = [{**base.values, name: share * np.asarray(start.law.values["c"])} for share in SHARES]
-    first = bench.initial_states(placed, model, start_vector(model, starts[0]), base.initial)
-
-    def cost(values: Mapping[str, Any]) -> float:
-        found = bench.result(placed, model.parameters.unpack(start_vector(model, values)), first, engine, model).cost
-        return found if np.isfinite(found) else np.inf
-
+    starts = [{**base.values, name: share * np.asarray(start.law.values["c"])} for share in START_SHARES]
+    best = bench.by_cost(placed, model, engine, starts, base.initial)[0]
     try:
-        return bench.fit(placed, [min(starts, key=cost)], states=base.initial, model=model, engine=engine)
+        return bench.fit(placed, [best], states=base.initial, model=model, engine=engine)
     except InputError:
         return None
 
@@ -276,9 +256,9 @@ def refit_learned(bench: Workbench, found: Fitted) -> Fitted:
     return bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
 
 
-def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute local coordinate, rate and force of an element along the fitted runs of all recordings, (M,) each."""
-    number %= len(fitted.simulator.elements)
+def signals_along(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute local coordinate, rate and force of the last element along the runs of all recordings, (M,) each."""
+    number = len(fitted.simulator.elements) - 1
     found = [law_signals(bench, fitted, number, i) for i in range(len(bench.recordings))]
     z, dz, w = (np.concatenate(part) for part in zip(*found, strict=True))
     return z, dz, w
@@ -382,9 +362,7 @@ def nearest_to_learned(bench: Workbench, fitted: Fitted, laws: Collection[type[L
     """
     element = fitted.simulator.elements[-1]
     z, dz, force = signals_along(bench, fitted)
-    inputs = dict(zip(bench.simulator.inputs, np.concatenate([r.u for r in bench.recordings]).T, strict=True))
-    rest = tuple(r.begins == "zero" for r in bench.recordings)
-    local = Local(z, dz, bench.dt, tuple(map(len, bench.recordings)), inputs=inputs, from_zero=rest)
+    local = bench.local(z, dz)
     kinds = bench.simulator.port(element.port).kinds
     tried = [law for law in laws if kinds & set(law.places)]
     for law in SCALABLE if "parallel" in kinds else ():
@@ -398,7 +376,7 @@ def nearest_laws(local: Local, force: np.ndarray, laws: Sequence[type[Law]]) -> 
 
     A constant is free, because the zero of z is arbitrary. Of several forms of a law, the best one counts.
     """
-    most = max(LONGEST // len(local.lengths), 1)
+    most = max(LONG // len(local.lengths), 1)
     ends = np.cumsum((0, *local.lengths))
     kept = np.concatenate([np.arange(a, min(b, a + most)) for a, b in pairwise(ends)])
     part = Local(
@@ -411,15 +389,11 @@ def nearest_laws(local: Local, force: np.ndarray, laws: Sequence[type[Law]]) -> 
     for law in (kind() for kind in laws):
         shapes = list(law.shapes(local)) if usable(law, local) else []
         columns = unit_forces(law, part, shapes) if shapes else np.zeros((len(kept), 0, 1))
-        for k in range(columns.shape[1]):
-            a = columns[:, k, :] - columns[:, k, :].mean(axis=0)
-            if not np.all(np.isfinite(a)):
-                continue
-            strengths = np.linalg.lstsq(a, centred, rcond=1e-9)[0]
-            fit = a @ strengths
+        made = (a - a.mean(axis=0) for a in np.moveaxis(columns, 1, 0))
+        for k, strengths, fit in fit_shapes(made, centred):
             error = float(np.sqrt(np.mean((centred - fit) ** 2))) / deviation
             if error < (best[law.id].error if law.id in best else 1.0):
                 whole = np.full(len(force), np.nan)
                 whole[kept] = fit + np.mean(force[kept])
                 best[law.id] = NearLaw(law, start_values(law, shapes[k], strengths), error, whole)
-    return tuple(sorted(best.values(), key=lambda n: n.error)[:SHOWN])
+    return tuple(sorted(best.values(), key=lambda n: n.error)[:FEW])

@@ -29,7 +29,7 @@ WALL = 1.0  # largest |λ| h of a contact on the finest steps
 
 BLOCK = 256  # samples propagated at a time
 CHUNK = 300  # samples linearised at a time
-FEW = 60  # samples of a run at which the user's equations are evaluated
+POINTS = 60  # samples of a run at which the user's equations are evaluated
 
 
 class Constant(Law):
@@ -208,7 +208,7 @@ def along(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
     r, model, n_x = bench.recordings[i], fitted.model, len(bench.simulator.states)
     short = r.slice(0, min(len(r), 3000))
     states = states_along(model, model.drive(short), fitted.vector, fitted.initial[i])[:: model.substeps, :n_x]
-    step = max(len(states) // FEW, 1)
+    step = max(len(states) // POINTS, 1)
     return states[::step], short.u[::step]
 
 

@@ -19,17 +19,14 @@ from .._base import InputError
 from ..data import Recording
 from ..laws import LINEAR, display_name
 from ..simulators import states_along
+from .evidence import AT_FLOOR, FAR, SURE, deviations
 from .gates import CERTAIN, EXPLAINED, LEAST_GAIN, SAME, USELESS_FIT, Gate, describe_fall, gain, open_start, refit
-from .posterior import Posterior, posterior
-from .proof import deviations
 from .search import Search
-from .verdict import AT_FLOOR, SURE
-from .workbench import THOROUGH, Fitted, Workbench
+from .verdict import Posterior, posterior
+from .workbench import FEW, THOROUGH, Fitted, Workbench
 
-WELL_ABOVE = 3.0  # error over the noise above which something else is missing
 # factors on a parameter's start value that are tried if the refit says nothing
-FAR = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)
-NAMED = 3  # values reported at most
+DECADES = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +51,7 @@ def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter 
         return None
     as_well = SAME**2 * answer.best.whole if named else np.inf
     # a larger error means that something else is missing
-    enough = min(as_well, (WELL_ABOVE if named else AT_FLOOR) ** 2 * search.floor2)
+    enough = min(as_well, (FAR if named else AT_FLOOR) ** 2 * search.floor2)
     best: tuple[str, Fitted] | None = None
     for name, p in bench.simulator.parameters.items():
         stays = bool((linear and np.all(p.fixed)) or np.all(without.at_bound(name)))
@@ -62,7 +59,7 @@ def find_pinned_parameter(search: Search, answer: Posterior) -> PinnedParameter 
             continue
         free = replace(p, fixed=False, bounds=(0.0 if float(p.value) > 0 else -np.inf, np.inf))
         simulator = bench.simulator.with_parameters({**bench.simulator.parameters, name: free})
-        far = () if linear else FAR
+        far = () if linear else DECADES
         starts = [without.values, *({**without.values, name: p.value * by} for by in far)]
         try:
             found = refit(bench, starts, simulator, states=without.initial, solver=THOROUGH)
@@ -102,7 +99,7 @@ def find_undeclared_port(search: Search) -> Sequence[Gate]:
     bench = replace(search.bench, simulator=open_)
     try:
         without = bench.fit(open_, [search.root.fitted.values], states=search.root.fitted.begin)
-        other = Search(bench, without, search.floor, search.laws, search.workers, search.say).run(1)
+        other = Search(bench, without, search.floor, search.laws, search.workers, search.say, until=search.until).run(1)
     except InputError:
         return ()
     except KeyboardInterrupt:
@@ -197,4 +194,4 @@ def _clearest_differences(
         clear = np.ptp(values) / max(error, 1e-300)
         if clear > CERTAIN:
             out.append((clear, name, values))
-    return [(name, values) for _, name, values in sorted(out, reverse=True)[:NAMED]]
+    return [(name, values) for _, name, values in sorted(out, reverse=True)[:FEW]]

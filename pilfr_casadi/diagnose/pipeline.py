@@ -1,4 +1,23 @@
-"""The steps of a diagnosis in their order."""
+"""The steps of a diagnosis in their order.
+
+How an answer comes about:
+
+1. `prepare` corrects faults of the recordings, refits the simulator, and measures the noise. The refitted simulator is
+   the hypothesis that nothing is missing. What it leaves above the noise is the mismatch.
+2. `Search.run` fits further hypotheses: the simulator with laws in its ports, with all parameters estimated together.
+   Each of them gets a log evidence: how well it follows the recordings, less the cost of its parameters, plus its prior
+   (`evidence`, which lists every number on which an answer rests, with its reason).
+3. `posterior` turns the evidences into probabilities. An effect's confidence is the probability of all hypotheses that
+   have it, times the probability that its law is the physics, which is small if a flexible force explains much of the
+   rest.
+4. `judge` chooses the verdict. It is a recording fault if its correction removed the mismatch; missing physics if the
+   law of the likeliest hypothesis is more likely than not the physics; complete if the refit's residual can be noise;
+   else unexplained.
+5. `find_correction` compares named laws with a learned force on held-out parts of the recordings. A name that predicts
+   worse than the force is refuted, and the verdict is chosen again.
+6. The proof (`proof`) adds errors on test recordings, placebos and standard errors. It changes no verdict; offsets that
+   gain nothing beside the effects are set to zero.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +36,10 @@ from ..simulators import Simulator
 from .checkup import BlindSpot, assess
 from .correction import Correction, find_correction, named_correction
 from .detectability import port_units
+from .evidence import AS_GIVEN, SURE, deviations
 from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
-from .posterior import Named, Posterior, names, posterior
 from .prediction import FOCUS, FOLLOWED, can_be_led, prediction_note, predictor
 from .preparation import (
     CHECKS,
@@ -34,16 +53,15 @@ from .preparation import (
     prepare,
     stated_hold,
 )
-from .proof import deviations, free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
+from .proof import free_run_errors, mean_nrmse, next_experiment, parameter_table, placebo, test_errors
 from .recording_faults import clipped_input, tones
 from .result import Diagnosis, Effect
 from .search import Search
 from .surrogates import surrogate_gates
 from .trials import Trial
-from .verdict import SURE, Verdict, judge
+from .verdict import Named, Posterior, Verdict, judge, names, posterior
 from .workbench import Fitted, RunsAway
 
-AS_GIVEN = 0.5  # ratio of mean squares below which a second search, with channels as they were given, counts
 SEARCHING = 0.7  # share of the remaining time for the search; the rest is for the correction
 
 
@@ -111,15 +129,7 @@ def diagnose_in_steps(
     focus: str | None,
     progress: Progress | None,
 ) -> Diagnosis:
-    """Carry out `diagnose`, whose parameters these are.
-
-    1. Check the arguments, and match channels by name.
-    2. Check the recordings for faults, refit the simulator, and measure the noise (`preparation`).
-    3. Fit hypotheses, which are sets of laws in ports, and keep all of them (`search`).
-    4. Weigh all hypotheses; choose verdict, effects and corrected simulator (`conclude`).
-    5. Compute the proof (`proof`): errors on test recordings, placebos, standard errors. It changes no verdict; offsets
-       that gain nothing beside the effects are set to zero.
-    """
+    """Carry out `diagnose`, whose parameters these are, by the steps of the module docstring."""
     began = time.perf_counter()
     workers = min(processors(), 4) if workers is None else whole(workers, "workers", 1)
     most_effects = np.inf if effects is None else whole(effects, "effects", 0)
@@ -137,9 +147,8 @@ def diagnose_in_steps(
         simulator, recordings, tried, hold, engine, workers, most_effects, stand_in_error, deadline, say, focus
     )
     request, ready, search = _search_with_focus(request)
-    concluding = search.begin("conclusion")
-    found = conclude(search, (*request.notes, *ready.gates, *search.gates))
-    search.timed("conclusion", concluding)
+    with search.stage("conclusion"):
+        found = conclude(search, (*request.notes, *ready.gates))
     return _build_diagnosis(request, ready, search, found, tests, limits, began)
 
 
@@ -408,7 +417,7 @@ def _next(search: Search, effects: Sequence[Named], limits: Mapping[str, float] 
 
 def _row(search: Search, t: Trial, parent: Trial) -> dict[str, Any]:
     """Return a candidate's row for diagnosis.json."""
-    held_out = search.held_out.get(t.key)
+    held_out = search.findings[t.key].held_out
     gain = search.evidence(t) - search.evidence(parent)
     return {
         "port": t.port,

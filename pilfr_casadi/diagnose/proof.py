@@ -14,11 +14,14 @@ from ..laws import Law
 from ..models import Model
 from ..optimise import first_state, samples_for_state
 from ..simulators import Simulator, discretise
-from .floor import effective_size
 from .gates import Gate
 from .linearise import linearised
-from .remainder import Remainder, held_out
+from .screen import RIDGES, Remainder, held_out
 from .workbench import Fitted, Workbench
+
+AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
+SINES = 12  # frequencies of sines that are tried
+MOST_SAMPLES = 3000  # longest simulated experiment, in samples
 
 
 def mean_nrmse(bench: Workbench, fitted: Fitted) -> float:
@@ -90,9 +93,7 @@ def test_errors(
         if g.change is not None:
             tests = [g.change(r) for r in tests]
     for name, one in (("before", without), ("after", after)):
-        out[name] = errors_of(
-            bench.on(tests), one.model.with_parameters(one.model.parameters.at(one.vector)), starts_of(one)
-        )
+        out[name] = errors_of(bench.on(tests), one.fitted_model, starts_of(one))
     return out
 
 
@@ -107,39 +108,6 @@ def free_run_errors(
         free = discretise(replace(led, observer=None), bench.dt, bench.hold, fitted.model.substeps)
         out[name] = errors_of(bench, free, starts_of(fitted))
     return out
-
-
-def deviations(bench: Workbench, fitted: Fitted) -> dict[str, np.ndarray]:
-    """Compute standard errors from the residual and its correlation time; nan for fixed parameters and at bounds."""
-    return _by_name(fitted, *covariance(bench, fitted))
-
-
-def _by_name(fitted: Fitted, where: np.ndarray, matrix: np.ndarray) -> dict[str, np.ndarray]:
-    full = np.full(fitted.model.parameters.size, np.nan)
-    full[where] = np.sqrt(np.maximum(np.diag(matrix), 0))
-    return fitted.model.parameters.unpack(full)
-
-
-def covariance(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places (k,) of free parameters inside their bounds, and the covariance (k, k) of their estimates.
-
-    Initial states are estimated together with them.
-    """
-    free = fitted.model.with_parameters(fitted.model.parameters.at(fitted.vector))
-    problem = bench.problem(free, fitted.engine)
-    n_free = int(problem.free.sum())
-    theta = problem.start.copy()
-    states = [s for p, s in zip(problem._placed, fitted.initial, strict=True) if p.first is not None]
-    theta[n_free:] = np.concatenate(states) if states else theta[n_free:]
-    _, _, hessian = problem.normal(theta)
-    inside = (theta > problem.lower) & (theta < problem.upper)
-    keep = np.flatnonzero(inside & (np.diag(hessian) > 0))
-    size = np.sqrt(np.maximum(np.diag(hessian)[keep], 1e-300))
-    scaled = hessian[np.ix_(keep, keep)] / np.outer(size, size)
-    matrix = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) / np.outer(size, size)
-    n = max(effective_size(fitted.residual), 10.0)
-    own = keep < n_free
-    return np.flatnonzero(problem.free)[keep[own]], matrix[np.ix_(own, own)] * fitted.cost / n
 
 
 def parameter_table(
@@ -157,11 +125,6 @@ def parameter_table(
             "unit": p.unit,
         }
     return out
-
-
-SHARES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
-SINES = 12  # frequencies of sines that are tried
-MOST_SAMPLES = 3000  # longest simulated experiment, in samples
 
 
 def next_experiment(
@@ -208,7 +171,7 @@ def next_experiment(
             wave = np.sin(2 * np.pi * f * t)
             if waveform == "triangle":
                 wave = 2 / np.pi * np.arcsin(wave)
-            for share in SHARES:
+            for share in AMPLITUDES:
                 drive = np.tile(rest, (m, 1))
                 drive[:, i] += share * most * wave
                 value = separation(drive)
@@ -246,6 +209,6 @@ def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[floa
             for r in runs
         ]
         rest = Remainder.of(bench, probe, shifted, [type(law)], at=port)
-        found = [held_out(rest.columns(task)[0], rest.left, rest.odd, (1e-6, 1e-3)) for task in rest.tasks]
+        found = [held_out(rest.columns(task)[0], rest.left, rest.odd, RIDGES) for task in rest.tasks]
         shares.append(found[0] if found else 0.0)
     return shares[0], shares[1]

@@ -28,7 +28,7 @@ from ..data import Recording
 from ..laws import AsymmetricSaturation
 from .gates import CURED, LEAST_GAIN, USELESS_FIT, Checked, FirstOrder, Gate, describe_fall, gain, open_start, refit
 from .linearise import linearised
-from .remainder import folds, held_out
+from .screen import folds, held_out
 from .workbench import Fitted, Workbench
 
 CUBIC = np.array([-1, 4, 0, 4, -1]) / 6  # through the neighbours at -2, -1, 1, 2

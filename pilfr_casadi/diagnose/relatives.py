@@ -11,7 +11,7 @@ A relative is a pair of port and law with its own start values:
 
 Two effects may hide each other, so that neither law explains enough alone. Then every pair of laws at two ports is
 scored along the refitted simulation. Let Q_a and Q_b be orthonormal columns of the output changes by small doses of the
-two (`remainder`), and e' the remaining error. The pair explains the share
+two (`screen`), and e' the remaining error. The pair explains the share
 
     |Q_aᵀ e'|² + rᵀ (I - W Wᵀ)⁻¹ r,    r = Q_bᵀ e' - W Q_aᵀ e',    W = Q_bᵀ Q_a
 
@@ -20,7 +20,7 @@ of it. The best pairs are fitted.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,17 +29,17 @@ import numpy as np
 from ..laws import Attached, Delay, Lag, Law, Local, Resonance, unit_forces
 from ..models import map_points
 from ..simulators import in_series, signals, states_along
-from .remainder import Dose, Remainder, held_out, orthonormal
-from .screen import Scored, start_values
-from .trials import BRIEF, Trial, Trials, place_law
-from .workbench import Fitted, Workbench
+from .evidence import FAR, NEAR
+from .screen import HUGE, Dose, Pair, Remainder, Scored, fit_shapes, held_out, orthonormal, start_values
+from .trials import Trial, Trials, place_law
+from .workbench import BRIEF, FEW, Fitted, Workbench
 
-NEAR = 1.5  # ratio to the best error beyond which a related law gets another start
-BEHIND = 3.0  # largest ratio to the best error of a delay or a lag that may represent a resonance
 DAMPED = (0.25, 0.6)  # damping ratios of the resonances tried in place of a delay or a lag
-MATCHES = 3  # simple laws, with a force like that of a flexible law, that are tried
+SHAPES = 5  # shapes of each law at each port: the best alone
+PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each pair of ports
+LOOKED_AT = 60  # pairs of laws whose share is cross-validated
+RIDGE = 1e-4  # on the gram matrix of orthonormal columns, against nearly parallel laws
 SEEN = 4000  # approximate number of samples on which forces are compared
-HUGE = 1e60  # bound on signals, above which a simulation diverges
 
 
 def complements(one: Law, other: Law) -> bool:
@@ -74,26 +74,29 @@ def relatives(bench: Workbench, trials: Sequence[Trial], scored: Sequence[Scored
     return [*found, *_matching_forces(bench, trials, scored)]
 
 
-def _near(trials: Sequence[Trial]) -> set[tuple[str, type[Law]]]:
+def _near(trials: Sequence[Trial]) -> set[Pair]:
     """Return the pairs of port and law that came near the best error."""
-    return {(t.port, type(t.law)) for t in trials if t.error < NEAR * trials[0].error}
+    return {t.pair for t in trials if t.error < NEAR * trials[0].error}
 
 
 def _special_cases(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     """Select special cases of the best law at its port that did not come near, as from a wrong minimum."""
     best, near = trials[0], _near(trials)
     cases = best.law.contains
-    return [s for s in scored if s.port == best.port and s.law.id in cases and (s.port, type(s.law)) not in near]
+    return [s for s in scored if s.port == best.port and s.law.id in cases and s.pair not in near]
 
 
 def _other_forms(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     """Select untried forms of the laws that came near."""
-    tried = {(t.port, type(t.law)) for t in trials}
-    ids = {(t.port, t.law.id) for t in trials if t.error < NEAR * trials[0].error}
-    out: dict[tuple[str, type[Law]], Scored] = {}
-    for s in scored:
-        if (s.port, s.law.id) in ids and (s.port, type(s.law)) not in tried:
-            out.setdefault((s.port, type(s.law)), s)
+    tried, near = {t.pair for t in trials}, {(port, law.id) for port, law in _near(trials)}
+    return _first_of_pairs(s for s in scored if (s.port, s.law.id) in near and s.pair not in tried)
+
+
+def _first_of_pairs(entries: Iterable[Scored]) -> list[Scored]:
+    """Return the first entry of each pair."""
+    out: dict[Pair, Scored] = {}
+    for s in entries:
+        out.setdefault(s.pair, s)
     return list(out.values())
 
 
@@ -103,16 +106,14 @@ def _attached_masses(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[
     if not {"W", "D"} <= set(best.law.units) or isinstance(best.law, Attached):
         return []
     found = {k: float(np.ravel(best.own[k])[0]) for k in ("W", "D")}
-    return _with_starts(
-        (s for s in scored if isinstance(s.law, Attached) and (s.port, type(s.law)) not in near), [found]
-    )
+    return _with_starts((s for s in scored if isinstance(s.law, Attached) and s.pair not in near), [found])
 
 
 def _damped_resonances(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     """Select damped resonances in place of a delay or a lag T that came near: at low frequencies T = 2 D / W."""
     late: dict[str, float] = {}
     for t in trials:
-        if isinstance(t.law, Delay | Lag) and t.error < BEHIND * trials[0].error and t.port not in late:
+        if isinstance(t.law, Delay | Lag) and t.error < FAR * trials[0].error and t.port not in late:
             late[t.port] = float(np.ravel(t.own["T"])[0])
     out = []
     for port, time in late.items():
@@ -128,48 +129,41 @@ def _other_end(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored
         return []
     times = {k: best.own[k] for k, unit in best.law.units.items() if unit in ("s", "rad/s", "")}
     same = (s for s in scored if type(s.law) is type(best.law) and in_series(s.port))
-    return _with_starts((s for s in same if (s.port, type(s.law)) not in near), [times])
+    return _with_starts((s for s in same if s.pair not in near), [times])
 
 
-def _with_starts(entries: Iterator[Scored], starts: Sequence[dict[str, Any]]) -> list[Scored]:
+def _with_starts(entries: Iterable[Scored], starts: Sequence[dict[str, Any]]) -> list[Scored]:
     """Return the first entry of each pair, with starts at some given values added."""
-    out: dict[tuple[str, type], Scored] = {}
-    for s in entries:
-        more = [{**own, **start} for own in s.starts for start in starts]
-        out.setdefault((s.port, type(s.law)), replace(s, starts=(*more, *s.starts)))
-    return list(out.values())
+    return [
+        replace(s, starts=(*({**own, **start} for own in s.starts for start in starts), *s.starts))
+        for s in _first_of_pairs(entries)
+    ]
 
 
 def _extended_laws(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     """Select laws with one more term than one that came near, if worse or untried: from its values."""
-    least = {(t.port, type(t.law)): t.error for t in reversed(trials)}
-    out: dict[tuple[str, type], Scored] = {}
-    for t in trials:
-        if t.error > NEAR * trials[0].error:
-            continue
+    near, least = _near(trials), {t.pair: t.error for t in reversed(trials)}
+    out: dict[Pair, Scored] = {}
+    for t in (t for t in trials if t.pair in near):
         for s in scored:
-            key = s.port, type(s.law)
             wider = s.port == t.port and isinstance(s.law, type(t.law)) and type(s.law) is not type(t.law)
-            if wider and least.get(key, np.inf) > t.error and key not in out:
+            if wider and least.get(s.pair, np.inf) > t.error and s.pair not in out:
                 start = s.law.starts_as(t.law, t.own)
-                out |= {key: replace(s, starts=(start,))} if start else {}
+                out |= {s.pair: replace(s, starts=(start,))} if start else {}
     return list(out.values())
 
 
 def _simpler_laws(trials: Sequence[Trial], scored: Sequence[Scored]) -> list[Scored]:
     """Select the law that one which came near refines, if untried or far worse: from its values."""
-    near, out = _near(trials), dict[tuple[str, type], Scored]()
-    for t in trials:
+    near, out = _near(trials), dict[Pair, Scored]()
+    for t in (t for t in trials if t.pair in near):
         plain: Any = type(t.law).__base__
-        key = t.port, plain
-        if key in near or t.error > NEAR * trials[0].error or not getattr(plain, "units", {}):
+        pair, units = (t.port, plain), set(getattr(plain, "units", {}))
+        if not units or not units <= set(t.law.units) or pair in near or pair in out:
             continue
-        if set(plain.units) <= set(t.law.units) and key not in out:
-            own = {k: t.own[k] for k in plain.units}
-            for s in scored:
-                if (s.port, type(s.law)) == key:
-                    out[key] = replace(s, starts=(own,))
-                    break
+        entry = next((s for s in scored if s.pair == pair), None)
+        if entry is not None:
+            out[pair] = replace(entry, starts=({k: t.own[k] for k in plain.units},))
     return list(out.values())
 
 
@@ -180,7 +174,7 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
         return []
     entries: dict[type[Law], Scored] = {}
     for s in scored:
-        if s.port == best.port and not s.law.flexible and (s.port, type(s.law)) not in near:
+        if s.port == best.port and not s.law.flexible and s.pair not in near:
             entries.setdefault(type(s.law), s)
     local = port_signals(bench, best.fitted, best.port)
     # also excludes nan, for example from the root of a negative number
@@ -192,7 +186,7 @@ def _matching_forces(bench: Workbench, trials: Sequence[Trial], scored: Sequence
     force = unit_forces(law.at(values), local, [shape])[:, 0] @ strengths
     with np.errstate(over="ignore", invalid="ignore"):
         found = [(*_match_force(s.law, local, force), s) for s in entries.values()]
-    ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:MATCHES]
+    ranked = sorted((f for f in found if f[0] < 1), key=lambda f: f[0])[:FEW]
     return [replace(s, starts=(start, *s.starts)) for _, start, s in ranked]
 
 
@@ -207,11 +201,8 @@ def port_signals(bench: Workbench, fitted: Fitted, port: str) -> Local:
             slope = np.gradient(r.u, r.dt, axis=0) if bench.hold == "linear" and len(r) > 2 else np.zeros_like(r.u)
             z, dz, *_ = map_points(own, x, r.u, slope, r.dt * np.arange(len(r))[:, None], fitted.vector)
         parts.append((z[:, index, 0], dz[:, index, 0]))
-    lengths = tuple(len(z) for z, _ in parts)
     z, dz = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-    inputs = dict(zip(simulator.inputs, np.concatenate([r.u for r in bench.recordings]).T, strict=True))
-    rest = tuple(r.begins == "zero" for r in bench.recordings)
-    return Local(z, dz, bench.dt, lengths, inputs=inputs, from_zero=rest)
+    return bench.local(z, dz)
 
 
 def _match_force(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict[str, Any]]:
@@ -223,23 +214,13 @@ def _match_force(law: Law, local: Local, force: np.ndarray) -> tuple[float, dict
     target = force[::every] - q @ (q.T @ force[::every])
     total, best, start = float(target @ target), np.inf, dict[str, Any]()
     made = unit_forces(law, local, shapes)[::every]
-    for k, shape in enumerate(shapes):
-        columns = made[:, k] - q @ (q.T @ made[:, k])
-        if not np.all(np.isfinite(columns)):
-            continue
-        found = np.linalg.lstsq(columns, target, rcond=1e-9)[0]
+    for k, found, fit in fit_shapes((a - q @ (q.T @ a) for a in np.moveaxis(made, 1, 0)), target):
         if not law.strength and found[0] <= 0:  # the simulator's gain may scale the force, but not change its sign
             continue
-        left = float(np.sum((target - columns @ found) ** 2)) / max(total, 1e-300)
+        left = float(np.sum((target - fit) ** 2)) / max(total, 1e-300)
         if left < best:
-            best, start = left, start_values(law, shape, found)
+            best, start = left, start_values(law, shapes[k], found)
     return best, start
-
-
-SHAPES = 5  # shapes of each law at each port: the best alone
-PLACES, LAWS = 4, 2  # pairs of ports that are tried, and pairs of laws at each pair of ports
-LOOKED_AT = 60  # pairs of laws whose share is cross-validated
-RIDGE = 1e-4  # on the gram matrix of orthonormal columns, against nearly parallel laws
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +275,7 @@ def choose_pairs(rest: Remainder) -> list[tuple[_Block, _Block]]:
         if len(seen) >= LOOKED_AT or not np.isfinite(worth[i, j]):
             break
         pair = blocks[min(i, j)], blocks[max(i, j)]
-        key = tuple((b.scored.port, type(b.scored.law)) for b in pair)
+        key = tuple(b.scored.pair for b in pair)
         if key not in seen and _opposes(pair, rest.left):
             kept = 1 - held_out(np.hstack([b.dose.phi for b in pair]), rest.left, rest.odd)
             seen[key] = (kept, pair)

@@ -21,6 +21,7 @@ from ..models import ParameterSet
 from ..simulators import Simulator, discretise, in_series
 from .checkup import BlindSpot
 from .correction import Correction
+from .evidence import BETTER, FAR, SURE
 from .floor import ABOVE_NOISE
 from .gates import Gate
 from .learned import Learned
@@ -33,11 +34,8 @@ VERDICTS = ("missing-physics", "complete", "unexplained", "recording-fault")
 
 STEPS = {"nominal": "as given", "before": "refitted", "after": "corrected"}  # the errors that are printed
 MOST = 8  # parameters and blind spots that are printed at most
-WORSE = 1.05  # ratio of the test errors after and before above which a correction makes the test recordings worse
-SURE = 0.5  # confidence above which an effect is stated as found; below it is a guess
 RUN_AWAY = 1e4  # error from which its size says nothing
 CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
-FAR = 3.0  # ratio of the test error to the training error above which the result warns
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = "The time limit ended the search: the answer rests on the fits made until then."
 
@@ -161,7 +159,7 @@ class Diagnosis:
         if not errors or not self._changed:
             return ""
         before, after = errors["before"], errors["after"]
-        if not after <= WORSE * before:
+        if not after <= BETTER * before:
             return "worse"
         return "better" if after < before else "same"
 

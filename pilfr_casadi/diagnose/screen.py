@@ -1,8 +1,14 @@
 """A score test of every port and law: the share of the residual that a small dose of a law would remove.
 
-The outputs' sensitivity to a law at zero strength is projected off the simulator's own parameters and the initial
-states (Rao 1948); shape parameters lie on a grid. The test is done twice: along the refitted simulation, and along an
-observer with process noise at every port, on its innovations.
+Errors and responses are taken beyond the base: the orthonormal directions in which the simulator's own parameters and
+the initial states can change the stacked outputs (Rao 1948). The remainders are
+
+    e' = e - base baseᵀ e,    φ' = φ - base baseᵀ φ,
+
+where φ holds the outputs' changes by a small dose of each law at a port, a column for each of its shapes and strengths;
+shape parameters lie on a grid. Each port is processed separately: its columns are the largest arrays of a diagnosis.
+The test is done twice: along the refitted simulation, and along an observer with process noise at every port, on its
+innovations.
 
 The same test is done for any force at a port: a flexible surface `w(z, ż)` of Chebyshev terms up to the fourth degree,
 with stops, plays and relaxations beside it. Its response is linear in its coefficients, which are fitted to every
@@ -12,25 +18,251 @@ noise from missing structure without knowing the floor, and a right name from on
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from .._base import side_by_side
-from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis
+from ..laws import Creep, Law, Local, PlayHysteresis, Relaxation, StopHysteresis, count_columns, unit_forces
 from ..models import Parameter
-from .linearise import Run, linearised, observer_gain, run
-from .remainder import HUGE, Remainder, Task, held_out
-from .workbench import Fitted, Workbench
+from ..simulators import Port
+from .linearise import Probe, Run, linearised, locals_of, observer_gain, propagate, run
+from .workbench import FEW, Fitted, Workbench
 
-KEPT = 3  # start values kept for each pair of port and law
-
+Pair = tuple[str, type[Law]]  # a port and the class of a law
+USED = 6000  # samples used at most
+HUGE = 1e60  # ratio to an output's deviation above which a response diverges
+BLOCKS = 10  # blocks a recording; every second block is held out in turn
+RIDGES = (1e-6, 1e-3)  # strengths of the ridge regression of flexible forces, relative to a column of unit length
 DEGREE = 4  # of the flexible surface
 # degrees in z and dz/dt of the surface's terms
 TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
-MOST, LEAST = 600_000, 2500  # largest product of samples and squared number of states; least number of samples
+# largest product of samples and squared number of states for a flexible force; least number of samples
+MOST_WORK, LEAST_SAMPLES = 600_000, 2500
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A port, its local signals over the whole recordings, and each law allowed there with its shapes."""
+
+    index: int
+    port: Port
+    local: Local
+    part: Local
+    pairs: list[tuple[Law, list[dict[str, Any]]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Dose:
+    """Response to a law of one shape: a column for each strength (R, n), and the forces' sizes (n,)."""
+
+    shape: dict[str, Any]
+    phi: np.ndarray
+    size: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder:
+    """The error along runs, and its part that the simulator's own parameters cannot imitate.
+
+    Attributes
+    ----------
+    runs : list of Run
+        The stretches that are used.
+    base : array, shape (R, n)
+        Orthonormal directions that parameters and initial states can follow.
+    left : array, shape (R,)
+        The rest of the error, each output in units of its deviation.
+    tasks : tuple of Task
+        Ports whose laws can be tried, sensors last.
+    odd : array, shape (R,), bool
+        Every second block.
+    """
+
+    bench: Workbench
+    runs: list[Run]
+    base: np.ndarray
+    left: np.ndarray
+    tasks: tuple[Task, ...]
+    odd: np.ndarray
+
+    @classmethod
+    def of(cls, bench: Workbench, probe: Probe, runs: list[Run], laws: Sequence[type[Law]], at: str = "") -> Remainder:
+        """Project the error along some runs, for the laws that the data can determine; with `at`, for one port only."""
+        signals = ("a", "b", "c", "d", "error", "z", "dz", "u")
+        short = [
+            replace(r, **{k: getattr(r, k)[w] for k in signals}, from_zero=r.from_zero and w.start == 0)
+            for r, w in zip(runs, _windows(bench, runs), strict=True)
+        ]
+        error = np.concatenate([(r.error / bench.scale).ravel() for r in short])
+        base = followed(bench, short)
+        left = project_off(error, base)
+        tasks = [t for t in _tasks(bench, probe, laws, runs, short) if at in ("", t.port.name)]
+        return cls(bench, short, base, left, tuple(tasks), folds(len(left), len(runs)))
+
+    def columns(self, task: Task) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the responses beyond the base to a port's laws, each with a force of unit size, and their sizes.
+
+        Shapes (R, n) and (n,); shapes and strengths of one law follow those of the other.
+        """
+        forces = [unit_forces(law, task.part, s).reshape(len(task.part.z), -1) for law, s in task.pairs]
+        return self.response(task.index, np.hstack(forces))
+
+    def response(self, port: int, forces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the responses beyond the base to forces (M, n) at a port, scaled to unit size, and their sizes."""
+        forces[~(np.abs(forces) < 1e100)] = 0.0
+        size = lengths(forces) / np.sqrt(len(forces))
+        size = np.where(size > 0, size, 1.0)
+        forces /= size
+        blocks, at = [], 0
+        for r in self.runs:
+            now = slice(at, at + len(r.z))
+            blocks.append(moved(self.bench, r, [(port, forces[now])])[:, -len(size) :])
+            at = now.stop
+        phi = np.concatenate(blocks) if len(blocks) > 1 else blocks[0]
+        size_before = lengths(phi)
+        phi -= self.base @ (self.base.T @ phi)
+        phi[:, lengths(phi) < 1e-6 * size_before] = 0.0  # the simulator's own parameters imitate these entirely
+        return phi, size
+
+    def doses(self, task: Task) -> Iterator[tuple[Law, list[Dose]]]:
+        """Generate each law of a port with a dose of each of its shapes; see `columns`."""
+        phi, size = self.columns(task)
+        at = 0
+        for law, shapes in task.pairs:
+            width = count_columns(law)
+            spans = [slice(at + k * width, at + (k + 1) * width) for k in range(len(shapes))]
+            yield law, [Dose(shape, phi[:, own], size[own]) for shape, own in zip(shapes, spans, strict=True)]
+            at += width * len(shapes)
+
+
+def moved(bench: Workbench, r: Run, forces: Sequence[tuple[int, np.ndarray]] = (), skip: int = 0) -> np.ndarray:
+    """Compute the stacked outputs' changes, over their deviation, by free parameters, initial state, and forces.
+
+    The first `skip` samples are left out; see `propagate` for the forces.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        y = propagate(r, forces)[skip:]
+        y /= bench.scale[:, None]
+    y = y.reshape(-1, y.shape[2])
+    y[:, ~((y.max(axis=0) < HUGE) & (y.min(axis=0) > -HUGE))] = 0.0  # a diverging response carries no information
+    return y
+
+
+def followed(bench: Workbench, runs: Sequence[Run], skips: Sequence[int] = ()) -> np.ndarray:
+    """Compute orthonormal directions of the stacked outputs that parameters and initial states can follow, (R, n)."""
+    return orthonormal(np.hstack(own_changes(bench, runs, skips)))
+
+
+def own_changes(
+    bench: Workbench, runs: Sequence[Run], skips: Sequence[int] = (), known: Sequence[bool] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the stacked outputs' changes by free parameters (R, n_free) and by unknown initial states (R, n).
+
+    `known` marks the runs whose initial state is known; see `moved` for the units and `skips`.
+    """
+    blocks = [moved(bench, r, skip=skip) for r, skip in zip(runs, skips or [0] * len(runs), strict=True)]
+    changes, n = block_diagonal(blocks, runs[0].n_free), runs[0].n_free
+    unknown = np.repeat(np.logical_not(known or [False] * len(runs)), (changes.shape[1] - n) // len(runs))
+    return changes[:, :n], changes[:, n:][:, unknown]
+
+
+def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
+    """Choose the stretch of each recording that is used: the one with the largest error."""
+    share = max(USED // len(runs) // len(bench.scale), 200)
+    out = []
+    for r, recording in zip(runs, bench.recordings, strict=True):
+        m, skip = len(r.error), recording.skip
+        if m - skip <= share:
+            out.append(slice(skip, m))
+            continue
+        energy = np.cumsum(np.append(0.0, np.sum((r.error / bench.scale) ** 2, axis=1)))
+        starts = np.arange(skip, m - share + 1, max(share // 8, 1))
+        at = int(starts[np.argmax(energy[starts + share] - energy[starts])])
+        out.append(slice(at, at + share))
+    return out
+
+
+def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]) -> list[Task]:
+    by_name = {port.name: port for port in bench.simulator.all_ports()}
+    out = []
+    for j, (name, local, part) in enumerate(
+        zip(probe.ports, locals_of(bench, runs), locals_of(bench, short), strict=True)
+    ):
+        port = by_name[name]
+        if not np.ptp(local.z) > 0 or name.removeprefix("equation:") in bench.simulator.kinematic:
+            continue
+        chosen = [law() for law in laws if port.kinds & set(law.places)]
+        pairs = [(law, list(law.shapes(local))) for law in chosen if usable(law, local)]
+        if pairs:
+            out.append(Task(j, port, local, part, pairs))
+    return sorted(out, key=lambda t: t.port.name.startswith("sensor:"))
+
+
+def usable(law: Law, local: Local) -> bool:
+    """Tell whether the data can determine a law at a port."""
+    if "dz" in law.reads() and not np.any(local.dz):
+        return False
+    return not law.why_not(local)
+
+
+def folds(length: int, recordings: int) -> np.ndarray:
+    """Mark every second block of the stacked record."""
+    return (np.arange(length) * BLOCKS * recordings // max(length, 1)) % 2 == 1
+
+
+def held_out(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridges: Sequence[float] = RIDGES[:1]) -> float:
+    """Compute the share of `left` that the columns explain on blocks that they were not fitted to."""
+    size = lengths(phi)
+    if not np.any(size > 0):
+        return 0.0
+    phi = phi[:, size > 0] / size[size > 0]
+    wrong = min(held_out_squares(phi, left, odd, ridge) for ridge in ridges)
+    return max(0.0, 1 - wrong / max(float(left @ left), 1e-300))
+
+
+def held_out_squares(phi: np.ndarray, left: np.ndarray, odd: np.ndarray, ridge: float) -> float:
+    """Compute the sum of squares on every second block by coefficients fitted to the others, and vice versa."""
+    parts = ((fold, ~fold) for fold in (odd, ~odd))
+    return sum(float(np.sum((left[b] - phi[b] @ ridge_solution(phi[a], left[a], ridge)) ** 2)) for a, b in parts)
+
+
+def ridge_solution(a: np.ndarray, b: np.ndarray, ridge: float) -> np.ndarray:
+    """Solve a x = b in the least squares sense, with the penalty ridge |x|²."""
+    return np.asarray(np.linalg.solve(a.T @ a + ridge * np.eye(a.shape[1]), a.T @ b))
+
+
+def block_diagonal(blocks: list[np.ndarray], n_free: int) -> np.ndarray:
+    """Arrange columns by parameters shared by all recordings, and by an initial state for each."""
+    n_x = blocks[0].shape[1] - n_free
+    out = np.zeros((sum(map(len, blocks)), n_free + n_x * len(blocks)))
+    at = 0
+    for i, b in enumerate(blocks):
+        rows = slice(at, at + len(b))
+        out[rows, :n_free] = b[:, :n_free]
+        out[rows, n_free + i * n_x : n_free + (i + 1) * n_x] = b[:, n_free:]
+        at += len(b)
+    return out
+
+
+def lengths(columns: np.ndarray) -> np.ndarray:
+    """Compute the length of each column."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->j", columns, columns)))
+
+
+def project_off(columns: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """Subtract the projection on orthonormal directions from one column (R,) or several (R, n)."""
+    return np.asarray(columns - base @ (base.T @ columns))
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Compute an orthonormal basis of the columns' span."""
+    size = lengths(columns)
+    kept = columns[:, size > 0] / size[size > 0]
+    u, s, _ = np.linalg.svd(kept, full_matrices=False)
+    return u[:, s > 1e-9 * s.max(initial=1e-300)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +281,11 @@ class Scored:
     sense: int = 0
     source: str = "simulation"
 
+    @property
+    def pair(self) -> Pair:
+        """Port and class of the law."""
+        return self.port, type(self.law)
+
 
 def screen(
     bench: Workbench, fitted: Fitted, laws: Sequence[type[Law]], noise: np.ndarray, workers: int = 1
@@ -66,13 +303,13 @@ def screen(
     """
     probe, runs = linearised(bench, fitted)
     gain = observer_gain(probe, runs, noise)
-    led = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
-    if not all(_stays_bounded(r, bench.scale) for r in led):
-        led = []
-    ways = [("simulation", Remainder.of(bench, probe, runs, laws))]
-    if led:
-        ways.append(("observer", Remainder.of(bench, probe, led, laws)))
-    tasks = [(rest, task, source) for source, rest in ways for task in rest.tasks]
+    observed = [run(bench, probe, fitted, i, gain) for i in range(len(runs))] if gain.any() else []
+    if not all(_stays_bounded(r, bench.scale) for r in observed):
+        observed = []
+    remainders = [("simulation", Remainder.of(bench, probe, runs, laws))]
+    if observed:
+        remainders.append(("observer", Remainder.of(bench, probe, observed, laws)))
+    tasks = [(rest, task, source) for source, rest in remainders for task in rest.tasks]
     found = [scored for one in side_by_side(lambda task: _score(*task), tasks, workers) for scored in one]
     seen = any(s.source == "observer" for s in found)
     return sorted(found, key=lambda s: -s.share), gain if seen else None
@@ -93,7 +330,7 @@ def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
             drop, strength = _gain(dose.phi, rest.left, law, sense)
             scores.append((drop / total, dose, -strength / dose.size))
         scores.sort(key=lambda s: -s[0])
-        starts = tuple(start_values(law, dose.shape, c) for _, dose, c in scores[:KEPT])
+        starts = tuple(start_values(law, dose.shape, c) for _, dose, c in scores[:FEW])
         # a law with the sign of a drive explains nothing
         share = min(held_out(scores[0][1].phi, rest.left, rest.odd), scores[0][0])
         out.append(Scored(task.port.name, law, share, starts, task.local, sense, source))
@@ -108,6 +345,14 @@ def start_values(law: Law, shape: dict[str, Any], strength: np.ndarray) -> dict[
         values[name] = strength[at : at + size] if p[name].value.ndim else float(strength[at])
         at += size
     return values
+
+
+def fit_shapes(columns: Iterable[np.ndarray], force: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Fit the unit forces (M, n) of each shape of a law to a force; generate shape, strengths and fitted force."""
+    for k, a in enumerate(columns):
+        if np.all(np.isfinite(a)):
+            strengths = np.linalg.lstsq(a, force, rcond=1e-9)[0]
+            yield k, strengths, a @ strengths
 
 
 def _signed(law: Law) -> np.ndarray:
@@ -143,10 +388,10 @@ def _gain(phi: np.ndarray, left: np.ndarray, law: Law, sense: int) -> tuple[floa
     return share, coefficients / size
 
 
-def chebyshev(x: Any, degree: int = DEGREE) -> list[Any]:
-    """Compute the Chebyshev polynomials of the first kind, from degree 0 on."""
+def chebyshev(x: Any) -> list[Any]:
+    """Compute the Chebyshev polynomials of the first kind, from degree 0 to DEGREE."""
     out = [1.0, x]
-    for _ in range(degree - 1):
+    for _ in range(DEGREE - 1):
         out.append(2 * x * out[-1] - out[-2])
     return out
 
@@ -185,10 +430,9 @@ FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
 
 def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:
     """Compute the held-out share of the residual's power that any force at a port explains, by port."""
-    most = max(MOST // max(fitted.model.n_state, 1) ** 2, LEAST) // len(bench.recordings)
+    most = max(MOST_WORK // max(fitted.model.n_state, 1) ** 2, LEAST_SAMPLES) // len(bench.recordings)
     if any(len(r) > most for r in bench.recordings):
-        bench = bench.on([r.slice(0, max(most, r.skip + LEAST // 10)) for r in bench.recordings])
+        bench = bench.on([r.slice(0, max(most, r.skip + LEAST_SAMPLES // 10)) for r in bench.recordings])
     probe, runs = linearised(bench, fitted)
     rest = Remainder.of(bench, probe, runs, FLEXIBLE)
-    ridges = (1e-6, 1e-3)
-    return {t.port.name: held_out(rest.columns(t)[0], rest.left, rest.odd, ridges) for t in rest.tasks}
+    return {t.port.name: held_out(rest.columns(t)[0], rest.left, rest.odd, RIDGES) for t in rest.tasks}

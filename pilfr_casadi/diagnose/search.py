@@ -11,20 +11,28 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from .._base import InputError, Stages, side_by_side
-from ..data import Recording
 from ..engine import make_engine
 from ..laws import FINER, Law
 from ..simulators import Placed, Simulator
 from .evidence import (
+    BETTER,
     EFFECT_PRIOR,
     EXACT,
+    FEWEST,
+    FORMULA,
+    LOUDEST,
+    NEAR,
+    REACH,
+    WRONG,
     HeldOut,
     Sample,
     held_out_errors,
@@ -34,28 +42,19 @@ from .evidence import (
     spread,
 )
 from .floor import Floor, effective_size, white_part
-from .gates import Gate, Offset
+from .gates import CLEARLY
 from .learned import learn_forces, nearest_to_learned
 from .linearise import linearised
 from .relatives import choose_pairs, complements, fit_pair, relatives
-from .remainder import Remainder
-from .screen import Scored, flexible_shares, screen
+from .screen import Remainder, Scored, flexible_shares, screen
 from .trials import Key, Trial, Trials
-from .workbench import THOROUGH, Fitted, Workbench, start_vector
+from .workbench import FEW, THOROUGH, Fitted, Workbench, start_vector
 
-POLISHED, BEHIND = 5, 1.5  # trials of a step fitted to convergence at most, and their largest ratio to the best error
-REACH = 8.0  # nats of log evidence below the best within which a hypothesis may still win
+# Effort
+POLISHED = 5  # trials of a step that are fitted to convergence at most
 NEARLY = 0.05  # share of the excess left by one law below which far worse laws are not refined
-ROUNDS = 3  # rounds of exchanges
-FORMULA = 1e-3  # share of a mismatch that the formula of the right law may leave: 3 % of its force
-FEWEST = 30.0  # least effective samples of the recordings
-WRONG = 0.2  # share of model error in the error above which models are judged on held-out blocks
 PREDICTED = 6  # hypotheses judged on held-out blocks; more only until the likeliest one is judged
-LOUDEST = 0.05  # share of an output's deviation; larger slow errors are not sensor noise
-PORTS = 3  # ports at which a force is learned: those where a flexible force explains most
 LEARNED = 2  # learned forces that are kept: those with the smallest error
-HOLD_RATIO = 1.05  # least ratio of rms errors for which the other hold is better
-BETTER_MINIMUM = 0.8  # largest share of the mean square left by a refit in a better minimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +64,28 @@ class Step:
     parent: Trial
     scored: tuple[Scored, ...]
     trials: tuple[Trial, ...]
+
+
+@dataclass(eq=False)
+class Findings:
+    """Results about one hypothesis that are computed when they are first needed.
+
+    Attributes
+    ----------
+    screened : tuple, optional
+        The scores of all further laws, and the observer's gain; see `screen`.
+    flexible : dict, optional
+        The share of the residual that a flexible force at each port explains.
+    learned : list of Fitted, optional
+        The learned forces beside it, best first.
+    held_out : HeldOut, optional
+        Its errors on held-out data.
+    """
+
+    screened: tuple[list[Scored], np.ndarray | None] | None = None
+    flexible: dict[str, float] | None = None
+    learned: list[Fitted] | None = None
+    held_out: HeldOut | None = None
 
 
 @dataclass(eq=False)
@@ -85,9 +106,8 @@ class Search:
         The best trial of every fitted hypothesis, by key.
     steps : list of Step
         The moves, in their order.
-    screens, open, learned_forces, held_out : dict
-        By hypothesis: scores of all further laws, share of the rest that a force at each port explains, learned forces,
-        and errors on held-out data.
+    findings : dict
+        Further results about each fitted hypothesis, by key.
     hold_said : bool
         Whether somebody stated the hold of the inputs between samples.
     stand_in_error : float
@@ -115,11 +135,7 @@ class Search:
     memo: dict[Key, Trial] = field(default_factory=dict)
     steps: list[Step] = field(default_factory=list)
     alternatives: dict[str, tuple[Law, ...]] = field(default_factory=dict)
-    gates: tuple[Gate, ...] = ()
-    open: dict[Key, dict[str, float]] = field(default_factory=dict)
-    learned_forces: dict[Key, list[Fitted]] = field(default_factory=dict)
-    held_out: dict[Key, HeldOut] = field(default_factory=dict)
-    screens: dict[Key, tuple[list[Scored], np.ndarray | None]] = field(default_factory=dict)
+    findings: defaultdict[Key, Findings] = field(default_factory=lambda: defaultdict(Findings))
     times: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
     out_of_time: bool = False
@@ -169,29 +185,29 @@ class Search:
 
         Where all models are wrong, the spread of predictions for other inputs counts as an error.
         """
-        known = self.held_out.get(trial.key)
+        known = self.findings[trial.key].held_out
         v = known.error**2 if known else trial.whole * self._held_out_ratio()
         v += known.spread if known and self._all_wrong else 0.0
         return self._log_evidence(trial, v, self.samples)
 
     def _held_out_ratio(self) -> float:
         """Compute the usual ratio of held-out to fit error (mean squares), for hypotheses that were not predicted."""
-        known = ((h.error**2, self.memo[key].whole) for key, h in self.held_out.items() if key in self.memo)
-        ratios = [held_out / fit for held_out, fit in known if np.isfinite(held_out) and fit > 0]
+        known = [(self.findings[key].held_out, trial.whole) for key, trial in self.memo.items()]
+        ratios = [h.error**2 / fit for h, fit in known if h and np.isfinite(h.error) and fit > 0]
         return float(np.median(ratios)) if ratios else 1.0
 
     def _log_evidence(self, trial: Trial, v: float, n: float) -> float:
-        told = trial.information if trial.information is not None else np.zeros(0)
-        v += self.tolerance
-        return log_evidence(v, told, log_prior(trial.laws, self.alternatives, trial.doubtful), n)
+        known = trial.information if trial.information is not None else np.zeros(0)
+        return log_evidence(v + self.tolerance, known, log_prior(trial.laws, self.alternatives, trial.doubtful), n)
 
-    def predicts(self, trial: Trial) -> HeldOut:
+    def held_out(self, trial: Trial) -> HeldOut:
         """Compute the held-out errors of a hypothesis, once."""
-        if trial.key not in self.held_out:
-            self.held_out[trial.key] = self.predict(trial.fitted, self.spread(trial.fitted, trial.laws))
-        return self.held_out[trial.key]
+        known = self.findings[trial.key]
+        if known.held_out is None:
+            known.held_out = self.held_out_errors(trial.fitted, self.spread(trial.fitted, trial.laws))
+        return known.held_out
 
-    def predict(self, fitted: Fitted, spread: float) -> HeldOut:
+    def held_out_errors(self, fitted: Fitted, spread: float) -> HeldOut:
         """Compute the held-out errors of a fitted simulator with a known spread for other inputs."""
         return replace(held_out_errors(self.bench, fitted, self.workers), spread=spread)
 
@@ -205,7 +221,7 @@ class Search:
         """Whether even the best model's error is mostly model error."""
         return self.samples < EXACT / WRONG
 
-    def _predict(self) -> None:
+    def _judge_on_held_out_data(self) -> None:
         """Compute the held-out errors of the likeliest hypotheses.
 
         If only one is likely and its error is noise, the fit error is enough. A wrong model may overfit; and of several
@@ -213,16 +229,15 @@ class Search:
         """
         if not self._all_wrong and len({frozenset((e.port, e.law.id) for e in t.laws) for t in self._likeliest()}) < 2:
             return
-        began = self.begin("held-out blocks")
-        if self._all_wrong:
-            self.predicts(self.root)
-        for done in itertools.count():
-            likely = sorted(self._likeliest(), key=self.evidence, reverse=True)
-            left = [t for t in likely if t.key not in self.held_out]
-            if not left or (done >= PREDICTED and left[0] is not likely[0]) or not self._in_time():
-                break
-            self.predicts(left[0])
-        self.timed("held-out blocks", began)
+        with self.stage("held-out blocks"):
+            if self._all_wrong:
+                self.held_out(self.root)
+            for done in itertools.count():
+                likely = self._likeliest()
+                left = [t for t in likely if self.findings[t.key].held_out is None]
+                if not left or (done >= PREDICTED and left[0] is not likely[0]) or not self._in_time():
+                    break
+                self.held_out(left[0])
 
     def _likeliest(self) -> list[Trial]:
         """List the hypotheses that may be the likeliest."""
@@ -230,32 +245,27 @@ class Search:
 
     def flexible(self, trial: Trial) -> dict[str, float]:
         """Compute the share of a trial's residual that a flexible force explains, by port."""
-        if trial.key not in self.open:
-            began = self.begin("flexible")
-            self.open[trial.key] = flexible_shares(self.bench, trial.fitted)
-            self.timed("flexible", began)
-        return self.open[trial.key]
+        known = self.findings[trial.key]
+        if known.flexible is None:
+            with self.stage("flexible"):
+                known.flexible = flexible_shares(self.bench, trial.fitted)
+        return known.flexible
 
-    def _residual(self, trial: Trial) -> list[tuple[np.ndarray, Recording]]:
-        """Return each recording's residual with the recording."""
-        return list(zip(trial.fitted.residual, self.bench.recordings, strict=True))
-
-    def begin(self, stage: str) -> float:
-        """Report that a stage begins; return the time in s, for `timed`."""
-        self.say(stage, 0, 1, self.without.cost**0.5)
-        return time.perf_counter()
-
-    def timed(self, stage: str, began: float) -> None:
-        """Report that a stage is done and add its seconds; end the search if a fit was interrupted.
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Report that a stage begins and ends, add its seconds, and end the search if one of its fits was interrupted.
 
         Raises
         ------
         KeyboardInterrupt
             If a fit was interrupted. Such a fit has returned its best result so far.
         """
-        self.times[stage] = self.times.get(stage, 0.0) + time.perf_counter() - began
-        self.say(stage, 1, 1, self.best.error)
-        if self.bench.interrupted_fits:
+        self.say(name, 0, 1, self.without.cost**0.5)
+        began = time.perf_counter()
+        yield
+        self.times[name] = self.times.get(name, 0.0) + time.perf_counter() - began
+        self.say(name, 1, 1, self.best.error)
+        if self.bench.interrupted_fits and not self.interrupted:
             raise KeyboardInterrupt
 
     def run(self, effects: float) -> Search:
@@ -265,7 +275,7 @@ class Search:
             self._estimate_noise()
             if self._grow(effects) and self._name_rest(effects):
                 self._every_sensor()
-                self._predict()
+                self._judge_on_held_out_data()
         except KeyboardInterrupt:
             self.interrupted = True
         return self
@@ -279,7 +289,7 @@ class Search:
         """Add effects while that pays; return False as soon as the other hold proves better."""
         while (
             self.can_improve(parent := self.best)
-            and _count(parent) < effects
+            and len(parent.effects) < effects
             and self._pays(parent)
             and self._in_time()
         ):
@@ -288,11 +298,11 @@ class Search:
                 self.add(self.root)
             if self.other_hold_fits_better():
                 return False
-            if _count(self.best) > _count(parent) >= 1:
+            if len(self.best.effects) > len(parent.effects) >= 1:
                 self.exchange()
             if len(self.best.laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        if effects > 1 and _count(self.best) < 2 and self.can_improve(self.best) and self._in_time():
+        if effects > 1 and len(self.best.effects) < 2 and self.can_improve(self.best) and self._in_time():
             self.add_two()
         return True
 
@@ -300,14 +310,14 @@ class Search:
         """Name the forces learned beside the simulator and the best hypothesis; go on if one of the laws leads."""
         best = self.best
         for base in {t.key: t for t in (self.root, best)}.values():
-            if _count(base) < effects and self.can_improve(best) and self._in_time():
+            if len(base.effects) < effects and self.can_improve(best) and self._in_time():
                 self.name_learned(base)
         return self.best is best or self._grow(effects)
 
     def _pays(self, trial: Trial) -> bool:
         """Tell whether the last of several laws was worth it; a wrong model can always use one more."""
-        fewer = [t for t in self.memo.values() if t.laws and _count(t) < _count(trial)]
-        return _count(trial) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
+        fewer = [t for t in self.memo.values() if t.laws and len(t.effects) < len(trial.effects)]
+        return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
 
     def other_hold_fits_better(self) -> bool:
         """Tell whether the best hypothesis follows the recordings better with the other hold of the inputs."""
@@ -320,13 +330,18 @@ class Search:
             )
         except InputError:
             return False
-        return other.cost * HOLD_RATIO**2 < best.cost
+        return other.cost * BETTER**2 < best.cost
 
     def can_improve(self, trial: Trial) -> bool:
         """Tell whether a law that removes all but the noise would be worth its prior beside a hypothesis."""
         left, noise = (v + self.tolerance for v in (trial.whole, self.floor2))
         most = 0.5 * self.sample.effective(0.0) * np.log(max(left / noise, 1.0))
         return bool(most > np.log(max(len(self.alternatives), 1)) - EFFECT_PRIOR)
+
+    @property
+    def past_deadline(self) -> bool:
+        """Whether the time for the whole diagnosis is over."""
+        return time.perf_counter() > self.deadline
 
     def _in_time(self) -> bool:
         """Tell whether there is time for more; if not, note that in the result."""
@@ -340,10 +355,7 @@ class Search:
         known = self.memo.get(trial.key)
         if known is None or trial.supersedes(known):
             self.memo[trial.key] = trial
-            self.open.pop(trial.key, None)
-            self.learned_forces.pop(trial.key, None)
-            self.held_out.pop(trial.key, None)
-            self.screens.pop(trial.key, None)
+            self.findings.pop(trial.key, None)
 
     def add(self, parent: Trial, again: bool = False) -> Step:
         """Fit the laws that the screen selects beside a hypothesis, fewer if `again`; polish those that may win."""
@@ -355,57 +367,54 @@ class Search:
         more = relatives(self.bench, trials, scored) if self._in_time() else []
         if more:
             trials = sorted([*trials, *self._fitted(parent, more, gain, enough, again)], key=lambda t: t.error)
-        began = self.begin("choice")
-        for trial in trials:
-            self.keep(trial)
-        self._polish(trials)
-        step = Step(parent, tuple(scored), tuple(trials))
-        self.steps.append(step)
-        self._finer(parent)
-        self._estimate_noise()
-        self.timed("choice", began)
+        with self.stage("choice"):
+            step = self._record(parent, scored, trials)
+            self._finer(parent)
+            self._estimate_noise()
         return step
+
+    def _record(self, parent: Trial, scored: Sequence[Scored], trials: Sequence[Trial]) -> Step:
+        """Keep the trials of a move, and note the move."""
+        self._keep_all(trials)
+        self.steps.append(Step(parent, tuple(scored), tuple(trials)))
+        return self.steps[-1]
 
     def screened(self, parent: Trial) -> tuple[list[Scored], np.ndarray | None]:
         """Score every port and law beside a hypothesis; see `screen`."""
-        if parent.key not in self.screens:
-            began = self.begin("screen")
-            scored, gain = screen(self.bench, parent.fitted, self.laws, self.floor.deviation, self.workers)
-            self.screens[parent.key] = scored, gain
-            for s in scored:
-                known = self.alternatives.setdefault(s.port, ())
-                if not any(type(law) is type(s.law) for law in known):
-                    self.alternatives[s.port] = (*known, s.law)
-            self.timed("screen", began)
-        return self.screens[parent.key]
+        known = self.findings[parent.key]
+        if known.screened is None:
+            with self.stage("screen"):
+                known.screened = screen(self.bench, parent.fitted, self.laws, self.floor.deviation, self.workers)
+                for s in known.screened[0]:
+                    there = self.alternatives.setdefault(s.port, ())
+                    if not any(type(law) is type(s.law) for law in there):
+                        self.alternatives[s.port] = (*there, s.law)
+        return known.screened
 
     def _fitted(
         self, parent: Trial, scored: Sequence[Scored], gain: np.ndarray | None, enough: float, again: bool
     ) -> list[Trial]:
         began = time.perf_counter()
         stage = f"fits, effect {len(parent.laws) + 1}" if parent.laws else "fits"
-        trials = self.fits.beside(
-            parent, scored, gain, enough, lambda done, total, error: self.say(stage, done, total, error), again
-        )
+        trials = self.fits.beside(parent, scored, gain, enough, partial(self.say, stage), again)
         self.times["fits"] = self.times.get("fits", 0.0) + time.perf_counter() - began
         if self.bench.interrupted_fits:
             raise KeyboardInterrupt
         return trials
 
-    def _polish(self, trials: Sequence[Trial]) -> None:
-        """Fit the trials that may win to convergence."""
-        kept = [self.memo[t.key] for t in trials if t.key in self.memo]
-        ranked = sorted({t.key: t for t in kept}.values(), key=self.optimistic_evidence, reverse=True)
-        near = [t for t in ranked[:POLISHED] if not t.thorough and t.error < BEHIND * ranked[0].error]
-        fits = self.fits
-        with ThreadPoolExecutor(self.workers) as pool:
-            done = list(pool.map(fits.polish, near))
-        for trial in done:
+    def _keep_all(self, trials: Sequence[Trial]) -> None:
+        """Keep trials, and fit those that may win to convergence."""
+        for trial in trials:
+            self.keep(trial)
+        kept = {t.key: self.memo[t.key] for t in trials}.values()
+        ranked = sorted(kept, key=self.optimistic_evidence, reverse=True)
+        near = [t for t in ranked[:POLISHED] if not t.thorough and t.error < NEAR * ranked[0].error]
+        for trial in side_by_side(self.fits.polish, near, self.workers):
             self.keep(trial)
 
     def thorough(self, trial: Trial) -> Trial:
-        """Return the same hypothesis fitted to convergence and to all samples."""
-        if not self.memo[trial.key].thorough:
+        """Return the same hypothesis fitted to convergence and to all samples, or as it is after the deadline."""
+        if not self.memo[trial.key].thorough and not self.past_deadline:
             self.keep(self.fits.polish(trial))
         return self.memo[trial.key]
 
@@ -419,7 +428,8 @@ class Search:
         if self.floor.source != "estimated":
             return
         best = self.best
-        error = np.concatenate([e[r.skip :] for e, r in self._residual(best)])
+        pairs = zip(best.fitted.residual, self.bench.recordings, strict=True)
+        error = np.concatenate([e[r.skip :] for e, r in pairs])
         followed = [s.share for s in self.screened(best)[0] if s.source == "simulation"]
         share = float(np.clip(1 - max([*self.flexible(best).values(), *followed], default=0.0), 0.0, 1.0))
         rest = np.minimum(np.sqrt(share * np.mean(error**2, axis=0)), LOUDEST * self.bench.scale)
@@ -441,22 +451,20 @@ class Search:
             starts = [{**base.values, **element.named(shape)} for shape in shapes]
             found = self.fits.fitted(placed, starts, len(best.laws), states=base.begin)
             if found is not None:
-                self.keep(found)
-                self._polish([found])
+                self._keep_all([found])
 
     def learned(self, base: Trial) -> list[Fitted]:
         """Fit learned forces beside a hypothesis, at the most promising ports, to a part of the recordings."""
-        if base.key not in self.learned_forces:
-            began = self.begin("learned force")
-            shares = self.flexible(base)
-            ports = sorted(shares, key=lambda name: -shares[name])[:PORTS]
-            try:
-                found = learn_forces(self.fits.part, base.fitted, ports, self.workers)
-            except (InputError, np.linalg.LinAlgError):
-                found = []
-            self.learned_forces[base.key] = found[:LEARNED]
-            self.timed("learned force", began)
-        return self.learned_forces[base.key]
+        known = self.findings[base.key]
+        if known.learned is None:
+            with self.stage("learned force"):
+                shares = self.flexible(base)
+                ports = sorted(shares, key=lambda name: -shares[name])[:FEW]
+                try:
+                    known.learned = learn_forces(self.fits.part, base.fitted, ports, self.workers)[:LEARNED]
+                except (InputError, np.linalg.LinAlgError):
+                    known.learned = []
+        return known.learned
 
     def name_learned(self, base: Trial) -> None:
         """Fit the laws whose forces are nearest to those learned beside a hypothesis."""
@@ -470,18 +478,13 @@ class Search:
                     entries.append(replace(alike[0], law=near.kind, starts=(near.start,)))
         if not entries:
             return
-        enough = float(np.sqrt(self.floor2))
-        trials = self._fitted(base, entries, None, enough, True)
-        for trial in trials:
-            self.keep(trial)
-        self._polish(trials)
-        self.steps.append(Step(base, tuple(entries), tuple(trials)))
+        self._record(base, entries, self._fitted(base, entries, None, float(np.sqrt(self.floor2)), True))
 
     def exchange(self) -> None:
         """Try all other laws in place of each of several laws, the rest fixed in place, until none changes."""
-        for _ in range(ROUNDS):
+        for _ in range(FEW):
             best = self.best
-            for element in (e for e in best.laws if not isinstance(e.law, Offset)):
+            for element in best.effects:
                 if not self._in_time():
                     return
                 rest = self._beside([e for e in best.laws if e is not element], best)
@@ -494,17 +497,13 @@ class Search:
 
     def add_two(self) -> None:
         """Fit two laws at once beside the simulator alone, because one after the other may hide each other."""
-        began = self.begin("two at once")
-        rest = Remainder.of(self.bench, *linearised(self.bench, self.root.fitted), self.laws)
-        fits, before = self.fits, self.best
-        found = side_by_side(
-            lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest), self.workers
-        )
-        tried = [t for t in found if t is not None]
-        for trial in tried:
-            self.keep(trial)
-        self._polish(tried)
-        self.timed("two at once", began)
+        with self.stage("two at once"):
+            rest = Remainder.of(self.bench, *linearised(self.bench, self.root.fitted), self.laws)
+            fits, before = self.fits, self.best
+            found = side_by_side(
+                lambda pair: fit_pair(fits, self.root.fitted, rest, pair), choose_pairs(rest), self.workers
+            )
+            self._keep_all([t for t in found if t is not None])
         if self.best is not before:
             self.exchange()
 
@@ -517,36 +516,32 @@ class Search:
         filters = [e for e in best.laws if e.port.startswith("actuator:") and (e.law.order or e.law.shifts)]
         if len(names) < 2 or len(filters) != 1 or not self._in_time():
             return
-        began, (source,) = self.begin("every sensor"), filters
-        joint = self._beside([e for e in best.laws if e is not source], best)
-        simulator, named = joint.fitted.simulator, dict[str, object](joint.fitted.values)
-        for name in names:
-            simulator = simulator.with_element(f"sensor:{name}", source.law)
-            named |= simulator.elements[-1].named(source.own(best.fitted.values))
-        found = self.fits.fitted(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
-        if found is not None:
-            self.keep(self.fits.polish(found))
-        self.timed("every sensor", began)
+        with self.stage("every sensor"):
+            source = filters[0]
+            joint = self._beside([e for e in best.laws if e is not source], best)
+            simulator, named = joint.fitted.simulator, dict[str, object](joint.fitted.values)
+            for name in names:
+                simulator = simulator.with_element(f"sensor:{name}", source.law)
+                named |= simulator.elements[-1].named(source.own(best.fitted.values))
+            found = self.fits.fitted(simulator, [named], len(joint.laws) + len(names), states=joint.fitted.begin)
+            if found is not None:
+                self.keep(self.fits.polish(found))
 
     def _escape_local_minimum(self) -> bool:
         """Refit the simulator alone from the best law's parameters; if far better, restart the search and return True.
 
         The first refit was in a local minimum, and the law has compensated for that.
         """
-        best = self.best
-        began = self.begin("look back")
-        try:
-            alone = self.bench.fit(
-                self.bench.simulator, [best.fitted.values], states=best.fitted.begin, solver=THOROUGH
-            )
-        except InputError:
+        best, bench = self.best.fitted, self.bench
+        with self.stage("look back"):
+            try:
+                alone = bench.fit(bench.simulator, [best.values], states=best.begin, solver=THOROUGH)
+            except InputError:
+                return False
+        if alone.cost > CLEARLY * self.root.whole:
             return False
-        finally:
-            self.timed("look back", began)
-        if alone.cost > BETTER_MINIMUM * self.root.whole:
-            return False
-        self.without, self.memo, self.open, self.held_out, self.screens, self.steps = alone, {}, {}, {}, {}, []
-        self.learned_forces = {}
+        self.without, self.memo, self.steps = alone, {}, []
+        self.findings.clear()
         self.keep(Trial((), alone, alone.cost, alone.cost, True))
         return True
 
@@ -562,9 +557,7 @@ class Search:
         vector = start_vector(model, named)
         initial = self.bench.initial_states(simulator, model, vector, joint.fitted.begin)
         fitted = self.bench.result(simulator, model.parameters.unpack(vector), initial, engine, model)
-        return Trial(
-            simulator.elements[len(simulator.elements) - len(laws) :] if laws else (), fitted, fitted.cost, fitted.cost
-        )
+        return Trial(fitted.last_elements(len(laws)), fitted, fitted.cost, fitted.cost)
 
 
 def likeliest(trials: Sequence[Trial], evidence: Callable[[Trial], float]) -> list[Trial]:
@@ -582,8 +575,3 @@ def _count_samples(fitted: Fitted, bench: Workbench) -> float:
     """Compute the number of samples over the correlation time of a fit's residual."""
     residual = [e[r.skip :] for e, r in zip(fitted.residual, bench.recordings, strict=True)]
     return max(effective_size(residual), FEWEST)
-
-
-def _count(trial: Trial) -> int:
-    """Count the effects of a hypothesis; offsets are not effects."""
-    return sum(not isinstance(e.law, Offset) for e in trial.laws)

@@ -18,26 +18,30 @@ import numpy as np
 
 from .._base import InputError
 from ..data import Recording
-from ..engine import Engine, make_engine
+from ..engine import make_engine
 from ..laws import Law
-from ..models import Model
-from ..optimise import GaussNewton
 from ..simulators import Placed, Simulator
-from .gates import open_start
-from .screen import Scored
-from .workbench import QUICK, THOROUGH, Fitted, Workbench, knee_starts, refit_on_finer_steps, start_vector
+from .evidence import FAR, FORMULA
+from .gates import Offset, open_start
+from .screen import Pair, Scored
+from .workbench import (
+    BRIEF,
+    FEW,
+    LONG,
+    QUICK,
+    THOROUGH,
+    Fitted,
+    Workbench,
+    knee_starts,
+    refit_on_finer_steps,
+)
 
-LONG = 8000  # samples used by brief fits
-BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)  # first fit of each pair, to rank the pairs
-# pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
-BEST, FEW = 10, 4
-EQUAL = 1e-3  # difference of shares that counts as zero
-REFINED, FIRST = 8, 3  # pairs fitted from several starts, and how many of them at first, or if `again`
-AGAIN = 3  # starts from which a pair is fitted again
-SAME = 1.02  # ratio of mean square errors within which fits count as equal
-BEHIND = 3.0  # ratio to the best error above which a pair gets no more starts
+# Effort: pairs of each list of the screen that are fitted, besides the best of each port; the same if `again`
+BEST, BEST_AGAIN = 10, 4
+REFINED = 8  # pairs fitted from several starts; only FEW if `again`
+AGREEING = 1.02  # ratio of mean square errors within which fits count as equal
 LEAST_SHARE = 0.01  # ratio to the larger share of the two runs below which a run's start values are not used
-Key = frozenset[tuple[str, type[Law]]]
+Key = frozenset[Pair]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +74,15 @@ class Trial:
         """Ports and classes of the laws; equal keys mean the same hypothesis."""
         return frozenset((e.port, type(e.law)) for e in self.laws)
 
+    @property
+    def effects(self) -> tuple[Placed, ...]:
+        """The laws that are effects; an offset is a finding about the recording."""
+        return tuple(e for e in self.laws if not isinstance(e.law, Offset))
+
     def supersedes(self, other: Trial) -> bool:
         """Tell whether this fit of a hypothesis replaces another; a thorough one has priority."""
         if self.thorough != other.thorough:
-            return self.thorough or self.whole < other.whole / SAME
+            return self.thorough or self.whole < other.whole / AGREEING
         return self.whole < other.whole
 
     @property
@@ -90,6 +99,11 @@ class Trial:
     def law(self) -> Law:
         """The law added last."""
         return self.element.law
+
+    @property
+    def pair(self) -> Pair:
+        """Port and class of the law added last."""
+        return self.port, type(self.law)
 
     @property
     def name(self) -> tuple[str, str]:
@@ -153,11 +167,10 @@ class Trials:
 
     def make_trial(self, found: Fitted, count: int) -> Trial:
         """Make a trial of a fit to a part of the recordings."""
-        laws = found.simulator.elements[len(found.simulator.elements) - count :] if count else ()
         whole = found
         if self.part is not self.bench:
             whole = self.bench.result(found.simulator, found.values, found.initial, found.engine, found.model)
-        return Trial(laws, whole, found.cost, whole.cost if np.isfinite(whole.cost) else np.inf)
+        return Trial(found.last_elements(count), whole, found.cost, whole.cost if np.isfinite(whole.cost) else np.inf)
 
     def polish(self, trial: Trial) -> Trial:
         """Fit a trial to convergence and to all samples."""
@@ -165,7 +178,7 @@ class Trials:
         placed = trial.fitted.corrected()  # choose sub-steps for the fitted laws
         model = bench.model(placed)
         engine = make_engine(model, bench.engine)
-        starts, states = knee_starts(trial), trial.fitted.initial
+        starts, states = knee_starts(trial.fitted, trial.knee), trial.fitted.initial
         try:
             if len(starts) > 1:
                 quick = bench.fit(placed, starts, states=states, model=model, engine=engine)
@@ -174,8 +187,7 @@ class Trials:
         except InputError:
             return replace(trial, whole=np.inf, thorough=True)
         fitted = refit_on_finer_steps(bench, fitted, trial.knee) if trial.knee else fitted
-        laws = fitted.simulator.elements[len(fitted.simulator.elements) - len(trial.laws) :]
-        return Trial(laws, fitted, fitted.cost, fitted.cost, thorough=True)
+        return Trial(fitted.last_elements(len(trial.laws)), fitted, fitted.cost, fitted.cost, thorough=True)
 
     def beside(
         self,
@@ -191,8 +203,8 @@ class Trials:
         If one of the first comes below the error `enough`, those far behind it are not refined. With `again`, in place
         of a known law, fewer pairs are fitted.
         """
-        pairs = select_pairs(scored, FEW if again else BEST)
-        most = FIRST if again else REFINED
+        pairs = select_pairs(scored, BEST_AGAIN if again else BEST)
+        most = FEW if again else REFINED
         done, total = 0, len(pairs) + min(len(pairs), most)
 
         def step(found: Sequence[Trial | None]) -> None:
@@ -211,9 +223,9 @@ class Trials:
                 step([p.trial for p in prepared])
             prepared.sort(key=lambda p: p.trial.error if p.trial else np.inf)
             found: list[Trial | None] = []
-            for group in (prepared[:FIRST], prepared[FIRST:most]):
+            for group in (prepared[:FEW], prepared[FEW:most]):
                 best = min((t.error for t in found if t), default=np.inf)
-                near = [p for p in group if best > enough or (p.trial and p.trial.error < BEHIND * best)]
+                near = [p for p in group if best > enough or (p.trial and p.trial.error < FAR * best)]
                 near = [] if self.over else near
                 found += [p.trial for p in group if p not in near]
                 for refined in self._refine(near, gain is not None, pool):
@@ -234,32 +246,32 @@ class Trials:
         nominal = {k: p.value for k, p in base.simulator.parameters.items()}
         starts: list[Mapping[str, Any]] = []
         # values from the observer's run, which may be near the truth if the simulation is not
-        led: list[Mapping[str, Any]] = []
+        observed: list[Mapping[str, Any]] = []
         for entry in entries:
             for i, own in enumerate(entry.starts):
                 _, named = place_law(base.simulator, entry, own)
                 starts.append({**base.values, **named})
                 if i == 0:
-                    led += [starts[-1]] if entry.source == "observer" else []
+                    observed += [starts[-1]] if entry.source == "observer" else []
                     starts.append({**nominal, **named})
         if set(first.law.parameters()) == set(first.law.strength):  # at zero strength the simulator is unchanged
             _, named = place_law(base.simulator, first, {k: 0.0 * np.asarray(v) for k, v in first.starts[0].items()})
             starts.append({**base.values, **named})
-        best, *rest = self._by_cost(placed, model, engine, starts, base)
-        ranked = [best, *(s for s in led if s is not best), *(s for s in rest if not any(s is o for o in led))]
+        best, *rest = self.part.by_cost(placed, model, engine, starts, base.begin)
+        others = (s for s in rest if not any(s is o for o in observed))
+        ranked = [best, *(s for s in observed if s is not best), *others]
         count = len(parent.laws) + 1
         options = {"states": base.begin, "model": model, "engine": engine}
         brief = self.fitted(placed, ranked[:1], count, solver=BRIEF, **options)
-        return _BriefFit(placed, model, engine, ranked, base.begin, count, brief)
+        return _BriefFit(placed, options, ranked, count, brief)
 
-    def _refine(self, pairs: Sequence[_BriefFit], led: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
-        """Fit pairs from several starts, and if `led` by the observer as well; three that agree are enough."""
+    def _refine(self, pairs: Sequence[_BriefFit], observer: bool, pool: ThreadPoolExecutor) -> Iterator[Trial | None]:
+        """Fit pairs from several starts, and if asked with the observer as well; three that agree are enough."""
 
         def submit(pair: _BriefFit, some: slice) -> list[Future[Trial | None]]:
-            options = {"states": pair.states, "model": pair.model, "engine": pair.engine}
             return [
-                pool.submit(self.fitted, pair.placed, [start], pair.count, anneal=anneal, **options)
-                for start, anneal in pair.starts_again(led)[some]
+                pool.submit(self.fitted, pair.placed, [start], pair.count, anneal=anneal, **pair.options)
+                for start, anneal in pair.starts_again(observer)[some]
             ]
 
         first = [submit(pair, slice(0, 3)) for pair in pairs]
@@ -271,50 +283,29 @@ class Trials:
             every = [pair.trial, *found, *(task.result() for task in tasks)]
             yield min((t for t in every if t is not None), key=lambda t: t.part, default=None)
 
-    def _by_cost(
-        self,
-        placed: Simulator,
-        model: Model,
-        engine: Engine,
-        starts: Sequence[Mapping[str, Any]],
-        base: Fitted,
-    ) -> list[Mapping[str, Any]]:
-        """Order starts by their error before a fit, from the initial states of a fit."""
-        part = self.part
-        initial = part.initial_states(placed, model, start_vector(model, starts[0]), base.begin)
-
-        def cost(start: Mapping[str, Any]) -> float:
-            values = model.parameters.unpack(start_vector(model, start))
-            found = part.result(placed, values, initial, engine, model).cost
-            return found if np.isfinite(found) else np.inf
-
-        return sorted(starts, key=cost)
-
 
 @dataclass(frozen=True, eq=False)
 class _BriefFit:
-    """A pair with its compiled model, its starts, best first, and its brief fit."""
+    """A pair with its compiled model among the options of its fits, its starts, best first, and its brief fit."""
 
     placed: Simulator
-    model: Model
-    engine: Engine
+    options: dict[str, Any]
     starts: list[Mapping[str, Any]]
-    states: list[np.ndarray]
     count: int
     trial: Trial | None
 
-    def starts_again(self, led: bool) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
+    def starts_again(self, observer: bool) -> list[tuple[Mapping[str, Any], tuple[float, ...]]]:
         """Return the starts for further fits, each with the observer's gains; those with the observer come first."""
-        starts = self.starts[:AGAIN]
+        starts = self.starts[:FEW]
         if self.trial is not None:
             starts = [self.trial.fitted.values, *starts[1:]]
-        return [(start, (1.0, 0.1)) for start in self.starts[: int(led)]] + [(start, ()) for start in starts]
+        return [(start, (1.0, 0.1)) for start in self.starts[: int(observer)]] + [(start, ()) for start in starts]
 
 
 def _agree(found: Sequence[Trial | None]) -> bool:
     """Tell whether three fits came to the same minimum."""
     costs = sorted(t.part for t in found if t)
-    return len(costs) > 2 and costs[2] < SAME * costs[0]
+    return len(costs) > 2 and costs[2] < AGREEING * costs[0]
 
 
 def _head(r: Recording, share: float) -> Recording:
@@ -323,27 +314,27 @@ def _head(r: Recording, share: float) -> Recording:
     return r if cut >= len(r) else open_start(r.slice(0, cut))
 
 
-def select_pairs(scored: Sequence[Scored], best: int = BEST) -> list[list[Scored]]:
+def select_pairs(scored: Sequence[Scored], best: int) -> list[list[Scored]]:
     """Select the pairs worth a full fit: the best of both lists and the best of each port."""
-    chosen: dict[tuple[str, type[Law]], list[Scored]] = {}
+    chosen: dict[Pair, list[Scored]] = {}
     for source in ("simulation", "observer"):
         ports, passed = set[str](), list[Scored]()
         for s in (s for s in scored if s.source == source):
             if len(passed) < best or s.port not in ports:
-                chosen.setdefault((s.port, type(s.law)), [])
+                chosen.setdefault(s.pair, [])
             if not any(_is_redundant(s, other) for other in passed):  # two forms of one law are one hypothesis
                 passed.append(s)
             ports.add(s.port)
     for s in scored:
-        if (s.port, type(s.law)) in chosen:
-            chosen[s.port, type(s.law)].append(s)
+        if s.pair in chosen:
+            chosen[s.pair].append(s)
     return [[s for s in found if s.share > LEAST_SHARE * found[0].share] or found for found in chosen.values()]
 
 
 def _is_redundant(one: Scored, other: Scored) -> bool:
     """Tell whether, of two laws at a port, one refines the other and they score the same."""
     a, b = type(one.law), type(other.law)
-    return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < EQUAL
+    return one.port == other.port and (issubclass(a, b) or issubclass(b, a)) and other.share - one.share < FORMULA
 
 
 def place_law(simulator: Simulator, entry: Scored, start: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:

@@ -1,31 +1,222 @@
-"""The verdict in words, from the posterior, the checks of the recordings, and the remainder of the refit."""
+"""The posterior of all answers, from the log evidences of all fitted hypotheses, and the verdict that follows.
+
+A hypothesis with laws has a probability in proportion to its evidence. The simulator alone claims that its whole error
+is noise; so it is weighed with samples that count in full (`search.Search.optimistic_evidence`).
+
+The right law leaves little of the mismatch for a flexible force to explain. Let s be the share of the mismatch that the
+law leaves and that a flexible force at some port would explain. The density of s is
+
+    1 / (s log(1 / s_0)) for s from s_0 to 1, if the physics has no name: log-uniform,
+    2 / (π s_0 (1 + (s / s_0)²)), if the law is the physics: half-Cauchy,
+
+and the probability of a hypothesis is divided between a named and an unnamed answer in this ratio. s_0 is the share
+that the formula of the right law may leave. The verdict is the likeliest of complete, missing physics and unexplained.
+The confidence of an effect is the probability that it is included. An effect beside others is named if that exceeds one
+half (Barbieri & Berger 2004).
+
+`judge` puts the verdict into words. It also takes into account what the checks of the recordings have found, and
+whether the refit's residual can be noise.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..laws import display_name
-from .floor import swells_with, white_part
+from ..simulators import Placed
+from .evidence import (
+    ALIKE,
+    AT_FLOOR,
+    CHANCE,
+    COLOURED,
+    DISTURBED,
+    FAR,
+    FORMULA,
+    HINT,
+    LOUDEST,
+    NEAR,
+    OUTSIDE,
+    QUIET,
+    SILENT,
+    SOMEWHAT,
+    SURE,
+)
+from .floor import ABOVE_NOISE, swells_with, white_part
 from .gates import Gate
-from .posterior import Posterior
 from .proof import mean_nrmse
 from .recording_faults import ringing
 from .search import Search
 from .trials import Trial
 
-AT_FLOOR = 1.15  # ratio to the noise that counts as at the noise
-# largest ratio of noise to a measured floor; to an estimated floor; to that if no force explains the noise
-QUANTISED, SOMEWHAT, COLOURED = 2.0, 4.0, 9.0
-LOUD, SILENT = 0.05, 0.01  # largest coloured noise over the deviation, and the share of it that a force may explain
-QUIET, CHANCE = 0.01, 0.05  # the same for noise too small to matter: a force explains that much by chance
-HINT = 0.1  # least share of a residual that a flexible force has to explain to count
-CURES = 1e-3  # share of the mean square left by a fault's correction below which the fault was the mismatch
-HALVED = 3.0  # least ratio of errors by which an effect improves on a corrected fault, to be named instead
-AS_NEAR = 1.5  # ratio to a surrogate's own error within which nothing can be said
-SURE = 0.5  # confidence above which a name is stated without reservation
+Name = tuple[str, str]  # port and law id
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """An effect of the likeliest hypothesis.
+
+    Attributes
+    ----------
+    confidence : float
+        Probability that it is included, or the same law elsewhere if the recordings cannot tell the place.
+    alike : dict
+        Port and law id of indistinguishable effects in its place -> the hypothesis, the likeliest first.
+    """
+
+    element: Placed
+    confidence: float
+    alike: dict[Name, Trial]
+
+    @property
+    def name(self) -> Name:
+        """Port and law id."""
+        return self.element.port, self.element.law.id
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Probabilities of the answers.
+
+    Attributes
+    ----------
+    best : Trial
+        The likeliest hypothesis.
+    named : float
+        Probability that the laws of the best hypothesis are the physics, given this hypothesis.
+    effects : tuple of Named
+        Its laws, strongest first.
+    nothing : float
+        Probability of the simulator alone.
+    """
+
+    best: Trial
+    named: float
+    effects: tuple[Named, ...]
+    nothing: float
+
+    @property
+    def sure(self) -> float:
+        """Confidence of the least sure effect; zero without effects."""
+        return min((e.confidence for e in self.effects), default=0.0)
+
+    def within(self, elements: Collection[Name], learned: float) -> Posterior:
+        """Restrict the effects to those in the corrected simulator, beside a learned force of a share of the mismatch.
+
+        Effects that predict other recordings worse than their replacement lose their names.
+        """
+        effects = [e for e in self.effects if e.name in elements]
+        named = min(self.named, share_named(learned if effects else 1.0))
+        ratio = named / max(self.named, 1e-300)
+        return replace(self, named=named, effects=tuple(replace(e, confidence=ratio * e.confidence) for e in effects))
+
+
+def names(trial: Trial) -> frozenset[Name]:
+    """Return ports and law ids of the effects of a hypothesis."""
+    return frozenset((e.port, e.law.id) for e in trial.effects)
+
+
+def explainable_remainder(search: Search, trial: Trial) -> float:
+    """Compute the share s of the mismatch that a hypothesis leaves and that a flexible force would explain.
+
+    A remainder that no force at a port explains counts little: it may be a disturbance that acts beside the law.
+    """
+    share = float(np.clip(max(search.flexible(trial).values(), default=0.0), 0.0, 1.0))
+    return share_left(search, trial.whole) * (share + DISTURBED * (1 - share))
+
+
+def share_left(search: Search, mean_square: float) -> float:
+    """Compute the share of the refit's mismatch above the noise that a mean square error is."""
+    excess = max(search.root.whole - search.floor2, 1e-300)
+    return float(np.clip((mean_square - search.floor2) / excess, 0.0, 1.0))
+
+
+def share_named(s: float) -> float:
+    """Compute the probability that a law which leaves the share s is the physics."""
+    law = (1 - OUTSIDE) * 2 / (np.pi * FORMULA * (1 + (s / FORMULA) ** 2))
+    other = OUTSIDE / (max(s, FORMULA) * np.log(1 / FORMULA))
+    return float(law / (law + other))
+
+
+def posterior(search: Search) -> Posterior:
+    """Weigh all hypotheses of a search."""
+    trials = list(search.memo.values())
+    weights = _weights(search, trials)
+    by_names: dict[frozenset[Name], float] = {}
+    for t, w in zip(trials, weights, strict=True):
+        by_names[names(t)] = by_names.get(names(t), 0.0) + float(w)
+    said = max(by_names, key=lambda n: by_names[n])
+    while True:
+        best = max((t for t in trials if names(t) == said), key=search.evidence)
+        if not said:
+            return Posterior(best, 0.0, (), by_names[said])
+        found = [_make_effect(search, best, e, by_names) for e in best.effects]
+        least = min(found, key=lambda e: e.confidence)
+        fewer = said - {least.name}
+        if least.confidence > SURE or fewer not in by_names or not fewer:
+            break
+        said = fewer
+    named = share_named(explainable_remainder(search, best))
+    effects = tuple(replace(e, confidence=named * e.confidence) for e in found)
+    return Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
+
+
+def _make_effect(search: Search, best: Trial, element: Placed, by_names: Mapping[frozenset[Name], float]) -> Named:
+    """Make an effect, with its inclusion probability given that the physics is in the catalogue."""
+    twins = _indistinguishable(search, best, element)
+    same = {
+        (element.port, element.law.id),
+        *(n for name in twins if name[1] == element.law.id for n in _single_effects(name)),
+    }
+    return Named(element, sum(w for n, w in by_names.items() if n & same), twins)
+
+
+def _weights(search: Search, trials: Sequence[Trial]) -> np.ndarray:
+    """Compute the probability of each hypothesis.
+
+    The simulator alone claims that its whole error is noise, so samples count in full against it. Laws claim only to be
+    near the physics; they are weighed by samples that count as far as their error is noise.
+    """
+    full, tempered = (np.array([of(t) for t in trials]) for of in (search.optimistic_evidence, search.evidence))
+    alone = np.array([not names(t) for t in trials])
+    nothing = float(np.sum(_shares(full)[alone]))
+    weights = np.empty(len(trials))
+    weights[alone] = nothing * _shares(full[alone])
+    weights[~alone] = (1 - nothing) * _shares(tempered[~alone])
+    return weights
+
+
+def _shares(logs: np.ndarray) -> np.ndarray:
+    """Normalise numbers, given by their logarithms, to a sum of one."""
+    found = np.exp(logs - logs.max(initial=-np.inf)) if len(logs) else logs
+    return np.asarray(found / max(found.sum(), 1e-300))
+
+
+def _indistinguishable(search: Search, best: Trial, element: Placed) -> dict[Name, Trial]:
+    """Find hypotheses, about as likely as the best, that have another effect in place of one of its effects.
+
+    The same law in every sensor is one effect, at "sensor:a + sensor:b".
+    """
+    own = (element.port, element.law.id)
+    rest, out = names(best) - {own}, dict[Name, Trial]()
+    least = search.evidence(best) - ALIKE
+    every = [f"sensor:{name}" for name in search.bench.simulator.output_names]
+    for t in sorted(search.memo.values(), key=search.evidence, reverse=True):
+        other = names(t) - rest
+        if search.evidence(t) < least or not rest <= names(t) or own in other or not other:
+            continue
+        if len(other) == 1 and len(names(t)) == len(names(best)):
+            out.setdefault(next(iter(other)), t)
+        elif other == {(port, element.law.id) for port in every}:
+            out.setdefault((" + ".join(every), element.law.id), t)
+    return out
+
+
+def _single_effects(name: Name) -> list[Name]:
+    """Split an effect in several places into single effects."""
+    return [(port, name[1]) for port in name[0].split(" + ")]
 
 
 @dataclass(frozen=True)
@@ -42,51 +233,51 @@ def judge(search: Search, found: Posterior, gates: Sequence[Gate], closest: Tria
     `closest` is the hypothesis that an unexplained mismatch is compared with, by default the likeliest one.
     """
     off = mean_nrmse(search.bench, search.root.fitted)
-    if search.stand_in_error and off < AS_NEAR * search.stand_in_error:
+    if search.stand_in_error and off < NEAR * search.stand_in_error:
         return Verdict(
             "complete",
             "Nothing is seen that the simulation lacks: refitted, what stands for it follows the recordings to "
             f"{off:.3g} of the outputs' deviation, and the simulation itself to {search.stand_in_error:.3g}.",
         )
     faults = [g for g in gates if g.fault]
-    cured = min((g.left for g in faults), default=1.0) < CURES
-    if cured and search.root.whole < HALVED**2 * found.best.whole:  # beside the fault, an effect is negligible
+    cured = min((g.left for g in faults), default=1.0) < FORMULA
+    if cured and search.root.whole < FAR**2 * found.best.whole:  # beside the fault, an effect is negligible
         return Verdict("recording-fault", faults[0].sentence)
-    if found.effects and found.named > 0.5:
+    if found.effects and found.named > SURE:
         return Verdict("missing-physics", _describe_effects(search, found))
-    opened = search.flexible(search.root)
-    still = max(opened.values(), default=0.0)
-    hum = [g for g in gates if g.finding == "tone" and not found.effects]
-    own = ringing(search.bench, search.root.fitted)
-    noise = not found.effects and _is_noise(search, hum, still, own)
-    if faults and (noise or cured or (still < HINT and not found.effects)):
+    shares = search.flexible(search.root)
+    share = max(shares.values(), default=0.0)
+    steady = [g for g in gates if g.finding == "tone" and not found.effects]
+    mode = ringing(search.bench, search.root.fitted)
+    noise = not found.effects and _is_noise(search, steady, share, mode)
+    if faults and (noise or cured or (share < HINT and not found.effects)):
         return Verdict("recording-fault", faults[0].sentence)
-    if noise and still < HINT:
-        beside = f" but a steady tone in {' and '.join(g.channel for g in hum)}" if hum else ""
+    if noise and share < HINT:
+        beside = f" but a steady tone in {' and '.join(g.channel for g in steady)}" if steady else ""
         return Verdict(
             "complete",
             f"Nothing is missing{beside}: refitted, the simulator follows the recordings to {off:.3g} of the "
             "outputs' deviation, and no force at any port explains any of the rest.",
         )
     return Verdict(
-        "unexplained", _describe_unexplained(search, closest if closest and closest.laws else found.best, opened, own)
+        "unexplained", _describe_unexplained(search, closest if closest and closest.laws else found.best, shares, mode)
     )
 
 
-def _is_noise(search: Search, hum: Sequence[Gate], still: float, own: float | None) -> bool:
+def _is_noise(search: Search, steady: Sequence[Gate], share: float, mode: float | None) -> bool:
     """Tell whether the refit's residual can be noise: no force explains it, no mode rings, and its power is steady."""
     root = search.root
-    quiet = root.error * max(1 - sum(1 - g.left for g in hum), 0.0) ** 0.5
+    quiet = root.error * max(1 - sum(1 - g.left for g in steady), 0.0) ** 0.5
     white = white_part(root.fitted.residual) if search.floor.source == "estimated" else search.floor.deviation
     times = quiet / float(np.sqrt(np.mean((white / search.bench.scale) ** 2)))
     if times < AT_FLOOR:
         return True
-    unexplained = still < (CHANCE if root.whole < QUIET**2 else SILENT)
+    unexplained = share < (CHANCE if root.whole < QUIET**2 else SILENT)
     if search.floor.source != "estimated":
-        like = times < QUANTISED and unexplained
+        like = times < ABOVE_NOISE and unexplained
     else:
-        like = times < SOMEWHAT or (times < COLOURED and unexplained and root.whole < LOUD**2)
-    return like and own is None and not _swells(search)
+        like = times < SOMEWHAT or (times < COLOURED and unexplained and root.whole < LOUDEST**2)
+    return like and mode is None and not _swells(search)
 
 
 def _swells(search: Search) -> bool:
@@ -117,26 +308,26 @@ def _describe_vanished(search: Search, found: Posterior) -> str:
     return f" Beside {beside}, {' and '.join(gone)} {'come' if gone[1:] else 'comes'} out as zero." if gone else ""
 
 
-def _describe_unexplained(search: Search, closest: Trial, opened: dict[str, float], own: float | None) -> str:
-    root, still = search.root, max(opened.values(), default=0.0)
-    where = max(opened, key=lambda k: opened[k], default="")
-    laws = [e for e in closest.laws if e.law.id != "offset"]
+def _describe_unexplained(search: Search, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
+    root, share = search.root, max(shares.values(), default=0.0)
+    where = max(shares, key=lambda k: shares[k], default="")
+    laws = closest.effects
     if not laws:
         rings = (
-            f" The rest swings at the simulator's own {own:.3g} Hz, as from a force that was not recorded or a value "
+            f" The rest swings at the simulator's own {mode:.3g} Hz, as from a force that was not recorded or a value "
             "that varies in time."
-            if own
+            if mode
             else ""
         )
-        at = f" A force at {where} could explain {still:.0%} of the rest." if still > HINT else ""
+        at = f" A force at {where} could explain {share:.0%} of the rest." if share > HINT else ""
         noise = search.floor.nrmse(search.bench.scale)
         return (
             "Physics is missing, and no law of the catalogue explains it. The refitted simulator is off by "
             f"{100 * mean_nrmse(search.bench, root.fitted):.3g} % of the outputs' deviation; the noise is about "
             f"{100 * noise:.3g} %.{at}{rings}"
         )
-    port = where if opened.get(laws[0].port, 0.0) < 0.5 * still else laws[0].port
-    left = (closest.whole - search.floor2) / max(root.whole - search.floor2, 1e-300)
+    port = where if shares.get(laws[0].port, 0.0) < 0.5 * share else laws[0].port
+    left = share_left(search, closest.whole)
     rest = max(search.flexible(closest).values(), default=0.0)
     words = " and ".join(f"{display_name(e.law.id, e.law.form)} at {e.port}" for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"

@@ -11,20 +11,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .._base import InputError, one_at_a_time
 from ..data import Recording
 from ..engine import Engine, make_engine
-from ..identify import FitContext, match_channels, solve_within_bounds
+from ..identify import match_channels, solve_within_bounds
+from ..laws import Local
 from ..linear import INJECTION, with_output_injection
 from ..models import Model
 from ..optimise import GaussNewton, Problem, Status
 from ..simulators import (
     LARGEST_STEP,
     MOST_SUBSTEPS,
+    Placed,
     Simulator,
     choose_substeps,
     compute_equilibrium,
@@ -37,13 +39,25 @@ from ..simulators import (
 )
 from .floor import white_part
 
-QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)  # default solver of a fit
-HUGE, DIVERGED = 1e6, 1e20  # bounds on a diverging run: output over the largest measured value, and mean square error
+# Solvers: of the fits that results are based on; of other fits; of the first fit of a law, to rank the laws
+THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)
+QUICK = GaussNewton(max_iterations=40, tolerance=1e-3, patience=4)
+BRIEF = GaussNewton(max_iterations=12, tolerance=1e-3, patience=4)
+FEW = 3  # ports, laws, starts or fits that are tried at each choice of a search, which saves time
+LONG = 8000  # samples on which fits and forces are compared first
+
+# Steps of the integration
+FINER = 4  # largest factor on the sub-steps for a law, and factor of each refinement of steps and knees
+DEPENDS = 0.3  # least change by finer steps, over the noise, for which they are used
+LEAST_NOISE = 3e-4  # least noise, over the outputs' deviation, that the steps are compared with
+CHANGED = 0.1  # share by which finer steps may change the mean square
+NARROW = 0.05  # share of the widest knee that is tried, below which a knee is sharp
+
+# Diverging runs
+HUGE, DIVERGED = 1e6, 1e20  # bounds: output over the largest measured value, and mean square error
 RUNAWAY = 10.0  # over the outputs' deviation; a bounded oscillation about another point is off by less
 # growth within a recording, in e-folds, above which no estimated initial state can keep the run bounded
 MOST_GROWTH = 20.0
-FINER = 4  # largest factor on the sub-steps for a law
-THOROUGH = GaussNewton(max_iterations=150, tolerance=1e-6, patience=6)  # solver of the fits that results are based on
 
 
 class RunsAway(InputError):
@@ -80,6 +94,11 @@ class Fitted:
         return self.model.parameters.pack(self.values)
 
     @property
+    def fitted_model(self) -> Model:
+        """The model with the fitted values as start values."""
+        return self.model.with_parameters(self.model.parameters.at(self.vector))
+
+    @property
     def at_bounds(self) -> float:
         """Share of the free parameters at a bound."""
         p, at = self.model.parameters, self.vector
@@ -94,6 +113,10 @@ class Fitted:
     def begin(self) -> list[np.ndarray]:
         """The simulator's own states at each recording's first sample, without those of laws."""
         return [state[: len(self.simulator.states)] for state in self.initial]
+
+    def last_elements(self, count: int) -> tuple[Placed, ...]:
+        """Return the elements that were added last, in their order."""
+        return self.simulator.elements[len(self.simulator.elements) - count :]
 
     def corrected(self) -> Simulator:
         """Return the simulator with the fitted values as start values."""
@@ -167,14 +190,15 @@ class Workbench:
             least = min(least, FINER * self.chosen)
         return int(np.clip(wanted, least, max(FINER * self.chosen, least)))
 
-    def too_coarse(self, fitted: Fitted) -> bool:
-        """Tell whether a law became faster than the sub-steps allow, which were chosen at its start values."""
-        return self._substeps(fitted.corrected()) > fitted.model.substeps
+    def problem(self, model: Model, engine: Engine, scored: Sequence[np.ndarray] | None = None) -> Problem:
+        """Make the simulation-error problem of a model; `scored` marks the samples that count, all by default."""
+        return Problem(model, self.recordings, engine=engine, scale=self.scale, scored=scored)
 
-    def problem(self, model: Model, engine: Engine | str | None = None, recordings: Any = None) -> Problem:
-        """Make the simulation-error problem of a model."""
-        context = FitContext(tuple(recordings or self.recordings), QUICK)
-        return context.problem(model, engine=engine or self.engine, scale=self.scale)
+    def problem_at(self, fitted: Fitted, scored: Sequence[np.ndarray] | None = None) -> tuple[Problem, np.ndarray]:
+        """Make the simulation-error problem of a fitted simulator; return it and its variables at the fitted values."""
+        problem = self.problem(fitted.fitted_model, fitted.engine, scored)
+        states = [s for r, s in zip(self.recordings, fitted.initial, strict=True) if r.begins == "estimate"]
+        return problem, np.concatenate([problem.start[: problem.n_free], *states])
 
     def fit(
         self,
@@ -315,6 +339,30 @@ class Workbench:
             out.append(np.append(state, full[len(state) :]))
         return out
 
+    def by_cost(
+        self,
+        simulator: Simulator,
+        model: Model,
+        engine: Engine,
+        starts: Sequence[Mapping[str, Any]],
+        states: Sequence[np.ndarray],
+    ) -> list[Mapping[str, Any]]:
+        """Order starts by their error before a fit, from the same initial states."""
+        initial = self.initial_states(simulator, model, start_vector(model, starts[0]), states)
+
+        def cost(start: Mapping[str, Any]) -> float:
+            values = model.parameters.unpack(start_vector(model, start))
+            found = self.result(simulator, values, initial, engine, model).cost
+            return found if np.isfinite(found) else np.inf
+
+        return sorted(starts, key=cost)
+
+    def local(self, z: np.ndarray, dz: np.ndarray) -> Local:
+        """Return the local signals of a port along all recordings, with the inputs."""
+        inputs = dict(zip(self.simulator.inputs, np.concatenate([r.u for r in self.recordings]).T, strict=True))
+        lengths, rest = tuple(map(len, self.recordings)), tuple(r.begins == "zero" for r in self.recordings)
+        return Local(z, dz, self.dt, lengths, inputs=inputs, from_zero=rest)
+
     def rerun(self, fitted: Fitted, simulator: Simulator | None = None) -> Fitted:
         """Run the same values on this bench's steps, with the laws' parameters of `simulator` if that is given."""
         simulator = simulator or fitted.simulator
@@ -347,20 +395,10 @@ def start_vector(model: Model, start: Mapping[str, Any]) -> np.ndarray:
     return np.asarray(np.clip(p.pack({k: v for k, v in start.items() if k in p}), p.lower, p.upper))
 
 
-if TYPE_CHECKING:
-    from .trials import Trial
-
-DEPENDS = 0.3  # least change by finer steps, over the noise, for which they are used
-QUIET = 3e-4  # least noise, over the outputs' deviation, that the steps are compared with
-NARROW = 0.05  # share of the widest knee that is tried, below which a knee is sharp
-KNEES = (0.25, 4.0)  # factors on the knee width from which a law is fitted again
-FINEST, SAME = 16, 0.1  # largest factor on the sub-steps; share by which finer steps may change the mean square
-
-
 def refine_steps(bench: Workbench, fitted: Fitted) -> tuple[Workbench, Fitted]:
     """Refine the steps until their error is less than the noise; return the bench and the fit there."""
-    noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), QUIET**2)
-    most, steps = min(FINEST * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
+    noise2 = max(float(np.mean((white_part(fitted.residual) / bench.scale) ** 2)), LEAST_NOISE**2)
+    most, steps = min(FINER**2 * bench.chosen, MOST_SUBSTEPS), fitted.model.substeps
     while FINER * steps <= most and not fitted.simulator.discrete:
         steps = FINER * steps
         tried = replace(bench, substeps=steps)
@@ -388,12 +426,12 @@ def _difference2(bench: Workbench, one: Fitted, other: Fitted) -> float:
     return float(np.mean(np.concatenate([((a - b) / bench.scale)[r.skip :] for a, b, r in both]) ** 2))
 
 
-def knee_starts(candidate: Trial) -> list[dict[str, Any]]:
-    """Return the fitted values, and if the knee is sharp also those with a sharper and a wider one."""
-    values, knee = candidate.fitted.values, candidate.knee
-    if not knee or values[knee] > NARROW * candidate.fitted.model.parameters[knee].bounds[1]:
+def knee_starts(fitted: Fitted, knee: str) -> list[dict[str, Any]]:
+    """Return the fitted values, and if there is a sharp knee also those with a sharper and a wider one."""
+    values = fitted.values
+    if not knee or values[knee] > NARROW * fitted.model.parameters[knee].bounds[1]:
         return [values]
-    return [values, *({**values, knee: times * values[knee]} for times in KNEES)]
+    return [values, *({**values, knee: times * values[knee]} for times in (1 / FINER, FINER))]
 
 
 def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
@@ -403,14 +441,14 @@ def refit_on_finer_steps(bench: Workbench, fitted: Fitted, knee: str) -> Fitted:
     """
     given = fitted.simulator.parameters[knee]
     low, high = given.bounds
-    if fitted.model.substeps * FINER > FINEST * bench.chosen:
+    if fitted.model.substeps * FINER > FINER**2 * bench.chosen:
         return fitted
     finer, placed = replace(bench, at_least=FINER * fitted.model.substeps), fitted.corrected()
     sharper = replace(given, value=fitted.values[knee], bounds=(low / FINER, high))
     placed = placed.with_parameters({**placed.parameters, knee: sharper})
     there = finer.rerun(fitted, placed)
     held = fitted.values[knee] <= low
-    if not held and abs(there.cost / fitted.cost - 1) < SAME:
+    if not held and abs(there.cost / fitted.cost - 1) < CHANGED:
         return fitted
     starts = [fitted.values, *([{**fitted.values, knee: low / 2}] if held else [])]
     states, model, engine = fitted.begin, there.model, there.engine

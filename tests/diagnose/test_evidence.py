@@ -10,7 +10,7 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.evidence import EXACT, Sample, information, log_evidence, log_prior, spread
-from pilfr_casadi.diagnose.posterior import share_named
+from pilfr_casadi.diagnose.verdict import share_named
 
 NONE = np.zeros(0)
 

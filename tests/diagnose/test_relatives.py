@@ -40,7 +40,7 @@ DT, M = 0.02, 1500
 
 def fitted(port, law, error, **own):
     """What is read of a fitted law of the catalogue."""
-    return SimpleNamespace(port=port, law=law, error=error, own=own)
+    return SimpleNamespace(port=port, law=law, pair=(port, type(law)), error=error, own=own)
 
 
 def asked_for(trials, scored):

@@ -1,6 +1,7 @@
 """The search over hypotheses: when it stops, what it keeps, and what an interrupt and a time limit leave."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,11 +10,12 @@ from diagnosis_rig import OFF, recordings, rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import laws
 from pilfr_casadi._base import Stages
-from pilfr_casadi.diagnose import Workbench, preparation
+from pilfr_casadi.diagnose import Workbench, correction, preparation
 from pilfr_casadi.diagnose.floor import Floor
 from pilfr_casadi.diagnose.search import Search
 from pilfr_casadi.diagnose.trials import Trials
-from pilfr_casadi.optimise import GaussNewton
+from pilfr_casadi.diagnose.verdict import posterior
+from pilfr_casadi.optimise import GaussNewton, Status
 
 FRICTION = laws.CoulombFriction(values={"F_c": 10.0, "v_0": 0.01})
 TRIED = (laws.CoulombFriction, laws.CubicStiffness, laws.ViscousDamping)
@@ -55,6 +57,35 @@ def test_at_the_time_limit_the_search_answers_from_what_it_has():
     assert "The time limit ended the search" in str(diagnosis)
     with pytest.raises(pilfr.InputError, match="time_limit=0 was given"):
         pilfr.diagnose(rig(OFF), recordings(FRICTION, count=1), time_limit=0)
+
+
+def test_after_the_deadline_the_correction_fits_nothing_more(monkeypatch):
+    found = searching(recordings(FRICTION, count=1)).run(1)
+    found.memo = {key: replace(t, thorough=False) for key, t in found.memo.items()}
+    fitted, polish = [], Trials.polish
+
+    def refit(bench, found):
+        fitted.append(found)
+        raise pilfr.InputError("It diverges.")
+
+    monkeypatch.setattr(Trials, "polish", lambda self, trial: fitted.append(trial) or polish(self, trial))
+    monkeypatch.setattr(correction, "refit_learned", refit)
+    found.deadline = 0.0
+    correction.find_correction(found, posterior(found))
+    assert not fitted
+    found.deadline = np.inf
+    correction.find_correction(found, posterior(found))
+    assert fitted
+
+
+def test_an_answer_that_rests_on_an_interrupted_fit_is_concluded():
+    search = searching(recordings(FRICTION, count=1)).run(1)
+    search.bench.interrupted_fits.append(Status.INTERRUPTED)
+    with pytest.raises(KeyboardInterrupt), search.stage("fits"):
+        pass
+    search.interrupted = True
+    with search.stage("conclusion"):
+        assert posterior(search).effects
 
 
 def test_a_hypothesis_fitted_to_a_part_is_judged_on_everything(monkeypatch):
