@@ -18,7 +18,6 @@ about. The files by stage:
 - Result: `result`.
 - Before a diagnosis: `checkup` (what the recordings can reveal), based on `identifiability` (of parameters) and
   `detectability` (of laws).
-- Without a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
 """
 
 from __future__ import annotations
@@ -31,6 +30,7 @@ from .._base.lazy import lazy_face
 if TYPE_CHECKING:
     from .._base import Progress
     from ..data import Recording
+    from ..identify import surrogate as surrogate
     from ..laws import Law
     from .checkup import BlindSpot as BlindSpot, Check as Check, check as check
     from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
     from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect
-    from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate
     from .workbench import Fitted as Fitted, Workbench as Workbench
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -12,6 +12,7 @@ import numpy as np
 
 from .._base import InputError, Progress, Stages, one_blas_thread, processors, whole
 from ..data import Recording
+from ..identify import surrogate_warning
 from ..laws import Law, readable_unit
 from ..simulators import Simulator
 from .checkup import BlindSpot, assess
@@ -37,7 +38,6 @@ from .proof import deviations, mean_nrmse, next_experiment, parameter_table, pla
 from .recording_faults import clipped_input, tones
 from .result import Diagnosis, Effect
 from .search import Search
-from .surrogates import surrogate_gates
 from .trials import Trial
 from .verdict import SURE, Verdict, judge
 from .workbench import Fitted
@@ -293,7 +293,7 @@ def _build_diagnosis(
             _row(search, search.memo.get(t.key, t), step.parent) for step in search.steps for t in step.trials
         ),
         gates=(
-            *surrogate_gates(request.stand_in_error),
+            *_surrogate_note(request.stand_in_error),
             *final_gates(found.gates, after, std, bool(effects), settled),
         ),
         mismatch=mismatch(
@@ -322,6 +322,14 @@ def _build_diagnosis(
         correction=found.correction,
         blind_spots=_blind_spots(request, search),
     )
+
+
+def _surrogate_note(error: float) -> tuple[Gate, ...]:
+    """Note that a surrogate stands for the simulation and misses it by an NRMSE of `error`; no note if that is zero."""
+    if not error:
+        return ()
+    words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
+    return (Gate("simulation", "surrogate", error, f"{words} {surrogate_warning(error)}".rstrip(), False),)
 
 
 def _blind_spots(request: Request, search: Search) -> tuple[BlindSpot, ...]:
