@@ -16,8 +16,8 @@ about. The files by stage:
 - Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
 - Proof: `proof` (errors before and after, placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`.
-- Before a diagnosis: `checkup` (what the recordings can reveal), based on `identifiability` (of parameters) and
-  `detectability` (of laws).
+- Before a diagnosis: `blind_spots` (`check`: what the recordings cannot reveal), based on `identifiability` (which
+  parameters are identifiable, and which laws detectable).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ..data import Recording
     from ..identify import surrogate as surrogate
     from ..laws import Law
-    from .checkup import BlindSpot as BlindSpot, Check as Check, check as check
+    from .blind_spots import BlindSpot as BlindSpot, Check as Check, check as check
     from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force

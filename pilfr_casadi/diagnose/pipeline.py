@@ -15,10 +15,11 @@ from ..data import Recording
 from ..identify import surrogate_warning
 from ..laws import Law, readable_unit
 from ..simulators import Simulator
-from .checkup import BlindSpot, assess
+from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
-from .detectability import port_units
+from .floor import Floor
 from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
+from .identifiability import port_units
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
 from .posterior import Named, Posterior, names, posterior
@@ -178,11 +179,10 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         early=shift_early,
         say=request.say,
     )
-    floor = ready.floor
     search = Search(
         ready.bench,
         ready.without,
-        floor.beside(request.stand_in_error * ready.bench.scale) if request.stand_in_error else floor,
+        _noise(request, ready),
         (*request.laws, Offset),
         request.workers,
         request.say,
@@ -193,6 +193,13 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         times={CHECKS: time.perf_counter() - began},
     )
     return ready, search.run(request.most_effects)
+
+
+def _noise(request: Request, ready: Prepared) -> Floor:
+    """Return the noise floor of the prepared recordings; the error of a surrogate counts as noise."""
+    if not request.stand_in_error:
+        return ready.floor
+    return ready.floor.beside(request.stand_in_error * ready.bench.scale)
 
 
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
@@ -320,7 +327,7 @@ def _build_diagnosis(
         substeps=after.model.substeps,
         freed=found.freed,
         correction=found.correction,
-        blind_spots=_blind_spots(request, search),
+        blind_spots=_blind_spots(request, ready, search),
     )
 
 
@@ -332,11 +339,11 @@ def _surrogate_note(error: float) -> tuple[Gate, ...]:
     return (Gate("simulation", "surrogate", error, f"{words} {surrogate_warning(error)}".rstrip(), False),)
 
 
-def _blind_spots(request: Request, search: Search) -> tuple[BlindSpot, ...]:
+def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[BlindSpot, ...]:
     """Find what the recordings cannot reveal of the refitted simulator; empty if that cannot be computed."""
-    bench = search.bench
+    stated = search.bench.hold if request.hold_said else ""
     with suppress(InputError, np.linalg.LinAlgError):
-        return assess(bench, search.root.fitted, bench.hold if request.hold_said else "").blind_spots
+        return assess_recordings(search.bench, search.root.fitted, _noise(request, ready), stated).blind_spots
     return ()
 
 
