@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from pilfr_casadi import Parameter, Port, Recording, Simulator, close_loop, diagnose
+from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
 from pilfr_casadi.laws import CoulombFriction, Delay
 
 DT, SAMPLES, FINE = 0.002, 3000, 10  # s, samples, steps of the truth in a sample
@@ -28,6 +28,10 @@ KNEE = 0.02  # rad/s
 
 def simulator(inertia: float, damping: float, friction: float) -> Simulator:
     """Make the rigid joint with friction, and a delay of the torque."""
+
+    def into(p: Any) -> dict[str, Any]:
+        return {"speed": -1 / p.J}
+
     rigid = Simulator(
         lambda x, u, p: {"angle": x.speed, "speed": (u.torque - p.d * x.speed) / p.J},
         lambda x: {"motor": x.angle},
@@ -37,19 +41,13 @@ def simulator(inertia: float, damping: float, friction: float) -> Simulator:
             "J": Parameter(inertia, unit="kg m^2", bounds=(inertia / 5, inertia * 5)),
             "d": Parameter(damping, unit="N m s/rad", bounds=(0.0, 50 * damping)),
         },
-        ports=Port(
-            "joint",
-            into=lambda p: {"speed": -1 / p.J},
-            across=lambda x: x.angle,
-            rate=lambda x: x.speed,
-            unit="N m",
-            across_unit="rad",
-        ),
+        ports=(Port("joint", into, lambda x: x.angle, lambda x: x.speed, unit="N m", across_unit="rad"),),
         hold="zero",
         units={"torque": "N m", "motor": "rad"},
     )
-    rubbing = close_loop(rigid, CoulombFriction().at({"F_c": friction, "v_0": KNEE}), "joint")
-    return close_loop(rubbing, Delay().at({"T": DT}), "actuator:torque")
+    friction_law = CoulombFriction().at({"F_c": friction, "v_0": KNEE})
+    rubbing = rigid.with_element("joint", friction_law)
+    return rubbing.with_element("actuator:torque", Delay().at({"T": DT}))
 
 
 def recorded(seed: int, elastic: bool) -> tuple[Simulator, Recording, Recording]:

@@ -187,12 +187,12 @@ def _surrogate(
 ) -> tuple[Simulator, float, str]:
     """Fit a linear model to the simulation; return it, its NRMSE, and a note if the fit is poor."""
     with deferred_interrupt():
-        from ..diagnose import POOR, TOO_POOR, surrogate
+        from ..identify import surrogate, surrogate_warning
     assert options.simulated is not None
     with progress_bar() as progress:
         progress("linear model of the simulation", 0, 0, np.nan)
         simulator, error = surrogate(options.read(options.simulated, inputs, outputs))
-    return simulator, error, TOO_POOR if error > POOR else ""
+    return simulator, error, surrogate_warning(error)
 
 
 def _simulated_names(options: DiagnoseOptions) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -242,7 +242,7 @@ def _unshared(files: Sequence[str], columns: Sequence[Sequence[str]], shared: Se
 
 def _cause(options: DiagnoseOptions, shared: Sequence[str]) -> tuple[str, ...]:
     """Return which of two columns is the input: a linear model fits only from cause to effect."""
-    from ..diagnose import surrogate
+    from ..identify import surrogate
 
     assert options.simulated is not None
     errors = {}

@@ -18,9 +18,8 @@ about. The files by stage:
 - Other explanations: `other_explanations` (a pinned value, an undeclared port, a machine that changed).
 - Proof: `proof` (errors before and after, placebo, next experiment), `force_recovery`, `mismatch_map`.
 - Result: `result`, and `refinement`: a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
-- Before a diagnosis: `checkup` (what the recordings can reveal), based on `identifiability` (of parameters) and
-  `detectability` (of laws).
-- Without a simulator: `surrogates` and `modes` make one from a table of simulated inputs and outputs.
+- Before a diagnosis: `blind_spots` (`check`: what the recordings cannot reveal), based on `identifiability` (which
+  parameters are identifiable, and which laws detectable).
 """
 
 from __future__ import annotations
@@ -33,15 +32,15 @@ from .._base.lazy import lazy_face
 if TYPE_CHECKING:
     from .._base import Progress
     from ..data import Recording
+    from ..identify import surrogate as surrogate
     from ..laws import Law
-    from .checkup import BlindSpot as BlindSpot, Check as Check, check as check
+    from .blind_spots import BlindSpot as BlindSpot, Check as Check, check as check
     from .force_recovery import HiddenForce as HiddenForce, hidden_force as hidden_force
     from .gates import Gate as Gate
     from .learned import Learned as Learned, NearLaw as NearLaw, learned_force as learned_force
     from .mismatch_map import mismatch as mismatch
     from .refinement import Refinement as Refinement
     from .result import Comparison as Comparison, Diagnosis as Diagnosis, Effect as Effect
-    from .surrogates import POOR as POOR, TOO_POOR as TOO_POOR, surrogate as surrogate
     from .workbench import Fitted as Fitted, Workbench as Workbench
 else:
     __getattr__, __dir__, __all__ = lazy_face(__name__, __file__)

@@ -256,9 +256,9 @@ def refit_learned(bench: Workbench, found: Fitted) -> Fitted:
     return bench.result(placed, {**fitted.values, **seen}, fitted.initial, engine, model)
 
 
-def signals_along(bench: Workbench, fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute local coordinate, rate and force of the last element along the runs of all recordings, (M,) each."""
-    number = len(fitted.simulator.elements) - 1
+def signals_along(bench: Workbench, fitted: Fitted, number: int = -1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute local coordinate, rate and force of an element along the runs of all recordings, (M,) each."""
+    number %= len(fitted.simulator.elements)
     found = [law_signals(bench, fitted, number, i) for i in range(len(bench.recordings))]
     z, dz, w = (np.concatenate(part) for part in zip(*found, strict=True))
     return z, dz, w

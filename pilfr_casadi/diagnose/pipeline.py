@@ -31,13 +31,15 @@ import numpy as np
 
 from .._base import InputError, Progress, Stages, one_blas_thread, processors, whole
 from ..data import Recording
+from ..identify import surrogate_warning
 from ..laws import Law, readable_unit
 from ..simulators import Simulator
-from .checkup import BlindSpot, assess
+from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction, find_correction, named_correction
-from .detectability import port_units
 from .evidence import AS_GIVEN, SURE, deviations
+from .floor import Floor
 from .gates import Gate, Offset, final_gates, offset_gates, without_idle_offsets
+from .identifiability import port_units
 from .mismatch_map import mismatch
 from .other_explanations import find_pinned_parameter, find_undeclared_port, find_varying_values
 from .prediction import FOCUS, FOLLOWED, can_be_led, prediction_note, predictor
@@ -57,7 +59,6 @@ from .proof import free_run_errors, mean_nrmse, next_experiment, parameter_table
 from .recording_faults import clipped_input, tones
 from .result import Diagnosis, Effect
 from .search import Search
-from .surrogates import surrogate_gates
 from .trials import Trial
 from .verdict import Named, Posterior, Verdict, judge, names, posterior
 from .workbench import Fitted, RunsAway
@@ -211,11 +212,10 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
     )
     if request.focus is None:  # an unstable simulator may stay within bounds and still not follow
         ready.bench.check_followed(ready.without, FOLLOWED)
-    floor = ready.floor
     search = Search(
         ready.bench,
         ready.without,
-        floor.beside(request.stand_in_error * ready.bench.scale) if request.stand_in_error else floor,
+        _noise(request, ready),
         (*request.laws, Offset),
         request.workers,
         request.say,
@@ -226,6 +226,13 @@ def _search_once(request: Request, shift_early: bool) -> tuple[Prepared, Search]
         times={CHECKS: time.perf_counter() - began},
     )
     return ready, search.run(request.most_effects)
+
+
+def _noise(request: Request, ready: Prepared) -> Floor:
+    """Return the noise floor of the prepared recordings; the error of a surrogate counts as noise."""
+    if not request.stand_in_error:
+        return ready.floor
+    return ready.floor.beside(request.stand_in_error * ready.bench.scale)
 
 
 def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
@@ -328,7 +335,7 @@ def _build_diagnosis(
             _row(search, search.memo.get(t.key, t), step.parent) for step in search.steps for t in step.trials
         ),
         gates=(
-            *surrogate_gates(request.stand_in_error),
+            *_surrogate_note(request.stand_in_error),
             *final_gates(found.gates, after, std, bool(effects), settled),
         ),
         mismatch=mismatch(
@@ -355,15 +362,23 @@ def _build_diagnosis(
         substeps=after.model.substeps,
         freed=found.freed,
         correction=found.correction,
-        blind_spots=_blind_spots(request, search),
+        blind_spots=_blind_spots(request, ready, search),
     )
 
 
-def _blind_spots(request: Request, search: Search) -> tuple[BlindSpot, ...]:
+def _surrogate_note(error: float) -> tuple[Gate, ...]:
+    """Note that a surrogate stands for the simulation and misses it by an NRMSE of `error`; no note if that is zero."""
+    if not error:
+        return ()
+    words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
+    return (Gate("simulation", "surrogate", error, f"{words} {surrogate_warning(error)}".rstrip(), False),)
+
+
+def _blind_spots(request: Request, ready: Prepared, search: Search) -> tuple[BlindSpot, ...]:
     """Find what the recordings cannot reveal of the refitted simulator; empty if that cannot be computed."""
-    bench = search.bench
+    stated = search.bench.hold if request.hold_said else ""
     with suppress(InputError, np.linalg.LinAlgError):
-        return assess(bench, search.root.fitted, bench.hold if request.hold_said else "").blind_spots
+        return assess_recordings(search.bench, search.root.fitted, _noise(request, ready), stated).blind_spots
     return ()
 
 

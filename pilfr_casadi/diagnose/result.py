@@ -19,7 +19,7 @@ from ..identify import match_channels
 from ..laws import display_name
 from ..models import ParameterSet
 from ..simulators import Simulator, discretise, in_series
-from .checkup import BlindSpot
+from .blind_spots import BlindSpot
 from .correction import Correction
 from .evidence import BETTER, FAR, SURE
 from .floor import ABOVE_NOISE

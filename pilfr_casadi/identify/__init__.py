@@ -3,7 +3,8 @@
 `fitting` holds `fit`, which checks its arguments and chooses the method. `start` computes start values, `multistart`
 chooses which of them are tried and polishes the best, `context` solves with the options that all fits share,
 `penalty` adds the L1 penalty, and `lagged` trains NARX and NOE models. `result` is the `Fit`, `uncertainty` its
-standard errors, and `sparse` makes fits with fewer operators from it.
+standard errors, and `sparse` makes fits with fewer operators from it. `surrogates` makes a linear simulator in `modes`
+from a table of simulated inputs and outputs.
 """
 
 from typing import TYPE_CHECKING
@@ -65,6 +66,11 @@ if TYPE_CHECKING:
         network_start as network_start,
         paper_start as paper_start,
         unit_states as unit_states,
+    )
+    from .surrogates import (
+        POOR_SURROGATE as POOR_SURROGATE,
+        surrogate as surrogate,
+        surrogate_warning as surrogate_warning,
     )
     from .uncertainty import (
         covariance as covariance,

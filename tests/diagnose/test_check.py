@@ -322,5 +322,5 @@ def test_every_law_of_the_catalogue_is_in_the_table():
 
 
 def test_its_name_stays_a_function():
-    importlib.import_module("pilfr_casadi.diagnose.checkup")
+    importlib.import_module("pilfr_casadi.diagnose.blind_spots")
     assert pilfr.check is check and "without fitting a law" in check.__doc__

@@ -1,5 +1,7 @@
 """What stands for a simulator: a linear surrogate of a simulation, a control.StateSpace, a fitted PI-LFR."""
 
+import importlib
+
 import control
 import numpy as np
 import pytest
@@ -8,11 +10,10 @@ from scipy.signal import cont2discrete
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Recording, multisine
-from pilfr_casadi.diagnose import POOR, surrogate
-from pilfr_casadi.diagnose.modes import modes, to_continuous
-from pilfr_casadi.diagnose.surrogates import modal_simulator
 from pilfr_casadi.engine import VirtualMachine
-from pilfr_casadi.identify import fit
+from pilfr_casadi.identify import POOR_SURROGATE, fit, surrogate, surrogate_warning
+from pilfr_casadi.identify.modes import modes, to_continuous
+from pilfr_casadi.identify.surrogates import modal_simulator
 from pilfr_casadi.simulators import as_simulator, discretise
 
 DT = 0.01
@@ -151,7 +152,13 @@ def test_a_mass_on_a_rail_is_one_mode(drag):
 
 
 def test_a_simulation_that_is_not_linear_has_a_poor_surrogate():
-    assert surrogate(simulation(cubic=3000.0))[1] > POOR
+    error = surrogate(simulation(cubic=3000.0))[1]
+    assert error > POOR_SURROGATE and "is not linear" in surrogate_warning(error)
+    assert surrogate_warning(POOR_SURROGATE) == ""
+
+
+def test_the_diagnosis_offers_it_too():
+    assert importlib.import_module("pilfr_casadi.diagnose").surrogate is surrogate
 
 
 def test_a_state_space_is_a_simulator():

@@ -1,9 +1,9 @@
-"""Assess recordings before a diagnosis: what they and the sensors can reveal of a simulator, without fitting a law.
+"""Blind spots: what recordings and sensors cannot reveal of a simulator, found without fitting a law (`pilfr check`).
 
-The simulator's own parameters are refitted once. Everything else follows from the simulator linearised along that run:
-`identifiability` tells which parameters are identifiable, `detectability` which laws are detectable at which ports. A
-parameter or law that is neither is a blind spot. The gravest blind spot that another recording can mend decides what to
-record next.
+The simulator's own parameters are refitted once. `identifiability` then tells which parameters are identifiable and
+which laws are detectable at which ports, and `excitations` counts reversals and amplitudes of the motion. A parameter
+or law that is not identifiable or detectable is a blind spot, and so is a motion without reversals. The gravest blind
+spot that another recording can mend decides what to record next.
 """
 
 from __future__ import annotations
@@ -19,15 +19,29 @@ from .._base import in_words, one_blas_thread, to_json
 from ..data import Recording
 from ..laws import LINEAR, Law, display_name
 from ..simulators import in_series
-from .detectability import Excitation, LawRow, assess_laws, excitations, group_alike
-from .floor import ABOVE_NOISE, noise_floor
-from .identifiability import ParameterRow, Sensitivity, Tie, assess_parameters, helpful_sensors
-from .linearise import linearised
+from .floor import ABOVE_NOISE, Floor, noise_floor
+from .identifiability import (
+    TENTH,
+    LawRow,
+    ParameterRow,
+    Sensitivity,
+    Tie,
+    assess_laws,
+    assess_parameters,
+    group_alike,
+    helpful_sensors,
+    live_ports,
+    port_units,
+)
+from .linearise import Probe, Run, linearised
 from .preparation import check_laws, match_recordings, stated_hold
 from .workbench import Fitted, Workbench
 
-FINEST = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
-HALF = 0.5  # mean square error over the outputs' power above which the linearisation may be far from the machine
+LEAST_NOISE = 1e-6  # least noise assumed, as a share of the output's deviation: a 20-bit sensor
+# mean square error over the outputs' power above which the linearisation may be far from the machine: the simulator
+# then explains less of the outputs than it misses
+ROUGH = 0.5
+SMALLEST_SWING = TENTH / 2  # of a reversal, as a share of the travel: an amplitude a tenth of the largest
 
 IDENTIFIABLE = {  # by status: the word in the table, and the sentence of the blind spot
     "identifiable": ("yes", ""),
@@ -67,6 +81,30 @@ class BlindSpot:
     kind: str
     names: tuple[str, ...]
     sentence: str
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Motion of a port's local coordinate.
+
+    Attributes
+    ----------
+    travel : float
+        Largest minus smallest value, in `unit`.
+    reversals : int
+        Turning points with swings of at least a twentieth of the travel on both sides.
+    amplitudes : int
+        Distinct amplitudes of nine tenths of the swings; amplitudes closer than a tenth of the largest count once.
+    rests : int
+        Stretches longer than two typical swings in which the coordinate stays within a twentieth of the travel.
+    """
+
+    port: str
+    travel: float
+    unit: str
+    reversals: int
+    amplitudes: int
+    rests: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,17 +282,18 @@ def check(
     bench = Workbench.of(simulator, recordings, stated or "zero", engine)
     fitted = bench.fit(simulator)
     bench.check_followed(fitted)
-    return assess(bench, fitted, stated or "", laws)
+    return assess_recordings(bench, fitted, noise_floor(recordings, fitted.residual), stated or "", laws)
 
 
-def assess(bench: Workbench, fitted: Fitted, stated: str, laws: Sequence[type[Law]] | None = None) -> Check:
+def assess_recordings(
+    bench: Workbench, fitted: Fitted, floor: Floor, stated: str, laws: Sequence[type[Law]] | None = None
+) -> Check:
     """Assess the recordings of a bench along a refitted run; `stated` is the stated hold, "" if none was stated."""
     began, inputs, outputs = time.perf_counter(), bench.simulator.inputs, bench.simulator.output_names
-    floor = noise_floor(bench.recordings, fitted.residual)
-    noise = np.maximum(floor.deviation, FINEST * bench.scale)
+    noise = np.maximum(floor.deviation, LEAST_NOISE * bench.scale)
+    probe, runs = linearised(bench, fitted)
     quiet = replace(bench, scale=noise)  # from here on, the noise is the unit of all outputs
-    probe, runs = linearised(quiet, fitted)
-    response = Sensitivity.of(quiet, probe, runs)
+    response = Sensitivity.of(quiet, fitted, runs)
     parameters, ties = assess_parameters(response, quiet, fitted)
     rows, classes = assess_laws(quiet, fitted, probe, runs, laws, response.names)
     found = Check(
@@ -291,7 +330,7 @@ def _alive_as_given(bench: Workbench, fitted: Fitted, parameters: Sequence[Param
     given = bench.result(fitted.simulator, values, fitted.initial, fitted.engine, fitted.model)
     if not np.isfinite(given.cost):
         return ()
-    response = Sensitivity.of(bench, *linearised(bench, given))
+    response = Sensitivity.of(bench, given, linearised(bench, given)[1])
     reach = dict(zip(response.names, response.reach, strict=True))
     return tuple(name for name in doubtful if reach[name] >= 1)
 
@@ -306,7 +345,7 @@ def _find_blind_spots(found: Check, still: Sequence[str], alive: Sequence[str]) 
         if names:
             yield BlindSpot(kind, tuple(names), sentence.format(in_words(names)))
 
-    if found.error**2 > HALF:
+    if found.error**2 > ROUGH:
         left = f"{100 * found.error:.3g} % of the outputs' deviation"
         yield BlindSpot("rough", (), f"The refitted simulator leaves {left}, so all of this is rough.")
     yield from spot("constant-input", still, "Constant in all recordings: {}.")
@@ -390,3 +429,59 @@ def _next_record(found: Check, inputs: Sequence[str], sensors: Sequence[str]) ->
     if found.ties:
         return f"No further record of these signals helps: measure {found.ties[0].names[0]} separately and fix it."
     return "None is pressing; for the test take amplitudes that the training recordings do not have."
+
+
+def excitations(bench: Workbench, probe: Probe, runs: Sequence[Run]) -> Iterator[Excitation]:
+    """Count reversals, distinct amplitudes and rests of every live port's local coordinate along the refitted run."""
+    for port in live_ports(bench.simulator):
+        signals = [r.z[:, probe.ports.index(port.name)] for r in runs]
+        travel = float(np.ptp(np.concatenate(signals)))
+        least = SMALLEST_SWING * travel
+        reversals, rests, swings = 0, 0, list[float]()
+        for z in signals if travel > 0 else ():
+            turns = _turning_points(z, least)
+            reversals += max(len(turns) - 2, 0)
+            swings += np.abs(np.diff(z[turns])).tolist()
+            rests += _rests(z, least, 2 * float(np.median(np.diff(turns))) if len(turns) > 2 else TENTH * len(z))
+        unit = port_units(port, bench.recordings[0])[1]
+        yield Excitation(port.name, travel, unit, reversals, _distinct(np.array(swings)), rests)
+
+
+def _turning_points(z: np.ndarray, least: float) -> list[int]:
+    """Find the turning points of z between swings of at least `least`, the first and the last included."""
+    turns, extreme, way = [0], 0, 0.0
+    for k, value in enumerate(z.tolist()):
+        if way == 0:
+            if abs(value - z[0]) >= least:
+                way, extreme = np.sign(value - z[0]), k
+        elif way * (value - z[extreme]) >= 0:
+            extreme = k
+        elif way * (z[extreme] - value) >= least:
+            turns.append(extreme)
+            way, extreme = -way, k
+    return [*turns, extreme] if extreme > turns[-1] else turns
+
+
+def _distinct(swings: np.ndarray) -> int:
+    """Count the distinct sizes of nine tenths of the swings; sizes within a tenth of the largest count once."""
+    if not len(swings):
+        return 0
+    left, counts = np.sort(swings)[::-1], list[int]()
+    apart = TENTH * float(left[0])
+    while len(left):
+        own = left > left[0] - apart
+        counts.append(int(np.sum(own)))
+        left = left[~own]
+    share = np.cumsum(sorted(counts, reverse=True)) / sum(counts)
+    return int(np.searchsorted(share, 1 - TENTH - 1e-9) + 1)
+
+
+def _rests(z: np.ndarray, least: float, samples: float) -> int:
+    """Count the stretches of more than `samples` samples in which z stays within `least`."""
+    count, begin, low, high = 0, 0, z[0], z[0]
+    for k, value in enumerate(z):
+        low, high = min(low, value), max(high, value)
+        if high - low > least or k == len(z) - 1:
+            count += k - begin > samples
+            begin, low, high = k, value, value
+    return count

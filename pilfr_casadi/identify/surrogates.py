@@ -19,18 +19,12 @@ import numpy as np
 
 from .._base import InputError
 from ..data import Recording, as_recordings, check_for_identification, nrmse
-from ..identify import fit
 from ..models import PILFR, Parameter
 from ..simulators import Named, Port, Simulator
-from .gates import Gate
+from .fitting import fit
 from .modes import Mode, modes, to_continuous
 
-POOR = 0.02  # NRMSE above which a simulation is too nonlinear for a surrogate
-# the note about a surrogate above POOR
-TOO_POOR = (
-    "The linear model is poor: the simulation is not linear there, and what the model misses may show up as missing "
-    "physics. Give the simulator itself where it can be had."
-)
+POOR_SURROGATE = 0.02  # NRMSE above which a simulation is too nonlinear for a surrogate
 FREE = 0.3  # range of the parameters, as a share of their values
 EXACT = 1e-3  # NRMSE below which no higher order is tried
 HIGHEST = 8  # highest order that is tried
@@ -82,13 +76,14 @@ def surrogate(recordings: Recording | Sequence[Recording], *, nx: int | None = N
     return simulator, error
 
 
-def surrogate_gates(error: float) -> tuple[Gate, ...]:
-    """Note that a surrogate misses its simulation by an NRMSE of `error`; no note if that is zero."""
-    if not error:
-        return ()
-    words = f"A linear model stands for the simulation, which it follows to NRMSE {error:.4f}; that counts as noise."
-    words += f" {TOO_POOR}" if error > POOR else ""
-    return (Gate("simulation", "surrogate", error, words, False),)
+def surrogate_warning(error: float) -> str:
+    """Warn of a surrogate whose NRMSE `error` shows that the simulation is not linear; empty if it is small enough."""
+    if error <= POOR_SURROGATE:
+        return ""
+    return (
+        "The linear model is poor: the simulation is not linear there, and what the model misses may show up as "
+        "missing physics. Give the simulator itself where it can be had."
+    )
 
 
 def _identify(records: Sequence[Recording], n: int, hold: str | None) -> tuple[float, Simulator] | None:
