@@ -39,13 +39,12 @@ Change = Callable[[Recording], Recording]
 
 LEAST_GAIN = 12.0  # least gain of a correction beyond the BIC cost of its parameters, in nats: odds of about 1e5
 CERTAIN = (2 * LEAST_GAIN) ** 0.5  # the same in standard errors of one parameter
-# largest share of the mean square error that the correction of a fault leaves
-CURED = 0.25
-CLEARLY = 0.8  # the same for an edit that is clearly better than another edit, or than none
+CURED = 0.25  # largest share of the mean square that the correction of a fault leaves: it halves the error
+USELESS_FIT = CURED  # the same share of the outputs' variance: a worse refit says nothing
+POOR_FIT = 0.04  # share of the outputs' variance from which a refit may be in a wrong minimum
+CLEARLY = 0.8  # share left by an edit that is clearly better than another edit, or than none
 SAME = 1.02  # ratio of errors that count as equal
 AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong
-# mean square error from which a refit may be in a wrong minimum; from which it says nothing
-POOR_FIT, USELESS_FIT = 0.04, 0.25
 FEWEST = 30.0  # effective samples that a residual has at least
 TURNS = 8  # alternations of edit and refit at most
 
@@ -290,9 +289,10 @@ def robust_deviation(v: np.ndarray) -> np.ndarray:
 # sign, unit, exchange, unit of time
 
 
-def map_channels(kind: str, matrix: np.ndarray) -> Change:
-    """Multiply the inputs ("u") or the outputs ("y") by a matrix (n, n)."""
-    return lambda r: r.with_(**{kind: getattr(r, kind) @ matrix})
+def map_channels(kind: str, matrix: np.ndarray, channel: str, finding: str, value: Any, words: str) -> Gate:
+    """Return the fault that inputs ("u") or outputs ("y") times a matrix (n, n) correct."""
+    sentence = f"In the recordings {channel if finding != 'exchange' else ' and '.join(value)} {words}"
+    return Gate(channel, finding, value, sentence, change=lambda r: r.with_(**{kind: getattr(r, kind) @ matrix}))
 
 
 def scale_channels(kind: str, names: Sequence[str], columns: Sequence[int], factor: float, more: str = "") -> Gate:
@@ -300,18 +300,16 @@ def scale_channels(kind: str, names: Sequence[str], columns: Sequence[int], fact
     matrix, channel = np.eye(len(names)), ", ".join(names[i] for i in columns)
     matrix[columns, columns] = factor
     if factor < 0:
-        words = f"In the recordings {channel} has the wrong sign{more}"
-        return Gate(channel, "sign", factor, words, change=map_channels(kind, matrix))
-    words = f"In the recordings {channel} {'are' if len(columns) > 1 else 'is'} {_describe_factor(factor, more)}"
-    return Gate(channel, "unit", factor, words, change=map_channels(kind, matrix))
+        return map_channels(kind, matrix, channel, "sign", factor, f"has the wrong sign{more}")
+    words = f"{'are' if len(columns) > 1 else 'is'} {_describe_factor(factor, more)}"
+    return map_channels(kind, matrix, channel, "unit", factor, words)
 
 
 def exchange_channels(kind: str, names: Sequence[str], one: int, other: int) -> Gate:
     """Return the fault that two channels are exchanged."""
-    order, both = np.arange(len(names)), [names[one], names[other]]
-    order[[one, other]] = other, one
-    words = f"In the recordings {' and '.join(both)} are exchanged"
-    return Gate(", ".join(both), "exchange", both, words, change=map_channels(kind, np.eye(len(names))[order]))
+    matrix, both = np.eye(len(names)), [names[one], names[other]]
+    matrix[[one, other]] = matrix[[other, one]]
+    return map_channels(kind, matrix, ", ".join(both), "exchange", both, "are exchanged")
 
 
 def scale_time(factor: float) -> Gate:
@@ -477,12 +475,6 @@ def constant_at(port: str, value: float = 0.0, parameter: str = "") -> Constant:
     return Constant(name, "offset", value, words, parameter=parameter, port=port)
 
 
-def constants_among(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Constant]:
-    """List the offsets among fitted elements."""
-    placed = [(e, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
-    return [constant_at(e.port, float(values[name]), name) for e, name in placed]
-
-
 def find_offsets(now: Checked) -> Checked:
     """Find constants at inputs and outputs, the most useful first, and keep them as parameters of the simulator.
 
@@ -499,8 +491,8 @@ def find_offsets(now: Checked) -> Checked:
         after = correct(now, constant_at(port), [now.fitted.values], now.fitted.initial, THOROUGH)
         if after is None:
             break
-        constant = constants_among(after.bench.simulator.elements, after.fitted.values)[-1]
-        accepted = accept(now, after, constant)
+        name = f"{after.bench.simulator.elements[-1].prefix}w_0"
+        accepted = accept(now, after, constant_at(port, float(after.fitted.values[name]), name))
         if accepted.bench is now.bench:
             break
         now = accepted
@@ -523,7 +515,8 @@ def share_of_constants(bench: Workbench, fitted: Fitted, ports: Sequence[str]) -
 
 def offset_gates(elements: Sequence[Any], values: Mapping[str, Any]) -> list[Gate]:
     """List the offsets among fitted laws as findings."""
-    found = constants_among(elements, values)
+    placed = [(e.port, f"{e.prefix}w_0") for e in elements if isinstance(e.law, Offset)]
+    found = [constant_at(port, float(values[name]), name) for port, name in placed]
     return [replace(c, sentence=f"{c.sentence}; it is a parameter of the corrected simulator.") for c in found]
 
 
@@ -531,8 +524,8 @@ def without_idle_offsets(bench: Workbench, fitted: Fitted) -> Fitted:
     """Fix offsets at zero that gain nothing beside effects: an effect may have looked like an offset."""
     before = len(bench.simulator.elements)
     placed = fitted.simulator.elements
-    for constant in constants_among(placed[:before], fitted.values) if len(placed) > before else ():
-        name = constant.parameter
+    for offset in offset_gates(placed[:before], fitted.values) if len(placed) > before else ():
+        name = offset.parameter
         held = replace(fitted.simulator.parameters[name], value=0.0, fixed=True)
         simulator = fitted.simulator.with_parameters({**fitted.simulator.parameters, name: held})
         start = {k: v for k, v in fitted.values.items() if k != name}

@@ -31,6 +31,7 @@ from .floor import ABOVE_NOISE
 from .gates import (
     AT_NOISE,
     CLEARLY,
+    CURED,
     POOR_FIT,
     SAME,
     Checked,
@@ -52,7 +53,6 @@ LONG = 4.5  # shift in samples above which a whole shift is a fault of the recor
 AVERAGED = 0.5  # largest share of a channel's noise that interpolation between its samples removes
 
 MOST_GAPS = 3  # gaps that are sought at most
-WORSE = 2.0  # least ratio of the error left by a shock or a step to that left by a jump
 SHORTEST = 40  # samples of a piece at least
 BESIDE = 5  # samples around a jump at which rivals are tried, and at which a drift would explain as much
 BETWEEN = (-0.5, 0.0, 0.5)  # delays of a shock that are tried, in samples
@@ -124,7 +124,7 @@ class TimeShift(Gate):
         value = _minimise(self.remainder(first, after.fitted), self.value - width, self.value + width)[0]
         return self if abs(value - self.value) < 2e-3 * width else self.at(value, now.bench.dt)
 
-    def may_be_physics(self, dt: float, part: float) -> bool:
+    def is_like_delay(self, dt: float, part: float) -> bool:
         """Tell whether it is late as by a delay: by a fraction of `part` samples, or by little."""
         late = self.finding == "alignment" and self.value > -WHOLE * dt
         return late and not (in_steps(self.value, dt, part) and self.value > LONG * dt)
@@ -185,9 +185,8 @@ def find_time_shift(now: Checked, part: float = 1.0, early: bool = True) -> Chec
         return found
     late = fault.finding == "clock" or fault.value > 0
     more_is_wrong = after.cost > AT_NOISE**2 * noise2  # then a late channel or a slow clock may be physics
-    if fault.may_be_physics(bench.dt, part) or (more_is_wrong and (late or not early)):
-        return now
-    return found
+    may_be_physics = fault.is_like_delay(bench.dt, part) or (more_is_wrong and (late or not early))
+    return now if may_be_physics else found
 
 
 def run_as_given(bench: Workbench, plain: Fitted) -> Fitted:
@@ -231,12 +230,12 @@ def _screen_shifts(bench: Workbench, plain: Fitted) -> list[TimeShift]:
 
 @dataclass(frozen=True, eq=False)
 class Jump(Gate):
-    """A jump of the state at a sample of a recording; the shares are those of the mean square that it removes.
+    """A jump of the state, as where samples were lost; until it is reported, its value is (recording, sample).
 
     Attributes
     ----------
     share : float
-        Share that the jump removes.
+        Share of the mean square that the jump removes.
     rival : float
         Share that a shock nearby, or a step of one force or sensor there, removes.
     beside : float
@@ -245,22 +244,21 @@ class Jump(Gate):
         Initial states of the recordings when this one is cut there.
     """
 
-    recording: int = 0
-    sample: int = 0
     share: float = 0.0
     rival: float = 0.0
     beside: float = 0.0
     states: Sequence[np.ndarray] = ()
     remedy: ClassVar[str] = "with the recording cut there"
 
-    def beats(self, other: float, times: float) -> bool:
-        """Tell whether a rival that removes the share `other` leaves more than `times` this jump's error."""
-        return 1 - other > times * max(1 - self.share, 0.0)
+    def beats(self, other: float, share: float) -> bool:
+        """Tell whether this jump leaves at most a share of the error that a rival leaves, which removes `other`."""
+        return 1 - self.share < share * (1 - other)
 
     def apply(self, bench: Workbench) -> Workbench:
         """Cut the recording; the state at the first sample of the later piece is estimated."""
-        i, r = self.recording, bench.recordings[self.recording]
-        pieces = r.slice(0, self.sample), r.slice(self.sample).with_(initial="estimate", period=None)
+        i, k = self.value
+        r = bench.recordings[i]
+        pieces = r.slice(0, k), r.slice(k).with_(initial="estimate", period=None)
         return replace(bench, recordings=(*bench.recordings[:i], *pieces, *bench.recordings[i + 1 :]))
 
     def begin(self, previous: Fitted) -> Sequence[np.ndarray]:
@@ -269,11 +267,9 @@ class Jump(Gate):
 
     def relocate(self, now: Checked, after: Checked) -> Jump | None:
         """Find the jump along the run that a fit to the two pieces makes of the whole recording."""
-        initial = [x for i, x in enumerate(after.fitted.initial) if i != self.recording + 1]
-        whole = now.bench.result(
-            now.bench.simulator, after.fitted.values, initial, after.fitted.engine, after.fitted.model
-        )
-        return find_jump(now.bench, whole)
+        fitted, bench = after.fitted, now.bench
+        initial = [x for i, x in enumerate(fitted.initial) if i != self.value[0] + 1]
+        return find_jump(bench, bench.result(bench.simulator, fitted.values, initial, fitted.engine, fitted.model))
 
 
 def settle_jump(now: Checked) -> tuple[Jump, Checked] | None:
@@ -292,14 +288,15 @@ def find_gaps(now: Checked) -> Checked:
     last, found = now, now
     while len(origins) - len(now.bench.recordings) < MOST_GAPS and last.cost > ABOVE_NOISE**2 * noise2:
         settled = settle_jump(last)
-        if settled is None or not settled[0].beats(settled[0].rival, SAME**2):
+        if settled is None or not settled[0].beats(settled[0].rival, 1 / SAME**2):
             break
         jump, last = settled
-        r, begin = origins[jump.recording]
-        origins.insert(jump.recording + 1, (r, begin + jump.sample))
+        i, k = jump.value
+        r, begin = origins[i]
+        origins.insert(i + 1, (r, begin + k))
         # jumps around a drift also imitate it
-        sharp = jump.beats(jump.beside, 1 / CLEARLY) or last.cost < AT_NOISE**2 * noise2
-        if sharp and jump.beats(jump.rival, WORSE):
+        sharp = jump.beats(jump.beside, CLEARLY) or last.cost < AT_NOISE**2 * noise2
+        if sharp and jump.beats(jump.rival, CURED):
             accepted = accept(now, _name_pieces(last, origins), _describe_gaps(jump, origins))
             found = accepted if len(accepted.gates) > len(now.gates) else found
     return found
@@ -356,14 +353,13 @@ def find_jump(bench: Workbench, fitted: Fitted) -> Jump | None:
         if shares[k] > best.share:
             around = slice(max(k - BESIDE, 0), k + BESIDE + 1)
             rival, beside = float(np.max(rivals[around])), float(max(shares[around.start], shares[k + BESIDE]))
-            best = replace(best, value=(i, k), recording=i, sample=k)
-            best = replace(best, share=float(shares[k]), rival=rival, beside=beside)
+            best = replace(best, value=(i, k), share=float(shares[k]), rival=rival, beside=beside)
             best_size = sizes[k]
     if best.share < 1 - CLEARLY:
         return None
-    i, model = best.recording, fitted.model
+    (i, k), model = best.value, fitted.model
     run = states_along(model, model.drive(bench.recordings[i]), fitted.vector, fitted.initial[i])
-    state = run[best.sample * model.substeps, : len(best_size)] - best_size
+    state = run[k * model.substeps, : len(best_size)] - best_size
     return replace(best, states=[*fitted.begin[: i + 1], np.asarray(state), *fitted.begin[i + 1 :]])
 
 
