@@ -36,8 +36,8 @@ REACH = 6  # widths on either side of a glitch or a spectral line with which it 
 RARE = 0.02  # share of the samples, or of the power, up to which something is an exception
 
 CUBIC, STENCIL = np.array([-1, 4, 0, 4, -1]) / 6, 2  # through the neighbours at -2, -1, 1, 2
-GLITCH_FAR, GLITCH_SIZE = 14.0, 0.1  # least distance of a glitch over the deviation nearby, and over the output's
-ALONE = 0.12  # largest distance of the neighbours of a replaced glitch, over its own; a kink leaves 1/6
+GLITCH_SIZE = 0.1  # least distance of a glitch over the output's deviation
+ALONE = 0.12  # largest distance of neighbours, and deviation nearby, over a glitch's distance; a kink leaves 1/6
 
 CONTINUOUS = 0.5  # share of the samples with distinct values above which a signal is not quantised
 STANDING = 5  # longest rest of an encoder or a machine, in samples; largest motion of an encoder in a sample, in steps
@@ -102,7 +102,7 @@ def distances(y: np.ndarray) -> np.ndarray:
 def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
     """Tell whether a sample stands out, and its neighbours do not once it is replaced."""
     around = np.arange(max(k - REACH * STENCIL, STENCIL), min(k + REACH * STENCIL + 1, len(y) - STENCIL))
-    if abs(d[k]) <= GLITCH_FAR * robust_deviation(d[around[np.abs(around - k) > STENCIL]]):
+    if robust_deviation(d[around[np.abs(around - k) > STENCIL]]) >= ALONE * abs(d[k]):
         return False
     whole = slice(max(k - 2 * STENCIL, 0), min(k + 2 * STENCIL + 1, len(y)))
     other = np.array(y[whole])
