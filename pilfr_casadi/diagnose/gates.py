@@ -43,6 +43,7 @@ CURED = 0.25  # largest share of the mean square that the correction of a fault 
 USELESS_FIT = CURED  # the same share of the outputs' variance: a worse refit says nothing
 POOR_FIT = 0.04  # share of the outputs' variance from which a refit may be in a wrong minimum
 CLEARLY = 0.8  # share left by an edit that is clearly better than another edit, or than none
+RARE = 0.02  # share of a mean square, or of the samples, up to which something is an exception
 SAME = 1.02  # ratio of errors that count as equal
 AT_NOISE = 5.0  # rms error over the noise up to which nothing else is wrong
 FEWEST = 30.0  # effective samples that a residual has at least
@@ -486,7 +487,7 @@ def find_offsets(now: Checked) -> Checked:
     while ports:
         share = share_of_constants(now.bench, now.fitted, ports)
         port = max(share, key=lambda name: share[name])
-        if gain(1.0, 1 - share[port], now.fitted.residual) < LEAST_GAIN:
+        if share[port] < RARE:
             break
         after = correct(now, constant_at(port), [now.fitted.values], now.fitted.initial, THOROUGH)
         if after is None:

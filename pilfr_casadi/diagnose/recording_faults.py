@@ -27,13 +27,12 @@ import numpy as np
 
 from ..data import Recording
 from ..laws import AsymmetricSaturation
-from .gates import CURED, LEAST_GAIN, Checked, FirstOrder, Gate, accept, correct, open_start, robust_deviation
+from .gates import CURED, LEAST_GAIN, RARE, Checked, FirstOrder, Gate, accept, correct, open_start, robust_deviation
 from .linearise import linearised
 from .remainder import folds, held_out
 from .workbench import Fitted, Workbench
 
 REACH = 6  # widths on either side of a glitch or a spectral line with which it is compared
-RARE = 0.02  # share of the samples, or of the power, up to which something is an exception
 
 CUBIC, STENCIL = np.array([-1, 4, 0, 4, -1]) / 6, 2  # through the neighbours at -2, -1, 1, 2
 GLITCH_SIZE = 0.1  # least distance of a glitch over the output's deviation
